@@ -1,0 +1,123 @@
+"""The session: which bus, which drives, what is streamed, recorded, published and identified."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from configs.base import Frozen
+from configs.robot import Name, Positive
+
+ObjectName = Literal["position", "velocity", "current", "torque", "demand", "status"]
+Every = Annotated[int, Field(ge=1, le=240)]
+
+
+class Bus(Frozen):
+    """A CAN bus. ``bitrate`` is ``None`` on a virtual bus, which has none."""
+
+    interface: Literal["socketcan", "udp_multicast"] = "socketcan"
+    channel: str = "vcan0"
+    bitrate: Annotated[int, Field(gt=0)] | None = None
+
+
+class Sync(Frozen):
+    """SYNC (CiA 301 section 7.2.5): who sends it, how often, and the overflow of its counter (1019h)."""
+
+    role: Literal["producer", "consumer"] = "producer"
+    period_us: Annotated[int, Field(ge=100, le=1_000_000)] = 200
+    counter: Annotated[int, Field(ge=2, le=240)] = 240
+
+
+class DriveNode(Frozen):
+    """One CANopen node and the joint whose motor it drives."""
+
+    joint: Name
+    node_id: Annotated[int, Field(ge=1, le=127)]
+    eds: Path
+
+
+class Stream(Frozen):
+    """One TPDO of every drive, sent on every ``every``-th SYNC, recorded as the topic of this name."""
+
+    tpdo: Annotated[int, Field(ge=1, le=4)]
+    every: Every = 1
+    objects: Annotated[tuple[ObjectName, ...], Field(min_length=1)]
+
+
+class Setpoints(Frozen):
+    """Position set points (607Ah) in cyclic synchronous position mode, interpolated by the drives."""
+
+    rpdo: Annotated[int, Field(ge=1, le=4)] = 1
+    every: Every = 5
+    trajectory: Path
+    repeat: Annotated[int, Field(ge=1)] = 1
+    settle_s: Annotated[float, Field(ge=0)] = 0.5
+
+
+class RecordingOptions(Frozen):
+    """Where and how recordings are written."""
+
+    directory: Path = Path("recordings")
+    chunk_ms: Annotated[int, Field(ge=10, le=1000)] = 100
+    drain_ms: Annotated[int, Field(ge=1, le=100)] = 10
+
+
+class ZenohOptions(Frozen):
+    """Zenoh: peers on loopback unless ``config`` names a Zenoh configuration file (JSON5)."""
+
+    config: Path | None = None
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    commands: bool = False
+    queue_blocks: Annotated[int, Field(ge=16)] = 512
+    cache_blocks: Annotated[int, Field(ge=0)] = 4096
+
+
+class IdentificationOptions(Frozen):
+    """What the worker runs on an experiment; the same names as the options of ``armident identify``."""
+
+    method: Literal["idim-piv", "idim-iv", "idim-ls"] = "idim-piv"
+    derivatives: Literal["irwsm", "irwsm2", "bandpass"] = "irwsm"
+    controller: Literal["crc", "known"] = "crc"
+
+
+class SessionConfig(Frozen):
+    """Everything one cell needs; relative paths are relative to the file they stand in."""
+
+    schema_: Literal["armident/session/1"] = Field(alias="schema")
+    cell: Name
+    robot: Path
+    bus: Bus = Bus()
+    sync: Sync = Sync()
+    drives: Annotated[tuple[DriveNode, ...], Field(min_length=1)]
+    heartbeat_ms: Annotated[int, Field(ge=10, le=60_000)] = 100
+    sdo_timeout_s: Positive = 1.0
+    streams: dict[Name, Stream]
+    setpoints: Setpoints | None = None
+    recording: RecordingOptions = RecordingOptions()
+    zenoh: ZenohOptions = ZenohOptions()
+    identification: IdentificationOptions = IdentificationOptions()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        nodes = [d.node_id for d in self.drives]
+        if len(set(nodes)) != len(nodes):
+            raise ValueError("drives: node_id must be unique")
+        if len({d.joint for d in self.drives}) != len(self.drives):
+            raise ValueError("drives: each joint has one drive")
+        tpdos = [s.tpdo for s in self.streams.values()]
+        if len(set(tpdos)) != len(tpdos):
+            raise ValueError("streams: each stream needs a tpdo of its own")
+        if "samples" not in self.streams or self.streams["samples"].every != 1:
+            raise ValueError("streams: a stream named 'samples' with every: 1 is required")
+        for label, every in [(f"streams.{k}", s.every) for k, s in self.streams.items()] + (
+            [("setpoints", self.setpoints.every)] if self.setpoints else []
+        ):
+            if self.sync.counter % every:
+                raise ValueError(f"{label}.every: {every} does not divide sync.counter {self.sync.counter}")
+        return self
+
+    @property
+    def sync_period(self) -> float:
+        """Time between two SYNC, s."""
+        return self.sync.period_us * 1e-6

@@ -1,0 +1,95 @@
+"""Reference trajectories: point-to-point moves with smoothed trapezoidal velocities (thesis section B.4)."""
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from configs.base import Frozen
+from configs.errors import ConfigError
+from configs.robot import RobotConfig
+
+RAMP_SHARE = 0.4
+"""Share of a move spent accelerating; as much again decelerating, the rest at constant speed."""
+
+
+class Move(Frozen):
+    """All joints go to ``to`` (rad or m) in ``duration`` seconds, then stand still for ``dwell``."""
+
+    to: tuple[float, ...]
+    duration: Annotated[float, Field(gt=0)]
+    dwell: Annotated[float, Field(ge=0)] = 0.0
+
+
+class Trajectory(Frozen):
+    """A sequence of synchronous point-to-point moves from ``start``."""
+
+    schema_: Literal["armident/trajectory/1"] = Field(alias="schema")
+    start: tuple[float, ...]
+    moves: Annotated[tuple[Move, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _same_length(self) -> Self:
+        for k, move in enumerate(self.moves):
+            if len(move.to) != len(self.start):
+                raise ValueError(f"moves[{k}].to: expected {len(self.start)} numbers")
+        return self
+
+    @property
+    def duration(self) -> float:
+        """Length of the whole trajectory, s."""
+        return sum(move.duration + move.dwell for move in self.moves)
+
+    def sample(self, period: float) -> NDArray[np.float64]:
+        """Positions at ``0, period, 2 period, ...`` up to the end; shape (N, n), rad or m."""
+        t = np.arange(int(round(self.duration / period)) + 1) * period
+        q = np.empty((t.size, len(self.start)))
+        origin, begin = np.array(self.start), 0.0
+        for move in self.moves:
+            target = np.array(move.to)
+            inside = t >= begin - 1e-12
+            q[inside] = origin + _smooth_step((t[inside] - begin) / move.duration)[:, None] * (target - origin)
+            origin, begin = target, begin + move.duration + move.dwell
+        return q
+
+    def check(self, robot: RobotConfig, where: str = "trajectory") -> None:
+        """Refuse a trajectory that leaves the limits of the robot.
+
+        Raises
+        ------
+        ConfigError
+            Naming the joint, the limit, and by how much it is exceeded.
+        """
+        if len(self.start) != robot.n:
+            raise ConfigError(f"{where}: {len(self.start)} joints, but {robot.name} has {robot.n}")
+        period = 1e-3
+        q = self.sample(period)
+        qd = np.diff(q, axis=0) / period
+        qdd = np.diff(qd, axis=0) / period
+        for j, joint in enumerate(robot.joints):
+            low, high = joint.limits.position
+            if q[:, j].min() < low or q[:, j].max() > high:
+                raise ConfigError(
+                    f"{where}: {joint.name} moves over [{q[:, j].min():.3f}, {q[:, j].max():.3f}], "
+                    f"allowed is [{low:.3f}, {high:.3f}]"
+                )
+            for label, values, limit in (
+                ("velocity", qd[:, j], joint.limits.velocity),
+                ("acceleration", qdd[:, j], joint.limits.acceleration),
+            ):
+                peak = float(np.abs(values).max(initial=0.0))
+                if peak > limit * (1 + 1e-6):
+                    raise ConfigError(f"{where}: {joint.name} reaches {label} {peak:.3f}, allowed is {limit:.3f}")
+
+
+def _smooth_step(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0 to 1 for ``s`` in [0, 1] with a trapezoidal velocity whose ramps are half cosines."""
+    a = RAMP_SHARE
+    v = 1.0 / (1.0 - a)
+    s = np.clip(s, 0.0, 1.0)
+    rising = v * (s / 2 - a / (2 * np.pi) * np.sin(np.pi * s / a))
+    falling = 1.0 - v * ((1 - s) / 2 - a / (2 * np.pi) * np.sin(np.pi * (1 - s) / a))
+    level = v * (s - a / 2)
+    step: NDArray[np.float64] = np.where(s < a, rising, np.where(s > 1 - a, falling, level))
+    return step

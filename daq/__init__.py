@@ -1,0 +1,1 @@
+"""Acquisition: samples from the bus to recordings and streams, and the root of the command line."""

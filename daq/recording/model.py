@@ -1,0 +1,125 @@
+"""What a recording is once it is read: raw numbers in arrays, and what they mean."""
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import RobotConfig, SessionConfig
+
+Quantity = Literal["position", "velocity", "current", "voltage", "torque", "demand", "status"]
+Side = Literal["motor", "joint"]
+
+
+@dataclass(frozen=True)
+class Field:
+    """One quantity of every joint: ``SI = scale * raw``, on the motor's or the joint's side.
+
+    ``demand`` is the reference position; ``unit`` is the unit after scaling (rad, m, A, V, N m, N or "").
+    """
+
+    name: str
+    quantity: Quantity
+    unit: str
+    side: Side
+    scale: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Samples matched by SYNC: row k of every array belongs to SYNC number ``sync[k]``.
+
+    ``sync`` (N,) int64 counts SYNC from the start of the capture and is strictly increasing; a number that is
+    absent is a gap. ``t_ns`` (N,) int64 is the kernel's receive time of that SYNC (ns, UTC).
+    ``raw[name]`` has shape (N, n), one column per joint, as it came off the bus.
+    """
+
+    name: str
+    every: int
+    sync: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    fields: dict[str, Field]
+    raw: dict[str, NDArray[Any]]
+
+    def si(self, name: str) -> NDArray[np.float64]:
+        """The field in SI units, shape (N, n), on the side the field says."""
+        scaled: NDArray[np.float64] = self.raw[name].astype(np.float64) * np.asarray(self.fields[name].scale)
+        return scaled
+
+    def named(self, quantity: Quantity) -> str | None:
+        """The name of the field with this quantity, if there is one."""
+        return next((f.name for f in self.fields.values() if f.quantity == quantity), None)
+
+
+@dataclass(frozen=True)
+class Gap:
+    """SYNC numbers ``first`` to ``last`` (inclusive) lack the sample of ``joint`` (``None``: of all)."""
+
+    stream: str
+    first: int
+    last: int
+    joint: str | None = None
+    reason: str = "lost"
+
+
+@dataclass(frozen=True)
+class Mark:
+    """An experiment begins or ends, or something worth keeping happened, at a SYNC number."""
+
+    kind: Literal["experiment_start", "experiment_end", "note", "emcy", "heartbeat_lost"]
+    sync: int
+    t_ns: int
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording, from a file or assembled from the stream: the same numbers either way."""
+
+    path: Path | None
+    robot: RobotConfig
+    session: SessionConfig | None
+    sample_rate_hz: float
+    streams: dict[str, Stream]
+    gaps: tuple[Gap, ...] = ()
+    marks: tuple[Mark, ...] = ()
+    counters: dict[str, int] = field(default_factory=dict)
+    metadata: dict[str, str] = field(default_factory=dict)
+    missing: str | None = None
+    """What a torn file lacks, in words; ``None`` for a complete one."""
+
+    @property
+    def samples(self) -> Stream:
+        """The stream that every recording has: one row per SYNC."""
+        return self.streams["samples"]
+
+    @property
+    def sha256(self) -> str:
+        """Digest of all raw samples in order, the same for the file and for the stream it was published as."""
+        digest = hashlib.sha256()
+        for name in sorted(self.streams):
+            stream = self.streams[name]
+            digest.update(name.encode())
+            digest.update(np.ascontiguousarray(stream.sync).tobytes())
+            for key in sorted(stream.raw):
+                digest.update(key.encode())
+                digest.update(np.ascontiguousarray(stream.raw[key]).tobytes())
+        return digest.hexdigest()
+
+    def experiments(self) -> list[tuple[int, int]]:
+        """SYNC numbers (first, last) of every marked experiment; the whole recording if none is marked."""
+        spans: list[tuple[int, int]] = []
+        start: int | None = None
+        for mark in sorted(self.marks, key=lambda m: m.sync):
+            if mark.kind == "experiment_start":
+                start = mark.sync
+            elif mark.kind == "experiment_end" and start is not None:
+                spans.append((start, mark.sync))
+                start = None
+        sync = self.samples.sync
+        if not spans and sync.size:
+            spans.append((int(sync[0]), int(sync[-1])))
+        return spans

@@ -1,0 +1,50 @@
+"""Zenoh key expressions of a cell (ARCHITECTURE: ``armident/<cell>/<robot>/...``)."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The key expressions of one robot in one cell."""
+
+    cell: str
+    robot: str
+
+    @property
+    def base(self) -> str:
+        """Prefix of every key of this robot."""
+        return f"armident/{self.cell}/{self.robot}"
+
+    @property
+    def samples(self) -> str:
+        """Blocks of raw samples, in the order of the recording."""
+        return f"{self.base}/samples"
+
+    @property
+    def events(self) -> str:
+        """Marks, gaps, EMCY, heartbeat losses (JSON)."""
+        return f"{self.base}/events"
+
+    @property
+    def health(self) -> str:
+        """Rates, gaps, drops, queue depth at 1 Hz (JSON)."""
+        return f"{self.base}/health"
+
+    @property
+    def status(self) -> str:
+        """What capture and worker are doing, progress included (JSON)."""
+        return f"{self.base}/status"
+
+    @property
+    def identification(self) -> str:
+        """The last identification document (published, and answered to queries)."""
+        return f"{self.base}/result/identification"
+
+    @property
+    def diagnosis(self) -> str:
+        """The last diagnosis document (published, and answered to queries)."""
+        return f"{self.base}/result/diagnosis"
+
+    def alive(self, component: str) -> str:
+        """Liveliness token of a component (``capture``, ``worker``)."""
+        return f"{self.base}/alive/{component}"

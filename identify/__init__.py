@@ -1,0 +1,1 @@
+"""From a recording to a dynamic model: signals, controller, estimators, reports, the worker."""

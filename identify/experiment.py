@@ -1,0 +1,29 @@
+"""An experiment: joint positions and torques on an even time grid, ready to be identified."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What the estimators see of a recording; SI units, joint side, no gaps.
+
+    Parameters
+    ----------
+    q
+        Measured joint positions, shape (N, n), rad or m.
+    tau
+        Joint torques from the drives' signals, shape (N, n), N m or N. Sample k is the torque held
+        over ``[k, k + 1)`` sampling periods, as a digital drive applies it.
+    q_ref
+        Reference positions, shape (N, n), or ``None`` where none was recorded.
+    dt
+        Sampling period, s.
+    """
+
+    q: NDArray[np.float64]
+    tau: NDArray[np.float64]
+    q_ref: NDArray[np.float64] | None
+    dt: float
