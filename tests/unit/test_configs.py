@@ -1,0 +1,138 @@
+"""Configuration files: what is accepted, and that every mistake is named in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from configs import ConfigError, RobotConfig, config_path, load_robot, load_session, load_trajectory
+from configs.loading import HERE, parse
+
+TX40 = yaml.safe_load((HERE / "tx40.yaml").read_text())
+
+
+def robot_with(**changes: object) -> str:
+    return yaml.safe_dump(TX40 | changes)
+
+
+@pytest.mark.parametrize("path", sorted(HERE.glob("*.yaml")), ids=lambda p: p.name)
+def test_every_shipped_configuration_loads(path: Path) -> None:
+    kind = yaml.safe_load(path.read_text())["schema"]
+    load = {"armident/robot/1": load_robot, "armident/session/1": load_session}[kind]
+    assert load(path) == load(path)
+
+
+@pytest.mark.parametrize("name", ["tx40", "tx40.yaml", "configs/tx40.yaml", str(HERE / "tx40.yaml")])
+def test_a_shipped_configuration_is_found_by_its_short_names(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert load_robot(name).n == 6
+
+
+def test_a_file_in_the_working_directory_wins_over_the_shipped_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("tx40.yaml").write_text(robot_with(description="mine"))
+    assert load_robot("tx40.yaml").description == "mine"
+
+
+def test_motor_six_turns_with_joint_five_as_on_the_tx40() -> None:
+    matrix = load_robot("tx40").transmission_matrix
+    assert matrix[5, 4] == matrix[5, 5] == 32.0
+    assert np.allclose(np.linalg.solve(matrix, matrix @ np.arange(6.0)), np.arange(6.0), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (robot_with(transmision=[[1.0]]), "transmision: unknown key; did you mean 'transmission'?"),
+        (robot_with(bandwidth_hz=-1), "bandwidth_hz: input should be greater than 0, found -1"),
+        (robot_with(bandwidth_hz=float("nan")), "bandwidth_hz: "),
+        (robot_with(transmission=[[1.0]]), "transmission: expected 6 rows of 6 numbers"),
+        (robot_with(transmission=[[0.0] * 6] * 6), "transmission: the matrix is singular"),
+        (robot_with(joints=TX40["joints"][:5] + [TX40["joints"][4]]), "joints: names must be unique"),
+        (
+            robot_with(couplings=[{"name": "m6", "joints": ["joint_5", "joint_7"]}]),
+            "couplings: no joint named 'joint_7'",
+        ),
+        (robot_with(schema="armident/robot/2"), "schema: input should be 'armident/robot/1'"),
+        ("joints: [", "line 1"),
+        ("- a\n- b\n", "expected keys and values, found list"),
+    ],
+)
+def test_a_mistake_is_named_in_one_line_with_file_key_and_expectation(text: str, expected: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(text, RobotConfig, "robot.yaml")
+    message = str(caught.value)
+    assert message.startswith("robot.yaml:")
+    assert expected in message
+    assert "\n" not in message
+
+
+def test_a_missing_file_names_what_is_shipped() -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml: no such file .*tx40\.yaml"):
+        config_path("nowhere.yaml")
+
+
+def session_with(tmp_path: Path, **changes: object) -> Path:
+    data = yaml.safe_load((HERE / "tx40_cell.yaml").read_text())
+    data["robot"] = str(HERE / "tx40.yaml")
+    data["setpoints"]["trajectory"] = str(HERE / "trajectories" / "tx40_excitation.yaml")
+    for drive in data["drives"]:
+        drive["eds"] = str(HERE / "eds" / "cia402_servo.eds")
+    for key, value in changes.items():
+        data[key] = value(data[key]) if callable(value) else value
+    path = tmp_path / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("robot", "nowhere.yaml", "robot: no such file nowhere.yaml"),
+        ("streams", lambda s: s | {"more": {"tpdo": 1, "objects": ["torque"]}}, "each stream needs a tpdo of its own"),
+        ("streams", lambda s: s | {"more": {"tpdo": 3, "every": 7, "objects": ["torque"]}}, "7 does not divide"),
+        ("streams", {"demand": {"tpdo": 1, "objects": ["demand"]}}, "a stream named 'samples'"),
+        ("drives", lambda d: [*d[:-1], d[0] | {"joint": "joint_6"}], "node_id must be unique"),
+        ("drives", lambda d: [*d[:-1], d[-1] | {"joint": "wrist"}], "'wrist' is not a joint of tx40.yaml"),
+        ("drives", lambda d: [*d[:-1], d[-1] | {"eds": "no.eds"}], "drives[5].eds: no such file no.eds"),
+        ("sync", {"period_us": 20}, "sync.period_us: input should be greater than or equal to 100, found 20"),
+    ],
+)
+def test_a_session_that_cannot_work_is_refused_with_its_key(
+    tmp_path: Path, key: str, value: object, expected: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_session(session_with(tmp_path, **{key: value}))
+    assert expected in str(caught.value)
+
+
+def test_trajectory_starts_and_ends_at_rest_and_reaches_every_waypoint() -> None:
+    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
+    q = trajectory.sample(1e-3)
+    assert np.allclose(q[0], trajectory.start)
+    assert np.allclose(q[-1], trajectory.moves[-1].to)
+    ends = np.cumsum([m.duration + m.dwell for m in trajectory.moves])
+    for end, move in zip(ends, trajectory.moves, strict=True):
+        assert np.allclose(q[round(end / 1e-3)], move.to, atol=1e-9)
+    assert np.abs(np.diff(q[[0, 1, -2, -1]], axis=0)[[0, 2]]).max() < 1e-5
+
+
+def test_trajectory_velocity_is_continuous_and_acceleration_bounded() -> None:
+    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
+    limits = np.array([j.limits.acceleration for j in load_robot("tx40").joints])
+    qd = np.diff(trajectory.sample(1e-4), axis=0) / 1e-4
+    assert (np.abs(np.diff(qd, axis=0)) / 1e-4 <= limits * 1.001).all()
+
+
+def test_a_trajectory_beyond_a_limit_is_refused_with_joint_and_value() -> None:
+    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
+    far = trajectory.model_copy(update={"start": (9.0, *trajectory.start[1:])})
+    with pytest.raises(ConfigError, match=r"joint_1 moves over \[.*9\.000\], allowed is \[-3\.140, 3\.140\]"):
+        far.check(load_robot("tx40"))
+    with pytest.raises(ConfigError, match="6 joints, but emps has 1"):
+        trajectory.check(load_robot("emps"))
