@@ -121,7 +121,7 @@ class RobotConfig(Frozen):
     friction: Friction = Friction()
     controller: Controller | None = None
     bandwidth_hz: Positive | None = Field(None, description="closed-loop bandwidth; None: from the data")
-    initial_parameters: dict[str, float] = {}
+    initial_parameters: dict[str, float] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -43,7 +43,7 @@ class Trajectory(Frozen):
 
     def sample(self, period: float) -> NDArray[np.float64]:
         """Positions at ``0, period, 2 period, ...`` up to the end; shape (N, n), rad or m."""
-        t = np.arange(int(round(self.duration / period)) + 1) * period
+        t: NDArray[np.float64] = np.arange(round(self.duration / period) + 1, dtype=np.float64) * period
         q = np.empty((t.size, len(self.start)))
         origin, begin = np.array(self.start), 0.0
         for move in self.moves:

@@ -53,7 +53,7 @@ def test_motor_six_turns_with_joint_five_as_on_the_tx40() -> None:
         (robot_with(bandwidth_hz=float("nan")), "bandwidth_hz: "),
         (robot_with(transmission=[[1.0]]), "transmission: expected 6 rows of 6 numbers"),
         (robot_with(transmission=[[0.0] * 6] * 6), "transmission: the matrix is singular"),
-        (robot_with(joints=TX40["joints"][:5] + [TX40["joints"][4]]), "joints: names must be unique"),
+        (robot_with(joints=[*TX40["joints"][:5], TX40["joints"][4]]), "joints: names must be unique"),
         (
             robot_with(couplings=[{"name": "m6", "joints": ["joint_5", "joint_7"]}]),
             "couplings: no joint named 'joint_7'",
