@@ -1,0 +1,1 @@
+"""Signals: smoothing, differentiation and decimation of what was measured."""

@@ -1,0 +1,45 @@
+"""The thesis's bandpass: zero-phase Butterworth and central differences (section 2.3.1)."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from configs import DataError
+
+
+def butterworth(
+    x: NDArray[np.float64], dt: float, cutoff_hz: float, order: int = 4, padlen: int | None = None
+) -> NDArray[np.float64]:
+    """Zero-phase Butterworth low-pass along the first axis, in second-order sections.
+
+    Parameters
+    ----------
+    x
+        Shape (N,) or (N, n).
+    dt
+        Sampling period, s.
+    cutoff_hz
+        Cut-off of one pass, Hz; the forward and reverse passes together have -6 dB there.
+    order
+        Order of one pass.
+    padlen
+        Samples of odd extension at each end; ``None``: ``3 * order``.
+
+    Raises
+    ------
+    DataError
+        If the cut-off is not below the Nyquist frequency or the series is shorter than the padding.
+    """
+    if cutoff_hz * dt >= 0.5:
+        raise DataError(f"cut-off {cutoff_hz:g} Hz is not below half the sampling rate ({0.5 / dt:g} Hz)")
+    padlen = 3 * order if padlen is None else padlen
+    if x.shape[0] <= padlen:
+        raise DataError(f"filtering needs more than {padlen} samples, got {x.shape[0]}")
+    sections = signal.butter(order, 2 * cutoff_hz * dt, output="sos")
+    filtered: NDArray[np.float64] = signal.sosfiltfilt(sections, x, axis=0, padlen=padlen)
+    return filtered
+
+
+def central_difference(x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+    """``(x(k+1) - x(k-1)) / (2 dt)`` along the first axis, one-sided at the two ends."""
+    return np.gradient(x, dt, axis=0)

@@ -1,0 +1,87 @@
+"""The parallel ("decimate") filter: one zero-phase low-pass for torque and regressor alike (section 2.3.1)."""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from configs import DataError
+
+STOPBAND_DB = 70.0
+"""Attenuation beyond the Nyquist frequency of the decimated signal."""
+
+TRANSITION = 0.5
+"""Width of the transition band as a share of the decimated Nyquist frequency."""
+
+
+@dataclass(frozen=True)
+class Decimation:
+    """A linear-phase low-pass of finite length and the factor by which it thins out the samples.
+
+    Being symmetric it has zero phase, being finite it needs no initial state: samples whose window
+    leaves the record are dropped.
+    """
+
+    factor: int
+    taps: NDArray[np.float64]
+
+    @property
+    def margin(self) -> int:
+        """Samples dropped at each end."""
+        return (self.taps.size - 1) // 2
+
+    def count(self, samples: int) -> int:
+        """How many samples are left of ``samples``."""
+        return max(0, (samples - self.taps.size) // self.factor + 1)
+
+    def instants(self, samples: int) -> NDArray[np.int64]:
+        """Index of the sample at the centre of each window, shape (M,)."""
+        return self.margin + self.factor * np.arange(self.count(samples), dtype=np.int64)
+
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Filter and thin out along the first axis: (N, ...) to (M, ...)."""
+        count = self.count(x.shape[0])
+        if count == 0:
+            raise DataError(
+                f"{x.shape[0]} samples are fewer than the {self.taps.size} that a decimation by {self.factor} needs"
+            )
+        flat = np.ascontiguousarray(x, dtype=np.float64).reshape(x.shape[0], -1)
+        out: NDArray[np.float64] = _convolve(flat, self.taps, self.factor, count)
+        return out.reshape((count, *x.shape[1:]))
+
+
+def design(dt: float, cutoff_hz: float, factor: int | None = None) -> Decimation:
+    """Low-pass that keeps everything up to about ``cutoff_hz`` and decimates accordingly.
+
+    Parameters
+    ----------
+    dt
+        Sampling period, s.
+    cutoff_hz
+        Half-amplitude frequency, Hz (thesis: ``w_Fp >= 2 w_dyn``).
+    factor
+        Keep one sample of ``factor``; ``None``: as many as the Nyquist rate of ``cutoff_hz`` allows, which is
+        the thesis's ``n_d = w_nyq / w_Fp``.
+    """
+    if factor is None:
+        factor = max(1, int(0.5 / (dt * cutoff_hz) + 1e-9))
+    if factor == 1:
+        return Decimation(1, np.ones(1))
+    width = TRANSITION * 2 * dt * cutoff_hz
+    length, beta = signal.kaiserord(STOPBAND_DB, width)
+    taps = signal.firwin(length | 1, 2 * dt * cutoff_hz, window=("kaiser", beta))
+    return Decimation(factor, np.asarray(taps, dtype=np.float64))
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _convolve(x, taps, factor, count):  # type: ignore[no-untyped-def]
+    out = np.zeros((count, x.shape[1]))
+    for m in range(count):
+        for i in range(taps.size):
+            h = taps[i]
+            k = m * factor + i
+            for c in range(x.shape[1]):
+                out[m, c] += h * x[k, c]
+    return out

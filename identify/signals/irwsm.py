@@ -1,0 +1,217 @@
+"""Integrated-random-walk smoother (IRWSM) in its exact banded form (thesis section 5.1.2).
+
+The fixed-interval smoother of an integrated random walk of order ``d`` minimises
+``sum (y - x)^2 + (1/NVR) sum (D x)^2`` with ``D`` the d-th difference, so ``x = y - D' V^-1 D y`` with the banded
+``V = NVR I + D D'``, and the concentrated likelihood (5.16, 5.21) needs only the factors of ``V``: O(N) throughout.
+"""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import DataError
+
+LOG10_NVR_RANGE = {2: (-12.0, 4.0), 3: (-14.0, 4.0)}
+"""Where the likelihood is searched; below, third-order factors lose definiteness (about 1e-16)."""
+
+_STENCIL = {2: np.array([1.0, -2.0, 1.0]), 3: np.array([-1.0, 3.0, -3.0, 1.0])}
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A smoothed series and its differences, in units per sample.
+
+    Parameters
+    ----------
+    level
+        Smoothed series, shape (N,).
+    slope
+        First difference of ``level``, shape (N - 1,). Element k is the state "slope" of sample k: the forward
+        difference, which belongs to the instant k + 1/2.
+    nvr
+        Noise-variance ratio that was used.
+    """
+
+    level: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    nvr: float
+
+
+def irwsm(y: NDArray[np.float64], order: int, nvr: float) -> Smoothed:
+    """Smooth a series with the integrated random walk of a given order.
+
+    Parameters
+    ----------
+    y
+        Series, shape (N,), N > 2 ``order``.
+    order
+        2: level and slope (IRWSM 1, 5.23); 3: level, slope and curvature (IRWSM 2, 5.24).
+    nvr
+        Noise-variance ratio ``var(kappa) / var(e)``, positive.
+
+    Raises
+    ------
+    DataError
+        If the series is too short or not finite.
+    ValueError
+        If ``order`` or ``nvr`` is out of range.
+    """
+    y = _checked(y, order)
+    if not nvr > 0:
+        raise ValueError(f"nvr: expected a positive number, got {nvr}")
+    level = y - _correction(np.diff(y, n=order), _band(order, nvr), _STENCIL[order])
+    return Smoothed(level=level, slope=np.diff(level), nvr=nvr)
+
+
+def negative_log_likelihood(y: NDArray[np.float64], order: int, nvr: float) -> float:
+    """Concentrated ``-2 log L`` of the noise-variance ratio, up to a constant (thesis 5.16, 5.21).
+
+    Equals ``(N - order) log(s2) + sum log nu(k)`` of a Kalman filter started from a diffuse state.
+    """
+    w = np.diff(_checked(y, order), n=order)
+    return _profile(w, _band(order, nvr))
+
+
+def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
+    """Noise-variance ratio of greatest likelihood, by a bounded search on ``log10(NVR)``.
+
+    On measured positions the likelihood may follow the noise too closely (thesis section 5.3.1: modelling
+    error and vibration count as dynamics); the decimation filter that follows compensates.
+
+    Parameters
+    ----------
+    y
+        Series, shape (N,).
+    order
+        2 or 3, see :func:`irwsm`.
+    tolerance
+        Width of the final bracket in decades; the likelihood is flat to a few hundredths there.
+
+    Returns
+    -------
+    float
+        The ratio; 1.0 for a series whose differences are all zero (a standstill says nothing).
+    """
+    w = np.diff(_checked(y, order), n=order)
+    if not np.any(w):
+        return 1.0
+    w = w / np.abs(w).max()
+    low, high = LOG10_NVR_RANGE[order]
+    grid = np.arange(low, high + 1e-9, 2.0)
+    values = [_profile(w, _band(order, 10.0**g)) for g in grid]
+    best = int(np.argmin(values))
+    a, b = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
+    return float(10.0 ** _golden(w, order, float(a), float(b), tolerance))
+
+
+def _golden(w: NDArray[np.float64], order: int, a: float, b: float, tolerance: float) -> float:
+    """Golden-section search of the likelihood on ``log10(NVR)`` in [a, b]."""
+    share = (np.sqrt(5.0) - 1) / 2
+    x1, x2 = b - share * (b - a), a + share * (b - a)
+    f1, f2 = _profile(w, _band(order, 10.0**x1)), _profile(w, _band(order, 10.0**x2))
+    while b - a > tolerance:
+        if f1 < f2:
+            b, x2, f2 = x2, x1, f1
+            x1 = b - share * (b - a)
+            f1 = _profile(w, _band(order, 10.0**x1))
+        else:
+            a, x1, f1 = x1, x2, f2
+            x2 = a + share * (b - a)
+            f2 = _profile(w, _band(order, 10.0**x2))
+    return (a + b) / 2
+
+
+def _checked(y: NDArray[np.float64], order: int) -> NDArray[np.float64]:
+    if order not in _STENCIL:
+        raise ValueError(f"order: expected 2 or 3, got {order}")
+    y = np.ascontiguousarray(y, dtype=np.float64)
+    if y.ndim != 1 or y.size <= 2 * order:
+        raise DataError(f"smoothing needs a series of more than {2 * order} samples, got shape {y.shape}")
+    if not np.isfinite(y).all():
+        raise DataError(f"smoothing: sample {int(np.argmin(np.isfinite(y)))} is not a finite number")
+    return y
+
+
+def _band(order: int, nvr: float) -> NDArray[np.float64]:
+    """First row of the symmetric Toeplitz band of ``V = NVR I + D D'``, shape (order + 1,)."""
+    stencil = _STENCIL[order]
+    band = np.array([stencil[k:] @ stencil[: stencil.size - k] for k in range(order + 1)])
+    band[0] += nvr
+    return band
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
+    """Row i of ``V = L diag(d) L'``: fills ``low[i % p]`` (distance 1..p) and returns d_i; rings of length p."""
+    for j in range(min(p, i), 0, -1):
+        value = band[j]
+        for k in range(j + 1, min(p, i) + 1):
+            value -= low[i % (p + 1), k] * low[(i - j) % (p + 1), k - j] * d[(i - k) % (p + 1)]
+        low[i % (p + 1), j] = value / d[(i - j) % (p + 1)]
+    pivot = band[0]
+    for k in range(1, min(p, i) + 1):
+        pivot -= low[i % (p + 1), k] ** 2 * d[(i - k) % (p + 1)]
+    return pivot
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _profile(w, band):  # type: ignore[no-untyped-def]
+    """``m log(w' V^-1 w) + log|V|`` in one forward sweep; the factors of a Toeplitz band become constant."""
+    m, p = w.size, band.size - 1
+    d, low, z = np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.zeros(p + 1)
+    quadratic, logdet, pivot, steady, i = 0.0, 0.0, 1.0, 0, 0
+    while i < m and steady <= p:
+        before = pivot
+        pivot = _row(band, d, low, i, p)
+        d[i % (p + 1)] = pivot
+        steady = steady + 1 if abs(pivot - before) <= 4e-16 * pivot else 0
+        value = w[i]
+        for k in range(1, min(p, i) + 1):
+            value -= low[i % (p + 1), k] * z[(i - k) % (p + 1)]
+        z[i % (p + 1)] = value
+        quadratic += value * value / pivot
+        logdet += np.log(pivot)
+        i += 1
+    if i < m:
+        row = low[(i - 1) % (p + 1)]
+        l1, l2 = row[1], row[2]
+        l3 = row[3] if p == 3 else 0.0
+        z1, z2 = z[(i - 1) % (p + 1)], z[(i - 2) % (p + 1)]
+        z3 = z[(i - 3) % (p + 1)] if p == 3 else 0.0
+        squares = 0.0
+        for k in range(i, m):
+            value = w[k] - l1 * z1 - l2 * z2 - l3 * z3
+            squares += value * value
+            z3, z2, z1 = z2, z1, value
+        quadratic += squares / pivot
+        logdet += (m - i) * np.log(pivot)
+    return m * np.log(quadratic) + logdet
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _correction(w, band, stencil):  # type: ignore[no-untyped-def]
+    """``D' V^-1 w``, shape (m + order,)."""
+    m, p = w.size, band.size - 1
+    d, low, z = np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.empty(m)
+    pivots, rows = np.empty(m), np.zeros((m, p + 1))
+    for i in range(m):
+        d_i = _row(band, d, low, i, p)
+        d[i % (p + 1)] = d_i
+        pivots[i] = d_i
+        value = w[i]
+        for k in range(1, min(p, i) + 1):
+            rows[i, k] = low[i % (p + 1), k]
+            value -= rows[i, k] * z[i - k]
+        z[i] = value
+    for i in range(m):
+        z[i] /= pivots[i]
+    for i in range(m - 1, -1, -1):
+        for k in range(1, min(p, m - 1 - i) + 1):
+            z[i] -= rows[i + k, k] * z[i + k]
+    out = np.zeros(m + p)
+    for i in range(m):
+        for k in range(p + 1):
+            out[i + k] += stencil[k] * z[i]
+    return out
