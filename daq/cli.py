@@ -1,0 +1,124 @@
+"""Root of the command line: finds the commands that the packages registered, and loads the one that is called.
+
+A command is an entry point of group ``armident.commands`` naming a function with typer annotations. Its
+module must be light: what it works with is imported when the function runs.
+"""
+
+import functools
+import importlib.metadata
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+GROUP = "armident.commands"
+DEBUG_VARIABLE = "ARMIDENT_DEBUG"
+INTERRUPTED = 130
+
+EPILOG = "Exit codes: 0 done, 2 usage or configuration, 3 the data cannot support the request, 4 changed or unexplained, 1 anything else."
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command that ``arguments`` (default: those of the process) name, and exit with its status."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    application(words)(args=words, prog_name="armident")
+    raise SystemExit(0)
+
+
+def application(words: Sequence[str], entry_points: Iterable[importlib.metadata.EntryPoint] | None = None) -> typer.Typer:
+    """Build the command line, loading only the commands among ``words``, or all where none is named (help, completion).
+
+    Parameters
+    ----------
+    words
+        Arguments of the command line.
+    entry_points
+        The registered commands; by default those of the installed packages.
+    """
+    app = typer.Typer(
+        no_args_is_help=True,
+        rich_markup_mode=None,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+        epilog=EPILOG,
+    )
+    app.callback()(_root)
+    known = importlib.metadata.entry_points(group=GROUP) if entry_points is None else entry_points
+    registered = {entry.name: entry for entry in known}
+    called = next((word for word in words if not word.startswith("-")), None)
+    for name in [called] if called in registered else sorted(registered):
+        _add(app, registered[name])
+    return app
+
+
+def _add(app: typer.Typer, entry: importlib.metadata.EntryPoint) -> None:
+    try:
+        function: Callable[..., Any] = entry.load()
+    except (ImportError, AttributeError) as error:
+        reason = f"{entry.value} cannot be loaded: {_one_line(error)}"
+
+        def unavailable() -> None:
+            print(f"armident: {entry.name} is unavailable: {reason}", file=sys.stderr)
+            raise typer.Exit(1)
+
+        anything = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+        app.command(entry.name, help="(unavailable)", context_settings=anything)(unavailable)
+    else:
+        app.command(entry.name)(_reported(function))
+
+
+def _reported(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap a command so that what it raises becomes one line on stderr and the exit code that belongs to it."""
+
+    @functools.wraps(function)
+    def command(*args: Any, **kwargs: Any) -> None:
+        try:
+            function(*args, **kwargs)
+        except (typer.Exit, typer.Abort, typer.BadParameter, BrokenPipeError):
+            raise
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
+        except Exception as error:
+            from configs.errors import ArmidentError
+
+            if os.environ.get(DEBUG_VARIABLE):
+                traceback.print_exc()
+            if isinstance(error, ArmidentError):
+                print(f"armident: {_one_line(error)}", file=sys.stderr)
+                raise typer.Exit(error.exit_code) from None
+            hint = f" (--debug or {DEBUG_VARIABLE}=1 shows where)"
+            print(f"armident: {type(error).__name__}: {_one_line(error)}{hint}", file=sys.stderr)
+            raise typer.Exit(1) from None
+
+    return command
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"armident {importlib.metadata.version('armident')}")
+        raise typer.Exit
+
+
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
+) -> None:
+    """Record robot arms over CANopen at 5 kHz and identify their dynamic models.
+
+    Start with: armident demo
+    """
+    if debug:
+        os.environ[DEBUG_VARIABLE] = "1"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""``python -m drivers.vcan [-n BUSES] [-m MEMORY] [--guest] -- COMMAND``: run a command where vcan buses are up."""
+
+import argparse
+import os
+import sys
+
+from configs.errors import ArmidentError
+from drivers.vcan import guest, interfaces, packages
+
+CANNOT_RUN = 125
+
+
+def main() -> int:
+    """Run the command natively where this kernel has vcan buses for us, in a guest where it has not."""
+    parser = argparse.ArgumentParser(prog="python -m drivers.vcan", description=main.__doc__)
+    parser.add_argument("-n", dest="buses", type=int, default=1, metavar="BUSES", help="how many: vcan0 and on (1)")
+    parser.add_argument("-m", dest="memory", default="4096M", help="memory of a guest (4096M)")
+    parser.add_argument("--guest", action="store_true", help="use a guest even where this kernel has SocketCAN")
+    parser.add_argument("--setup", action="store_true", help="only fetch and unpack what a guest needs")
+    parser.add_argument("command", nargs=argparse.REMAINDER, metavar="-- COMMAND")
+    options = parser.parse_args()
+    command = options.command[1:] if options.command[:1] == ["--"] else options.command
+    if not command and not options.setup:
+        parser.error("no command")
+    try:
+        if options.setup:
+            print(packages.provide())
+            return 0
+        if not options.guest and interfaces.have_socketcan():
+            try:
+                for number in range(options.buses):
+                    interfaces.ensure_vcan(f"vcan{number}")
+            except ArmidentError as error:
+                print(f"{error}; using a User-Mode Linux guest instead", file=sys.stderr)
+            else:
+                os.execvp(command[0], command)
+        return guest.run(command, options.buses, options.memory)
+    except (ArmidentError, OSError) as error:
+        print(f"drivers.vcan: {error}", file=sys.stderr)
+        return CANNOT_RUN
+
+
+if __name__ == "__main__":
+    sys.exit(main())

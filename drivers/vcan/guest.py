@@ -1,0 +1,211 @@
+"""Runs a command under a User-Mode Linux kernel with real vcan buses, over this machine's file system.
+
+The guest sees the host's files read-only, with /tmp, the working directory and a few cache folders writable; it has no
+stdin, no terminal and no network but loopback. Output streams live; environment, exit status, Ctrl-C
+and SIGTERM pass through.
+"""
+
+import ctypes
+import fcntl
+import os
+import platform
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+
+from configs.errors import ArmidentError
+from drivers.vcan import packages
+
+FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+GRACE_S = 15.0
+"""How long a command may take to end after a signal before the guest is switched off."""
+PR_SET_PDEATHSIG = 1
+
+
+def launcher_available() -> str | None:
+    """Why commands cannot be run in a guest here, ``None`` if they can (as far as one can tell without trying)."""
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        return f"User-Mode Linux is for Linux on x86-64, this is {platform.system()} on {platform.machine()}"
+    return packages.obstacle()
+
+
+def launcher_command(command: Sequence[str], buses: int = 1) -> list[str]:
+    """The command line that runs ``command`` where ``vcan0`` to ``vcan{buses - 1}`` are up."""
+    return [sys.executable, "-m", "drivers.vcan", "-n", str(buses), "--", *command]
+
+
+def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable: Sequence[Path] = ()) -> int:
+    """Run ``command`` in a guest and return its exit status.
+
+    Parameters
+    ----------
+    command
+        Program and arguments, started in the current directory.
+    buses
+        How many vcan interfaces are up.
+    memory
+        The guest's memory, as the kernel's ``mem=`` takes it; only what is touched is taken from the host.
+    writable
+        Further folders that the command may write to.
+
+    Raises
+    ------
+    ArmidentError
+        If the guest cannot be set up or ends without a status; the message holds the end of its kernel log.
+    """
+    reason = launcher_available()
+    if reason is not None:
+        raise ArmidentError(f"no vcan: {reason}")
+    root = packages.provide()
+    environment = dict(os.environ)
+    # compiled kernels want a folder they can write to, whatever the guest's root is
+    numba = Path(environment.setdefault("NUMBA_CACHE_DIR", str(packages.cache_folder().parent / "numba"))).absolute()
+    environment["PATH"] = f"{environment.get('PATH', os.defpath)}:/usr/sbin:/sbin:{root / 'bin'}"
+    environment["ARMIDENT_GUEST"] = "1"
+    numba.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        cpu = stack.enter_context(_cpu_of_our_own())
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="armident-vcan-")))
+        _write_scripts(folder, root, command, environment, buses, [folder, Path.cwd(), numba, *writable])
+        _boot(folder, root, cpu, memory)
+        try:
+            return int((folder / "status").read_text())
+        except (OSError, ValueError):
+            log = (folder / "log").read_text(errors="replace").splitlines()
+            raise ArmidentError("the vcan guest ended without a status: " + " | ".join(log[-6:])) from None
+
+
+def _write_scripts(
+    folder: Path,
+    root: Path,
+    command: Sequence[str],
+    environment: dict[str, str],
+    buses: int,
+    writable: Sequence[Path],
+) -> None:
+    busybox = root / "bin" / "busybox"
+    settings = {"BIN": root / "bin", "MODULES": root / "modules", "RUN": folder, "BUSES": buses}
+    head = "".join(f"{name}={shlex.quote(str(value))}\n" for name, value in settings.items())
+    init = Path(__file__).with_name("init.sh").read_text(encoding="utf-8")
+    (folder / "init").write_text(f"#!{folder / 'sh'}\n{head}{init}", encoding="utf-8")
+    (folder / "init").chmod(0o755)
+    # a path without spaces for the interpreter line, wherever the cache is
+    (folder / "sh").symlink_to(busybox)
+    mounts = []
+    for path in dict.fromkeys([Path("/tmp"), *(p.resolve() for p in writable)]):
+        if "," in str(path):
+            raise ArmidentError(f"{path}: a folder with a comma in its name cannot be mounted in the guest")
+        quoted = shlex.quote(str(path))
+        if path == Path("/"):
+            mounts.append("$B mount -o remount,rw /\n")
+        elif path == Path("/tmp") or not path.is_relative_to("/tmp"):
+            mounts.append(f"$B mount -t hostfs -o {quoted} none {quoted} || give_up mount {quoted}\n")
+    (folder / "mounts").write_text("".join(mounts), encoding="utf-8")
+    exports = "".join(f"export {k}={shlex.quote(v)}\n" for k, v in environment.items() if k.isidentifier())
+    start = f"cd {shlex.quote(str(Path.cwd()))} || exit 126\nexec {shlex.join(command)}\n"
+    (folder / "command").write_text(exports + start, encoding="utf-8", errors="surrogateescape")
+
+
+@contextmanager
+def _cpu_of_our_own() -> Iterator[int]:
+    """One CPU that no other guest uses, as long as there are any.
+
+    The guest's kernel and its processes hand over to each other at every system call, which takes many times
+    as long from one CPU to another.
+    """
+    cpus = sorted(os.sched_getaffinity(0), reverse=True)
+    with ExitStack() as stack:
+        for cpu in cpus:
+            lock = stack.enter_context((packages.cache_folder() / f"cpu{cpu}.lock").open("w"))
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield cpu
+            return
+        yield cpus[os.getpid() % len(cpus)]
+
+
+def _boot(folder: Path, root: Path, cpu: int, memory: str) -> None:
+    """Boot the guest and wait until it has switched itself off."""
+    libc = ctypes.CDLL(None, use_errno=True)
+
+    def pin_and_tie() -> None:
+        os.sched_setaffinity(0, {cpu})
+        libc.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+    sys.stdout.flush()
+    sys.stderr.flush()
+    reading, writing = os.pipe()
+    with (folder / "log").open("ab") as log, ExitStack() as stack:
+        stack.callback(os.close, writing)
+        console = os.dup(log.fileno())
+        output, errors = os.dup(1), os.dup(2)
+        passed = (console, output, errors, reading)
+        arguments = [
+            *(f"mem={memory}", "seccomp=auto", "rootfstype=hostfs", "root=none", "hostfs=/", "ro", "quiet"),
+            *(f"init={folder / 'init'}", "con=null", f"con0=null,fd:{console}", "ssl=null"),
+            *(f"ssl0=null,fd:{output}", f"ssl1=null,fd:{errors}", f"ssl2=fd:{reading},null"),
+            *(f"umid=armident{os.getpid()}", f"uml_dir={folder}/"),
+        ]
+        try:
+            guest = subprocess.Popen(
+                [packages.kernel(root), *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                pass_fds=passed,
+                preexec_fn=pin_and_tie,
+                start_new_session=True,
+                env={**os.environ, "TMPDIR": str(_memory_folder())},
+            )
+        finally:
+            for descriptor in passed:
+                os.close(descriptor)
+        with _forwarding(guest, writing):
+            guest.wait()
+
+
+def _memory_folder() -> Path:
+    """Where the file behind the guest's memory lies: in memory, unless containers leave too little of it there."""
+    shared = Path("/dev/shm")
+    if shared.is_dir() and os.access(shared, os.W_OK) and shutil.disk_usage(shared).free > 2 << 30:
+        return shared
+    return Path(tempfile.gettempdir())
+
+
+@contextmanager
+def _forwarding(guest: "subprocess.Popen[bytes]", channel: int) -> Iterator[None]:
+    """Pass signals on to the command; switch the guest off if it does not end in time."""
+    deadline: list[float] = []
+
+    def forward(number: int, _frame: FrameType | None) -> None:
+        os.write(channel, signal.Signals(number).name.removeprefix("SIG").encode() + b"\n")
+        if not deadline:
+            deadline.append(time.monotonic() + GRACE_S)
+            threading.Thread(target=switch_off, daemon=True).start()
+
+    def switch_off() -> None:
+        try:
+            guest.wait(max(0.0, deadline[0] - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            guest.kill()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, forward) for number in FORWARDED}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,74 @@
+"""The vcan interfaces of the running kernel."""
+
+import socket
+import subprocess
+from pathlib import Path
+
+from configs.errors import ConfigError
+
+NETWORK = Path("/sys/class/net")
+IFF_UP = 1
+
+
+def have_socketcan() -> bool:
+    """Whether this kernel opens raw CAN sockets (loading its module on the way, where it has one)."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (OSError, AttributeError):
+        return False
+    return True
+
+
+def is_up(name: str) -> bool:
+    """Whether the network interface exists and is administratively up."""
+    try:
+        flags = int((NETWORK / name / "flags").read_text(), 16)
+    except (OSError, ValueError):
+        return False
+    return bool(flags & IFF_UP)
+
+
+def ensure_vcan(name: str = "vcan0") -> None:
+    """Bring the vcan interface up, creating it first if there is none of that name.
+
+    Raises
+    ------
+    ConfigError
+        If this takes rights we do not have; the message is the command for an administrator.
+    """
+    if is_up(name):
+        return
+    if not have_socketcan():
+        raise ConfigError(f"{name}: this kernel has no SocketCAN (an administrator may try: sudo modprobe can_raw vcan)")
+    steps = [["ip", "link", "set", "dev", name, "up"]]
+    if not (NETWORK / name).exists():
+        steps.insert(0, ["ip", "link", "add", "dev", name, "type", "vcan"])
+    for step in steps:
+        problem = _run(step)
+        if problem is not None:
+            administrator = " && ".join("sudo " + " ".join(s) for s in [["modprobe", "vcan"], *steps])
+            raise ConfigError(f"{name}: cannot bring it up ({problem}); an administrator must run: {administrator}")
+
+
+def remove_vcan(name: str) -> None:
+    """Delete the vcan interface; nothing happens if it is gone already.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be deleted.
+    """
+    if not (NETWORK / name).exists():
+        return
+    problem = _run(["ip", "link", "delete", "dev", name])
+    if problem is not None:
+        raise ConfigError(f"{name}: cannot delete it ({problem})")
+
+
+def _run(command: list[str]) -> str | None:
+    """Run a command; what went wrong in one line, ``None`` if nothing."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        return f"{command[0]}: {error.strerror}"
+    return None if done.returncode == 0 else " ".join(done.stderr.split()) or f"{command[0]} exited {done.returncode}"
