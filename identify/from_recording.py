@@ -1,0 +1,248 @@
+"""From a recording, read from a file or assembled from the stream, to experiments that can be identified."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import DataError, RobotConfig
+from daq.recording import Recording, Stream
+from identify.experiment import Experiment
+
+MAX_MISSING_SHARE = 0.05
+"""Samples an experiment may lack; with more, what is left no longer is the motion that was designed."""
+MIN_PIECE_S = 0.5
+"""A piece between two gaps shorter than this (s) cannot be filtered without edge effects all over it."""
+STILL_SHARE = 1e-3
+"""A joint that uses less than this share of its position range is said not to move."""
+RATE_TOLERANCE = 0.01
+"""Relative difference between the nominal rate and the receive times that is worth a warning."""
+EFFORTS: tuple[Literal["torque", "current", "voltage"], ...] = ("torque", "current", "voltage")
+
+Array = NDArray[np.float64]
+
+
+def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tuple[list[Experiment], list[str]]:
+    """Raw numbers to SI on the joint side, cut at the experiment marks and at gaps.
+
+    Joint positions are ``R^-1 q_motor`` and joint torques ``R' tau_motor`` (thesis equation 2.14 and section B.1).
+    The reference between two set points is the straight line that a CiA 402 drive interpolates (60C2h).
+
+    Parameters
+    ----------
+    recording
+        The recording; a torn one is used as far as it goes.
+    robot
+        The robot to identify: the recorded one, possibly with other numbers.
+
+    Returns
+    -------
+    experiments
+        One per uninterrupted piece, in time order.
+    notes
+        One line each for whatever a reader of the result should know.
+
+    Raises
+    ------
+    DataError
+        If the recording is of another robot, lacks a quantity or too many samples, contains NaN, or disagrees with
+        its own counters.
+    """
+    _check_same_robot(recording.robot, robot)
+    _check_counters(recording)
+    notes: list[str] = []
+    if recording.missing:
+        notes.append(f"the recording is torn: {recording.missing}")
+    samples = recording.samples
+    dt = 1.0 / recording.sample_rate_hz
+    q = joint_positions(samples, "position", robot)
+    tau = joint_torques(samples, robot)
+    q_ref, has_ref = _reference(recording, robot)
+    if q_ref is None:
+        notes.append("no reference trajectory was recorded: identified without one")
+
+    experiments: list[Experiment] = []
+    for first, last in recording.experiments():
+        inside = (samples.sync >= first) & (samples.sync <= last)
+        _check_missing(int(inside.sum()), first, last, dt)
+        rows = np.flatnonzero(inside & has_ref)
+        lost_reference = int(inside.sum()) - rows.size
+        if lost_reference > MAX_MISSING_SHARE * max(int(inside.sum()), 1):
+            raise DataError(f"the reference is missing for {lost_reference} of {int(inside.sum())} samples")
+        cuts = np.flatnonzero(np.diff(samples.sync[rows]) != 1) + 1
+        pieces = [piece for piece in np.split(rows, cuts) if piece.size]
+        long_enough = [piece for piece in pieces if piece.size * dt >= MIN_PIECE_S]
+        if len(pieces) > 1:
+            lost = last - first + 1 - int(inside.sum())
+            notes.append(
+                f"{lost} of {last - first + 1} samples missing: {len(pieces)} pieces, "
+                f"{len(long_enough)} of them longer than {MIN_PIECE_S} s are used"
+            )
+        experiments += [
+            Experiment(q=q[piece], tau=tau[piece], q_ref=None if q_ref is None else q_ref[piece], dt=dt)
+            for piece in long_enough
+        ]
+    if not experiments:
+        raise DataError(
+            f"the recording has no uninterrupted piece of {MIN_PIECE_S} s inside its experiment marks "
+            f"({samples.sync.size} samples in all)"
+        )
+    notes += _signal_notes(experiments, robot)
+    notes += _rate_notes(recording)
+    return experiments, notes
+
+
+def joint_positions(stream: Stream, quantity: Literal["position", "demand"], robot: RobotConfig) -> Array:
+    """Position or demand of a stream on the joint side, shape (N, n), rad or m.
+
+    Raises
+    ------
+    DataError
+        If the stream has no such quantity.
+    """
+    name = stream.named(quantity)
+    if name is None:
+        raise DataError(f"stream {stream.name!r} has no {quantity}; it has {', '.join(sorted(stream.fields))}")
+    values = _finite(stream, name, robot)
+    if stream.fields[name].side == "motor":
+        values = np.asarray(np.linalg.solve(robot.transmission_matrix, values.T).T, dtype=np.float64)
+    return np.ascontiguousarray(values)
+
+
+def joint_torques(stream: Stream, robot: RobotConfig) -> Array:
+    """Joint torques from what the drives reported, shape (N, n), N m or N.
+
+    A current or a voltage belongs to the motor whatever side the positions are on; a torque says its side.
+
+    Raises
+    ------
+    DataError
+        If the stream has neither current, voltage nor torque.
+    """
+    wanted = robot.joints[0].drive.signal
+    for quantity in sorted(EFFORTS, key=lambda effort: effort != wanted):
+        name = stream.named(quantity)
+        if name is None:
+            continue
+        values = _finite(stream, name, robot)
+        if quantity != "torque":
+            values = values * np.array([joint.drive.gain for joint in robot.joints])
+        elif stream.fields[name].side == "joint":
+            return np.ascontiguousarray(values)
+        return np.ascontiguousarray(values @ robot.transmission_matrix)
+    raise DataError(
+        f"stream {stream.name!r} has no current, voltage or torque; it has {', '.join(sorted(stream.fields))}"
+    )
+
+
+def _check_same_robot(recorded: RobotConfig, robot: RobotConfig) -> None:
+    differences = []
+    if recorded.name != robot.name:
+        differences.append(f"named {recorded.name!r} / {robot.name!r}")
+    if recorded.n != robot.n:
+        differences.append(f"{recorded.n} / {robot.n} joints")
+    elif [j.name for j in recorded.joints] != [j.name for j in robot.joints]:
+        differences.append(
+            f"joints {', '.join(j.name for j in recorded.joints)} / {', '.join(j.name for j in robot.joints)}"
+        )
+    elif not np.allclose(recorded.transmission_matrix, robot.transmission_matrix, rtol=1e-9, atol=0):
+        differences.append("different transmissions")
+    if differences:
+        raise DataError(
+            f"the recording is of robot {recorded.name!r}, the configuration describes {robot.name!r} "
+            f"(recording / configuration: {'; '.join(differences)})"
+        )
+
+
+def _check_counters(recording: Recording) -> None:
+    if recording.missing:
+        return
+    for name, stream in recording.streams.items():
+        counted = recording.counters.get(f"{name}.rows")
+        if counted is not None and counted != stream.sync.size:
+            raise DataError(f"the recording's counter says {counted} samples of {name!r}, it holds {stream.sync.size}")
+
+
+def _finite(stream: Stream, name: str, robot: RobotConfig) -> Array:
+    """Return the field in SI, on its own side, so that the one joint that is not a number can be named."""
+    values = stream.si(name)
+    bad = np.argwhere(~np.isfinite(values))
+    if bad.size:
+        row, joint = bad[0]
+        raise DataError(f"{name} of {robot.joints[joint].name} is not a number at sample {row} ({len(bad)} in all)")
+    return values
+
+
+def _check_missing(present: int, first: int, last: int, dt: float) -> None:
+    expected = last - first + 1
+    if expected - present > MAX_MISSING_SHARE * expected:
+        raise DataError(
+            f"{expected - present} of {expected} samples ({100 * (1 - present / expected):.1f} %) of the experiment "
+            f"from SYNC {first} to {last} ({expected * dt:.2f} s) are missing; "
+            f"at most {100 * MAX_MISSING_SHARE:.0f} % may be"
+        )
+
+
+def _reference(recording: Recording, robot: RobotConfig) -> tuple[Array | None, NDArray[np.bool_]]:
+    """Reference (N, n) at the rate of the samples, and for which samples it is known."""
+    sync = recording.samples.sync
+    everywhere = np.ones(sync.size, dtype=bool)
+    if recording.samples.named("demand") is not None:
+        demand = joint_positions(recording.samples, "demand", robot)
+        return demand, everywhere
+    stream = next((s for s in recording.streams.values() if s.named("demand") is not None and s.sync.size > 1), None)
+    if stream is None:
+        return None, everywhere
+    knots = joint_positions(stream, "demand", robot)
+    before = np.searchsorted(stream.sync, sync, side="right") - 1
+    on_knot = (before >= 0) & (stream.sync[np.maximum(before, 0)] == sync)
+    between = (before >= 0) & (before < stream.sync.size - 1)
+    low = np.clip(before, 0, stream.sync.size - 2)
+    width = stream.sync[low + 1] - stream.sync[low]
+    share = np.clip((sync - stream.sync[low]) / width, 0.0, 1.0)[:, None]
+    q_ref = knots[low] + share * (knots[low + 1] - knots[low])
+    known = on_knot | (between & (width == stream.every))
+    return q_ref, known
+
+
+def _signal_notes(experiments: list[Experiment], robot: RobotConfig) -> list[str]:
+    notes = []
+    q = np.concatenate([e.q for e in experiments])
+    tau = np.concatenate([e.tau for e in experiments])
+    for j, joint in enumerate(robot.joints):
+        low, high = joint.limits.position
+        seen = (float(q[:, j].min()), float(q[:, j].max()))
+        if seen[1] - seen[0] < STILL_SHARE * (high - low):
+            notes.append(f"{joint.name} does not move: its own parameters cannot be told from this recording")
+        if seen[0] < low or seen[1] > high:
+            unit = "rad" if joint.type == "revolute" else "m"
+            notes.append(
+                f"{joint.name} was recorded over [{seen[0]:.3g}, {seen[1]:.3g}] {unit}, outside its limits "
+                f"[{low:.3g}, {high:.3g}]: wrong unit, or wrong limits?"
+            )
+        if float(np.ptp(tau[:, j])) == 0.0:
+            notes.append(f"{joint.name}: the torque never changes; is its drive reporting?")
+    saturation = [joint.drive.saturation for joint in robot.joints]
+    motor = np.linalg.solve(robot.transmission_matrix.T, tau.T).T
+    for j, limit in enumerate(saturation):
+        gain = robot.joints[j].drive.gain
+        if limit is None or gain == 0.0:
+            continue
+        share = float(np.mean(np.abs(motor[:, j] / gain) >= 0.999 * limit))
+        if share > 0.01:
+            notes.append(f"{robot.joints[j].name}: its drive is saturated in {100 * share:.0f} % of the samples")
+    return notes
+
+
+def _rate_notes(recording: Recording) -> list[str]:
+    samples = recording.samples
+    elapsed = float(samples.t_ns[-1] - samples.t_ns[0]) * 1e-9
+    if elapsed <= 0:
+        return []
+    rate = float(samples.sync[-1] - samples.sync[0]) / elapsed
+    if abs(rate / recording.sample_rate_hz - 1.0) > RATE_TOLERANCE:
+        return [
+            f"received at {rate:.1f} samples/s, configured are {recording.sample_rate_hz:.1f}: "
+            "SYNC or the receiving clock is off"
+        ]
+    return []
