@@ -1,5 +1,18 @@
 """Recordings: what they are, how they are read and written."""
 
+from daq.recording.layout import StreamLayout
 from daq.recording.model import Field, Gap, Mark, Recording, Stream
+from daq.recording.reader import read_recording
+from daq.recording.writer import RecordingWriter, write_recording
 
-__all__ = ["Field", "Gap", "Mark", "Recording", "Stream"]
+__all__ = [
+    "Field",
+    "Gap",
+    "Mark",
+    "Recording",
+    "RecordingWriter",
+    "Stream",
+    "StreamLayout",
+    "read_recording",
+    "write_recording",
+]

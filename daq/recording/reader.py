@@ -1,0 +1,231 @@
+"""Reads recordings, whole or torn, in file order and chunk by chunk, straight into arrays."""
+
+import json
+import mmap
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from configs import ConfigError, DataError, RobotConfig, SessionConfig
+from daq.recording import mcap_format as mcap
+from daq.recording.layout import StreamLayout
+from daq.recording.model import Gap, Mark, Recording, Stream
+from daq.recording.writer import GAPS_TOPIC, MARKS_TOPIC, SCHEMA
+
+_Rows = tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[Any]]]
+_LARGEST_CHUNK = 1 << 30
+
+
+@dataclass
+class _Content:
+    """What was found in a file so far."""
+
+    channels: dict[int, mcap.ChannelRecord] = field(default_factory=dict)
+    layouts: dict[int, StreamLayout] = field(default_factory=dict)
+    rows: dict[int, list[_Rows]] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    gaps: list[Gap] = field(default_factory=list)
+    marks: list[Mark] = field(default_factory=list)
+    damaged: list[str] = field(default_factory=list)
+    finished: bool = False
+    end: int = 0
+
+
+def read_recording(path: Path | str) -> Recording:
+    """Read a recording; of a torn one all whole chunks, with what is missing said in words.
+
+    Parameters
+    ----------
+    path
+        The MCAP file.
+
+    Returns
+    -------
+    Recording
+        Raw values in the dtypes they were captured in; ``missing`` is ``None`` if the file is complete.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file, or it cannot be read.
+    DataError
+        If it is not a recording of armident, and why.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            if path.stat().st_size == 0:
+                raise DataError(f"{path}: empty, not a recording")
+            return _read(path, memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such recording") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _read(path: Path, data: memoryview) -> Recording:
+    if bytes(data[: len(mcap.MAGIC)]) != mcap.MAGIC:
+        raise DataError(f"{path}: not a recording (not an MCAP file)")
+    content = _Content()
+    try:
+        for opcode, at, body in mcap.records(data, len(mcap.MAGIC)):
+            _take(content, opcode, at, body)
+            content.end = at + mcap.RECORD_HEAD.size + len(body)
+            if content.finished:
+                break
+        content.finished = content.finished and bytes(data[-len(mcap.MAGIC) :]) == mcap.MAGIC
+        return _recording(path, content, len(data))
+    except mcap.MalformedRecord as error:
+        raise DataError(f"{path}: damaged: {error}") from error
+    except DataError as error:
+        raise error if str(path) in str(error) else DataError(f"{path}: {error}") from error
+
+
+def _take(content: _Content, opcode: int, at: int, body: memoryview) -> None:
+    if opcode == mcap.CHANNEL:
+        _take_channel(content, mcap.read_channel(body))
+    elif opcode == mcap.METADATA:
+        name, entries = mcap.read_metadata(body)
+        content.metadata[name] = entries
+    elif opcode == mcap.CHUNK:
+        raw = _uncompressed(mcap.read_chunk(body))
+        if raw is None:
+            content.damaged.append(f"the chunk at byte {at} is damaged and left out")
+        else:
+            _take_chunk(content, raw)
+    elif opcode == mcap.DATA_END:
+        content.finished = True
+
+
+def _take_channel(content: _Content, channel: mcap.ChannelRecord) -> None:
+    content.channels[channel.channel_id] = channel
+    if "armident.stream" in channel.metadata:
+        content.layouts[channel.channel_id] = StreamLayout.from_json(channel.metadata["armident.stream"])
+
+
+def _uncompressed(chunk: mcap.ChunkRecord) -> bytes | None:
+    """The chunk's records, or ``None`` if it is damaged."""
+    if chunk.size > _LARGEST_CHUNK:
+        return None
+    if chunk.compression == "zstd":
+        try:
+            raw = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.size)
+        except zstandard.ZstdError:
+            return None
+    elif chunk.compression == "":
+        raw = bytes(chunk.data)
+    else:
+        raise DataError(f"compressed with {chunk.compression!r}; recordings are compressed with zstd")
+    if len(raw) != chunk.size or (chunk.crc and zlib.crc32(raw) != chunk.crc):
+        return None
+    return raw
+
+
+def _take_chunk(content: _Content, raw: bytes) -> None:
+    at = 0
+    while at + mcap.RECORD_HEAD.size <= len(raw):
+        opcode, length = mcap.RECORD_HEAD.unpack_from(raw, at)
+        body = at + mcap.RECORD_HEAD.size
+        if body + length > len(raw):
+            raise mcap.MalformedRecord("a record reaches beyond its chunk")
+        if opcode == mcap.CHANNEL:
+            _take_channel(content, mcap.read_channel(memoryview(raw)[body : body + length]))
+        elif opcode == mcap.MESSAGE and length >= mcap.MESSAGE_HEAD.size:
+            channel_id = mcap.MESSAGE_HEAD.unpack_from(raw, body)[0]
+            layout = content.layouts.get(channel_id)
+            if layout is not None:
+                count = layout.run_length(raw, at, channel_id)
+                if count == 0:
+                    raise DataError(f"a message of topic {layout.topic} is not as long as its channel says")
+                dtype = layout.record[0]
+                rows = np.frombuffer(raw, dtype, count=count, offset=at)
+                content.rows.setdefault(channel_id, []).append(layout.unpack(rows))
+                at += count * dtype.itemsize
+                continue
+            _take_event(content, channel_id, raw[body + mcap.MESSAGE_HEAD.size : body + length])
+        at = body + length
+
+
+def _take_event(content: _Content, channel_id: int, data: bytes) -> None:
+    channel = content.channels.get(channel_id)
+    if channel is None or channel.topic not in (GAPS_TOPIC, MARKS_TOPIC):
+        return
+    try:
+        if channel.topic == GAPS_TOPIC:
+            content.gaps.append(Gap(**json.loads(data)))
+        else:
+            content.marks.append(Mark(**json.loads(data)))
+    except (ValueError, TypeError) as error:
+        raise DataError(f"topic {channel.topic}: an event that cannot be understood: {error}") from error
+
+
+def _recording(path: Path, content: _Content, size: int) -> Recording:
+    head = content.metadata.get("armident.recording")
+    if head is None:
+        what = "no metadata 'armident.recording'" if content.finished else "torn before its first chunk"
+        raise DataError(f"{path}: an MCAP file, but not a recording of armident ({what})")
+    if head.get("schema") != SCHEMA:
+        raise DataError(f"{path}: a recording of schema {head.get('schema')!r}, this version reads {SCHEMA}")
+    streams = {layout.name: _stream(layout, content.rows.get(k, [])) for k, layout in content.layouts.items()}
+    if "samples" not in streams:
+        raise DataError(f"{path}: no topic /samples")
+    try:
+        robot = RobotConfig.model_validate_json(content.metadata["armident.robot"]["json"])
+        stored = content.metadata.get("armident.session")
+        session = SessionConfig.model_validate_json(stored["json"]) if stored else None
+        rate = float(head["sample_rate_hz"])
+        counters = {key: int(value) for key, value in content.metadata.get("armident.counters", {}).items()}
+    except (KeyError, ValidationError, ValueError) as error:
+        raise DataError(f"{path}: its configuration cannot be understood: {_one_line(error)}") from error
+    joints = tuple(joint.name for joint in robot.joints)
+    for layout in content.layouts.values():
+        if layout.joints != joints:
+            raise DataError(f"{path}: topic {layout.topic} has other joints than its robot {robot.name}")
+    return Recording(
+        path=path,
+        robot=robot,
+        session=session,
+        sample_rate_hz=rate,
+        streams=streams,
+        gaps=tuple(content.gaps),
+        marks=tuple(content.marks),
+        counters=counters,
+        metadata=content.metadata.get("armident.facts", {}),
+        missing=_missing(content, streams["samples"], size),
+    )
+
+
+def _stream(layout: StreamLayout, parts: list[_Rows]) -> Stream:
+    names = [f.name for f in layout.fields]
+    if parts:
+        sync = np.concatenate([p[0] for p in parts])
+        t_ns = np.concatenate([p[1] for p in parts])
+        raw = {name: np.concatenate([p[2][name] for p in parts]) for name in names}
+    else:
+        sync, t_ns = np.empty(0, np.int64), np.empty(0, np.int64)
+        shape = (0, len(layout.joints))
+        raw = {name: np.empty(shape, dtype) for name, dtype in zip(names, layout.dtypes, strict=True)}
+    if np.any(np.diff(sync) <= 0):
+        raise DataError(f"topic {layout.topic}: SYNC numbers do not increase")
+    return Stream(layout.name, layout.every, sync, t_ns, {f.name: f for f in layout.fields}, raw)
+
+
+def _missing(content: _Content, samples: Stream, size: int) -> str | None:
+    words = list(content.damaged)
+    if not content.finished:
+        last = f"after SYNC {samples.sync[-1]}" if samples.sync.size else "from the start"
+        words.append(
+            f"the file was not finished: whatever came {last} and the counters are missing"
+            f" ({size - content.end} bytes of a torn record left out)"
+        )
+    return "; ".join(words) or None
+
+
+def _one_line(error: Exception) -> str:
+    return str(error).replace("\n", " ")[:200]

@@ -1,0 +1,294 @@
+"""Writes recordings: MCAP, chunk by chunk, so that what is on the disk is always whole up to the last chunk."""
+
+import contextlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from configs import ConfigError, RobotConfig, SessionConfig
+from daq.recording import mcap_format as mcap
+from daq.recording.layout import StreamLayout
+from daq.recording.model import Gap, Mark, Recording
+
+SCHEMA = "armident/recording/1"
+GAPS_TOPIC, MARKS_TOPIC = "/events/gaps", "/events/marks"
+_ZSTD_LEVEL = 1
+_ROWS_PER_CHUNK = 5000
+
+_EVENTS = {
+    GAPS_TOPIC: {"stream": "string", "first": "integer", "last": "integer", "joint": "string", "reason": "string"},
+    MARKS_TOPIC: {"kind": "string", "sync": "integer", "t_ns": "integer", "text": "string"},
+}
+
+
+class RecordingWriter:
+    """A recording being written.
+
+    Rows are gathered and written as one zstd chunk with its index per ``chunk_ns``, then synced to the disk: a killed
+    process or a pulled plug loses at most that. A chunk that does not go to the disk whole (disk full) is taken back,
+    its rows are counted in :attr:`lost_rows`, and writing goes on.
+
+    Parameters
+    ----------
+    path
+        The file; must not exist yet.
+    robot, session
+        Stored in the file.
+    sample_rate_hz
+        Rate of SYNC, 1/s.
+    layouts
+        One per stream.
+    metadata
+        Facts worth keeping, stored in the file.
+    chunk_ns
+        Longest time a chunk spans, ns.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be created.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        robot: RobotConfig,
+        session: SessionConfig | None,
+        sample_rate_hz: float,
+        layouts: Sequence[StreamLayout],
+        metadata: Mapping[str, str],
+        chunk_ns: int = 100_000_000,
+    ) -> None:
+        self.path = path
+        self.lost_rows = 0
+        self.problem: str | None = None
+        self._chunk_ns = chunk_ns
+        self._layouts = {layout.name: (k, layout) for k, layout in enumerate(layouts, start=1)}
+        self._topics = {topic: len(layouts) + k for k, topic in enumerate(_EVENTS, start=1)}
+        self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
+        self._parts: list[bytes] = []
+        self._indexes: dict[int, list[NDArray[np.uint64]]] = {}
+        self._size = 0
+        self._rows = 0
+        self._span: tuple[int, int] | None = None
+        self._total_span: tuple[int, int] | None = None
+        self._chunks: list[mcap.ChunkPlace] = []
+        self._metadata: list[mcap.MetadataPlace] = []
+        self._messages: dict[int, int] = {}
+        self._schemas = [mcap.schema(k, la.message_name, "protobuf", la.descriptor) for k, la in self._layouts.values()]
+        self._channels = [
+            mcap.channel(k, k, la.topic, "protobuf", {"armident.stream": la.to_json()})
+            for k, la in self._layouts.values()
+        ]
+        for topic, k in self._topics.items():
+            properties = {name: {"type": kind} for name, kind in _EVENTS[topic].items()}
+            document = json.dumps({"type": "object", "properties": properties}).encode()
+            self._schemas.append(mcap.schema(k, f"armident{topic.replace('/', '.')}", "jsonschema", document))
+            self._channels.append(mcap.channel(k, k, topic, "json", {}))
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+        self._position = 0
+        try:
+            self._append(mcap.MAGIC + mcap.header(f"armident {_version()}") + b"".join(self._schemas + self._channels))
+            head = {"schema": SCHEMA, "sample_rate_hz": repr(sample_rate_hz)}
+            self._add_metadata("armident.recording", head)
+            self._add_metadata("armident.robot", {"json": robot.model_dump_json(by_alias=True)})
+            if session is not None:
+                self._add_metadata("armident.session", {"json": session.model_dump_json(by_alias=True)})
+            self._add_metadata("armident.facts", metadata)
+        except OSError as error:
+            self.abort()
+            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+
+    def append(
+        self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """Add rows to a stream: ``sync`` and ``t_ns`` of shape (N,), each of ``raw`` (N, n)."""
+        if len(sync) == 0:
+            return
+        channel, layout = self._layouts[stream]
+        rows = layout.pack(channel, sync, t_ns, raw)
+        offsets = self._size + np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.itemsize)
+        self._rows += len(rows)
+        self._gather(channel, t_ns, offsets, rows.tobytes())
+
+    def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
+        """Record gaps found at ``t_ns``."""
+        for gap in gaps:
+            self._event(GAPS_TOPIC, gap.first, t_ns, asdict(gap))
+
+    def add_marks(self, marks: Sequence[Mark]) -> None:
+        """Record marks."""
+        for mark in marks:
+            self._event(MARKS_TOPIC, mark.sync, mark.t_ns, asdict(mark))
+
+    def flush(self) -> None:
+        """Write what is gathered as a chunk and bring it to the disk."""
+        if not self._parts or self._span is None:
+            return
+        raw = b"".join(self._parts)
+        compressed = self._compressor.compress(raw)
+        chunk = mcap.chunk(*self._span, raw, compressed)
+        indexes, offsets = b"", {}
+        counts = {}
+        for channel, entries in self._indexes.items():
+            pairs = np.concatenate(entries)
+            counts[channel] = len(pairs)
+            offsets[channel] = self._position + len(chunk) + len(indexes)
+            indexes += mcap.message_index(channel, pairs.tobytes())
+        place = mcap.ChunkPlace(
+            *self._span, self._position, len(chunk), offsets, len(indexes), len(compressed), len(raw)
+        )
+        try:
+            self._append(chunk + indexes)
+            os.fdatasync(self._file)
+        except OSError as error:
+            self.lost_rows += self._rows
+            self.problem = f"{self.path}: {error.strerror}"
+        else:
+            self._chunks.append(place)
+            for channel, count in counts.items():
+                self._messages[channel] = self._messages.get(channel, 0) + count
+            low, high = self._total_span or self._span
+            self._total_span = min(low, self._span[0]), max(high, self._span[1])
+        self._parts, self._indexes, self._size, self._rows, self._span = [], {}, 0, 0, None
+
+    def close(self, counters: Mapping[str, int]) -> None:
+        """Write the rest, the counters and the summary; the file is complete afterwards.
+
+        Raises
+        ------
+        ConfigError
+            If the disk does not take the end of the file; what is there remains readable as a torn file.
+        """
+        try:
+            self.flush()
+            self._add_metadata("armident.counters", {key: str(value) for key, value in counters.items()})
+            statistics = mcap.statistics(
+                len(self._schemas),
+                len(self._channels),
+                len(self._metadata),
+                len(self._chunks),
+                self._total_span or (0, 0),
+                self._messages,
+            )
+            groups = [
+                (mcap.SCHEMA, b"".join(self._schemas)),
+                (mcap.CHANNEL, b"".join(self._channels)),
+                (mcap.STATISTICS, statistics),
+                (mcap.CHUNK_INDEX, b"".join(place.record() for place in self._chunks)),
+                (mcap.METADATA_INDEX, b"".join(place.record() for place in self._metadata)),
+            ]
+            self._append(mcap.ending(self._position, groups))
+            os.fsync(self._file)
+        except OSError as error:
+            raise ConfigError(f"{self.path}: could not be finished: {error.strerror}") from error
+        finally:
+            self._release()
+
+    def abort(self) -> None:
+        """Leave nothing behind."""
+        self._release()
+        self.path.unlink(missing_ok=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._release()
+
+    def _release(self) -> None:
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+    def _event(self, topic: str, sync: int, t_ns: int, entries: dict[str, Any]) -> None:
+        channel = self._topics[topic]
+        data = mcap.message(channel, sync, t_ns, json.dumps(entries).encode())
+        self._gather(channel, np.array([t_ns]), np.array([self._size], dtype=np.uint64), data)
+
+    def _gather(self, channel: int, t_ns: NDArray[np.int64], offsets: NDArray[np.uint64], data: bytes) -> None:
+        pairs = np.stack([t_ns.astype(np.uint64), offsets], axis=1)
+        self._indexes.setdefault(channel, []).append(pairs)
+        self._parts.append(data)
+        self._size += len(data)
+        low, high = int(t_ns.min()), int(t_ns.max())
+        if self._span is not None:
+            low, high = min(low, self._span[0]), max(high, self._span[1])
+        self._span = low, high
+        if high - low >= self._chunk_ns:
+            self.flush()
+
+    def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
+        data = mcap.metadata(name, entries)
+        place = mcap.MetadataPlace(name, self._position, len(data))
+        self._append(data)
+        self._metadata.append(place)
+
+    def _append(self, data: bytes) -> None:
+        """Write all of ``data``, or nothing."""
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[os.write(self._file, view) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._file, self._position)
+                os.lseek(self._file, self._position, os.SEEK_SET)
+            raise
+        self._position += len(data)
+
+
+def write_recording(recording: Recording, path: Path) -> None:
+    """Write a recording that is in memory; the file appears under its name when it is complete.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    joints = [joint.name for joint in recording.robot.joints]
+    layouts = [StreamLayout.of(stream, joints) for stream in recording.streams.values()]
+    writer = RecordingWriter(
+        temporary, recording.robot, recording.session, recording.sample_rate_hz, layouts, recording.metadata, 2**62
+    )
+    try:
+        first_ns = 0
+        for stream in recording.streams.values():
+            first_ns = int(stream.t_ns[0]) if stream.t_ns.size else first_ns
+            for begin in range(0, len(stream.sync), _ROWS_PER_CHUNK):
+                part = slice(begin, begin + _ROWS_PER_CHUNK)
+                raw = {name: values[part] for name, values in stream.raw.items()}
+                writer.append(stream.name, stream.sync[part], stream.t_ns[part], raw)
+                writer.flush()
+        writer.add_gaps(recording.gaps, first_ns)
+        writer.add_marks(recording.marks)
+        writer.flush()
+        if writer.problem is not None:
+            raise ConfigError(f"{path}: cannot be written: {writer.problem.rpartition(': ')[2]}")
+        writer.close(recording.counters)
+        temporary.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        writer.abort()
+
+
+def _version() -> str:
+    try:
+        return version("armident")
+    except PackageNotFoundError:
+        return "unpackaged"

@@ -1,0 +1,239 @@
+"""Recordings: what is written is what is read, by us and by anyone's MCAP reader."""
+
+import json
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from mcap_protobuf.decoder import DecoderFactory
+
+from configs import ConfigError, DataError, SessionConfig, config_path, load_robot
+from configs.loading import parse
+from daq.recording import Field, Gap, Mark, Recording, RecordingWriter, Stream, StreamLayout
+from daq.recording import read_recording, write_recording
+
+T0 = 1_700_000_000_000_000_000
+
+
+def make_recording(rows: int = 1500, seed: int = 0) -> Recording:
+    """A recording like those of the cell: samples on every SYNC but a few, demand on every fifth."""
+    rng = np.random.default_rng(seed)
+    robot = load_robot("tx40.yaml")
+    session = parse(config_path("tx40_cell.yaml").read_text(), SessionConfig, "tx40_cell.yaml")
+    one = (1.0,) * robot.n
+    sync = np.delete(np.arange(rows + 3, dtype=np.int64), [7, 8, 9])
+    int32 = np.iinfo(np.int32)
+    samples = Stream(
+        "samples",
+        1,
+        sync,
+        T0 + sync * 200_000,
+        {
+            "position": Field("position", "position", "rad", "motor", tuple(2 * np.pi / 65536 for _ in one)),
+            "current": Field("current", "current", "A", "motor", tuple(0.0025 for _ in one)),
+            "status": Field("status", "status", "", "motor", one),
+        },
+        {
+            "position": rng.integers(int32.min, int32.max, (rows, robot.n), dtype=np.int32, endpoint=True),
+            "current": rng.integers(-32768, 32767, (rows, robot.n), dtype=np.int16, endpoint=True),
+            "status": rng.integers(0, 65535, (rows, robot.n), dtype=np.uint16, endpoint=True),
+        },
+    )
+    fifth = np.arange(4, rows, 5, dtype=np.int64)
+    demand = Stream(
+        "demand",
+        5,
+        fifth,
+        T0 + fifth * 200_000,
+        {"demand": Field("demand", "demand", "rad", "motor", tuple(2 * np.pi / 65536 for _ in one))},
+        {"demand": rng.integers(int32.min, int32.max, (fifth.size, robot.n), dtype=np.int32)},
+    )
+    return Recording(
+        None,
+        robot,
+        session,
+        5000.0,
+        {"samples": samples, "demand": demand},
+        (Gap("samples", 7, 9, "joint_2", "lost"), Gap("samples", 8, 8, None, "SYNC not received")),
+        (Mark("experiment_start", 10, T0, "a"), Mark("experiment_end", 400, T0 + 1)),
+        {"sync_sent": rows + 3, "frames": 5},
+        {"host": "x"},
+    )
+
+
+def assert_same(a: Recording, b: Recording) -> None:
+    """Everything but the path is the same."""
+    assert a.sha256 == b.sha256
+    assert (a.robot, a.session, a.sample_rate_hz) == (b.robot, b.session, b.sample_rate_hz)
+    assert (a.gaps, a.marks, a.counters, a.metadata) == (b.gaps, b.marks, b.counters, b.metadata)
+    assert a.streams.keys() == b.streams.keys()
+    for name, stream in a.streams.items():
+        other = b.streams[name]
+        assert stream.fields == other.fields
+        assert stream.every == other.every
+        assert np.array_equal(stream.t_ns, other.t_ns)
+        for key, values in stream.raw.items():
+            assert values.dtype == other.raw[key].dtype
+            assert np.array_equal(values, other.raw[key])
+
+
+def test_a_recording_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
+    recording = make_recording(12_000)
+    write_recording(recording, tmp_path / "r.mcap")
+    read = read_recording(tmp_path / "r.mcap")
+    assert read.missing is None
+    assert_same(recording, read)
+    assert [p.name for p in tmp_path.iterdir()] == ["r.mcap"]
+
+
+def test_float64_channels_are_read_back_to_the_last_bit(tmp_path: Path) -> None:
+    robot = load_robot("emps.yaml")
+    sync = np.arange(300, dtype=np.int64)
+    raw = {"position": np.random.default_rng(1).normal(size=(300, 1))}
+    stream = Stream(
+        "samples", 1, sync, sync * 10**6, {"position": Field("position", "position", "m", "joint", (1.0,))}, raw
+    )
+    recording = Recording(None, robot, None, 1000.0, {"samples": stream})
+    write_recording(recording, tmp_path / "e.mcap")
+    assert_same(recording, read_recording(tmp_path / "e.mcap"))
+
+
+def test_the_stock_reader_decodes_every_message(tmp_path: Path) -> None:
+    recording = make_recording(700)
+    write_recording(recording, tmp_path / "r.mcap")
+    with (tmp_path / "r.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 700 + recording.streams["demand"].sync.size + 4
+        rows = [m for *_, m in reader.iter_decoded_messages(topics=["/samples"])]
+        names = {m.name: m.metadata for m in reader.iter_metadata()}
+        gaps = [json.loads(m.data) for _, _, m in reader.iter_messages(topics=["/events/gaps"])]
+    assert [r.sync for r in rows] == recording.samples.sync.tolist()
+    for name in ("position", "current", "status"):
+        got = [[getattr(getattr(r, j.name), name) for j in recording.robot.joints] for r in rows]
+        assert np.array_equal(got, recording.samples.raw[name])
+    assert names["armident.counters"] == {"sync_sent": "703", "frames": "5"}
+    assert gaps[0] == {"stream": "samples", "first": 7, "last": 9, "joint": "joint_2", "reason": "lost"}
+
+
+def test_the_stock_reader_finds_a_time_span_by_the_index(tmp_path: Path) -> None:
+    recording = make_recording(2000)
+    write_chunked(recording, tmp_path / "r.mcap").close({})
+    with (tmp_path / "r.mcap").open("rb") as file:
+        found = list(make_reader(file).iter_messages(["/samples"], T0 + 100 * 200_000, T0 + 200 * 200_000))
+    assert len(found) == 100
+    assert found[0][2].sequence == 100
+
+
+def write_chunked(recording: Recording, path: Path, chunk_ns: int = 20_000_000) -> RecordingWriter:
+    """As capture does: batches of some rows, many chunks; not yet closed."""
+    joints = [j.name for j in recording.robot.joints]
+    layouts = [StreamLayout.of(s, joints) for s in recording.streams.values()]
+    writer = RecordingWriter(path, recording.robot, recording.session, 5000.0, layouts, recording.metadata, chunk_ns)
+    for first in range(0, int(recording.samples.sync[-1]) + 1, 50):
+        for stream in recording.streams.values():
+            part = (stream.sync >= first) & (stream.sync < first + 50)
+            writer.append(
+                stream.name, stream.sync[part], stream.t_ns[part], {k: v[part] for k, v in stream.raw.items()}
+            )
+    return writer
+
+
+def test_batches_and_chunks_leave_no_trace_in_the_numbers(tmp_path: Path) -> None:
+    recording = make_recording(3000)
+    write_chunked(recording, tmp_path / "r.mcap").close(recording.counters)
+    assert read_recording(tmp_path / "r.mcap").sha256 == recording.sha256
+
+
+def test_a_file_cut_anywhere_opens_up_to_its_last_whole_chunk(tmp_path: Path) -> None:
+    recording = make_recording(2000)
+    write_chunked(recording, tmp_path / "whole.mcap").close({})
+    data = (tmp_path / "whole.mcap").read_bytes()
+    rng = np.random.default_rng(2)
+    seen = []
+    for cut in sorted(rng.integers(8_000, len(data), 60)):
+        torn = tmp_path / "torn.mcap"
+        torn.write_bytes(data[:cut])
+        read = read_recording(torn)
+        assert read.missing is not None
+        assert "not finished" in read.missing
+        count = read.samples.sync.size
+        assert np.array_equal(read.samples.sync, recording.samples.sync[:count])
+        assert np.array_equal(read.samples.raw["position"], recording.samples.raw["position"][:count])
+        seen.append(count)
+    assert seen == sorted(seen)
+    assert seen[-1] > 1000
+
+
+def test_an_unclosed_file_loses_at_most_one_chunk(tmp_path: Path) -> None:
+    recording = make_recording(2000)
+    write_chunked(recording, tmp_path / "r.mcap")
+    read = read_recording(tmp_path / "r.mcap")
+    assert recording.samples.sync[-1] - read.samples.sync[-1] <= 150
+    assert read.missing is not None
+    assert f"after SYNC {read.samples.sync[-1]}" in read.missing
+
+
+def test_a_flipped_bit_in_a_chunk_is_found_and_named(tmp_path: Path) -> None:
+    recording = make_recording(2000)
+    write_chunked(recording, tmp_path / "r.mcap").close({})
+    data = bytearray((tmp_path / "r.mcap").read_bytes())
+    data[len(data) // 2] ^= 0x10
+    (tmp_path / "r.mcap").write_bytes(data)
+    read = read_recording(tmp_path / "r.mcap")
+    assert read.missing is not None
+    assert "damaged" in read.missing
+    kept = np.isin(recording.samples.sync, read.samples.sync)
+    assert np.array_equal(recording.samples.raw["position"][kept], read.samples.raw["position"])
+    assert 0 < (~kept).sum() < 300
+
+
+@pytest.mark.parametrize(
+    ("content", "words"), [(b"", "empty"), (b"t,q1\n0,1\n", "not an MCAP"), (b"\x89MCAP0\r\n\x01", "torn before")]
+)
+def test_what_is_not_a_recording_is_named(tmp_path: Path, content: bytes, words: str) -> None:
+    (tmp_path / "x.mcap").write_bytes(content)
+    with pytest.raises(DataError, match=words):
+        read_recording(tmp_path / "x.mcap")
+
+
+def test_another_tool_s_mcap_is_not_a_recording(tmp_path: Path) -> None:
+    with (tmp_path / "x.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()
+    with pytest.raises(DataError, match="not a recording of armident"):
+        read_recording(tmp_path / "x.mcap")
+
+
+def test_no_such_recording_is_a_usage_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no such recording"):
+        read_recording(tmp_path / "x.mcap")
+
+
+def test_a_place_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot be written"):
+        write_recording(make_recording(10), tmp_path / "file" / "r.mcap")
+
+
+def test_a_full_disk_keeps_the_file_whole_and_counts_the_loss(tmp_path: Path) -> None:
+    recording = make_recording(2000)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
+    try:
+        writer = write_chunked(recording, tmp_path / "r.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    writer.close({})
+    read = read_recording(tmp_path / "r.mcap")
+    assert writer.problem is not None
+    assert writer.lost_rows > 0
+    rows = sum(s.sync.size for s in read.streams.values())
+    assert rows + writer.lost_rows == sum(s.sync.size for s in recording.streams.values())
+    assert read.missing is None
