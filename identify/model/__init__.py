@@ -1,0 +1,1 @@
+"""The robot model: serial chains from MDH, base parameters, closed-loop simulation."""

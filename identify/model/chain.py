@@ -1,0 +1,122 @@
+"""The constant arrays a kernel needs: geometry of the chain, columns of the regressor, values of the parameters."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import RobotConfig
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+INERTIAL = ("xx", "xy", "xz", "yy", "yz", "zz", "mx", "my", "mz", "m")
+"""Inertial parameters of a link, in the order of the columns (thesis equation 2.6)."""
+
+
+class Chain(NamedTuple):
+    """Geometry of a serial chain: modified Denavit-Hartenberg (thesis section 2.1.1), one entry per joint."""
+
+    cos_alpha: Floats
+    sin_alpha: Floats
+    d: Floats
+    theta: Floats
+    r: Floats
+    prismatic: NDArray[np.bool_]
+    gravity: Floats
+
+
+class Columns(NamedTuple):
+    """Which column of the regressor a parameter has; -1 where it has none."""
+
+    inertial: Ints
+    ia: Ints
+    fv: Ints
+    fc: Ints
+    off: Ints
+    coupling_joints: Ints
+    coupling: Ints
+
+
+class Values(NamedTuple):
+    """Parameter values by meaning: ``inertial`` (n, 10), joint terms (n,), ``coupling`` (c, 3)."""
+
+    inertial: Floats
+    ia: Floats
+    fv: Floats
+    fc: Floats
+    off: Floats
+    coupling_joints: Ints
+    coupling: Floats
+    smoothing: float
+
+
+def cos_sin(angle: float) -> tuple[float, float]:
+    """Cosine and sine with exact zeros and ones at multiples of a right angle."""
+    c, s = float(np.cos(angle)), float(np.sin(angle))
+    return (round(c), float(round(s))) if min(abs(c), abs(s)) < 1e-12 else (c, s)
+
+
+def chain_of(robot: RobotConfig) -> Chain:
+    """Geometry of a robot configuration."""
+    angles = np.array([cos_sin(j.mdh.alpha) for j in robot.joints], dtype=np.float64)
+    return Chain(
+        cos_alpha=angles[:, 0].copy(),
+        sin_alpha=angles[:, 1].copy(),
+        d=np.array([j.mdh.d for j in robot.joints]),
+        theta=np.array([j.mdh.theta for j in robot.joints]),
+        r=np.array([j.mdh.r for j in robot.joints]),
+        prismatic=np.array([j.type == "prismatic" for j in robot.joints]),
+        gravity=np.array(robot.gravity),
+    )
+
+
+def standard_names(robot: RobotConfig) -> tuple[str, ...]:
+    """Names of the standard parameters: 14 per link (13 without rotor inertia), then 3 per coupling."""
+    names: list[str] = []
+    for k, joint in enumerate(robot.joints, start=1):
+        kinds = [*INERTIAL, *(["ia"] if joint.rotor_inertia else []), "fv", "fc", "off"]
+        names += [f"{kind}{k}" for kind in kinds]
+    for coupling in robot.couplings:
+        names += [f"{kind}{coupling.name}" for kind in ("ia", "fv", "fc")]
+    return tuple(names)
+
+
+def columns_of(robot: RobotConfig, names: tuple[str, ...]) -> Columns:
+    """Column numbers of the standard parameters listed in ``names``."""
+    where = {name: k for k, name in enumerate(names)}
+    joints = range(1, robot.n + 1)
+    index = {joint.name: k for k, joint in enumerate(robot.joints)}
+
+    def per_joint(kind: str) -> Ints:
+        return np.array([where.get(f"{kind}{k}", -1) for k in joints], dtype=np.int64)
+
+    return Columns(
+        inertial=np.stack([per_joint(kind) for kind in INERTIAL], axis=1),
+        ia=per_joint("ia"),
+        fv=per_joint("fv"),
+        fc=per_joint("fc"),
+        off=per_joint("off"),
+        coupling_joints=np.array(
+            [[index[joint] for joint in c.joints] for c in robot.couplings], dtype=np.int64
+        ).reshape(-1, 2),
+        coupling=np.array(
+            [[where.get(f"{kind}{c.name}", -1) for kind in ("ia", "fv", "fc")] for c in robot.couplings],
+            dtype=np.int64,
+        ).reshape(-1, 3),
+    )
+
+
+def values_of(columns: Columns, theta: Floats, smoothing: float) -> Values:
+    """Parameter vector ``theta`` taken apart by meaning; parameters without a column are zero."""
+    padded = np.append(np.asarray(theta, dtype=np.float64), 0.0)
+    return Values(
+        inertial=padded[columns.inertial],
+        ia=padded[columns.ia],
+        fv=padded[columns.fv],
+        fc=padded[columns.fc],
+        off=padded[columns.off],
+        coupling_joints=columns.coupling_joints,
+        coupling=padded[columns.coupling],
+        smoothing=smoothing,
+    )

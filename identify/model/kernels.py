@@ -1,0 +1,372 @@
+"""Compiled recursions over the chain: regressor, inverse dynamics, mass matrix and bias forces.
+
+Newton-Euler in modified Denavit-Hartenberg frames, thesis equations A.22 to A.26. Gravity enters as
+acceleration ``-g`` of the base. Vectors of link j are written in frame j, scalars by component.
+"""
+
+import numpy as np
+
+from identify.model.chain import Chain, Columns, Floats, Values
+from identify.model.compiled import compiled, inlined
+
+TWO_OVER_PI = 2.0 / np.pi
+
+
+@inlined
+def smooth_sign(x: float, smoothing: float) -> float:
+    """``sign(x)``, or ``(2/pi) atan(smoothing x)`` where ``smoothing`` is positive (thesis section B.2)."""
+    return TWO_OVER_PI * np.arctan(smoothing * x) if smoothing > 0.0 else float(np.sign(x))
+
+
+@inlined
+def into_child(
+    ca: float, sa: float, c: float, s: float, x: float, y: float, z: float
+) -> tuple[float, float, float]:
+    """A vector of frame j-1 written in frame j."""
+    t = ca * y + sa * z
+    return c * x + s * t, c * t - s * x, ca * z - sa * y
+
+
+@inlined
+def into_parent(
+    ca: float, sa: float, c: float, s: float, x: float, y: float, z: float
+) -> tuple[float, float, float]:
+    """A vector of frame j written in frame j-1."""
+    t = s * x + c * y
+    return c * x - s * y, ca * t - sa * z, sa * t + ca * z
+
+
+@compiled
+def fill_regressor(
+    chain: Chain, columns: Columns, smoothing: float, q: Floats, qd: Floats, qdd: Floats, out: Floats
+) -> None:
+    """Write the columns of the inverse dynamic model into ``out`` (N, n, columns), which holds zeros."""
+    n = chain.d.size
+    lin = np.empty((n, 3))
+    ang = np.empty((n, 3))
+    for k in range(q.shape[0]):
+        wx = wy = wz = bx = by = bz = 0.0
+        ax, ay, az = -chain.gravity[0], -chain.gravity[1], -chain.gravity[2]
+        for j in range(n):
+            v, a = qd[k, j], qdd[k, j]
+            ca, sa, d = chain.cos_alpha[j], chain.sin_alpha[j], chain.d[j]
+            moves = chain.prismatic[j]
+            angle = chain.theta[j] + (0.0 if moves else q[k, j])
+            r = chain.r[j] + (q[k, j] if moves else 0.0)
+            c, s = np.cos(angle), np.sin(angle)
+            px, py, pz = d, -r * sa, r * ca
+            # Acceleration of O_j before the joint's own motion: a + wd x P + w x (w x P).
+            ux, uy, uz = wy * pz - wz * py, wz * px - wx * pz, wx * py - wy * px
+            ax += by * pz - bz * py + wy * uz - wz * uy
+            ay += bz * px - bx * pz + wz * ux - wx * uz
+            az += bx * py - by * px + wx * uy - wy * ux
+            ax, ay, az = into_child(ca, sa, c, s, ax, ay, az)
+            wx, wy, wz = into_child(ca, sa, c, s, wx, wy, wz)
+            bx, by, bz = into_child(ca, sa, c, s, bx, by, bz)
+            if moves:
+                ax += 2.0 * v * wy
+                ay -= 2.0 * v * wx
+                az += a
+            else:
+                bx += wy * v
+                by -= wx * v
+                bz += a
+                wz += v
+            for i in range(j):
+                lx, ly, lz = lin[i, 0], lin[i, 1], lin[i, 2]
+                rx, ry, rz = ang[i, 0], ang[i, 1], ang[i, 2]
+                lin[i, 0], lin[i, 1], lin[i, 2] = into_child(
+                    ca, sa, c, s, lx + ry * pz - rz * py, ly + rz * px - rx * pz, lz + rx * py - ry * px
+                )
+                ang[i, 0], ang[i, 1], ang[i, 2] = into_child(ca, sa, c, s, rx, ry, rz)
+            lin[j, 0] = lin[j, 1] = ang[j, 0] = ang[j, 1] = 0.0
+            lin[j, 2] = 1.0 if moves else 0.0
+            ang[j, 2] = 0.0 if moves else 1.0
+
+            axx, ayy, azz = -(wy * wy + wz * wz), -(wx * wx + wz * wz), -(wx * wx + wy * wy)
+            axy, ayx = wx * wy - bz, wx * wy + bz
+            axz, azx = wx * wz + by, wx * wz - by
+            ayz, azy = wy * wz - bx, wy * wz + bx
+            col = columns.inertial[j]
+            for i in range(j + 1):
+                lx, ly, lz = lin[i, 0], lin[i, 1], lin[i, 2]
+                rx, ry, rz = ang[i, 0], ang[i, 1], ang[i, 2]
+                ux, uy, uz = ry * wz - rz * wy, rz * wx - rx * wz, rx * wy - ry * wx
+                row = out[k, i]
+                if col[0] >= 0:
+                    row[col[0]] = rx * bx + ux * wx
+                if col[1] >= 0:
+                    row[col[1]] = rx * by + ry * bx + ux * wy + uy * wx
+                if col[2] >= 0:
+                    row[col[2]] = rx * bz + rz * bx + ux * wz + uz * wx
+                if col[3] >= 0:
+                    row[col[3]] = ry * by + uy * wy
+                if col[4] >= 0:
+                    row[col[4]] = ry * bz + rz * by + uy * wz + uz * wy
+                if col[5] >= 0:
+                    row[col[5]] = rz * bz + uz * wz
+                if col[6] >= 0:
+                    row[col[6]] = lx * axx + ly * ayx + lz * azx - ry * az + rz * ay
+                if col[7] >= 0:
+                    row[col[7]] = lx * axy + ly * ayy + lz * azy + rx * az - rz * ax
+                if col[8] >= 0:
+                    row[col[8]] = lx * axz + ly * ayz + lz * azz - rx * ay + ry * ax
+                if col[9] >= 0:
+                    row[col[9]] = lx * ax + ly * ay + lz * az
+            row = out[k, j]
+            if columns.ia[j] >= 0:
+                row[columns.ia[j]] = a
+            if columns.fv[j] >= 0:
+                row[columns.fv[j]] = v
+            if columns.fc[j] >= 0:
+                row[columns.fc[j]] = smooth_sign(v, smoothing)
+            if columns.off[j] >= 0:
+                row[columns.off[j]] = 1.0
+        for m in range(columns.coupling_joints.shape[0]):
+            i, j = columns.coupling_joints[m]
+            inertia, viscous, coulomb = columns.coupling[m]
+            if inertia >= 0:
+                out[k, i, inertia] = qdd[k, j]
+                out[k, j, inertia] = qdd[k, i]
+            if viscous >= 0:
+                out[k, i, viscous] = qd[k, j]
+                out[k, j, viscous] = qd[k, i]
+            if coulomb >= 0:
+                out[k, i, coulomb] = out[k, j, coulomb] = smooth_sign(qd[k, i] + qd[k, j], smoothing)
+
+
+@compiled
+def add_friction(values: Values, smoothing: float, qd: Floats, tau: Floats) -> None:
+    """Add friction, offsets and coupled friction at velocity ``qd`` (n,) to ``tau`` (n,) (2.7, B.1)."""
+    for j in range(qd.size):
+        tau[j] += values.fv[j] * qd[j] + values.off[j]
+        if values.fc[j] != 0.0:
+            tau[j] += values.fc[j] * smooth_sign(qd[j], smoothing)
+    for m in range(values.coupling_joints.shape[0]):
+        i, j = values.coupling_joints[m]
+        sign = values.coupling[m, 2] * smooth_sign(qd[i] + qd[j], smoothing)
+        tau[i] += values.coupling[m, 1] * qd[j] + sign
+        tau[j] += values.coupling[m, 1] * qd[i] + sign
+
+
+@compiled
+def rigid_torque(
+    chain: Chain, values: Values, q: Floats, qd: Floats, qdd: Floats, work: Floats, tau: Floats
+) -> None:
+    """Torques of the rigid chain, without friction and rotors, for one sample; ``work`` is (n, 8)."""
+    n = chain.d.size
+    wx = wy = wz = bx = by = bz = 0.0
+    ax, ay, az = -chain.gravity[0], -chain.gravity[1], -chain.gravity[2]
+    for j in range(n):
+        v, a = qd[j], qdd[j]
+        ca, sa, d = chain.cos_alpha[j], chain.sin_alpha[j], chain.d[j]
+        moves = chain.prismatic[j]
+        angle = chain.theta[j] + (0.0 if moves else q[j])
+        r = chain.r[j] + (q[j] if moves else 0.0)
+        c, s = np.cos(angle), np.sin(angle)
+        work[j, 6] = c
+        work[j, 7] = s
+        px, py, pz = d, -r * sa, r * ca
+        ux, uy, uz = wy * pz - wz * py, wz * px - wx * pz, wx * py - wy * px
+        ax += by * pz - bz * py + wy * uz - wz * uy
+        ay += bz * px - bx * pz + wz * ux - wx * uz
+        az += bx * py - by * px + wx * uy - wy * ux
+        ax, ay, az = into_child(ca, sa, c, s, ax, ay, az)
+        wx, wy, wz = into_child(ca, sa, c, s, wx, wy, wz)
+        bx, by, bz = into_child(ca, sa, c, s, bx, by, bz)
+        if moves:
+            ax += 2.0 * v * wy
+            ay -= 2.0 * v * wx
+            az += a
+        else:
+            bx += wy * v
+            by -= wx * v
+            bz += a
+            wz += v
+        xx, xy, xz, yy, yz, zz, mx, my, mz, mass = values.inertial[j]
+        ux, uy, uz = wy * mz - wz * my, wz * mx - wx * mz, wx * my - wy * mx
+        work[j, 0] = mass * ax + by * mz - bz * my + wy * uz - wz * uy
+        work[j, 1] = mass * ay + bz * mx - bx * mz + wz * ux - wx * uz
+        work[j, 2] = mass * az + bx * my - by * mx + wx * uy - wy * ux
+        ux = xx * wx + xy * wy + xz * wz
+        uy = xy * wx + yy * wy + yz * wz
+        uz = xz * wx + yz * wy + zz * wz
+        work[j, 3] = xx * bx + xy * by + xz * bz + wy * uz - wz * uy + my * az - mz * ay
+        work[j, 4] = xy * bx + yy * by + yz * bz + wz * ux - wx * uz + mz * ax - mx * az
+        work[j, 5] = xz * bx + yz * by + zz * bz + wx * uy - wy * ux + mx * ay - my * ax
+    fx = fy = fz = mx = my = mz = 0.0
+    for j in range(n - 1, -1, -1):
+        fx += work[j, 0]
+        fy += work[j, 1]
+        fz += work[j, 2]
+        mx += work[j, 3]
+        my += work[j, 4]
+        mz += work[j, 5]
+        moves = chain.prismatic[j]
+        tau[j] = fz if moves else mz
+        ca, sa, c, s = chain.cos_alpha[j], chain.sin_alpha[j], work[j, 6], work[j, 7]
+        r = chain.r[j] + (q[j] if moves else 0.0)
+        px, py, pz = chain.d[j], -r * sa, r * ca
+        fx, fy, fz = into_parent(ca, sa, c, s, fx, fy, fz)
+        mx, my, mz = into_parent(ca, sa, c, s, mx, my, mz)
+        mx += py * fz - pz * fy
+        my += pz * fx - px * fz
+        mz += px * fy - py * fx
+
+
+@compiled
+def fill_mass_matrix(chain: Chain, values: Values, q: Floats, work: Floats, mass: Floats) -> None:
+    """Mass matrix (n, n) with rotors and couplings, by composite rigid bodies; ``work`` is (n, 8).
+
+    Columns 6 and 7 of ``work`` hold the cosine and sine of the joint angles, as `rigid_torque` leaves them.
+    """
+    n = chain.d.size
+    xx = xy = xz = yy = yz = zz = hx = hy = hz = m = 0.0
+    for j in range(n - 1, -1, -1):
+        p = values.inertial[j]
+        xx += p[0]
+        xy += p[1]
+        xz += p[2]
+        yy += p[3]
+        yz += p[4]
+        zz += p[5]
+        hx += p[6]
+        hy += p[7]
+        hz += p[8]
+        m += p[9]
+        # Wrench at O_j that gives joint j a unit acceleration, handed down the chain.
+        if chain.prismatic[j]:
+            fx, fy, fz, tx, ty, tz = 0.0, 0.0, m, hy, -hx, 0.0
+            mass[j, j] = m + values.ia[j]
+        else:
+            fx, fy, fz, tx, ty, tz = -hy, hx, 0.0, xz, yz, zz
+            mass[j, j] = zz + values.ia[j]
+        for i in range(j, 0, -1):
+            ca, sa, c, s = chain.cos_alpha[i], chain.sin_alpha[i], work[i, 6], work[i, 7]
+            r = chain.r[i] + (q[i] if chain.prismatic[i] else 0.0)
+            px, py, pz = chain.d[i], -r * sa, r * ca
+            fx, fy, fz = into_parent(ca, sa, c, s, fx, fy, fz)
+            tx, ty, tz = into_parent(ca, sa, c, s, tx, ty, tz)
+            tx += py * fz - pz * fy
+            ty += pz * fx - px * fz
+            tz += px * fy - py * fx
+            mass[i - 1, j] = mass[j, i - 1] = fz if chain.prismatic[i - 1] else tz
+        if j == 0:
+            break
+        ca, sa, c, s = chain.cos_alpha[j], chain.sin_alpha[j], work[j, 6], work[j, 7]
+        r = chain.r[j] + (q[j] if chain.prismatic[j] else 0.0)
+        px, py, pz = chain.d[j], -r * sa, r * ca
+        hx, hy, hz = into_parent(ca, sa, c, s, hx, hy, hz)
+        # Rot(z) then Rot(x) of the inertia, then its shift from O_j to O_j-1.
+        cc, ss, cs = c * c, s * s, c * s
+        jxx, jyy, jxy = cc * xx - 2 * cs * xy + ss * yy, ss * xx + 2 * cs * xy + cc * yy, cs * (xx - yy) + (cc - ss) * xy
+        jxz, jyz = c * xz - s * yz, s * xz + c * yz
+        cc, ss, cs = ca * ca, sa * sa, ca * sa
+        gx, gy, gz = px * m + 2 * hx, py * m + 2 * hy, pz * m + 2 * hz
+        square = px * gx + py * gy + pz * gz
+        xx = jxx + square - px * gx
+        xy = ca * jxy - sa * jxz - px * hy - py * hx - m * px * py
+        xz = sa * jxy + ca * jxz - px * hz - pz * hx - m * px * pz
+        yy, yz, zz = (
+            cc * jyy - 2 * cs * jyz + ss * zz + square - py * gy,
+            cs * (jyy - zz) + (cc - ss) * jyz - py * hz - pz * hy - m * py * pz,
+            ss * jyy + 2 * cs * jyz + cc * zz + square - pz * gz,
+        )
+        hx += m * px
+        hy += m * py
+        hz += m * pz
+    for k in range(values.coupling_joints.shape[0]):
+        i, j = values.coupling_joints[k]
+        mass[i, j] += values.coupling[k, 0]
+        mass[j, i] += values.coupling[k, 0]
+
+
+@compiled
+def fill_inverse_dynamics(
+    chain: Chain, values: Values, smoothing: float, q: Floats, qd: Floats, qdd: Floats, out: Floats
+) -> None:
+    """Joint torques ``out`` (N, n) of the whole model along a motion."""
+    work = np.empty((chain.d.size, 8))
+    for k in range(q.shape[0]):
+        rigid_torque(chain, values, q[k], qd[k], qdd[k], work, out[k])
+        add_friction(values, smoothing, qd[k], out[k])
+        for j in range(chain.d.size):
+            out[k, j] += values.ia[j] * qdd[k, j]
+        for m in range(values.coupling_joints.shape[0]):
+            i, j = values.coupling_joints[m]
+            out[k, i] += values.coupling[m, 0] * qdd[k, j]
+            out[k, j] += values.coupling[m, 0] * qdd[k, i]
+
+
+@compiled
+def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> None:
+    """Mass matrices ``out`` (N, n, n) at postures ``q`` (N, n)."""
+    n = chain.d.size
+    work = np.empty((n, 8))
+    for k in range(q.shape[0]):
+        for j in range(n):
+            angle = chain.theta[j] + (0.0 if chain.prismatic[j] else q[k, j])
+            work[j, 6] = np.cos(angle)
+            work[j, 7] = np.sin(angle)
+        fill_mass_matrix(chain, values, q[k], work, out[k])
+
+
+@compiled
+def cholesky(matrix: Floats, n: int) -> bool:
+    """Replace the lower triangle of ``matrix`` by its Cholesky factor; ``False`` if not positive definite.
+
+    The diagonal of the factor is stored inverted.
+    """
+    for j in range(n):
+        pivot = matrix[j, j]
+        floor = 1e-12 * abs(pivot)
+        for k in range(j):
+            pivot -= matrix[j, k] * matrix[j, k]
+        if not pivot > floor:
+            return False
+        inverse = 1.0 / np.sqrt(pivot)
+        matrix[j, j] = inverse
+        for i in range(j + 1, n):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = value * inverse
+    return True
+
+
+@compiled
+def solve_factored(factor: Floats, n: int, x: Floats) -> None:
+    """Solve in place with the factor left by `cholesky`."""
+    for i in range(n):
+        value = x[i]
+        for k in range(i):
+            value -= factor[i, k] * x[k]
+        x[i] = value * factor[i, i]
+    for i in range(n - 1, -1, -1):
+        value = x[i]
+        for k in range(i + 1, n):
+            value -= factor[k, i] * x[k]
+        x[i] = value * factor[i, i]
+
+
+@compiled
+def fill_forward_dynamics(
+    chain: Chain, values: Values, smoothing: float, q: Floats, qd: Floats, tau: Floats, out: Floats
+) -> int:
+    """Joint accelerations ``out`` (N, n); returns the first sample whose mass matrix is singular, or -1."""
+    n = chain.d.size
+    work = np.empty((n, 8))
+    mass = np.empty((n, n))
+    bias = np.empty(n)
+    still = np.zeros(n)
+    for k in range(q.shape[0]):
+        rigid_torque(chain, values, q[k], qd[k], still, work, bias)
+        add_friction(values, smoothing, qd[k], bias)
+        fill_mass_matrix(chain, values, q[k], work, mass)
+        if not cholesky(mass, n):
+            return k
+        for j in range(n):
+            out[k, j] = tau[k, j] - bias[j]
+        solve_factored(mass, n, out[k])
+    return -1
+
