@@ -16,28 +16,36 @@ def main() -> int:
     parser.add_argument("-n", dest="buses", type=int, default=1, metavar="BUSES", help="how many: vcan0 and on (1)")
     parser.add_argument("-m", dest="memory", default="4096M", help="memory of a guest (4096M)")
     parser.add_argument("--guest", action="store_true", help="use a guest even where this kernel has SocketCAN")
-    parser.add_argument("--setup", action="store_true", help="only fetch and unpack what a guest needs")
+    parser.add_argument("--setup", action="store_true", help="only make sure that it can be done; fetch what it takes")
     parser.add_argument("command", nargs=argparse.REMAINDER, metavar="-- COMMAND")
     options = parser.parse_args()
     command = options.command[1:] if options.command[:1] == ["--"] else options.command
     if not command and not options.setup:
         parser.error("no command")
     try:
+        native = not options.guest and _native(options.buses)
         if options.setup:
-            print(packages.provide())
+            print("SocketCAN of this kernel" if native else f"User-Mode Linux in {packages.provide()}")
             return 0
-        if not options.guest and interfaces.have_socketcan():
-            try:
-                for number in range(options.buses):
-                    interfaces.ensure_vcan(f"vcan{number}")
-            except ArmidentError as error:
-                print(f"{error}; using a User-Mode Linux guest instead", file=sys.stderr)
-            else:
-                os.execvp(command[0], command)
+        if native:
+            os.execvp(command[0], command)
         return guest.run(command, options.buses, options.memory)
     except (ArmidentError, OSError) as error:
         print(f"drivers.vcan: {error}", file=sys.stderr)
         return CANNOT_RUN
+
+
+def _native(buses: int) -> bool:
+    """Bring this kernel's vcan buses up, if it has any and lets us."""
+    if not interfaces.have_socketcan():
+        return False
+    try:
+        for number in range(buses):
+            interfaces.ensure_vcan(f"vcan{number}")
+    except ArmidentError as error:
+        print(f"{error}; using a User-Mode Linux guest instead", file=sys.stderr)
+        return False
+    return True
 
 
 if __name__ == "__main__":

@@ -92,14 +92,13 @@ def _write_scripts(
     buses: int,
     writable: Sequence[Path],
 ) -> None:
-    busybox = root / "bin" / "busybox"
-    settings = {"BIN": root / "bin", "MODULES": root / "modules", "RUN": folder, "BUSES": buses}
+    settings = {"MODULES": root / "modules", "RUN": folder, "BUSES": buses}
     head = "".join(f"{name}={shlex.quote(str(value))}\n" for name, value in settings.items())
     init = Path(__file__).with_name("init.sh").read_text(encoding="utf-8")
-    (folder / "init").write_text(f"#!{folder / 'sh'}\n{head}{init}", encoding="utf-8")
+    (folder / "init").write_text(f"#!{folder / 'busybox'} sh\n{head}{init}", encoding="utf-8")
     (folder / "init").chmod(0o755)
     # a path without spaces for the interpreter line, wherever the cache is
-    (folder / "sh").symlink_to(busybox)
+    (folder / "busybox").symlink_to(root / "bin" / "busybox")
     mounts = []
     for path in dict.fromkeys([Path("/tmp"), *(p.resolve() for p in writable)]):
         if "," in str(path):

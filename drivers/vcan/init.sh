@@ -1,6 +1,6 @@
-# First process of the guest. Variables from the launcher: BIN MODULES RUN BUSES; files in $RUN:
-# command (script to run), mounts (script that makes host folders writable), status (written here at the end).
-B=$BIN/busybox
+# First process of the guest. Variables from the launcher: MODULES RUN BUSES; files in $RUN:
+# busybox, command (script to run), mounts (script that makes host folders writable), status (written here at the end).
+B=$RUN/busybox
 
 give_up() {
   echo "guest: $*" >&2

@@ -1,0 +1,83 @@
+# Installs into .venv from requirements.lock, whatever index pip is configured with.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.ONESHELL:
+.DEFAULT_GOAL := help
+
+VENV := .venv
+PY := $(VENV)/bin/python
+PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13; do \
+	"$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo "$$p"; break; }; done)
+# compiled kernels are kept here: the folder is writable in the vcan guest too
+export NUMBA_CACHE_DIR := $(CURDIR)/.cache/numba
+SOURCES := configs drivers daq identify virtual_robot tests
+PYTEST := $(PY) -m pytest
+WITH_VCAN := $(PY) -m drivers.vcan -n 2 --
+
+.PHONY: help install demo test check lint vcan bench lock clean
+
+help: ## what there is to do
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(PY):
+	@if [ -z "$(PYTHON)" ]; then
+		echo "armident needs Python 3.11 or later; an administrator must run: sudo apt-get install python3" >&2; exit 1
+	fi
+	if ! "$(PYTHON)" -c 'import ensurepip' 2>/dev/null; then
+		if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+			apt-get -q update && apt-get -qy install python3-venv
+		else
+			echo "Python's venv is not installed; an administrator must run: sudo apt-get install python3-venv" >&2; exit 1
+		fi
+	fi
+	"$(PYTHON)" -m venv $(VENV)
+
+$(VENV)/.lock: requirements.lock | $(PY)
+	@echo "installing what requirements.lock lists into $(VENV)"
+	$(PY) -m pip install -q --disable-pip-version-check --require-hashes -r requirements.lock
+	touch $@
+
+$(VENV)/.project: pyproject.toml $(VENV)/.lock
+	@$(PY) -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation -e .
+	mkdir -p .cache/numba
+	touch $@
+
+install: $(VENV)/.project ## install into .venv
+
+demo: install ## the whole story on this machine, ends with a report (DEMO="--out DIR" passes options)
+	@$(VENV)/bin/armident demo $(DEMO)
+
+lint: install
+	@$(PY) -m ruff check $(SOURCES)
+	$(PY) -m ruff format --check $(SOURCES)
+	$(PY) -m mypy
+	$(VENV)/bin/lint-imports
+
+check: lint ## ruff, mypy, import-linter and the quick tests, under two minutes
+	@$(PYTEST) -q -m "not vcan and not slow"
+
+test: lint ## everything, the tests on vcan included
+	@mkdir -p .cache
+	$(PYTEST) -m "not vcan" 2>&1 | tee .cache/tests.log
+	if $(PY) -m drivers.vcan -n 2 --setup; then
+		$(WITH_VCAN) $(PYTEST) -m vcan tests/integration 2>&1 | tee .cache/tests-vcan.log
+	else
+		$(PYTEST) -m vcan tests/integration 2>&1 | tee .cache/tests-vcan.log
+	fi
+	echo
+	echo "Skipped:"
+	grep -hE '^SKIPPED' .cache/tests.log .cache/tests-vcan.log || echo "nothing"
+
+vcan: install ## fetch what the vcan guest needs, where this kernel has no SocketCAN
+	@$(PY) -m drivers.vcan --setup
+
+bench: install ## figures of ours beside those of named alternatives
+	@$(PY) -m tests.benchmarks.run
+
+lock: install ## write requirements.lock anew from the ranges in pyproject.toml
+	@$(PY) -m pip install -q --disable-pip-version-check uv
+	$(VENV)/bin/uv pip compile --upgrade --universal --python-version 3.11 --extra dev --generate-hashes --no-header \
+		--no-annotate --no-emit-index-url --no-emit-find-links -q -o requirements.lock pyproject.toml
+
+clean: ## remove what make and the tools created
+	@rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out
