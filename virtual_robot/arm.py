@@ -1,0 +1,142 @@
+"""The virtual arm: six servo drives on the plant, one control period at a time."""
+
+import math
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from configs import ConfigError, RobotConfig
+from configs.scenario import Scenario
+from virtual_robot import servo
+from virtual_robot.noise import Noise
+from virtual_robot.plant import BRAKE, Plant
+
+Raw32 = NDArray[np.int32]
+Raw16 = NDArray[np.int16]
+
+
+class Motion(Protocol):
+    """What stands behind the drives: raw numbers for the coming SYNC, and how to get to the next.
+
+    ``position`` (n,) int32 counts, ``current`` (n,) int16 per mille of rated and ``demand`` (n,) int32 counts
+    are replaced in place by ``advance``.
+    """
+
+    position: Raw32
+    current: Raw16
+    demand: Raw32
+
+    def enable(self, joint: int, enabled: bool) -> None:
+        """Drive ``joint`` enters or leaves operation enabled."""
+
+    def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
+        """Take ``targets`` (n,) counts over where ``fresh``: the drives reach them after their interpolation time."""
+
+    def advance(self) -> None:
+        """Move on by one SYNC period."""
+
+
+class Arm:
+    """Plant, drives and noise; numbers as they stand on the bus.
+
+    Parameters
+    ----------
+    robot
+        Its joints, transmission and drives; every joint needs ``counts_per_unit``.
+    q
+        Posture at the start, shape (n,), rad or m.
+    sync_period
+        Time between two SYNC, s: a multiple of the control period, 200 us.
+    seed, noise
+        Noise of the size of table 6.3, ``noise`` scales its amplitude.
+    scenario
+        Hidden effects.
+
+    Raises
+    ------
+    ConfigError
+        If the SYNC period is not a multiple of the control period, or an encoder resolution is missing.
+    """
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        q: ArrayLike,
+        sync_period: float = servo.CONTROL_PERIOD,
+        seed: int = 0,
+        noise: float = 1.0,
+        scenario: Scenario | None = None,
+    ) -> None:
+        n = robot.n
+        self._periods = round(sync_period / servo.CONTROL_PERIOD)
+        if self._periods < 1 or abs(self._periods * servo.CONTROL_PERIOD - sync_period) > 1e-9:
+            raise ConfigError(
+                f"SYNC period {sync_period * 1e6:.0f} us: the virtual drives need a multiple of "
+                f"{servo.CONTROL_PERIOD * 1e6:.0f} us"
+            )
+        self.plant = Plant(robot, q, scenario)
+        self._noise = Noise(robot, servo.CONTROL_PERIOD, seed, noise)
+        self._ratio = robot.transmission_matrix
+        drives = [joint.drive for joint in robot.joints]
+        self._per_rad = counts_per_si(robot)
+        self._torque = self._ratio.T * np.array([drive.gain for drive in drives])
+        self._limit = np.array([drive.saturation or np.inf for drive in drives])
+        self._permille = np.array([1000.0 / drive.rated for drive in drives])
+        self._kp, self._kv = servo.gains(robot, self.plant.mass_matrix())
+        self._smooth = 1.0 - math.exp(-2 * math.pi * servo.VELOCITY_FILTER_HZ * servo.CONTROL_PERIOD)
+        self._origin, self._target = np.zeros(n), np.zeros(n)
+        self._age, self._steps = np.zeros(n, np.int64), np.ones(n, np.int64)
+        self._held = np.ones(n, np.bool_)
+        self._error, self._error_rate, self._current = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._disturbance = np.zeros(n)
+        self.position, self.current, self.demand = np.zeros(n, np.int32), np.zeros(n, np.int16), np.zeros(n, np.int32)
+        self.plant.brake[:] = BRAKE
+        self._control()
+
+    def interpolation_time(self, joint: int, seconds: float) -> None:
+        """How long drive ``joint`` takes from one target to the next (60C2h), s."""
+        self._steps[joint] = max(round(seconds / servo.CONTROL_PERIOD), 1)
+
+    def enable(self, joint: int, enabled: bool) -> None:
+        """Open or close the brake of ``joint``; its demand starts at the measured position."""
+        self._held[joint] = not enabled
+        self.plant.brake[joint] = 0.0 if enabled else BRAKE
+
+    def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
+        """Take new targets (n,) in counts where ``fresh``: interpolation starts where the last one ends."""
+        take = fresh & ~self._held
+        np.copyto(self._origin, self._target, where=take)
+        np.copyto(self._target, targets, where=take)
+        # The control period that follows is one after this SYNC.
+        np.copyto(self._age, 1, where=take)
+
+    def advance(self) -> None:
+        """Move on by one SYNC period."""
+        for _ in range(self._periods):
+            self.plant.advance(self._torque @ self._current + self._disturbance, servo.CONTROL_PERIOD)
+            self._control()
+
+    def _control(self) -> None:
+        measured, self._disturbance = self._noise.next()
+        servo.control(
+            self.plant.q, self._ratio, self._per_rad, self._origin, self._target, self._age, self._steps, self._held,
+            self._kp, self._kv, self._smooth, self._limit, measured, self._permille,
+            self._error, self._error_rate, self._current, self.position, self.current, self.demand,
+        )  # fmt: skip
+
+
+def counts_per_si(robot: RobotConfig) -> NDArray[np.float64]:
+    """Return encoder counts per rad (revolute) or metre (prismatic) of each motor, shape (n,).
+
+    Raises
+    ------
+    ConfigError
+        If a joint's drive has no encoder resolution.
+    """
+    out = []
+    for joint in robot.joints:
+        if joint.drive.counts_per_unit is None:
+            raise ConfigError(f"robot {robot.name!r}: {joint.name}.drive.counts_per_unit: a drive on a bus needs it")
+        out.append(joint.drive.counts_per_unit / (2 * np.pi if joint.type == "revolute" else 1.0))
+    return np.array(out)

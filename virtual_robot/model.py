@@ -1,0 +1,49 @@
+"""The arm as a Pinocchio model, built joint by joint from the modified Denavit-Hartenberg table."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pinocchio
+
+from configs import RobotConfig
+
+pin: Any = pinocchio
+
+
+def build_model(robot: RobotConfig, standard: Mapping[str, float]) -> Any:
+    """Build a Pinocchio model whose joint frames are the MDH frames (thesis section 2.1.1).
+
+    ``Rot(z, theta)`` and ``Trans(z, r)`` commute, so offset and ``r`` go before the joint and the
+    frame that moves with the joint is frame j itself: the standard parameters apply unchanged.
+
+    Parameters
+    ----------
+    robot
+        Geometry and gravity.
+    standard
+        Standard parameters by name (``xx1`` ... ``m6``), inertias about the frame origins.
+    """
+    model = pin.Model()
+    model.name = robot.name
+    parent = 0
+    for j, joint in enumerate(robot.joints, 1):
+        mdh = joint.mdh
+        about_x = pin.SE3(pin.utils.rotate("x", mdh.alpha), np.zeros(3)) * pin.SE3(
+            np.eye(3), np.array([mdh.d, 0.0, 0.0])
+        )
+        about_z = pin.SE3(pin.utils.rotate("z", mdh.theta), np.array([0.0, 0.0, mdh.r]))
+        kind = pin.JointModelRZ() if joint.type == "revolute" else pin.JointModelPZ()
+        parent = model.addJoint(parent, kind, about_x * about_z, joint.name)
+        model.appendBodyToJoint(parent, _body(standard, j), pin.SE3.Identity())
+    model.gravity.linear = np.array(robot.gravity)
+    return model
+
+
+def _body(standard: Mapping[str, float], link: int) -> Any:
+    xx, xy, xz, yy, yz, zz = (standard[f"{k}{link}"] for k in ("xx", "xy", "xz", "yy", "yz", "zz"))
+    mass = standard[f"m{link}"]
+    com = np.array([standard[f"{k}{link}"] for k in ("mx", "my", "mz")]) / mass
+    about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    shift = pin.skew(com)
+    return pin.Inertia(mass, com, about_origin + mass * shift @ shift)

@@ -1,0 +1,58 @@
+"""Noise of the size of table 6.3: white on the measured current, and slow torque on the arm itself."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import RobotConfig
+
+RESIDUAL_VARIANCE = (34.35, 21.01, 4.198, 0.4400, 1.425, 0.5057)
+"""Joint torque residual as sampled, (N m)^2 (table 6.3, without decimation)."""
+DECIMATED_VARIANCE = (1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523)
+"""The same below the cut-off of the decimation (table 6.3)."""
+DECIMATION_HZ = 20.0
+DISTURBANCE_HZ = 20.0
+"""Corner of the first-order spectrum of the disturbance: nearly white after decimation, as the thesis found."""
+BLOCK = 4096
+
+
+class Noise:
+    """Reproducible noise, one column per control period.
+
+    A white part and a slow part together have the table's variance; what of both lies below the cut-off
+    has the decimated one. ``level`` scales amplitudes; 0 switches the noise off.
+    """
+
+    def __init__(self, robot: RobotConfig, period: float, seed: int, level: float = 1.0) -> None:
+        n = robot.n
+        total, low = (
+            np.array([v[min(j, len(v) - 1)] for j in range(n)]) for v in (RESIDUAL_VARIANCE, DECIMATED_VARIANCE)
+        )
+        white_low = DECIMATION_HZ * 2 * period
+        slow_low = 2 / np.pi * np.arctan(DECIMATION_HZ / DISTURBANCE_HZ)
+        slow = (low - white_low * total) / (slow_low - white_low)
+        gain = np.array([joint.drive.gain for joint in robot.joints])
+        motor = np.linalg.solve(robot.transmission_matrix.T**2, np.maximum(total - slow, 0.0))
+        self._current = level * np.sqrt(np.maximum(motor, 0.0)) / np.abs(gain)
+        self._disturbance = level * np.sqrt(slow)
+        self._keep = float(np.exp(-2 * np.pi * DISTURBANCE_HZ * period))
+        self._random = np.random.default_rng(seed)
+        self._last = self._disturbance * self._random.standard_normal(n)
+        self._row = BLOCK
+        self.current: NDArray[np.float64] = np.zeros((BLOCK, n))
+        self.disturbance: NDArray[np.float64] = np.zeros((BLOCK, n))
+
+    def next(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Noise on the measured currents (A) and disturbance torques (N m, joint side), (n,) each."""
+        if self._row == BLOCK:
+            self._refill()
+        self._row += 1
+        return self.current[self._row - 1], self.disturbance[self._row - 1]
+
+    def _refill(self) -> None:
+        n = self._last.size
+        self.current[:] = self._random.standard_normal((BLOCK, n)) * self._current
+        fresh = self._random.standard_normal((BLOCK, n)) * (self._disturbance * np.sqrt(1 - self._keep**2))
+        for k in range(BLOCK):
+            self._last = self._keep * self._last + fresh[k]
+            self.disturbance[k] = self._last
+        self._row = 0

@@ -1,0 +1,117 @@
+"""A recording of the virtual arm without a bus: the same drives and plant, as fast as they compute."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import RobotConfig, Trajectory
+from configs.scenario import Scenario
+from daq.recording import Field, Mark, Recording, Stream
+from virtual_robot.arm import Arm, counts_per_si
+
+OPERATION_ENABLED = 0x1237
+"""Statusword: operation enabled, remote, drive follows the command value (CiA 402)."""
+COUNTER = 240
+"""Overflow of the SYNC counter: SYNC k carries ``k % COUNTER + 1``."""
+
+
+def simulate_recording(
+    robot: RobotConfig,
+    trajectory: Trajectory,
+    seed: int,
+    noise: float = 1.0,
+    scenario: Scenario | None = None,
+    period: float = 200e-6,
+    setpoint_every: int = 5,
+    settle: float = 0.3,
+    start_ns: int = 0,
+) -> Recording:
+    """Simulate what ``armident capture`` would record of the virtual arm on a trajectory.
+
+    Parameters
+    ----------
+    robot
+        The arm; one that ``virtual_robot`` has link parameters for.
+    trajectory
+        Reference, joint side; the arm stands at its start when the recording begins.
+    seed, noise, scenario
+        As for ``Arm``.
+    period
+        SYNC period, s.
+    setpoint_every
+        Set points go out, and demands are recorded, on every so many SYNC.
+    settle
+        Time at rest recorded before and after the trajectory, s.
+    start_ns
+        Time stamp of SYNC 0, ns.
+
+    Returns
+    -------
+    Recording
+        Streams ``samples`` (position, current, status) and ``demand``, and the marks of the experiment.
+
+    Raises
+    ------
+    ConfigError
+        If the trajectory leaves the robot's limits, or there is no such virtual arm.
+    """
+    trajectory.check(robot)
+    every = setpoint_every
+    scale = counts_per_si(robot)
+    rows = np.rint(trajectory.sample(period * every) @ robot.transmission_matrix.T * scale).astype(np.int32)
+    first = round(settle / period / every) * every + every - 1
+    last = first + (len(rows) - 1) * every
+    total = last + round(settle / period) + 1
+
+    arm = Arm(robot, trajectory.start, period, seed, noise, scenario)
+    for joint in range(robot.n):
+        arm.enable(joint, True)
+        arm.interpolation_time(joint, period * every)
+    n = robot.n
+    position, current = np.empty((total, n), np.int32), np.empty((total, n), np.int16)
+    demand = np.empty((total // every, n), np.int32)
+    fresh = np.ones(n, np.bool_)
+    for k in range(total):
+        position[k], current[k] = arm.position, arm.current
+        if (k % COUNTER + 1) % every == 0:
+            demand[k // every] = arm.demand
+            # Row m is the demand at SYNC first + m every, so it has to be the target one interpolation earlier.
+            m = (k + every - first) // every
+            arm.set_targets(rows[min(max(m, 0), len(rows) - 1)], fresh)
+        arm.advance()
+
+    step_ns = round(period * 1e9)
+
+    def times(sync: NDArray[np.int64]) -> NDArray[np.int64]:
+        return start_ns + sync * step_ns
+
+    sync = np.arange(total, dtype=np.int64)
+    knots = np.arange(every - 1, total, every, dtype=np.int64)
+    samples = Stream(
+        "samples", 1, sync, times(sync), sample_fields(robot),
+        {"position": position, "current": current, "status": np.full((total, n), OPERATION_ENABLED, np.uint16)},
+    )  # fmt: skip
+    demands = Stream("demand", every, knots, times(knots), demand_fields(robot), {"demand": demand})
+    marks = (
+        Mark("experiment_start", first, start_ns + first * step_ns),
+        Mark("experiment_end", last, start_ns + last * step_ns),
+    )
+    return Recording(None, robot, None, 1.0 / period, {"samples": samples, "demand": demands}, marks=marks)
+
+
+def sample_fields(robot: RobotConfig) -> dict[str, Field]:
+    """Fields of the ``samples`` stream: motor positions, currents, statuswords."""
+    rated = tuple(joint.drive.rated / 1000.0 for joint in robot.joints)
+    return {
+        "position": Field("position", "position", "rad", "motor", _per_count(robot)),
+        "current": Field("current", "current", "A", "motor", rated),
+        "status": Field("status", "status", "", "motor", (1.0,) * robot.n),
+    }
+
+
+def demand_fields(robot: RobotConfig) -> dict[str, Field]:
+    """Field of the ``demand`` stream: motor positions wanted."""
+    return {"demand": Field("demand", "demand", "rad", "motor", _per_count(robot))}
+
+
+def _per_count(robot: RobotConfig) -> tuple[float, ...]:
+    return tuple(float(1.0 / x) for x in counts_per_si(robot))

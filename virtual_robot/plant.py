@@ -1,0 +1,101 @@
+"""The arm's mechanics: Pinocchio's rigid bodies, rotor inertias, friction and whatever is hidden in it."""
+
+from typing import Any
+
+import numpy as np
+import pinocchio
+from numpy.typing import ArrayLike, NDArray
+
+from configs import RobotConfig
+from configs.scenario import Scenario
+from virtual_robot import dynamics
+from virtual_robot.effects import effect_table
+from virtual_robot.inertias import plant_parameters
+from virtual_robot.model import build_model
+
+pin: Any = pinocchio
+
+BRAKE = 1e9
+"""Viscous coefficient (N m s/rad) of a closed holding brake: it creeps less than an encoder count an hour."""
+
+
+class Plant:
+    """State and equations of motion of the arm; SI, joint side.
+
+    Over one period mass matrix and nonlinear effects are taken once, at the predicted middle; friction
+    is integrated in finer steps. Against a reference at a relative tolerance of 1e-9 the positions
+    stay far below an encoder count.
+
+    Parameters
+    ----------
+    robot
+        Geometry, gravity, couplings and smoothing of Coulomb friction.
+    q
+        Initial position, shape (n,), rad or m; the arm stands still.
+    scenario
+        Hidden effects.
+    """
+
+    def __init__(self, robot: RobotConfig, q: ArrayLike, scenario: Scenario | None = None) -> None:
+        standard = plant_parameters(robot)
+        n = robot.n
+        self.model = build_model(robot, standard)
+        self._data = self.model.createData()
+        self.q = np.array(q, dtype=np.float64)
+        self.qd = np.zeros(n)
+        self.qdd = np.zeros(n)
+        names = [joint.name for joint in robot.joints]
+        self.rotor = np.diag([standard[f"ia{j + 1}"] for j in range(n)])
+        self._friction = np.array([[standard[f"fv{j + 1}"], standard[f"fc{j + 1}"]] for j in range(n)])
+        self._offset = np.array([standard[f"off{j + 1}"] for j in range(n)])
+        self._pairs = np.array([[names.index(j) for j in c.joints] for c in robot.couplings], np.int64).reshape(-1, 2)
+        self._pair_friction = np.array(
+            [[standard[f"{k}{c.name}"] for k in ("fv", "fc")] for c in robot.couplings]
+        ).reshape(-1, 2)
+        for c, (i, j) in zip(robot.couplings, self._pairs, strict=True):
+            self.rotor[i, j] = self.rotor[j, i] = standard[f"ia{c.name}"]
+        self._smoothing = robot.friction.sign_smoothing
+        self._ratio = robot.transmission_matrix
+        self._effects = effect_table(scenario, robot)
+        self.brake = np.zeros(n)
+
+    def mass_matrix(self) -> NDArray[np.float64]:
+        """Joint-side mass matrix (n, n) at the present position, rotors included."""
+        upper = np.triu(pin.crba(self.model, self._data, self.q))
+        mass: NDArray[np.float64] = upper + np.triu(upper, 1).T + self.rotor
+        return mass
+
+    def resistance(self, q: NDArray[np.float64], qd: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Friction, brakes and hidden effects (n,): the torque that resists the motion."""
+        out, slope = np.empty(q.size), np.empty((q.size, q.size))
+        arguments = (q, qd, *self._resisting(), out, slope)
+        dynamics.resist(*arguments)
+        return out
+
+    def acceleration(
+        self, q: NDArray[np.float64], qd: NDArray[np.float64], tau: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Direct dynamics (n,) at any state: what ``advance`` integrates, without its approximations."""
+        upper = np.triu(pin.crba(self.model, self._data, q))
+        mass = upper + np.triu(upper, 1).T + self.rotor
+        bias = pin.nonLinearEffects(self.model, self._data, q, qd)
+        out: NDArray[np.float64] = np.linalg.solve(mass, tau - self._offset - bias - self.resistance(q, qd))
+        return out
+
+    def advance(self, tau: NDArray[np.float64], period: float) -> None:
+        """Hold the joint torques ``tau`` (n,) for ``period`` seconds."""
+        half = 0.5 * period
+        middle = self.q + half * (self.qd + 0.5 * half * self.qdd)
+        speed = self.qd + half * self.qdd
+        mass = pin.crba(self.model, self._data, middle)
+        bias = pin.nonLinearEffects(self.model, self._data, middle, speed)
+        dynamics.advance(
+            period, self.q, self.qd, self.qdd, tau - self._offset, mass, bias, self.rotor, *self._resisting()
+        )
+
+    def _resisting(self) -> tuple[Any, ...]:
+        effects = self._effects
+        return (
+            self._friction, self._smoothing, self._pairs, self._pair_friction, self.brake, self._ratio,
+            effects.code, effects.joint, effects.parameters,
+        )  # fmt: skip

@@ -1,0 +1,26 @@
+"""Reads a scenario file: the effects hidden in the virtual arm."""
+
+from pathlib import Path
+
+from configs import ConfigError, config_path
+from configs.loading import parse
+from configs.scenario import Scenario
+
+
+def load_scenario(name: str | Path) -> Scenario:
+    """Load a scenario from a file, or one of those in ``configs/scenarios`` by its name.
+
+    Raises
+    ------
+    ConfigError
+        Naming file, key and what was expected.
+    """
+    try:
+        path = config_path(name)
+    except ConfigError:
+        path = config_path(Path("configs/scenarios") / Path(name).name)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    return parse(text, Scenario, str(path))
