@@ -82,6 +82,17 @@ class Coupling(Frozen):
     joints: tuple[Name, Name]
 
 
+class Effect(Frozen):
+    """An effect of the discrepancy catalogue that is part of this robot's model, and its parameters.
+
+    Shape parameters (a Stribeck velocity, a harmonic) stay as given; linear ones are estimated with the rest.
+    """
+
+    effect: Name
+    joint: Name
+    parameters: dict[str, float] = {}
+
+
 class Friction(Frozen):
     """Coulomb friction near standstill.
 
@@ -108,6 +119,29 @@ class Controller(Frozen):
     kv: tuple[float, ...]
 
 
+class Preprocessing(Frozen):
+    """Filters of a published least-squares fit, applied as published; see ``identify.signals.classical``.
+
+    Parameters
+    ----------
+    cutoff_hz, order, padlen
+        Zero-phase Butterworth on the positions, before central differences.
+    drop
+        Samples dropped at the start.
+    decimation, decimation_order, decimation_ripple_db, decimation_padlen
+        Zero-phase Chebyshev low-pass on torque and regressor, and the factor of decimation.
+    """
+
+    cutoff_hz: Positive
+    order: Annotated[int, Field(ge=1)] = 4
+    padlen: Annotated[int, Field(ge=0)] = 12
+    drop: Annotated[int, Field(ge=0)] = 0
+    decimation: Annotated[int, Field(ge=2)]
+    decimation_order: Annotated[int, Field(ge=1)] = 8
+    decimation_ripple_db: Positive = 0.05
+    decimation_padlen: Annotated[int, Field(ge=0)] = 24
+
+
 class RobotConfig(Frozen):
     """A serial arm as the whole service sees it; all values SI, joint side unless said."""
 
@@ -118,6 +152,7 @@ class RobotConfig(Frozen):
     joints: Annotated[tuple[Joint, ...], Field(min_length=1)]
     transmission: tuple[tuple[float, ...], ...]
     couplings: tuple[Coupling, ...] = ()
+    effects: tuple[Effect, ...] = ()
     friction: Friction = Friction()
     controller: Controller | None = None
     bandwidth_hz: Positive | None = Field(None, description="closed-loop bandwidth; None: from the data")
@@ -137,6 +172,9 @@ class RobotConfig(Frozen):
             for joint in coupling.joints:
                 if joint not in names:
                     raise ValueError(f"couplings: no joint named {joint!r}; joints are {', '.join(names)}")
+        for effect in self.effects:
+            if effect.joint not in names:
+                raise ValueError(f"effects: no joint named {effect.joint!r}; joints are {', '.join(names)}")
         threshold = self.friction.velocity_threshold
         if threshold is not None and len(threshold) != n:
             raise ValueError(f"friction.velocity_threshold: expected {n} numbers")
