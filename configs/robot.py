@@ -157,6 +157,9 @@ class RobotConfig(Frozen):
     controller: Controller | None = None
     bandwidth_hz: Positive | None = Field(None, description="closed-loop bandwidth; None: from the data")
     initial_parameters: dict[str, float] = Field(default_factory=dict)
+    preprocessing: Preprocessing | None = Field(
+        None, description="filters of a published IDIM-LS fit, with a sharp sign(qd); None: from the bandwidth"
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

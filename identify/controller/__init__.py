@@ -1,0 +1,1 @@
+"""Identification of the controller, for the auxiliary closed loop."""

@@ -1,0 +1,1 @@
+"""Estimators of the thesis, each a short function over shared pieces."""

@@ -1,0 +1,94 @@
+"""IDIM-PIV: prefiltered instrumental variables (thesis section 6.2.2), after a rough decimation (section 7.2)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.estimators.auxiliary import AuxiliaryModel
+from identify.estimators.idim_iv import ITERATIONS, TOLERANCE
+from identify.estimators.noise import ArModel, fit_ar
+from identify.estimators.regression import (
+    Block,
+    Estimate,
+    instrumental_variable,
+    iterate,
+    iv_covariance,
+    joint_variances,
+    residuals,
+    weighted_rows,
+)
+
+MAX_AR_ORDER = 60
+
+
+def idim_piv(
+    blocks: Sequence[Block],
+    auxiliary: AuxiliaryModel,
+    start: NDArray[np.float64],
+    iterations: int = ITERATIONS,
+    max_order: int = MAX_AR_ORDER,
+) -> Estimate:
+    """Alternate the IV estimate of the parameters and an AR model of the noise of each joint.
+
+    Parameters
+    ----------
+    blocks
+        Roughly decimated equations at measured signals; all rows, since a whitening filter needs a gapless record.
+    auxiliary
+        The simulated closed loop; its instruments pass the same rough decimation.
+    start
+        First theta of the auxiliary model, shape (b,).
+    iterations
+        Most iterations.
+    max_order
+        Highest AR order tried.
+
+    Notes
+    -----
+    The noise model is fitted to ``tau - phi(q, qd, qdd) theta``: it is the error that the IV equations 6.30 weigh, and
+    whitening it makes their covariance minimal.
+
+    Raises
+    ------
+    DataError
+        If no auxiliary model runs, not even the first.
+    """
+    keep = [b.keep for b in blocks]
+    n = len(keep[0][0])
+    noise: list[ArModel] = joint_variances(blocks, start)  # step 1: H = 1
+
+    def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
+        nonlocal noise
+        zeta = auxiliary.instruments(previous)  # step 2a
+        z = weighted_rows(zeta, keep, noise)
+        x = weighted_rows([b.x for b in blocks], keep, noise)
+        y = weighted_rows([b.y for b in blocks], keep, noise)
+        estimate = instrumental_variable(z, x, y)  # step 2b, 6.30
+        noise = noise_models(blocks, estimate, n, max_order)  # step 2c
+        weighted = [r for r in residuals(blocks, estimate)]
+        norm = float(np.linalg.norm(weighted_rows(weighted, keep, joint_variances(blocks, start))))
+        return estimate, norm
+
+    theta, done, converged, reason = iterate(step, start, iterations, TOLERANCE)
+    z = weighted_rows(auxiliary.instruments(theta), keep, noise)
+    x = weighted_rows([b.x for b in blocks], keep, noise)
+    errors = residuals(blocks, theta)
+    white = tuple(
+        tuple(noise[j].whiten(e[:, j])[b.keep[noise[j].order :, j]] for e, b in zip(errors, blocks, strict=True))
+        for j in range(n)
+    )
+    return Estimate(
+        theta, iv_covariance(z, x), tuple(noise), white, done, converged, reason, tuple(auxiliary.warnings)
+    )
+
+
+def noise_models(blocks: Sequence[Block], theta: NDArray[np.float64], n: int, max_order: int) -> list[ArModel]:
+    """AR model of each joint's residual (6.21 to 6.25), its variance corrected for the parameters estimated."""
+    errors = residuals(blocks, theta)
+    total = sum(b.y.size for b in blocks)
+    models = []
+    for j in range(n):
+        ar = fit_ar([e[:, j] for e in errors], max_order)
+        models.append(ArModel(ar.coefficients, ar.variance / (1 - theta.size / total), ar.aic))
+    return models

@@ -1,0 +1,111 @@
+"""Autoregressive noise models, whitening and whiteness (thesis section 6.1.3)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class ArModel:
+    """``C(z^-1) xi = e`` with ``C = 1 + c_1 z^-1 + ...`` (6.19), ``e`` white of the given variance.
+
+    ``coefficients`` has shape (l,); order 0 is white noise.
+    """
+
+    coefficients: NDArray[np.float64]
+    variance: float
+    aic: float
+
+    @property
+    def order(self) -> int:
+        """Number of coefficients."""
+        return self.coefficients.size
+
+    def whiten(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order, ...): no initial state is invented."""
+        flat = np.ascontiguousarray(x, dtype=np.float64).reshape(x.shape[0], -1)
+        out: NDArray[np.float64] = _convolve(flat, self.coefficients) / np.sqrt(self.variance)
+        return out.reshape((out.shape[0], *x.shape[1:]))
+
+
+WHITE = ArModel(np.empty(0), 1.0, 0.0)
+"""The initial noise model, ``H = 1`` and ``lambda = 1`` (section 6.2.2, step 1)."""
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Autocorrelation of residuals at lags 1..L against the 2-sigma band of white noise."""
+
+    autocorrelation: NDArray[np.float64]
+    bound: float
+
+    @property
+    def lags(self) -> int:
+        """Number of lags tested."""
+        return self.autocorrelation.size
+
+    @property
+    def fraction_outside(self) -> float:
+        """Share of the lags outside the band; white noise has about 0.05."""
+        return float(np.mean(np.abs(self.autocorrelation) > self.bound))
+
+
+def fit_ar(series: Sequence[NDArray[np.float64]], max_order: int) -> ArModel:
+    """AR model of residuals by Levinson-Durbin on the Yule-Walker equations, order by AIC (6.21 to 6.25).
+
+    Parameters
+    ----------
+    series
+        Residuals of one joint, one array (M,) per experiment; each is centred by the common mean.
+    max_order
+        Highest order tried; limited to a tenth of the samples.
+    """
+    total = sum(s.size for s in series)
+    mean = sum(float(s.sum()) for s in series) / total
+    max_order = max(0, min(max_order, total // 10, min(s.size for s in series) - 1))
+    r = np.zeros(max_order + 1)
+    for s in series:
+        centred = s - mean
+        for lag in range(max_order + 1):
+            r[lag] += centred[lag:] @ centred[: centred.size - lag]
+    r /= total
+    if r[0] <= 0:
+        return ArModel(np.empty(0), np.finfo(np.float64).tiny, -np.inf)
+    best = ArModel(np.empty(0), float(r[0]), total * float(np.log(r[0])))
+    c, variance = np.zeros(0), float(r[0])
+    for order in range(1, max_order + 1):
+        reflection = -(r[order] + c @ r[order - 1 : 0 : -1]) / variance
+        c = np.append(c + reflection * c[::-1], reflection)
+        variance *= 1 - reflection**2
+        if variance <= 1e-14 * r[0]:
+            break
+        aic = 2 * order + total * float(np.log(variance))
+        if aic < best.aic:
+            best = ArModel(c.copy(), variance, aic)
+    return best
+
+
+def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whiteness:
+    """Autocorrelation of residuals pooled over experiments, with the bound ``2 / sqrt(M)``."""
+    total = sum(s.size for s in series)
+    mean = sum(float(s.sum()) for s in series) / total
+    r = np.zeros(lags + 1)
+    for s in series:
+        centred = s - mean
+        for lag in range(min(lags, centred.size - 1) + 1):
+            r[lag] += centred[lag:] @ centred[: centred.size - lag]
+    return Whiteness(r[1:] / r[0] if r[0] > 0 else np.zeros(lags), 2 / float(np.sqrt(total)))
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _convolve(x, coefficients):  # type: ignore[no-untyped-def]
+    order = coefficients.size
+    out = x[order:].copy()
+    for k in range(out.shape[0]):
+        for i in range(order):
+            for c in range(x.shape[1]):
+                out[k, c] += coefficients[i] * x[k + order - 1 - i, c]
+    return out
