@@ -19,18 +19,14 @@ def smooth_sign(x: float, smoothing: float) -> float:
 
 
 @inlined
-def into_child(
-    ca: float, sa: float, c: float, s: float, x: float, y: float, z: float
-) -> tuple[float, float, float]:
+def into_child(ca: float, sa: float, c: float, s: float, x: float, y: float, z: float) -> tuple[float, float, float]:
     """A vector of frame j-1 written in frame j."""
     t = ca * y + sa * z
     return c * x + s * t, c * t - s * x, ca * z - sa * y
 
 
 @inlined
-def into_parent(
-    ca: float, sa: float, c: float, s: float, x: float, y: float, z: float
-) -> tuple[float, float, float]:
+def into_parent(ca: float, sa: float, c: float, s: float, x: float, y: float, z: float) -> tuple[float, float, float]:
     """A vector of frame j written in frame j-1."""
     t = s * x + c * y
     return c * x - s * y, ca * t - sa * z, sa * t + ca * z
@@ -150,9 +146,7 @@ def add_friction(values: Values, smoothing: float, qd: Floats, tau: Floats) -> N
 
 
 @compiled
-def rigid_torque(
-    chain: Chain, values: Values, q: Floats, qd: Floats, qdd: Floats, work: Floats, tau: Floats
-) -> None:
+def rigid_torque(chain: Chain, values: Values, q: Floats, qd: Floats, qdd: Floats, work: Floats, tau: Floats) -> None:
     """Torques of the rigid chain, without friction and rotors, for one sample; ``work`` is (n, 8)."""
     n = chain.d.size
     wx = wy = wz = bx = by = bz = 0.0
@@ -259,7 +253,11 @@ def fill_mass_matrix(chain: Chain, values: Values, q: Floats, work: Floats, mass
         hx, hy, hz = into_parent(ca, sa, c, s, hx, hy, hz)
         # Rot(z) then Rot(x) of the inertia, then its shift from O_j to O_j-1.
         cc, ss, cs = c * c, s * s, c * s
-        jxx, jyy, jxy = cc * xx - 2 * cs * xy + ss * yy, ss * xx + 2 * cs * xy + cc * yy, cs * (xx - yy) + (cc - ss) * xy
+        jxx, jyy, jxy = (
+            cc * xx - 2 * cs * xy + ss * yy,
+            ss * xx + 2 * cs * xy + cc * yy,
+            cs * (xx - yy) + (cc - ss) * xy,
+        )
         jxz, jyz = c * xz - s * yz, s * xz + c * yz
         cc, ss, cs = ca * ca, sa * sa, ca * sa
         gx, gy, gz = px * m + 2 * hx, py * m + 2 * hy, pz * m + 2 * hz
@@ -369,4 +367,3 @@ def fill_forward_dynamics(
             out[k, j] = tau[k, j] - bias[j]
         solve_factored(mass, n, out[k])
     return -1
-

@@ -56,9 +56,7 @@ def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> di
             for kind in ("xx", "xy", "xz", "yy", "yz", "zz"):
                 _regroup(forms, own[kind], j, parent[kind])
         else:
-            if f"ia{link}" in forms and (
-                j == r1 or (j == r2 and _orthogonal(axes[j], axes[r1]))
-            ):
+            if f"ia{link}" in forms and (j == r1 or (j == r2 and _orthogonal(axes[j], axes[r1]))):
                 _add(forms[own["zz"]], forms.pop(f"ia{link}"), {(): 1.0})
             _add(forms[own["xx"]], forms[own["yy"]], {(): -1.0})
             # The rotation about z_j mixes xx and yy: only their sum, constant, goes to the parent.
@@ -140,9 +138,7 @@ def _add(target: Form, source: Form, factor: Polynomial) -> None:
                 into[monomial] = into.get(monomial, 0.0) + a * b
 
 
-def _regroup(
-    forms: dict[str, Form], name: str, j: int, rows: Mapping[str, Polynomial], still: bool = False
-) -> None:
+def _regroup(forms: dict[str, Form], name: str, j: int, rows: Mapping[str, Polynomial], still: bool = False) -> None:
     """Hand parameter ``name`` of link j+1 to its parent; dropped where the parent is the base.
 
     With ``still`` terms in the joint's own ``r`` are left out: displacements along the only axis of rotation.
@@ -248,9 +244,7 @@ def _direction_unseen(forms: dict[str, Form], own: Mapping[str, str], axis: Floa
 
 def _alone_along_axis(prismatic: list[bool], axes: list[Floats], j: int) -> bool:
     """Whether only joint j itself ever moves its link along its axis."""
-    return all(
-        _orthogonal(axes[i], axes[j]) if prismatic[i] else _parallel(axes[i], axes[j]) for i in range(j)
-    )
+    return all(_orthogonal(axes[i], axes[j]) if prismatic[i] else _parallel(axes[i], axes[j]) for i in range(j))
 
 
 def _rotor_into_mass(

@@ -42,7 +42,9 @@ def test_dynamics_agree_with_pinocchio_on_random_chains(chain: tuple[int, int, b
         assert np.abs(ours - expected).max() < 1e-10 * (1.0 + np.abs(expected).max())
         expected = pin.aba(oracle, data, q[k], qd[k], tau[k])
         # The conditioning of the mass matrix amplifies the rounding of both sides.
-        assert np.abs(accelerations[k] - expected).max() < 1e-10 * np.linalg.cond(mass[k]) * (1 + np.abs(expected).max())
+        assert np.abs(accelerations[k] - expected).max() < 1e-10 * np.linalg.cond(mass[k]) * (
+            1 + np.abs(expected).max()
+        )
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,0 +1,295 @@
+"""Closed-loop simulation of the auxiliary model: direct dynamics under a discrete controller.
+
+The thesis integrates with a fixed-step explicit method (ode3). The smoothed Coulomb friction of a small
+wrist joint is too stiff for that at the sample rate, so the friction is linearly implicit here: over one
+sample the mass matrix and the bias forces are extrapolated to its middle from the last two samples
+(second order), and ``M qd' = tau - bias - friction(qd)`` is integrated by the two-stage Rosenbrock method
+of order two that damps any stiffness (Shampine and Reichelt 1997, ``ode23s``), in smaller steps while a
+joint passes through standstill.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from identify.model.arm import ArmModel
+from identify.model.chain import Chain, Floats, Values
+from identify.model.compiled import compiled
+from identify.model.controller import DiscreteController
+from identify.model.kernels import TWO_OVER_PI, cholesky, fill_mass_matrix, rigid_torque, solve_factored
+
+GAMMA = 1.0 / (2.0 + np.sqrt(2.0))
+"""Rosenbrock parameter that makes the two-stage method of order two L-stable."""
+
+RUNAWAY = 10.0
+"""A joint faster than this many times its configured limit has run away, where nothing else is said."""
+
+
+NEAR_STANDSTILL = 4.0
+"""``g |qd|`` under which the smoothed sign bends so much that its slope changes within a sample."""
+
+STEPS_PER_UNIT = 2.0
+"""Steps per unit of ``g qd`` passed within one sample near standstill."""
+
+MOST_STEPS = 8
+"""Most steps within one sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A simulated motion; all arrays (N, n), joint side, NaN from ``diverged_at`` on.
+
+    Parameters
+    ----------
+    q, qd
+        Positions and velocities at the samples.
+    qdd
+        Accelerations at the samples: the mean of those just before and just after the torque changes.
+    tau
+        Torque held over ``[k, k + 1)``.
+    diverged_at
+        Sample at which the simulation stopped: not finite, too fast, or a mass matrix that is not
+        positive definite; ``None`` if it reached the end.
+    """
+
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    tau: Floats
+    diverged_at: int | None
+
+
+def simulate(
+    model: ArmModel,
+    theta_base: ArrayLike,
+    controller: DiscreteController,
+    q_ref: ArrayLike,
+    dt: float,
+    *,
+    q0: ArrayLike | None = None,
+    qd0: ArrayLike | None = None,
+    max_velocity: ArrayLike | None = None,
+) -> Simulation:
+    """Simulate the arm under its controller along a reference (thesis equation 2.9, section B.3).
+
+    Parameters
+    ----------
+    theta_base
+        Base parameters (b,) or standard parameters (p,); friction is smoothed.
+    controller
+        Runs once per sample on the position at that sample; its torque is held over the sample.
+    q_ref
+        Reference positions (N, n), rad or m.
+    dt
+        Sampling period, s; that of the controller.
+    q0, qd0
+        State at the first sample, (n,); by default on the reference, with its velocity. Before the first
+        sample the tracking error was constant and the velocity ``qd0``.
+    max_velocity
+        Joint velocities, scalar or (n,), beyond which the simulation counts as diverged; by default ten
+        times the limits of the configuration.
+
+    Raises
+    ------
+    ValueError
+        If shapes or sampling periods do not fit.
+    """
+    reference = np.ascontiguousarray(q_ref, dtype=np.float64)
+    samples, n = reference.shape
+    if n != model.n or controller.n != n or samples < 1:
+        raise ValueError(f"reference (N, {n}) and controller of {controller.n} for an arm of {model.n} joints")
+    if abs(controller.dt - dt) > 1e-9 * dt:
+        raise ValueError(f"the controller runs every {controller.dt} s, the simulation every {dt} s")
+    if max_velocity is None:
+        max_velocity = [RUNAWAY * joint.limits.velocity for joint in model.robot.joints]
+    start = reference[0] if q0 is None else np.asarray(q0, dtype=np.float64)
+    if qd0 is None:
+        qd0 = (reference[1] - reference[0]) / dt if samples > 1 else np.zeros(n)
+    q, qd, qdd, tau = (np.full((samples, n), np.nan) for _ in range(4))
+    q[0], qd[0] = start, qd0
+    stopped = run(
+        model.chain,
+        model.values(theta_base),
+        np.ascontiguousarray(model.robot.transmission_matrix),
+        np.ascontiguousarray(np.linalg.inv(model.robot.transmission_matrix)),
+        controller.error_taps,
+        controller.position_taps,
+        controller.output_taps,
+        controller.saturation,
+        controller.memory,
+        reference,
+        dt,
+        np.broadcast_to(np.asarray(max_velocity, dtype=np.float64), (n,)).copy(),
+        q,
+        qd,
+        qdd,
+        tau,
+    )
+    if stopped < 0:
+        return Simulation(q, qd, qdd, tau, None)
+    for signal in (q, qd, qdd, tau):
+        signal[stopped:] = np.nan
+    return Simulation(q, qd, qdd, tau, stopped)
+
+
+@compiled
+def friction(values: Values, v: Floats, force: Floats, slope: Floats, pair_slope: Floats) -> None:
+    """Friction ``force`` (n,) at velocities ``v``, its diagonal ``slope`` (n,) and that of each coupling."""
+    g = values.smoothing
+    for j in range(v.size):
+        x = g * v[j]
+        force[j] = values.off[j] + values.fv[j] * v[j] + values.fc[j] * TWO_OVER_PI * np.arctan(x)
+        slope[j] = values.fv[j] + values.fc[j] * TWO_OVER_PI * g / (1.0 + x * x)
+    for m in range(values.coupling_joints.shape[0]):
+        i, j = values.coupling_joints[m]
+        x = g * (v[i] + v[j])
+        common = values.coupling[m, 2] * TWO_OVER_PI * np.arctan(x)
+        steep = values.coupling[m, 2] * TWO_OVER_PI * g / (1.0 + x * x)
+        force[i] += values.coupling[m, 1] * v[j] + common
+        force[j] += values.coupling[m, 1] * v[i] + common
+        slope[i] += steep
+        slope[j] += steep
+        pair_slope[m] = steep + values.coupling[m, 1]
+
+
+@compiled
+def divisions(values: Values, v: Floats, a: Floats, dt: float) -> int:
+    """How many steps one sample needs: more while a joint with Coulomb friction passes standstill."""
+    most = 1
+    for j in range(v.size):
+        x, dx = values.smoothing * v[j], values.smoothing * a[j] * dt
+        if values.fc[j] != 0.0 and abs(x) < abs(dx) + NEAR_STANDSTILL:
+            most = max(most, 1 + int(STEPS_PER_UNIT * abs(dx)))
+    for m in range(values.coupling_joints.shape[0]):
+        i, j = values.coupling_joints[m]
+        x, dx = values.smoothing * (v[i] + v[j]), values.smoothing * (a[i] + a[j]) * dt
+        if values.coupling[m, 2] != 0.0 and abs(x) < abs(dx) + NEAR_STANDSTILL:
+            most = max(most, 1 + int(STEPS_PER_UNIT * abs(dx)))
+    return min(most, MOST_STEPS)
+
+
+@compiled
+def run(
+    chain: Chain,
+    values: Values,
+    transmission: Floats,
+    inverse_transmission: Floats,
+    error_taps: Floats,
+    position_taps: Floats,
+    output_taps: Floats,
+    saturation: Floats,
+    memory: int,
+    reference: Floats,
+    dt: float,
+    max_velocity: Floats,
+    q: Floats,
+    qd: Floats,
+    qdd: Floats,
+    tau: Floats,
+) -> int:
+    """Fill ``q, qd, qdd, tau`` (N, n) from their first sample on; returns where it stopped, or -1."""
+    samples, n = reference.shape
+    pairs = values.coupling_joints.shape[0]
+    work, mass, mass_before, factor = np.empty((n, 8)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    bias, bias_before, still = np.empty(n), np.empty(n), np.zeros(n)
+    load, v, k1, k2, middle = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    force, slope, pair_slope = np.empty(n), np.empty(n), np.empty(pairs)
+    force_middle, slope_middle, pair_slope_middle = np.empty(n), np.empty(n), np.empty(pairs)
+    # Histories with the newest sample of step k at column memory - 1 + k.
+    error = np.empty((n, samples + memory))
+    position = np.empty((n, samples + memory))
+    output = np.empty((n, samples + memory))
+    for k in range(samples):
+        for j in range(n):
+            if not (np.isfinite(q[k, j]) and abs(qd[k, j]) <= max_velocity[j]):
+                return k
+        rigid_torque(chain, values, q[k], qd[k], still, work, bias)
+        fill_mass_matrix(chain, values, q[k], work, mass)
+        friction(values, qd[k], force, slope, pair_slope)
+        now = memory - 1 + k
+        for i in range(n):
+            e = p = 0.0
+            for j in range(n):
+                e += transmission[i, j] * (reference[k, j] - q[k, j])
+                p += transmission[i, j] * q[k, j]
+            error[i, now], position[i, now] = e, p
+        if k == 0:
+            for i in range(n):
+                held = speed = 0.0
+                for j in range(n):
+                    held += inverse_transmission[j, i] * (bias[j] + force[j])
+                    speed += transmission[i, j] * qd[0, j]
+                for back in range(1, memory):
+                    error[i, now - back] = error[i, now]
+                    position[i, now - back] = position[i, now] - back * dt * speed
+                    output[i, now - back] = held
+            mass_before[:] = mass
+            bias_before[:] = bias
+        for i in range(n):
+            nu = 0.0
+            for m in range(error_taps.shape[1]):
+                nu += error_taps[i, m] * error[i, now - m]
+            for m in range(position_taps.shape[1]):
+                nu += position_taps[i, m] * position[i, now - m]
+            for m in range(output_taps.shape[1]):
+                nu += output_taps[i, m] * output[i, now - 1 - m]
+            output[i, now] = min(max(nu, -saturation[i]), saturation[i])
+        before = tau[max(k - 1, 0)]
+        for j in range(n):
+            torque = 0.0
+            for i in range(n):
+                torque += transmission[i, j] * output[i, now]
+            tau[k, j] = torque
+            qdd[k, j] = 0.5 * (before[j] + torque) - bias[j] - force[j]
+        for i in range(n):
+            for j in range(i + 1):
+                factor[i, j] = mass[i, j]
+        if not cholesky(factor, n):
+            return k
+        solve_factored(factor, n, qdd[k])
+        if k + 1 == samples:
+            break
+        for i in range(n):
+            load[i] = tau[k, i] - (1.5 * bias[i] - 0.5 * bias_before[i])
+            v[i] = qd[k, i]
+            q[k + 1, i] = q[k, i]
+            for j in range(i + 1):
+                here = mass[i, j]
+                mass[i, j] = 1.5 * here - 0.5 * mass_before[i, j]
+                mass_before[i, j] = here
+            bias_before[i] = bias[i]
+        steps = divisions(values, qd[k], qdd[k], dt)
+        h = dt / steps
+        for step in range(steps):
+            if step > 0:
+                friction(values, v, force, slope, pair_slope)
+            for i in range(n):
+                for j in range(i + 1):
+                    factor[i, j] = mass[i, j]
+                factor[i, i] += GAMMA * h * slope[i]
+                k1[i] = load[i] - force[i]
+            for m in range(pairs):
+                i, j = values.coupling_joints[m]
+                factor[max(i, j), min(i, j)] += GAMMA * h * pair_slope[m]
+            if not cholesky(factor, n):
+                return k + 1
+            solve_factored(factor, n, k1)
+            for i in range(n):
+                middle[i] = v[i] + 0.5 * h * k1[i]
+            friction(values, middle, force_middle, slope_middle, pair_slope_middle)
+            # M k1 = load - force - gamma h F k1 spares the product with the mass matrix.
+            for i in range(n):
+                k2[i] = force[i] - force_middle[i] + GAMMA * h * slope[i] * k1[i]
+            for m in range(pairs):
+                i, j = values.coupling_joints[m]
+                k2[i] += GAMMA * h * pair_slope[m] * k1[j]
+                k2[j] += GAMMA * h * pair_slope[m] * k1[i]
+            solve_factored(factor, n, k2)
+            for i in range(n):
+                new = v[i] + h * (k1[i] + k2[i])
+                q[k + 1, i] += 0.5 * h * (v[i] + new)
+                v[i] = new
+        for i in range(n):
+            qd[k + 1, i] = v[i]
+    return -1
