@@ -12,8 +12,17 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from configs import ConfigError, DataError, SessionConfig, config_path, load_robot
 from configs.loading import parse
-from daq.recording import Field, Gap, Mark, Recording, RecordingWriter, Stream, StreamLayout
-from daq.recording import read_recording, write_recording
+from daq.recording import (
+    Field,
+    Gap,
+    Mark,
+    Recording,
+    RecordingWriter,
+    Stream,
+    StreamLayout,
+    read_recording,
+    write_recording,
+)
 
 T0 = 1_700_000_000_000_000_000
 
