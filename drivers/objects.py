@@ -1,0 +1,315 @@
+"""CANopen by its names: objects, identifiers, states and error codes of CiA 301 and CiA 402."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs.errors import ConfigError
+from configs.robot import Drive
+from configs.session import ObjectName
+
+PDO_BYTES = 8
+"""Data bytes of a classic CAN frame, and so the most a PDO can carry."""
+
+PDO_NOT_VALID = 1 << 31
+"""Bit of a PDO's COB-ID entry (sub-index 1) that switches the PDO off (CiA 301 section 7.5.2.35)."""
+
+COB_NMT = 0x000
+COB_SYNC = 0x080
+COB_EMCY = 0x080
+COB_SDO_RESPONSE = 0x580
+COB_SDO_REQUEST = 0x600
+COB_HEARTBEAT = 0x700
+COB_MASK = 0x7FF
+
+DEVICE_TYPE = 0x1000
+ERROR_REGISTER = 0x1001
+HEARTBEAT_PRODUCER = 0x1017
+IDENTITY = 0x1018
+SYNC_COUNTER_OVERFLOW = 0x1019
+RPDO_COMMUNICATION = 0x1400
+RPDO_MAPPING = 0x1600
+TPDO_COMMUNICATION = 0x1800
+TPDO_MAPPING = 0x1A00
+CONTROLWORD = 0x6040
+STATUSWORD = 0x6041
+MODE_OF_OPERATION = 0x6060
+MODE_DISPLAY = 0x6061
+POSITION_DEMAND = 0x6062
+POSITION_ACTUAL = 0x6064
+VELOCITY_ACTUAL = 0x606C
+RATED_CURRENT = 0x6075
+TORQUE_ACTUAL = 0x6077
+CURRENT_ACTUAL = 0x6078
+TARGET_POSITION = 0x607A
+ENCODER_RESOLUTION = 0x608F
+INTERPOLATION_MODE = 0x60C0
+INTERPOLATION_PERIOD = 0x60C2
+
+DEVICE_PROFILE_CIA402 = 402
+"""Low word of the device type (1000h) of every drive that follows CiA 402."""
+
+CYCLIC_SYNCHRONOUS_POSITION = 8
+"""Mode of operation (6060h) in which the drive follows a set point per cycle (CiA 402 part 2)."""
+
+
+@dataclass(frozen=True)
+class MappedObject:
+    """An object that fits into a PDO: where it stands in the dictionary and how its bytes read."""
+
+    name: str
+    index: int
+    subindex: int
+    format: str
+
+    @property
+    def bits(self) -> int:
+        """Length in bits, as the mapping entry states it."""
+        return 8 * np.dtype(self.format).itemsize
+
+    @property
+    def entry(self) -> int:
+        """The mapping entry: index, sub-index and length in bits (CiA 301 section 7.5.2.36)."""
+        return self.index << 16 | self.subindex << 8 | self.bits
+
+
+OBJECTS: dict[str, MappedObject] = {
+    o.name: o
+    for o in (
+        MappedObject("position", POSITION_ACTUAL, 0, "<i4"),
+        MappedObject("velocity", VELOCITY_ACTUAL, 0, "<i4"),
+        MappedObject("current", CURRENT_ACTUAL, 0, "<i2"),
+        MappedObject("torque", TORQUE_ACTUAL, 0, "<i2"),
+        MappedObject("demand", POSITION_DEMAND, 0, "<i4"),
+        MappedObject("status", STATUSWORD, 0, "<u2"),
+    )
+}
+"""The objects a stream may carry, by the names of the session schema."""
+
+SETPOINT = MappedObject("target", TARGET_POSITION, 0, "<i4")
+"""What the RPDO of the set points carries: the target position in counts."""
+
+
+@dataclass(frozen=True)
+class TpdoLayout:
+    """The data bytes of one TPDO: its objects in mapping order, little endian, without gaps."""
+
+    objects: tuple[MappedObject, ...]
+
+    @classmethod
+    def of(cls, names: Sequence[ObjectName | str], where: str = "stream") -> "TpdoLayout":
+        """The layout of a stream's objects.
+
+        Raises
+        ------
+        ConfigError
+            If an object is unknown or repeated, or the objects need more than eight bytes.
+        """
+        for name in names:
+            if name not in OBJECTS:
+                raise ConfigError(f"{where}: no object named {name!r}; objects are {', '.join(OBJECTS)}")
+        if len(set(names)) != len(names):
+            raise ConfigError(f"{where}: an object is mapped twice: {', '.join(names)}")
+        layout = cls(tuple(OBJECTS[name] for name in names))
+        if layout.size > PDO_BYTES:
+            sizes = ", ".join(f"{o.name} {o.bits // 8}" for o in layout.objects)
+            raise ConfigError(f"{where}: {layout.size} bytes ({sizes}) do not fit into the 8 bytes of a TPDO")
+        return layout
+
+    @property
+    def size(self) -> int:
+        """Number of data bytes in the frame."""
+        return sum(o.bits for o in self.objects) // 8
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Structured type of eight bytes, one field per object; the bytes behind the last object are padding."""
+        offsets = [sum(o.bits for o in self.objects[:k]) // 8 for k in range(len(self.objects))]
+        return np.dtype(
+            {
+                "names": [o.name for o in self.objects],
+                "formats": [o.format for o in self.objects],
+                "offsets": offsets,
+                "itemsize": PDO_BYTES,
+            }
+        )
+
+    @property
+    def entries(self) -> tuple[int, ...]:
+        """The mapping entries to write to 1A00h and following, in order."""
+        return tuple(o.entry for o in self.objects)
+
+    def decode(self, data: NDArray[np.uint8]) -> NDArray[Any]:
+        """Frames' data bytes, shape (N, 8), as records of shape (N,); a view where ``data`` is contiguous."""
+        return np.ascontiguousarray(data).view(self.dtype)[:, 0]
+
+
+def tpdo_cob(tpdo: int, node: int) -> int:
+    """COB-ID of TPDO 1 to 4 in the predefined connection set (CiA 301 section 7.3.5)."""
+    return 0x180 + 0x100 * (tpdo - 1) + node
+
+
+def rpdo_cob(rpdo: int, node: int) -> int:
+    """COB-ID of RPDO 1 to 4 in the predefined connection set (CiA 301 section 7.3.5)."""
+    return 0x200 + 0x100 * (rpdo - 1) + node
+
+
+def rated_milliamperes(drive: Drive) -> int:
+    """What 6075h of the drive must hold so that 1000 per mille of 6078h is ``drive.rated``."""
+    return round(drive.rated * 1000)
+
+
+class NmtCommand(IntEnum):
+    """NMT commands (CiA 301 section 7.2.8.3.1)."""
+
+    START = 1
+    STOP = 2
+    PRE_OPERATIONAL = 128
+    RESET_NODE = 129
+    RESET_COMMUNICATION = 130
+
+
+class NmtState(IntEnum):
+    """NMT states as a heartbeat carries them (CiA 301 section 7.2.8.3.2)."""
+
+    BOOT_UP = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+
+class Control(IntEnum):
+    """Controlword (6040h) of each command of the CiA 402 state machine."""
+
+    DISABLE_VOLTAGE = 0x00
+    QUICK_STOP = 0x02
+    SHUTDOWN = 0x06
+    SWITCH_ON = 0x07
+    ENABLE_OPERATION = 0x0F
+    FAULT_RESET = 0x80
+
+
+class DriveState(StrEnum):
+    """States of the CiA 402 state machine, by the names of the standard."""
+
+    NOT_READY = "not ready to switch on"
+    SWITCH_ON_DISABLED = "switch on disabled"
+    READY = "ready to switch on"
+    SWITCHED_ON = "switched on"
+    ENABLED = "operation enabled"
+    QUICK_STOP_ACTIVE = "quick stop active"
+    FAULT_REACTION = "fault reaction active"
+    FAULT = "fault"
+
+
+STATE_CODES: dict[DriveState, tuple[int, int]] = {
+    DriveState.NOT_READY: (0x4F, 0x00),
+    DriveState.SWITCH_ON_DISABLED: (0x4F, 0x40),
+    DriveState.READY: (0x6F, 0x21),
+    DriveState.SWITCHED_ON: (0x6F, 0x23),
+    DriveState.ENABLED: (0x6F, 0x27),
+    DriveState.QUICK_STOP_ACTIVE: (0x6F, 0x07),
+    DriveState.FAULT_REACTION: (0x4F, 0x0F),
+    DriveState.FAULT: (0x4F, 0x08),
+}
+"""Mask and value of the statusword in every state (CiA 402 part 2, table of 6041h)."""
+
+
+def drive_state(statusword: int) -> DriveState | None:
+    """The CiA 402 state that a statusword (6041h) reports; ``None`` for a pattern the standard does not know."""
+    for state, (mask, value) in STATE_CODES.items():
+        if statusword & mask == value:
+            return state
+    return None
+
+
+EMCY_TEXTS: dict[int, str] = {
+    0x0000: "error reset or no error",
+    0x1000: "generic error",
+    0x2000: "current",
+    0x2100: "current on the device input side",
+    0x2200: "internal current",
+    0x2211: "internal over-current 1",
+    0x2212: "internal over-current 2",
+    0x2220: "continuous over-current",
+    0x2230: "short circuit or earth leakage inside the device",
+    0x2300: "current on the device output side",
+    0x2310: "continuous over-current on the output side",
+    0x2320: "short circuit or earth leakage on the output side",
+    0x2330: "earth leakage on the output side",
+    0x2340: "short circuit on the output side",
+    0x2350: "load level fault (I2t, thermal state)",
+    0x3000: "voltage",
+    0x3100: "mains voltage",
+    0x3110: "mains over-voltage",
+    0x3120: "mains under-voltage",
+    0x3130: "mains phase failure",
+    0x3200: "DC link voltage",
+    0x3210: "DC link over-voltage",
+    0x3220: "DC link under-voltage",
+    0x3300: "output voltage",
+    0x4000: "temperature",
+    0x4100: "ambient temperature",
+    0x4200: "device temperature",
+    0x4210: "excess device temperature",
+    0x4300: "drive temperature",
+    0x4310: "excess drive temperature",
+    0x5000: "device hardware",
+    0x5100: "supply voltage",
+    0x5300: "operating unit",
+    0x5400: "power section",
+    0x5430: "input stages",
+    0x5440: "contacts",
+    0x5500: "data storage",
+    0x6000: "device software",
+    0x6100: "internal software",
+    0x6200: "user software",
+    0x6300: "data set",
+    0x7000: "additional modules",
+    0x7100: "power",
+    0x7110: "brake chopper",
+    0x7120: "motor",
+    0x7121: "motor blocked",
+    0x7122: "motor error or commutation malfunction",
+    0x7200: "measurement circuit",
+    0x7300: "sensor",
+    0x7305: "incremental encoder 1 fault",
+    0x7310: "speed",
+    0x7320: "position",
+    0x7400: "computation circuit",
+    0x7500: "communication",
+    0x8000: "monitoring",
+    0x8100: "communication",
+    0x8110: "CAN overrun (objects lost)",
+    0x8120: "CAN in error passive mode",
+    0x8130: "life guard or heartbeat error",
+    0x8140: "recovered from bus off",
+    0x8150: "CAN-ID collision",
+    0x8200: "protocol error",
+    0x8210: "PDO not processed because of its length",
+    0x8220: "PDO length exceeded",
+    0x8240: "unexpected SYNC data length",
+    0x8250: "RPDO timeout",
+    0x8300: "torque control",
+    0x8400: "velocity control",
+    0x8500: "position control",
+    0x8611: "following error",
+    0x8612: "reference limit",
+    0x8700: "sync control",
+    0x9000: "external error",
+    0xF000: "additional functions",
+    0xFF00: "device specific",
+}
+"""Texts of emergency error codes (CiA 301 table of section 7.2.7.1, CiA 402 part 2 error codes)."""
+
+
+def emcy_text(code: int) -> str:
+    """The text of an emergency error code: its own, or that of the narrowest group that has one."""
+    for mask in (0xFFFF, 0xFFF0, 0xFF00, 0xF000):
+        if code & mask in EMCY_TEXTS:
+            return EMCY_TEXTS[code & mask]
+    return "unknown error"
