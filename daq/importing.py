@@ -1,0 +1,308 @@
+"""Recordings from what other tools wrote: CSV, MAT, NPZ."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import ConfigError, DataError, RobotConfig
+from daq.recording import Field, Recording, Stream
+from daq.recording.model import Quantity, Side
+
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "time": ("t", "time", "times"),
+    "position": ("q", "qm", "position", "positions"),
+    "torque": ("tau", "torque", "torques"),
+    "current": ("current", "currents"),
+    "voltage": ("voltage", "vir"),
+    "demand": ("qr", "qg", "target_positions"),
+}
+"""By what names each quantity is known; ``q`` also stands for columns ``q1..qn``."""
+
+EFFORTS: tuple[Quantity, ...] = ("torque", "current", "voltage")
+_UNEVEN = 0.01
+"""Largest deviation of a sampling step from the median step, relative."""
+_FAR_OUT, _TOO_STRONG = 3.0, 10.0
+"""Positions and torques beyond these multiples of the joint's limits are taken as a wrong unit."""
+
+Table = dict[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file's named arrays, and how its places are called in messages."""
+
+    path: Path
+    table: Table
+    first_line: int | None = None
+
+    def place(self, row: int, name: str) -> str:
+        """Where row ``row`` of column ``name`` stands, for a message."""
+        where = f"row {row}" if self.first_line is None else f"line {self.first_line + row}"
+        return f"{self.path}: {where}, column {name}"
+
+
+def import_recording(
+    path: Path,
+    robot: RobotConfig,
+    *,
+    effort: Path | None = None,
+    motor_side: bool = False,
+    rate_hz: float | None = None,
+    names: Mapping[str, str] | None = None,
+) -> Recording:
+    """Read measured motion and effort as a recording, checked before anything is written.
+
+    Parameters
+    ----------
+    path
+        CSV with a header line, MAT (up to version 7) or NPZ; SI units.
+    robot
+        The robot that was measured.
+    effort
+        A second CSV with one effort column per joint; ``path`` then has one position column per joint, and
+        headers of both are free or absent.
+    motor_side
+        Positions and torques are those of the motors; currents and voltages always are.
+    rate_hz
+        Sampling rate where the file has no time column, or where its times are known to be worse than the clock.
+    names
+        Names of this file by quantity (``time, position, torque, current, voltage, demand``).
+
+    Raises
+    ------
+    ConfigError
+        If a file or option is wrong.
+    DataError
+        If the content is: missing columns, wrong number of axes, NaN, uneven time, or values far outside the limits.
+    """
+    names = dict(names or {})
+    unknown = sorted(names.keys() - NAMES.keys())
+    if unknown:
+        raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
+    source = _pair(path, effort, robot) if effort is not None else _load(path)
+    rate = rate_hz if rate_hz is not None else _rate(source, names)
+    side: Side = "motor" if motor_side else "joint"
+    fields, raw = {}, {}
+    for quantity in ("position", *EFFORTS, "demand"):
+        values = _pick(source, quantity, robot.n, names)
+        if values is None or (quantity in EFFORTS and any(e in raw for e in EFFORTS)):
+            continue
+        own_side: Side = "motor" if quantity in ("current", "voltage") else side
+        fields[quantity] = Field(quantity, quantity, _unit(quantity, robot), own_side, (1.0,) * robot.n)
+        raw[quantity] = values
+    if "position" not in raw or not any(e in raw for e in EFFORTS):
+        have = ", ".join(source.table)
+        raise DataError(
+            f"{path}: expected columns q1..q{robot.n} and tau1..tau{robot.n} (or current, voltage); found {have}"
+        )
+    _check_units(path, robot, fields, raw)
+    count = len(raw["position"])
+    sync = np.arange(count, dtype=np.int64)
+    t_ns = np.round(sync * (1e9 / rate)).astype(np.int64)
+    facts = {"source": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    if effort is not None:
+        facts |= {"effort": effort.name, "effort_sha256": hashlib.sha256(effort.read_bytes()).hexdigest()}
+    stream = Stream("samples", 1, sync, t_ns, fields, raw)
+    counters = {"samples_expected": count, "samples_received": count, "samples_in_gaps": 0}
+    return Recording(None, robot, None, rate, {"samples": stream}, counters=counters, metadata=facts)
+
+
+def _load(path: Path) -> Source:
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file")
+    kind = path.suffix.lower()
+    if kind in (".csv", ".txt"):
+        header, values, first_line = _csv(path)
+        if header is None:
+            raise DataError(f"{path}: no header line; expected t,q1..,tau1.. (or a pair of files with --effort)")
+        return Source(path, dict(zip(header, values.T, strict=True)), first_line)
+    if kind == ".npz":
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path}: not a readable NPZ file: {error}") from error
+        return Source(path, _numeric(arrays))
+    if kind == ".mat":
+        return Source(path, _numeric(_mat(path)))
+    raise ConfigError(f"{path}: cannot import {kind or 'a file without suffix'}; expected .csv, .mat or .npz")
+
+
+def _mat(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    try:
+        arrays: dict[str, Any] = loadmat(path)
+    except NotImplementedError as error:
+        raise DataError(f"{path}: MAT version 7.3 is not read; save it with -v7") from error
+    except (OSError, ValueError, TypeError) as error:
+        raise DataError(f"{path}: not a readable MAT file: {error}") from error
+    return arrays
+
+
+def _numeric(arrays: Mapping[str, Any]) -> Table:
+    """The real arrays, vectors as (N,)."""
+    table: Table = {}
+    for name, value in arrays.items():
+        if isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and value.size:
+            array = value.astype(np.float64)
+            table[name] = array.ravel() if array.ndim == 2 and 1 in array.shape else array
+    return table
+
+
+def _pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
+    """Two headerless or freely headed tables as one source; torque or the drive's own signal is what effort means."""
+    columns: Table = {}
+    first_line = 1
+    for file, base in ((path, "q"), (effort, "tau")):
+        if not file.is_file():
+            raise ConfigError(f"{file}: no such file")
+        _, values, first_line = _csv(file)
+        if values.shape[1] != robot.n:
+            raise DataError(f"{file}: {values.shape[1]} columns, but {robot.name} has {robot.n} joints")
+        _check_finite(Source(file, {}, first_line), values, [f"{j + 1}" for j in range(robot.n)])
+        columns |= {f"{base}{j + 1}": values[:, j] for j in range(robot.n)}
+    rows = {len(v) for v in columns.values()}
+    if len(rows) != 1:
+        raise DataError(f"{path} and {effort}: {' and '.join(str(r) for r in sorted(rows))} rows")
+    return Source(path, columns, first_line)
+
+
+def _csv(path: Path) -> tuple[list[str] | None, NDArray[np.float64], int]:
+    """Header (if there is one), values (N, columns) and the line number of the first values."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            first = file.readline()
+            delimiter = next((d for d in (",", ";", "\t") if d in first), None)
+            words = [word.strip() for word in first.split(delimiter)]
+            header = None if all(_is_number(w) for w in words) else words
+            file.seek(0)
+            skip = 0 if header is None else 1
+            values = np.loadtxt(file, delimiter=delimiter, skiprows=skip, ndmin=2, comments=None)
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a text file") from error
+    except ValueError as error:
+        raise DataError(_bad_line(path, delimiter, len(words), skip) or f"{path}: {error}") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    if values.size == 0:
+        raise DataError(f"{path}: no values")
+    if header is not None and len(header) != values.shape[1]:
+        raise DataError(f"{path}: {len(header)} names in the header, {values.shape[1]} columns of values")
+    return header, values, skip + 1
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _bad_line(path: Path, delimiter: str | None, columns: int, skip: int) -> str | None:
+    """What is wrong with the first line that cannot be read."""
+    with path.open(encoding="utf-8-sig") as file:
+        for number, line in enumerate(file, start=1):
+            words = line.split(delimiter)
+            if number <= skip or not line.strip():
+                continue
+            if len(words) != columns:
+                return f"{path}: line {number} has {len(words)} columns, expected {columns}"
+            for k, word in enumerate(words, start=1):
+                if not _is_number(word):
+                    return f"{path}: line {number}, column {k}: expected a number, found {word.strip()!r}"
+    return None
+
+
+def _pick(source: Source, quantity: str, n: int, names: Mapping[str, str]) -> NDArray[np.float64] | None:
+    """The (N, n) values of a quantity, or ``None`` if the file has none."""
+    for base in (names[quantity],) if quantity in names else NAMES[quantity]:
+        whole = source.table.get(base)
+        labels = [f"{base}{j + 1}" for j in range(n)]
+        if whole is not None:
+            values = whole[:, None] if whole.ndim == 1 else whole
+            if values.ndim != 2 or values.shape[1] != n:
+                raise DataError(f"{source.path}: {base} has {values.shape[-1]} axes, the robot has {n}")
+            labels = [base] * n if whole.ndim == 1 else labels
+        elif labels[0] in source.table:
+            absent = [name for name in labels if name not in source.table]
+            if absent:
+                raise DataError(f"{source.path}: no column {absent[0]}, the robot has {n} joints")
+            if f"{base}{n + 1}" in source.table:
+                raise DataError(f"{source.path}: has a column {base}{n + 1}, but the robot has {n} joints")
+            values = np.stack([source.table[name] for name in labels], axis=1)
+        else:
+            continue
+        _check_finite(source, values, labels)
+        return np.ascontiguousarray(values)
+    if quantity in names:
+        raise DataError(f"{source.path}: nothing named {names[quantity]!r}; found {', '.join(source.table)}")
+    return None
+
+
+def _check_finite(source: Source, values: NDArray[np.float64], labels: Sequence[str]) -> None:
+    bad = np.argwhere(~np.isfinite(values))
+    if bad.size:
+        row, column = (int(k) for k in bad[0])
+        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        raise DataError(f"{source.place(row, labels[column])}: {values[row, column]} is not a number{more}")
+
+
+def _rate(source: Source, names: Mapping[str, str]) -> float:
+    """Sampling rate from the time column, 1/s."""
+    times = _pick(source, "time", 1, names)
+    if times is None:
+        raise DataError(f"{source.path}: no time column t; say the sampling rate with --rate")
+    steps = np.diff(times[:, 0])
+    if steps.size == 0:
+        raise DataError(f"{source.path}: a single row is not a recording")
+    median = float(np.median(steps))
+    back = np.flatnonzero(steps <= 0)
+    if back.size:
+        raise DataError(f"{source.place(int(back[0]) + 1, 't')}: time does not increase")
+    uneven = np.flatnonzero(np.abs(steps - median) > _UNEVEN * median)
+    if uneven.size:
+        k = int(uneven[0])
+        raise DataError(
+            f"{source.place(k + 1, 't')}: a step of {steps[k]:.6g} s where {median:.6g} s is usual; "
+            "say the sampling rate with --rate if the samples are even"
+        )
+    return float(steps.size / (times[-1, 0] - times[0, 0]))
+
+
+def _unit(quantity: str, robot: RobotConfig) -> str:
+    kinds = {joint.type for joint in robot.joints}
+    if quantity in ("position", "demand"):
+        return "rad" if kinds == {"revolute"} else "m" if kinds == {"prismatic"} else "rad|m"
+    if quantity == "torque":
+        return "N m" if kinds == {"revolute"} else "N" if kinds == {"prismatic"} else "N m|N"
+    return "A" if quantity == "current" else "V"
+
+
+def _check_units(path: Path, robot: RobotConfig, fields: Mapping[str, Field], raw: Table) -> None:
+    """Refuse what cannot be in SI units on the side said."""
+    transmission = robot.transmission_matrix
+    for name, values in raw.items():
+        motor = fields[name].side == "motor"
+        if name in ("position", "demand"):
+            joint = values @ np.linalg.inv(transmission).T if motor else values
+            limits = [max(abs(end) for end in j.limits.position) for j in robot.joints]
+            factor, hint = _FAR_OUT, "rad (or m), joint side unless --motor-side"
+        elif name == "torque":
+            joint = values @ transmission if motor else values
+            limits = [j.limits.torque for j in robot.joints]
+            factor, hint = _TOO_STRONG, "N m (or N), joint side unless --motor-side"
+        else:
+            continue
+        peaks = np.abs(joint).max(axis=0)
+        for axis, peak, limit in zip(robot.joints, peaks, limits, strict=True):
+            if peak > factor * limit:
+                raise DataError(
+                    f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
+                )
