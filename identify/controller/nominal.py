@@ -1,0 +1,70 @@
+"""Controllers that are not identified: the known one, and a stiff stand-in that follows any motion."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import ConfigError, DataError, RobotConfig
+from identify.model.arm import ArmModel
+from identify.model.controller import DiscreteController
+
+STIFFNESS = 4.0
+"""Natural frequency of the stand-in, in closed-loop bandwidths of the robot."""
+
+HIGHEST = 0.3
+"""Largest natural frequency times sampling period (rad): beyond, the sampled loop is poorly damped."""
+
+
+def saturation(robot: RobotConfig) -> NDArray[np.float64]:
+    """Largest motor torque of each drive (N m or N), infinite where the configuration gives none."""
+    return np.array(
+        [np.inf if j.drive.saturation is None else abs(j.drive.gain) * j.drive.saturation for j in robot.joints]
+    )
+
+
+def known_controller(robot: RobotConfig, dt: float) -> DiscreteController:
+    """The cascade of the configuration.
+
+    Raises
+    ------
+    ConfigError
+        If the configuration has none.
+    """
+    if robot.controller is None:
+        raise ConfigError(f"controller known: the configuration of {robot.name} has no controller (kp, kv)")
+    gain = np.array([joint.drive.gain for joint in robot.joints])
+    return DiscreteController.cascade(
+        np.array(robot.controller.kp), np.array(robot.controller.kv), gain, dt, saturation=saturation(robot)
+    )
+
+
+def nominal_controller(
+    model: ArmModel, theta: NDArray[np.float64], q: NDArray[np.float64], dt: float, bandwidth_hz: float
+) -> DiscreteController:
+    """Critically damped PD on the tracking error for the mean inertia that each motor feels.
+
+    Its derivative acts on the error, not on the velocity, so that it follows a moving reference without lag.
+
+    Parameters
+    ----------
+    theta
+        Base parameters (b,).
+    q
+        Postures over which the inertia is averaged, shape (N, n).
+    bandwidth_hz
+        Closed-loop bandwidth of the robot, Hz.
+
+    Raises
+    ------
+    DataError
+        If these parameters give a motor no positive inertia.
+    """
+    ratios = model.robot.transmission_matrix
+    mass = model.mass_matrix(theta, q).mean(axis=0)
+    inverse = np.linalg.inv(ratios)
+    inertia = np.diag(inverse.T @ mass @ inverse)
+    if not (inertia > 0).all():
+        weak = model.robot.joints[int(np.argmin(inertia))].name
+        raise DataError(f"the estimated inertia seen by the motor of {weak} is not positive")
+    omega = min(2 * np.pi * STIFFNESS * bandwidth_hz, HIGHEST / dt)
+    stiffness, damping = inertia * omega**2, 2 * inertia * omega
+    return DiscreteController.fir(np.stack([stiffness + damping / dt, -damping / dt], axis=1), dt)

@@ -1,0 +1,45 @@
+"""Essential parameters: those that the data need (backward elimination with an F statistic)."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+CONFIDENCE = 0.99
+"""A parameter is essential if leaving it out raises the weighted error beyond this quantile of F."""
+
+
+def essential_parameters(
+    theta: NDArray[np.float64], covariance: NDArray[np.float64], equations: int, confidence: float = CONFIDENCE
+) -> NDArray[np.bool_]:
+    """Drop the least significant parameter, refit, and repeat until all that are left are significant.
+
+    The refit is exact for estimates that are Gaussian with this covariance: fixing parameter i at zero moves the others
+    by ``-C[:, i] theta_i / C_ii``, and ``theta_i^2 / C_ii`` is the F statistic (1 and ``equations - b`` degrees).
+
+    Parameters
+    ----------
+    theta, covariance
+        Full model, (b,) and (b, b). They are not changed: reported values stay those of the full base model, since
+        a fit after selection has standard deviations that are too small.
+    equations
+        Number of rows of the regression.
+
+    Returns
+    -------
+    ndarray
+        Mask (b,), true where essential.
+    """
+    theta, covariance = theta.copy(), covariance.copy()
+    essential = np.ones(theta.size, dtype=np.bool_)
+    limit = float(stats.f.ppf(confidence, 1, max(equations - theta.size, 1)))
+    while essential.any():
+        left = np.flatnonzero(essential)
+        f = theta[left] ** 2 / np.diag(covariance)[left]
+        weakest = left[int(np.argmin(f))]
+        if f.min() > limit:
+            break
+        row = covariance[:, weakest] / covariance[weakest, weakest]
+        theta -= row * theta[weakest]
+        covariance -= np.outer(row, covariance[weakest])
+        essential[weakest] = False
+    return essential
