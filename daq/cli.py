@@ -18,7 +18,10 @@ GROUP = "armident.commands"
 DEBUG_VARIABLE = "ARMIDENT_DEBUG"
 INTERRUPTED = 130
 
-EPILOG = "Exit codes: 0 done, 2 usage or configuration, 3 the data cannot support the request, 4 changed or unexplained, 1 anything else."
+EPILOG = (
+    "Exit codes: 0 done, 2 usage or configuration, 3 the data cannot support the request, "
+    "4 changed or unexplained, 1 anything else."
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -28,8 +31,10 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     raise SystemExit(0)
 
 
-def application(words: Sequence[str], entry_points: Iterable[importlib.metadata.EntryPoint] | None = None) -> typer.Typer:
-    """Build the command line, loading only the commands among ``words``, or all where none is named (help, completion).
+def application(
+    words: Sequence[str], entry_points: Iterable[importlib.metadata.EntryPoint] | None = None
+) -> typer.Typer:
+    """Build the command line with the command that ``words`` call, or with all where they call none (help, completion).
 
     Parameters
     ----------

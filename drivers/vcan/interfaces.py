@@ -39,7 +39,7 @@ def ensure_vcan(name: str = "vcan0") -> None:
     if is_up(name):
         return
     if not have_socketcan():
-        raise ConfigError(f"{name}: this kernel has no SocketCAN (an administrator may try: sudo modprobe can_raw vcan)")
+        raise ConfigError(f"{name}: this kernel has no SocketCAN (try: sudo modprobe -a can_raw vcan)")
     steps = [["ip", "link", "set", "dev", name, "up"]]
     if not (NETWORK / name).exists():
         steps.insert(0, ["ip", "link", "add", "dev", name, "type", "vcan"])

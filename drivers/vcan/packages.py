@@ -165,12 +165,12 @@ def _unpack(folder: Path, root: Path, log: int) -> None:
         target.mkdir(exist_ok=True)
         subprocess.run(["dpkg", "-x", deb, target], stdout=log, stderr=log, check=True)
     loader = _one(folder / "libc", "ld-linux-x86-64.so.2").relative_to(folder)
-    binary = [_one(folder, "patchelf"), "--set-interpreter", root / loader, "--set-rpath", root / loader.parent]
-    subprocess.run([*binary, kernel(folder)], stdout=log, stderr=log, check=True)
+    names = ["--set-interpreter", str(root / loader), "--set-rpath", str(root / loader.parent)]
+    subprocess.run([_one(folder, "patchelf"), *names, kernel(folder)], stdout=log, stderr=log, check=True)
     modules = folder / "modules"
     modules.mkdir()
     found = {path.stem: path for path in (folder / "usr" / "lib" / "uml").rglob("*.ko")}
-    if not NEEDED_MODULES <= found.keys():
+    if not found.keys() >= NEEDED_MODULES:
         raise LookupError(f"the kernel package lacks {', '.join(sorted(NEEDED_MODULES - found.keys()))}")
     for k, name in enumerate(name for name in MODULES if name in found):
         shutil.copy(found[name], modules / f"{k}-{name}.ko")

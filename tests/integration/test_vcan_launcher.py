@@ -1,0 +1,162 @@
+"""The launcher: what runs under it has real buses, and otherwise looks as if it ran here."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from configs.errors import ConfigError
+from drivers.vcan import ensure_vcan, have_socketcan, launcher_available, launcher_command, packages, remove_vcan
+
+IN_THE_GUEST = "ARMIDENT_GUEST" in os.environ
+REASON = "inside the guest already" if IN_THE_GUEST else launcher_available()
+needs_launcher = pytest.mark.skipif(REASON is not None, reason=f"no vcan launcher: {REASON}")
+
+WAIT_FOR_SIGNAL = """
+import signal, sys, time
+def end(*_):
+    print("ends cleanly", flush=True)
+    sys.exit(9)
+signal.signal(signal.SIGTERM, end)
+print("ready", flush=True)
+try:
+    time.sleep(60)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+    sys.exit(8)
+"""
+
+
+def launch(command: list[str], buses: int = 1, **options: object) -> "subprocess.CompletedProcess[str]":
+    line = launcher_command(command, buses)
+    return subprocess.run(line, capture_output=True, text=True, timeout=120, check=False, **options)  # type: ignore[call-overload, no-any-return]
+
+
+@needs_launcher
+@pytest.mark.slow
+def test_a_frame_sent_on_a_bus_of_the_launcher_is_received() -> None:
+    talk = """
+import socket
+a, b = (socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) for _ in range(2))
+a.bind(("vcan1",)); b.bind(("vcan1",)); b.settimeout(5)
+a.send(bytes.fromhex("80000000 01000000 2a00000000000000"))
+print(b.recv(16).hex())
+"""
+    done = launch([sys.executable, "-c", talk], buses=2)
+    assert done.stdout == "80000000010000002a00000000000000\n", done.stderr
+
+
+@needs_launcher
+@pytest.mark.slow
+def test_both_outputs_and_the_exit_status_pass_through() -> None:
+    done = launch(["sh", "-c", "seq 1 200000; seq 1 100000 >&2; exit 7"])
+    assert done.returncode == 7
+    assert done.stdout.split() == [str(k) for k in range(1, 200001)]
+    assert done.stderr.split() == [str(k) for k in range(1, 100001)]
+
+
+@needs_launcher
+@pytest.mark.slow
+def test_arguments_environment_and_folder_pass_through(tmp_path: Path) -> None:
+    folder = tmp_path / "a folder"
+    folder.mkdir()
+    strange = 'quo\'te "$HOME" \\ ü\ttab'
+    repository = Path(__file__).resolve().parents[2]
+    script = "import os, sys; print(repr((os.getcwd(), sys.argv[1], os.environ['STRANGE']))); open('made here', 'w')"
+    environment = {**os.environ, "STRANGE": strange, "PYTHONPATH": str(repository)}
+    done = launch([sys.executable, "-c", script, strange], cwd=folder, env=environment)
+    assert done.stdout == repr((str(folder), strange, strange)) + "\n", done.stderr
+    assert (folder / "made here").exists()
+
+
+@needs_launcher
+@pytest.mark.slow
+def test_output_arrives_while_the_command_still_runs() -> None:
+    with subprocess.Popen(
+        launcher_command([sys.executable, "-c", WAIT_FOR_SIGNAL]), stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        assert process.poll() is None
+        process.terminate()
+
+
+@needs_launcher
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "said", "status"), [(signal.SIGTERM, "ends cleanly", 9), (signal.SIGINT, "interrupted", 8)]
+)
+def test_a_signal_reaches_the_command_which_ends_as_it_likes(number: signal.Signals, said: str, status: int) -> None:
+    with subprocess.Popen(
+        launcher_command([sys.executable, "-c", WAIT_FOR_SIGNAL]), stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        assert process.stdout.read() == f"{said}\n"
+        assert process.wait(60) == status
+
+
+@needs_launcher
+@pytest.mark.slow
+def test_what_a_command_leaves_behind_does_not_keep_the_launcher() -> None:
+    start = time.monotonic()
+    assert launch(["sh", "-c", "sleep 300 & exit 3"]).returncode == 3
+    assert time.monotonic() - start < 100
+
+
+@needs_launcher
+@pytest.mark.slow
+def test_a_command_that_does_not_exist_is_127() -> None:
+    assert launch(["no-such-command-here"]).returncode == 127
+
+
+def test_packages_that_are_missing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VCAN_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("VCAN_DEBS", str(tmp_path))
+    (tmp_path / "patchelf_0.14_amd64.deb").touch()
+    reason = packages.obstacle()
+    assert reason is not None
+    assert "lacks user-mode-linux, libc6, busybox-static, can-utils" in reason
+
+
+def test_a_torn_package_is_one_line_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    debs = tmp_path / "debs"
+    debs.mkdir()
+    for name in packages.GUEST_PACKAGES + packages.HOST_PACKAGES:
+        (debs / f"{name}_1_amd64.deb").write_bytes(b"!<arch>\n")
+    environment = {**os.environ, "VCAN_CACHE": str(tmp_path / "cache"), "VCAN_DEBS": str(debs)}
+    line = [sys.executable, "-m", "drivers.vcan", "--guest", "--", "true"]
+    done = subprocess.run(line, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 125
+    assert done.stderr.count("\n") == 1
+    assert "setup.log" in done.stderr
+    assert not (tmp_path / "cache" / "root").exists()
+
+
+@pytest.mark.skipif(have_socketcan(), reason="this kernel has SocketCAN")
+def test_without_socketcan_a_bus_is_refused_with_the_command_to_try() -> None:
+    with pytest.raises(ConfigError, match=r"vcan7: .* sudo modprobe"):
+        ensure_vcan("vcan7")
+
+
+@pytest.mark.vcan
+def test_a_bus_is_made_once_and_removed(vcan_bus: str) -> None:
+    ensure_vcan(vcan_bus)
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
+        raw.bind((vcan_bus,))
+    remove_vcan(vcan_bus)
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw, pytest.raises(OSError, match="device"):
+        raw.bind((vcan_bus,))
+    remove_vcan(vcan_bus)
+
+
+@pytest.mark.vcan
+def test_a_bus_that_cannot_be_made_names_the_administrators_command() -> None:
+    with pytest.raises(ConfigError, match="an administrator must run: sudo modprobe vcan && sudo ip link add dev"):
+        ensure_vcan("a-name-longer-than-the-kernel-takes")

@@ -1,0 +1,159 @@
+"""The root of the command line: finds commands, loads only what is called, one line for every error."""
+
+import importlib.metadata
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from configs.errors import ArmidentError, ConfigError, DataError
+from daq.cli import DEBUG_VARIABLE, GROUP, application
+
+HEAVY = {"numpy", "scipy", "numba", "pydantic", "yaml", "zenoh", "matplotlib", "canopen", "can", "pinocchio", "rich"}
+ROOT_IN_A_PROCESS = [sys.executable, "-m", "daq.cli"]
+
+
+def refuse(kind: str) -> None:
+    """Raise the error that is asked for.
+
+    Example: armident refuse config
+    """
+    raise {
+        "config": ConfigError("cell.yaml: sync.rate_hz:\n expected a number"),
+        "data": DataError("too short"),
+        "other": ArmidentError("bus is down"),
+        "bug": ValueError("unforeseen"),
+        "interrupt": KeyboardInterrupt(),
+        "changed": typer.Exit(4),
+    }[kind]
+
+
+def greet(name: Annotated[str, typer.Option(help="Whom to greet.")] = "arm") -> None:
+    """Greet somebody."""
+    print(f"hello {name}")
+
+
+ENTRIES = [
+    importlib.metadata.EntryPoint(name, f"{__name__}:{function}", GROUP)
+    for name, function in [("refuse", "refuse"), ("greet", "greet")]
+]
+ABSENT = importlib.metadata.EntryPoint("absent", "daq.no_such_module:absent", GROUP)
+
+
+@pytest.fixture(autouse=True)
+def without_debug(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(DEBUG_VARIABLE, "")
+
+
+def call(*words: str) -> tuple[int, str, str]:
+    result = CliRunner().invoke(application(words, [*ENTRIES, ABSENT]), list(words))
+    return result.exit_code, result.stdout, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("kind", "code", "line"),
+    [
+        ("config", 2, "armident: cell.yaml: sync.rate_hz: expected a number"),
+        ("data", 3, "armident: too short"),
+        ("other", 1, "armident: bus is down"),
+    ],
+)
+def test_an_expected_error_is_one_line_on_stderr_and_its_own_exit_code(kind: str, code: int, line: str) -> None:
+    assert call("refuse", kind) == (code, "", line + "\n")
+
+
+def test_an_unforeseen_error_is_one_line_and_exit_code_1() -> None:
+    code, out, err = call("refuse", "bug")
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert err.startswith("armident: ValueError: unforeseen")
+
+
+def test_debug_shows_where_an_error_came_from() -> None:
+    code, _, err = call("--debug", "refuse", "bug")
+    assert code == 1
+    assert "Traceback" in err
+    assert "in refuse" in err
+
+
+def test_an_interrupt_ends_with_130_and_silently() -> None:
+    assert call("refuse", "interrupt") == (130, "", "")
+
+
+def test_a_command_chooses_its_own_exit_code() -> None:
+    assert call("refuse", "changed")[0] == 4
+
+
+def test_options_reach_the_command() -> None:
+    assert call("greet", "--name", "robot") == (0, "hello robot\n", "")
+
+
+@pytest.mark.parametrize("words", [["greet", "--nmae", "x"], ["no-such-command"], ["refuse"], ["--no-such-option"]])
+def test_wrong_usage_is_exit_code_2(words: list[str]) -> None:
+    code, out, err = call(*words)
+    assert (code, out) == (2, "")
+    assert "Usage: " in err
+
+
+def test_help_lists_every_command_with_its_first_line() -> None:
+    code, out, _ = call("--help")
+    assert code == 0
+    assert [line.split(maxsplit=1) for line in out.splitlines() if line.startswith("  greet")] == [
+        ["greet", "Greet somebody."]
+    ]
+    assert "Exit codes: 0 done" in out
+
+
+def test_a_command_whose_module_is_missing_is_listed_as_unavailable_and_says_why_when_called() -> None:
+    assert "(unavailable)" in call("--help")[1]
+    code, out, err = call("absent", "--whatever", "it", "is")
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert "no_such_module" in err
+
+
+def test_calling_one_command_does_not_load_the_others() -> None:
+    loaded: list[str] = []
+
+    class Watched(importlib.metadata.EntryPoint):
+        def load(self) -> object:
+            loaded.append(self.name)
+            return super().load()
+
+    application(["greet", "refuse"], [Watched(e.name, e.value, e.group) for e in ENTRIES])
+    assert loaded == ["greet"]
+
+
+def test_help_imports_nothing_heavy() -> None:
+    script = (
+        "import sys\n"
+        "from daq.cli import main\n"
+        "try:\n    main(['--help'])\n"
+        "except SystemExit as end:\n    assert not end.code\n"
+        f"print('HEAVY', sorted({HEAVY!r} & sys.modules.keys()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "HEAVY []"
+
+
+def test_every_registered_command_can_be_loaded() -> None:
+    done = subprocess.run([*ROOT_IN_A_PROCESS, "--help"], capture_output=True, text=True, check=True)
+    registered = importlib.metadata.entry_points(group=GROUP)
+    assert {"capture", "demo", "identify", "robot", "worker"} <= registered.names
+    assert "(unavailable)" not in done.stdout
+
+
+def test_the_version_is_that_of_the_distribution() -> None:
+    done = subprocess.run([*ROOT_IN_A_PROCESS, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"armident {importlib.metadata.version('armident')}\n"
+
+
+def test_every_command_shows_an_example(tmp_path: Path) -> None:
+    for name in sorted(importlib.metadata.entry_points(group=GROUP).names):
+        done = subprocess.run(
+            [*ROOT_IN_A_PROCESS, name, "--help"], capture_output=True, text=True, check=False, cwd=tmp_path
+        )
+        assert done.returncode == 0, f"{name}: {done.stderr}"
+        assert f"armident {name}" in done.stdout.split("Options:")[0].split("\n", 1)[1], f"{name} shows no example"
