@@ -106,7 +106,7 @@ class Assembler:
             self._books.state[ORIGIN] = first_counter
         self._open: dict[tuple[str, str | None, str], tuple[int, int]] = {}
         self._totals = dict.fromkeys(
-            [f"{s.name}_{what}" for s in streams for what in ("expected", "received", "in_gaps", "discarded")], 0
+            [f"{s.name}.{what}" for s in streams for what in ("expected", "rows", "in_gaps", "discarded")], 0
         )
 
     @property
@@ -118,7 +118,7 @@ class Assembler:
     def counters(self) -> dict[str, int]:
         """Counts of frames, SYNCs and samples.
 
-        Per stream, ``expected`` rows are ``received`` (complete) or ``in_gaps``; ``discarded`` counts the samples of
+        Per stream, ``expected`` rows are ``rows`` (complete) or ``in_gaps``; ``discarded`` counts the samples of
         single joints that did arrive for rows in gaps.
         """
         counts = dict(zip(COUNT_NAMES, (int(c) for c in self._books.counts), strict=True))
@@ -153,12 +153,12 @@ class Assembler:
             part = slice(0, int(out.count[s]))
             sync, t_ns, code = out.sync[s, part], out.t_ns[s, part], out.code[s, part]
             whole = (t_ns != UNSEEN) & (code == RECEIVED).all(axis=1)
-            self._totals[f"{stream.name}_expected"] += whole.size
+            self._totals[f"{stream.name}.expected"] += whole.size
             complete = int(np.count_nonzero(whole))
-            self._totals[f"{stream.name}_received"] += complete
+            self._totals[f"{stream.name}.rows"] += complete
             if complete < whole.size:
-                self._totals[f"{stream.name}_in_gaps"] += whole.size - complete
-                self._totals[f"{stream.name}_discarded"] += int(np.count_nonzero(code[~whole] == RECEIVED))
+                self._totals[f"{stream.name}.in_gaps"] += whole.size - complete
+                self._totals[f"{stream.name}.discarded"] += int(np.count_nonzero(code[~whole] == RECEIVED))
                 gaps += self._gaps(stream, sync[~whole], t_ns[~whole], code[~whole])
                 rows[stream.name] = Rows(sync[whole], t_ns[whole], out.data[s, part][whole])
             else:

@@ -108,7 +108,7 @@ def import_recording(
     if effort is not None:
         facts |= {"effort": effort.name, "effort_sha256": hashlib.sha256(effort.read_bytes()).hexdigest()}
     stream = Stream("samples", 1, sync, t_ns, fields, raw)
-    counters = {"samples_expected": count, "samples_received": count, "samples_in_gaps": 0}
+    counters = {"samples.expected": count, "samples.rows": count, "samples.in_gaps": 0}
     return Recording(None, robot, None, rate, {"samples": stream}, counters=counters, metadata=facts)
 
 

@@ -110,9 +110,9 @@ def test_every_sync_is_received_or_in_a_gap_and_the_counters_add_up(faults: Faul
         assert received | missing == due
         assert not received & missing
         assert np.all(np.diff(sync[stream.name]) > 0)
-        assert counters[f"{stream.name}_expected"] == len(due)
-        assert counters[f"{stream.name}_received"] == len(received)
-        assert counters[f"{stream.name}_in_gaps"] == len(missing)
+        assert counters[f"{stream.name}.expected"] == len(due)
+        assert counters[f"{stream.name}.rows"] == len(received)
+        assert counters[f"{stream.name}.in_gaps"] == len(missing)
     assert counters["frames"] == len(frames)
     assert counters["sync_seen"] + counters["sync_missing"] == COUNT
     assert counters["sync_missing"] == len(faults.sync)
@@ -159,11 +159,11 @@ def test_a_single_lost_tpdo_is_one_gap_of_one_joint() -> None:
     sync, _, gaps, counters = run(bus(2000, Faults(tpdo={(1000, 1)})), 2000, [])
     assert gaps == [Gap("samples", 1000, 1000, "joint_2", "lost")]
     assert sync["samples"].size == 1999
-    assert counters["samples_discarded"] == 2
+    assert counters["samples.discarded"] == 2
 
 
 def test_duplicates_are_counted_and_change_nothing() -> None:
-    sync, data, gaps, counters = run(bus(COUNT, Faults(twice={(10, 0), (10, 1), (200, 2)})), COUNT, [])
+    sync, _, gaps, counters = run(bus(COUNT, Faults(twice={(10, 0), (10, 1), (200, 2)})), COUNT, [])
     assert gaps == []
     assert counters["tpdo_duplicate"] == 3
     assert sync["samples"].size == COUNT
@@ -195,7 +195,7 @@ def test_a_jump_of_the_clock_is_no_gap() -> None:
         batch = assembler.push(moved, sent=COUNT)
         end = assembler.finish(COUNT)
         assert batch.gaps + end.gaps == ()
-        assert assembler.counters["samples_received"] == COUNT
+        assert assembler.counters["samples.rows"] == COUNT
 
 
 def test_a_foreign_sync_starts_at_its_own_counter() -> None:

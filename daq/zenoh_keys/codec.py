@@ -1,0 +1,218 @@
+"""Blocks of samples and events as bytes, and how they become a recording again.
+
+A block is ``ARMB``, version (u16), length of the head (u32), CRC-32 of all that follows it, the head (JSON: sequence
+number, rows, stream layout), then ``sync`` and ``t_ns`` as int64 and every field's raw values, little endian, row by row.
+"""
+
+import json
+import struct
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from configs import DataError, RobotConfig, SessionConfig
+from daq.recording import Gap, Mark, Recording, Stream, StreamLayout
+
+VERSION = 1
+EVENT_SCHEMA = "armident/event/1"
+_MAGIC = b"ARMB"
+_HEAD = struct.Struct("<4sHII")
+_LARGEST_HEAD = 1 << 16
+_MOST_ROWS = 1 << 20
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive rows of one stream; ``sequence`` counts the blocks of a capture, all streams together."""
+
+    layout: StreamLayout
+    sequence: int
+    sync: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    raw: dict[str, NDArray[Any]]
+
+
+def encode_block(block: Block) -> bytes:
+    """The bytes of a block."""
+    head = json.dumps(
+        {"sequence": block.sequence, "rows": len(block.sync), "layout": json.loads(block.layout.to_json())}
+    ).encode()
+    parts = [head, block.sync.astype("<i8").tobytes(), block.t_ns.astype("<i8").tobytes()]
+    for field, dtype in zip(block.layout.fields, block.layout.dtypes, strict=True):
+        parts.append(block.raw[field.name].astype(np.dtype(dtype).newbyteorder("<")).tobytes())
+    body = b"".join(parts)
+    return _HEAD.pack(_MAGIC, VERSION, len(head), zlib.crc32(body)) + body
+
+
+def decode_block(data: bytes) -> Block:
+    """A block from its bytes, every length checked before it is used.
+
+    Raises
+    ------
+    DataError
+        If the bytes are not a block of this version, and why.
+    """
+    if len(data) < _HEAD.size:
+        raise DataError(f"a block of {len(data)} bytes is too short")
+    magic, version, head_size, crc = _HEAD.unpack_from(data)
+    if magic != _MAGIC:
+        raise DataError("not a block of samples")
+    if version != VERSION:
+        raise DataError(f"a block of version {version}, this program reads {VERSION}")
+    body = memoryview(data)[_HEAD.size :]
+    if head_size > min(len(body), _LARGEST_HEAD):
+        raise DataError("a block shorter than its head says")
+    if zlib.crc32(body) != crc:
+        raise DataError("a block whose checksum is wrong")
+    try:
+        head = json.loads(bytes(body[:head_size]))
+        sequence, rows = int(head["sequence"]), int(head["rows"])
+        layout = StreamLayout.from_json(json.dumps(head["layout"]))
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise DataError(f"a block whose head cannot be understood: {error!r}") from error
+    shape = rows, len(layout.joints)
+    dtypes = [np.dtype(dtype).newbyteorder("<") for dtype in layout.dtypes]
+    size = rows * (16 + sum(dtype.itemsize for dtype in dtypes) * len(layout.joints))
+    if not 0 <= rows <= _MOST_ROWS or len(body) - head_size != size:
+        raise DataError(f"a block of {len(body) - head_size} bytes where {rows} rows of {layout.topic} need {size}")
+    at = _HEAD.size + head_size
+    sync = np.frombuffer(data, "<i8", rows, at).astype(np.int64)
+    t_ns = np.frombuffer(data, "<i8", rows, at + 8 * rows).astype(np.int64)
+    at += 16 * rows
+    raw = {}
+    for field, dtype in zip(layout.fields, dtypes, strict=True):
+        values = np.frombuffer(data, dtype, shape[0] * shape[1], at)
+        raw[field.name] = values.reshape(shape).astype(dtype.newbyteorder("="))
+        at += values.nbytes
+    return Block(layout, sequence, sync, t_ns, raw)
+
+
+def encode_event(kind: str, content: Mapping[str, Any]) -> bytes:
+    """The bytes of an event: JSON with ``schema`` and ``kind``."""
+    return json.dumps({"schema": EVENT_SCHEMA, "kind": kind, **content}).encode()
+
+
+def decode_event(data: bytes) -> dict[str, Any]:
+    """An event from its bytes.
+
+    Raises
+    ------
+    DataError
+        If the bytes are not an event of this version.
+    """
+    try:
+        event = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"an event that is not JSON: {error}") from error
+    if not isinstance(event, dict) or event.get("schema") != EVENT_SCHEMA or not isinstance(event.get("kind"), str):
+        raise DataError(f"not an event of schema {EVENT_SCHEMA}")
+    return event
+
+
+def start_content(
+    capture: str,
+    robot: RobotConfig,
+    session: SessionConfig,
+    sample_rate_hz: float,
+    layouts: Iterable[StreamLayout],
+    metadata: Mapping[str, str],
+) -> dict[str, Any]:
+    """What an ``experiment_start`` event says: all a listener needs to understand the blocks that follow."""
+    return {
+        "capture": capture,
+        "sample_rate_hz": sample_rate_hz,
+        "robot": robot.model_dump(mode="json", by_alias=True),
+        "session": session.model_dump(mode="json", by_alias=True),
+        "layouts": [json.loads(layout.to_json()) for layout in layouts],
+        "metadata": dict(metadata),
+    }
+
+
+def end_content(
+    capture: str, blocks: int, counters: Mapping[str, int], gaps: Iterable[Gap], marks: Iterable[Mark], path: Path
+) -> dict[str, Any]:
+    """What an ``experiment_end`` event says: what a complete assembly has to contain, and where the file is."""
+    return {
+        "capture": capture,
+        "blocks": blocks,
+        "counters": dict(counters),
+        "gaps": [asdict(gap) for gap in gaps],
+        "marks": [asdict(mark) for mark in marks],
+        "path": str(path),
+    }
+
+
+def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str, Any]) -> Recording:
+    """The recording that a capture published, the same numbers as in its file.
+
+    Parameters
+    ----------
+    start, end
+        The ``experiment_start`` and ``experiment_end`` events of the capture.
+    blocks
+        Its blocks, in any order, duplicates allowed.
+
+    Returns
+    -------
+    Recording
+        ``path`` is that of the file; ``missing`` says which blocks did not arrive.
+
+    Raises
+    ------
+    DataError
+        If the events or blocks do not belong together or cannot be understood.
+    """
+    if start.get("capture") != end.get("capture"):
+        raise DataError("the start and the end are of different captures")
+    try:
+        robot = RobotConfig.model_validate_json(json.dumps(start["robot"]))
+        session = SessionConfig.model_validate_json(json.dumps(start["session"]))
+        layouts = [StreamLayout.from_json(json.dumps(layout)) for layout in start["layouts"]]
+        rate, total = float(start["sample_rate_hz"]), int(end["blocks"])
+        gaps = tuple(Gap(**gap) for gap in end["gaps"])
+        marks = tuple(Mark(**mark) for mark in end["marks"])
+        counters = {str(key): int(value) for key, value in end["counters"].items()}
+        metadata = {str(key): str(value) for key, value in start["metadata"].items()}
+        path = Path(end["path"])
+    except (KeyError, TypeError, ValueError, ValidationError) as error:
+        raise DataError(f"an event that cannot be understood: {str(error).splitlines()[0]}") from error
+    by_number = {block.sequence: block for block in blocks if 0 <= block.sequence < total}
+    ordered = [by_number[k] for k in sorted(by_number)]
+    known = {layout.name: layout for layout in layouts}
+    for block in ordered:
+        if known.get(block.layout.name) != block.layout:
+            raise DataError(f"a block of stream {block.layout.name!r} is not laid out as the start event says")
+    lost = total - len(by_number)
+    return Recording(
+        path=path,
+        robot=robot,
+        session=session,
+        sample_rate_hz=rate,
+        streams={
+            layout.name: _stream(layout, [b for b in ordered if b.layout.name == layout.name]) for layout in layouts
+        },
+        gaps=gaps,
+        marks=marks,
+        counters=counters,
+        metadata=metadata,
+        missing=f"{lost} of {total} blocks did not arrive" if lost else None,
+    )
+
+
+def _stream(layout: StreamLayout, blocks: list[Block]) -> Stream:
+    fields = {f.name: f for f in layout.fields}
+    empty = np.empty(0, np.int64)
+    sync = np.concatenate([empty, *(b.sync for b in blocks)])
+    if np.any(np.diff(sync) <= 0):
+        raise DataError(f"stream {layout.name}: SYNC numbers do not increase")
+    raw = {
+        f.name: np.concatenate([np.empty((0, len(layout.joints)), dtype), *(b.raw[f.name] for b in blocks)])
+        for f, dtype in zip(layout.fields, layout.dtypes, strict=True)
+    }
+    return Stream(layout.name, layout.every, sync, np.concatenate([empty, *(b.t_ns for b in blocks)]), fields, raw)

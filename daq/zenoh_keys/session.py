@@ -1,0 +1,90 @@
+"""Opens Zenoh sessions: peers on loopback that find each other without a router and without multicast."""
+
+import json
+import zlib
+from pathlib import Path
+from typing import Literal
+
+import zenoh
+
+from configs import ConfigError, SessionConfig
+
+Role = Literal["capture", "worker", "observer"]
+
+_FIRST_PORT = 17_000
+_CELLS = 5_000
+
+
+def endpoints(session: SessionConfig) -> dict[Role, str]:
+    """Where capture and worker of a cell listen by default: two ports of loopback, told from the cell's name."""
+    port = _FIRST_PORT + 2 * (zlib.crc32(f"{session.cell}/{session.robot.stem}".encode()) % _CELLS)
+    return {"capture": f"tcp/127.0.0.1:{port}", "worker": f"tcp/127.0.0.1:{port + 1}"}
+
+
+def configuration(session: SessionConfig, role: Role) -> zenoh.Config:
+    """The Zenoh configuration of a role: the session's file, or peers on loopback.
+
+    Raises
+    ------
+    ConfigError
+        If the configuration file is not one of Zenoh's.
+    """
+    options = session.zenoh
+    if options.config is not None:
+        config = _from_file(options.config)
+    else:
+        config = zenoh.Config()
+        own = endpoints(session)
+        defaults = {
+            "mode": "peer",
+            "scouting/multicast/enabled": False,
+            "timestamping/enabled": True,
+            "listen/endpoints": [own[role]] if role in own else [],
+            "connect/endpoints": [place for name, place in own.items() if name != role],
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+        }
+        for key, value in defaults.items():
+            config.insert_json5(key, json.dumps(value))
+    if options.listen and role != "observer":
+        config.insert_json5("listen/endpoints", json.dumps(options.listen))
+    if options.connect:
+        config.insert_json5("connect/endpoints", json.dumps(options.connect))
+    return config
+
+
+def open_session(session: SessionConfig, role: Role) -> zenoh.Session:
+    """Open a Zenoh session; capture and worker may start in any order, and again.
+
+    Parameters
+    ----------
+    session
+        The cell's configuration.
+    role
+        ``capture`` and ``worker`` listen, one each per cell; an ``observer`` only connects to both.
+
+    Raises
+    ------
+    ConfigError
+        If Zenoh refuses the configuration or cannot listen (another process of that role runs).
+    """
+    config = configuration(session, role)
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        place = ", ".join(session.zenoh.listen) or endpoints(session).get(role, "")
+        raise ConfigError(
+            f"zenoh: no session as {role} at {place} (does another {role} of cell {session.cell} run?): {_short(error)}"
+        ) from error
+
+
+def _from_file(path: Path) -> zenoh.Config:
+    try:
+        return zenoh.Config.from_file(str(path))
+    except zenoh.ZError as error:
+        raise ConfigError(f"{path}: not a Zenoh configuration: {_short(error)}") from error
+
+
+def _short(error: Exception) -> str:
+    return str(error).splitlines()[0].split(" at ")[0][:160]
