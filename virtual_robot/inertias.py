@@ -45,6 +45,9 @@ FRICTION: dict[str, float] = {
 IAM6 = 0.002
 """Coupling inertia, kg m^2: absent from table B.4, so below what such an experiment can tell from zero."""
 
+REST = (0.0, 0.0, 1.5708, 0.0, 0.0, 0.0)
+"""Posture at power-on, rad: forearm at a right angle."""
+
 NOMINAL_MASS = (6.0, 6.0, 5.0, 1.6, 0.6, 0.2)
 """Masses the programme leans towards, kg: 27 kg of arm less its base."""
 GYRATION_RADIUS = 0.08
@@ -201,12 +204,20 @@ def plant_parameters(robot: RobotConfig) -> dict[str, float]:
     return parameters
 
 
+def rest_posture(robot: RobotConfig) -> tuple[float, ...]:
+    """Return where the virtual arm stands when it is switched on, joint side, rad or m."""
+    plant_parameters(robot)
+    data = yaml.safe_load((HERE / f"{robot.name}_inertias.yaml").read_text(encoding="utf-8"))
+    return tuple(float(x) for x in data["rest"])
+
+
 def main() -> None:
     """Solve and write the data file of the virtual TX40."""
     parameters = solve() | {f"off{j}": 0.0 for j in range(1, JOINTS + 1)} | FRICTION | {"iam6": IAM6}
     lines = [
         "# Standard parameters of the virtual TX40, joint side, SI. Generated: python -m virtual_robot.inertias",
         "# Inertias about the frame origins (MDH frames of table B.1); friction of table B.4.",
+        f"rest: [{', '.join(f'{x:.6g}' for x in REST)}]  # posture at power-on, rad",
         "parameters:",
     ]
     lines += [f"  {name}: {value:.12g}" for name, value in parameters.items()]

@@ -1,0 +1,26 @@
+"""The command ``armident robot``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def robot(
+    config: Annotated[Path, typer.Option(help="Session: bus, nodes, robot.")] = Path("tx40_cell.yaml"),
+    scenario: Annotated[Path | None, typer.Option(help="Effects hidden in the arm.")] = None,
+    replay: Annotated[Path | None, typer.Option(help="Recording to play instead of the plant.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
+    noise: Annotated[float, typer.Option(min=0.0, help="Amplitude of the noise; 0 switches it off.")] = 1.0,
+    duration: Annotated[float | None, typer.Option(min=0.0, help="Seconds to run; without it until Ctrl-C.")] = None,
+) -> None:
+    """Put the virtual arm on a bus: six CiA 402 drives, or a measured recording behind them.
+
+    Example: armident robot --config tx40_cell.yaml --scenario scenarios/tx40_worn_joint2.yaml
+    """
+    from configs import ConfigError
+    from virtual_robot.run import run_robot
+
+    if scenario is not None and replay is not None:
+        raise ConfigError("--scenario hides effects in the plant, --replay has no plant: give one of them")
+    run_robot(config, scenario, replay, seed, noise, duration)

@@ -1,0 +1,127 @@
+"""A measured recording in place of the plant: the drives send what an arm once sent."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import ConfigError, DataError, RobotConfig
+from daq.recording import Recording, Stream
+from virtual_robot.arm import Raw32, counts_per_si
+
+RATE_TOLERANCE = 1e-3
+"""Relative difference allowed between the recording's sample rate and the SYNC rate."""
+
+
+class Replay:
+    """Plays positions and currents of a recording, one sample per SYNC, through the drives.
+
+    Before all drives of ``joints`` are enabled the first sample stands; sample k is sent on the k-th SYNC
+    after that; the last one stands when the recording is over. Set points are not followed.
+
+    Parameters
+    ----------
+    recording
+        What is played; gaps repeat the sample before them.
+    robot
+        Encoder resolution, transmission, rated currents of the drives that send it.
+    sync_period
+        Time between two SYNC, s.
+    joints
+        Numbers of the joints that have to be enabled.
+
+    Raises
+    ------
+    ConfigError
+        If the recording is of another robot, or was not sampled at the SYNC rate.
+    DataError
+        If it has no positions or no efforts, or they do not fit into the drives' numbers.
+    """
+
+    def __init__(self, recording: Recording, robot: RobotConfig, sync_period: float, joints: tuple[int, ...]) -> None:
+        where = str(recording.path or "recording")
+        if recording.robot.name != robot.name or recording.robot.n != robot.n:
+            raise ConfigError(
+                f"{where}: a recording of {recording.robot.name!r} ({recording.robot.n} joints), "
+                f"this session's robot is {robot.name!r} ({robot.n} joints)"
+            )
+        if abs(recording.sample_rate_hz * sync_period - 1) > RATE_TOLERANCE:
+            raise ConfigError(
+                f"{where}: sampled at {recording.sample_rate_hz:g} Hz, but sync.period_us asks for {1 / sync_period:g} Hz"
+            )
+        samples = recording.samples
+        if not samples.sync.size:
+            raise DataError(f"{where}: holds no samples to replay")
+        rows = np.searchsorted(samples.sync, np.arange(samples.sync[0], samples.sync[-1] + 1), side="right") - 1
+        self._positions = _counts(samples, robot, "position", where)[rows]
+        self._currents = _permille(samples, robot, where)[rows]
+        self._demands = self._demand(recording, robot, where)
+        self._row = 0
+        self._waiting = set(joints)
+        self.position = self._positions[0].copy()
+        self.current = self._currents[0].copy()
+        self.demand = self._demands[0].copy()
+
+    def _demand(self, recording: Recording, robot: RobotConfig, where: str) -> Raw32:
+        stream = next((s for s in recording.streams.values() if s.named("demand")), None)
+        if stream is None or not stream.sync.size:
+            return self._positions
+        first = recording.samples.sync[0]
+        at = np.searchsorted(stream.sync, np.arange(first, first + len(self._positions)), side="right") - 1
+        return _counts(stream, robot, "demand", where)[np.maximum(at, 0)]
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last sample has been reached."""
+        return self._row == len(self._positions) - 1
+
+    def enable(self, joint: int, enabled: bool) -> None:
+        """Start playing when the last drive is enabled."""
+        if enabled:
+            self._waiting.discard(joint)
+
+    def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
+        """Set points mean nothing to a recording."""
+
+    def advance(self) -> None:
+        """Go on to the next sample."""
+        if self._waiting or self.finished:
+            return
+        self._row += 1
+        self.position[:] = self._positions[self._row]
+        self.current[:] = self._currents[self._row]
+        self.demand[:] = self._demands[self._row]
+
+
+def _counts(stream: Stream, robot: RobotConfig, quantity: str, where: str) -> Raw32:
+    """Motor positions of a stream in counts, shape (N, n)."""
+    name = stream.named("position" if quantity == "position" else "demand")
+    if name is None:
+        raise DataError(f"{where}: has no positions to replay")
+    motor = stream.si(name)
+    if stream.fields[name].side == "joint":
+        motor = motor @ robot.transmission_matrix.T
+    counts = np.rint(motor * counts_per_si(robot))
+    if not np.isfinite(counts).all() or np.abs(counts).max() > np.iinfo(np.int32).max:
+        raise DataError(f"{where}: {name} does not fit into 32 bits of encoder counts")
+    return counts.astype(np.int32)
+
+
+def _permille(stream: Stream, robot: RobotConfig, where: str) -> NDArray[np.int16]:
+    """Motor currents of a stream in per mille of rated, shape (N, n)."""
+    name = stream.named("current") or stream.named("torque")
+    if name is None:
+        raise DataError(f"{where}: has neither currents nor torques to replay")
+    field, values = stream.fields[name], stream.si(name)
+    if field.quantity == "torque":
+        if field.side == "joint":
+            values = np.linalg.solve(robot.transmission_matrix.T, values.T).T
+        values = values / np.array([joint.drive.gain for joint in robot.joints])
+    permille = np.rint(values * 1000.0 / np.array([joint.drive.rated for joint in robot.joints]))
+    if not np.isfinite(permille).all():
+        raise DataError(f"{where}: {name} holds values that are not numbers")
+    limit = np.iinfo(np.int16).max
+    worst = int(np.abs(permille).max(axis=0).argmax())
+    if np.abs(permille).max() > limit:
+        raise DataError(
+            f"{where}: {name} of {robot.joints[worst].name} exceeds {limit / 1000:g} times the rated current"
+        )
+    return permille.astype(np.int16)
