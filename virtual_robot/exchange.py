@@ -35,6 +35,7 @@ LIVE = {
     FOLLOWING_ERROR: ERROR,
 }
 TARGET, CONTROL, IGNORED = range(3)
+RECEIVED = {TARGET_POSITION: TARGET, CONTROLWORD: CONTROL}
 IDENTIFIERS = 2048
 
 
@@ -147,9 +148,7 @@ class Exchange:
             for cob_id, kind, mapped in drive.pdos(RPDO_COMMUNICATION):
                 entries, offset = [], 0
                 for index, _, size in mapped:
-                    entries.append(
-                        ({TARGET_POSITION: TARGET, CONTROLWORD: CONTROL}.get(index, IGNORED), j, offset, size)
-                    )
+                    entries.append((RECEIVED.get(index, IGNORED), j, offset, size))
                     offset += size
                 rx.append((cob_id, kind, entries))
         self._tx_kinds, self._tx_first, self._tx = _flat(tx)

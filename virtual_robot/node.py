@@ -104,6 +104,10 @@ class Nmt(NmtSlave):
         self._state = int(NmtState.PRE_OPERATIONAL)
         self.start_heartbeat(int.from_bytes(self._local_node.get_data(HEARTBEAT_PRODUCER, 0), "little"))
 
+    def halt(self) -> None:
+        """Stop the heartbeat."""
+        self.stop_heartbeat()
+
     @property
     def operational(self) -> bool:
         """Whether PDOs are exchanged."""

@@ -45,7 +45,8 @@ class Replay:
             )
         if abs(recording.sample_rate_hz * sync_period - 1) > RATE_TOLERANCE:
             raise ConfigError(
-                f"{where}: sampled at {recording.sample_rate_hz:g} Hz, but sync.period_us asks for {1 / sync_period:g} Hz"
+                f"{where}: sampled at {recording.sample_rate_hz:g} Hz, "
+                f"but the session's sync.period_us asks for {1 / sync_period:g} Hz"
             )
         samples = recording.samples
         if not samples.sync.size:
@@ -113,15 +114,13 @@ def _permille(stream: Stream, robot: RobotConfig, where: str) -> NDArray[np.int1
     field, values = stream.fields[name], stream.si(name)
     if field.quantity == "torque":
         if field.side == "joint":
-            values = np.linalg.solve(robot.transmission_matrix.T, values.T).T
+            values = values @ np.linalg.inv(robot.transmission_matrix)
         values = values / np.array([joint.drive.gain for joint in robot.joints])
     permille = np.rint(values * 1000.0 / np.array([joint.drive.rated for joint in robot.joints]))
     if not np.isfinite(permille).all():
         raise DataError(f"{where}: {name} holds values that are not numbers")
-    limit = np.iinfo(np.int16).max
-    worst = int(np.abs(permille).max(axis=0).argmax())
-    if np.abs(permille).max() > limit:
-        raise DataError(
-            f"{where}: {name} of {robot.joints[worst].name} exceeds {limit / 1000:g} times the rated current"
-        )
-    return permille.astype(np.int16)
+    if np.abs(permille).max() > np.iinfo(np.int16).max:
+        joint = robot.joints[int(np.abs(permille).max(axis=0).argmax())].name
+        raise DataError(f"{where}: {name} of {joint} exceeds 32 times the rated current")
+    fitting: NDArray[np.int16] = permille.astype(np.int16)
+    return fitting

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from configs import ConfigError, RobotConfig, SessionConfig
 from drivers.frames import FrameBus, frames
 from drivers.objects import COB_MASK, COB_NMT, COB_SDO_REQUEST, COB_SYNC, DriveState
-from drivers.socketcan import RawSocket
+from drivers.udp import open_bus
 from virtual_robot.arm import Motion, counts_per_si
 from virtual_robot.exchange import Exchange
 from virtual_robot.node import Drive
@@ -56,8 +56,9 @@ class ServerReport:
             else f"at worst {self.backlog_max - 1} SYNC behind ({self.lateness_max_us / 1000:.1f} ms)"
         )
         return (
-            f"{self.syncs} SYNC answered, after {self.lateness_p50_us:.0f} us (p50), {self.lateness_p99_us:.0f} us (p99), "
-            f"{self.lateness_max_us:.0f} us (worst); {behind}; {100 * self.cpu_share:.0f} % of one CPU; "
+            f"{self.syncs} SYNC answered, after {self.lateness_p50_us:.0f} us (p50), "
+            f"{self.lateness_p99_us:.0f} us (p99), {self.lateness_max_us:.0f} us (worst); {behind}; "
+            f"{100 * self.cpu_share:.0f} % of one CPU; "
             f"{self.dropped} frames dropped by the kernel"
         )
 
@@ -83,17 +84,16 @@ class Server:
         names = [joint.name for joint in robot.joints]
         self._dirty = self._status_dirty = False
         self.drives: list[Drive] = []
+        told = (self._changed, self._status_changed)
         for node in session.drives:
             j = names.index(node.joint)
-            self.drives.append(
-                Drive(node.node_id, node.eds, j, robot.joints[j], motion, self._changed, self._status_changed)
-            )
+            self.drives.append(Drive(node.node_id, node.eds, j, robot.joints[j], motion, *told))
         self._limit = _following_limit(robot)
         self._histogram = np.zeros(LATENESS_BINS + 1, np.int64)
         self._latest = 0.0
         self._backlog = self._syncs = 0
         self._seconds = self._cpu = 0.0
-        self._bus: FrameBus = open_frames(session)
+        self._bus: FrameBus = open_bus(session.bus, filters=((COB_SYNC, COB_MASK), *PDO_FILTERS))
         try:
             self._network = open_network(session, self.drives)
         except BaseException:
@@ -125,7 +125,7 @@ class Server:
     def __exit__(self, *_: object) -> None:
         """Take the drives off the bus."""
         for drive in self.drives:
-            drive.nmt.stop_heartbeat()
+            drive.nmt.halt()
         self._network.disconnect()
         self._bus.close()
 
@@ -196,22 +196,6 @@ class Server:
 
 def _following_limit(robot: RobotConfig) -> NDArray[np.float64]:
     return FOLLOWING_ERROR_LIMIT * np.abs(np.diag(robot.transmission_matrix)) * counts_per_si(robot)
-
-
-def open_frames(session: SessionConfig) -> FrameBus:
-    """Open the socket of the SYNC loop: SYNC and RPDOs only.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such bus.
-    """
-    bus = session.bus
-    if bus.interface == "socketcan":
-        return RawSocket(bus.channel, filters=((COB_SYNC, COB_MASK), *PDO_FILTERS))
-    from drivers.udp import UdpBus
-
-    return UdpBus(bus.channel)
 
 
 def open_network(session: SessionConfig, drives: Sequence[Drive]) -> Any:
