@@ -33,12 +33,12 @@ $(PY):
 	"$(PYTHON)" -m venv $(VENV)
 
 $(VENV)/.lock: requirements.lock | $(PY)
-	@echo "installing what requirements.lock lists into $(VENV)"
-	$(PY) -m pip install -q --disable-pip-version-check --require-hashes -r requirements.lock
+	@echo "installing what requirements.lock lists into $(VENV) (a minute or two)"
+	$(PY) -m pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
 	touch $@
 
 $(VENV)/.project: pyproject.toml $(VENV)/.lock
-	@$(PY) -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@$(PY) -m pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
 	mkdir -p .cache/numba
 	touch $@
 
@@ -75,7 +75,7 @@ bench: install ## figures of ours beside those of named alternatives
 	@$(PY) -m tests.benchmarks.run
 
 lock: install ## write requirements.lock anew from the ranges in pyproject.toml
-	@$(PY) -m pip install -q --disable-pip-version-check uv
+	@$(PY) -m pip install -qq --disable-pip-version-check uv
 	$(VENV)/bin/uv pip compile --upgrade --universal --python-version 3.11 --extra dev --generate-hashes --no-header \
 		--no-annotate --no-emit-index-url --no-emit-find-links -q -o requirements.lock pyproject.toml
 
