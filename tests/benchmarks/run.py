@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import ModuleType
 
 from drivers.vcan import launcher_command
 from tests.benchmarks.harness import Row
@@ -39,7 +40,7 @@ def main(arguments: list[str]) -> int:
     return int(failed)
 
 
-def _module(name: str) -> object:
+def _module(name: str) -> ModuleType:
     return importlib.import_module(f"tests.benchmarks.{name}")
 
 
@@ -49,7 +50,7 @@ def _run(names: list[str]) -> tuple[list[Row], bool]:
     for name in names:
         print(f"{name} ...", file=sys.stderr, flush=True)
         try:
-            rows += _module(name).run()  # type: ignore[attr-defined]
+            rows += _module(name).run()
         except Exception as error:  # the others are still worth running
             print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
             failed = True
@@ -65,9 +66,8 @@ def _print(rows: list[Row]) -> None:
         alternative = "" if row.alternative is None else f"{row.alternative:.4g}"
         ratio = "" if row.ratio is None else f"{row.ratio:.3g}"
         table.add_row(row.name, f"{row.ours:.4g}", alternative, ratio, row.unit, row.note)
-    console = Console()
-    # a redirected table keeps its columns whatever COLUMNS says
-    Console(width=None if console.is_terminal else 160).print(table)
+    # a redirected table is not squeezed into the width of a terminal that is not there
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
 
 
 if __name__ == "__main__":

@@ -32,9 +32,11 @@ except KeyboardInterrupt:
 """
 
 
-def launch(command: list[str], buses: int = 1, **options: object) -> "subprocess.CompletedProcess[str]":
+def launch(
+    command: list[str], buses: int = 1, cwd: Path | None = None, env: dict[str, str] | None = None
+) -> "subprocess.CompletedProcess[str]":
     line = launcher_command(command, buses)
-    return subprocess.run(line, capture_output=True, text=True, timeout=120, check=False, **options)  # type: ignore[call-overload, no-any-return]
+    return subprocess.run(line, capture_output=True, text=True, timeout=120, check=False, cwd=cwd, env=env)
 
 
 @needs_launcher
