@@ -12,6 +12,7 @@ from configs import RobotConfig, SessionConfig
 
 Quantity = Literal["position", "velocity", "current", "voltage", "torque", "demand", "status"]
 Side = Literal["motor", "joint"]
+MarkKind = Literal["experiment_start", "experiment_end", "note", "emcy", "heartbeat_lost"]
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Gap:
 class Mark:
     """An experiment begins or ends, or something worth keeping happened, at a SYNC number."""
 
-    kind: Literal["experiment_start", "experiment_end", "note", "emcy", "heartbeat_lost"]
+    kind: MarkKind
     sync: int
     t_ns: int
     text: str = ""

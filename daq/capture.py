@@ -1,0 +1,386 @@
+"""The capture daemon: starts the drives, moves them if asked to, and records every SYNC of it."""
+
+import datetime
+import json
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from configs import (
+    ArmidentError,
+    ConfigError,
+    RobotConfig,
+    SessionConfig,
+    Trajectory,
+    load_robot,
+    load_session,
+    load_trajectory,
+)
+from daq.assembler import Assembler
+from daq.facts import host_facts
+from daq.motion import Motion, plan_motion
+from daq.publisher import Publisher
+from daq.recording import Mark, RecordingWriter
+from daq.sink import Sink
+from daq.streams import CapturedStream, captured_streams
+from daq.zenoh_keys import Keys
+from drivers.bus_load import check_fits
+from drivers.frames import FrameBus, frames
+from drivers.master import DriveMaster
+from drivers.objects import COB_MASK, COB_SYNC
+from drivers.sync import SyncProducer
+from drivers.udp import NOTE, open_bus
+
+BATCH = 4096
+HEALTH_S = 1.0
+LAST_ANSWERS_S = 0.1
+"""How long answers to the last SYNC are waited for."""
+QUICK_STOP_S = 0.3
+"""How long a quick stop is given before the drives are disabled."""
+
+
+@dataclass(frozen=True)
+class Captured:
+    """What a capture left: the finished recording, its counters and marks, and what ended it early."""
+
+    path: Path
+    counters: dict[str, int]
+    marks: tuple[Mark, ...]
+    trouble: ArmidentError | None
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be captured, checked before anything is touched."""
+
+    session: SessionConfig
+    robot: RobotConfig
+    streams: tuple[CapturedStream, ...]
+    trajectory: Trajectory | None
+    directory: Path
+    duration: float | None = None
+    listen_only: bool = False
+
+    @property
+    def producing(self) -> bool:
+        """Whether we send SYNC."""
+        return self.session.sync.role == "producer" and not self.listen_only
+
+
+def prepare(config: str | Path, out: Path | None, duration: float | None, listen_only: bool) -> Order:
+    """Load and check everything a capture needs.
+
+    Raises
+    ------
+    ConfigError
+        For whatever is wrong with the configuration, the trajectory's limits, or the load of the bus.
+    """
+    session = load_session(config)
+    robot = load_robot(session.robot)
+    check_fits(session, str(config))
+    trajectory = None
+    if session.setpoints is not None and not listen_only:
+        if session.sync.role != "producer":
+            raise ConfigError(f"{config}: setpoints need sync.role producer; only who sends SYNC can play them")
+        trajectory = load_trajectory(session.setpoints.trajectory)
+        trajectory.check(robot, str(session.setpoints.trajectory))
+    directory = out if out is not None else session.recording.directory
+    return Order(session, robot, captured_streams(session, robot), trajectory, directory, duration, listen_only)
+
+
+def capture(order: Order, stop: threading.Event, say: Callable[[str], None]) -> Captured:
+    """Run one capture from the first SDO to the finished file.
+
+    Parameters
+    ----------
+    order
+        What to capture.
+    stop
+        Set it to end the capture; the file is finished all the same.
+    say
+        Takes lines that tell how it goes.
+
+    Returns
+    -------
+    Captured
+        With ``trouble`` if the bus or a drive failed on the way; the recording is finished then too.
+
+    Raises
+    ------
+    ConfigError
+        If it could not start: bus, drives, mapping, disk, Zenoh. Nothing is left behind then.
+    """
+    session, robot = order.session, order.robot
+    now = datetime.datetime.now(datetime.UTC)
+    name = f"{robot.name}-{now:%Y%m%dT%H%M%S}-{now.microsecond // 1000:03d}Z"
+    with ExitStack() as stack:
+        metadata = host_facts(now) | {"capture": name, "cell": session.cell}
+        rate = 1.0 / session.sync_period
+        writer = stack.enter_context(
+            RecordingWriter(
+                order.directory / f"{name}.mcap",
+                robot,
+                session,
+                rate,
+                [stream.layout for stream in order.streams],
+                metadata,
+                session.recording.chunk_ms * 1_000_000,
+            )
+        )
+        try:
+            bus = stack.enter_context(open_bus(session.bus, filters=_filters(order)))
+            if session.bus.interface == "udp_multicast":
+                say(NOTE)
+            publisher = Publisher(session, Keys(session.cell, robot.name))
+            stack.callback(publisher.close)
+            run = _Run(order, bus, Sink(writer, publisher, order.streams, name), publisher, stop, say)
+            run.start(stack)
+        except BaseException:
+            writer.abort()
+            raise
+        run.sink.announce(robot, session, rate, metadata)
+        say(f"recording to {writer.path}")
+        trouble = run.record()
+        counters = run.counters()
+        run.sink.finish(counters)
+        if writer.problem is not None:
+            say(f"warning: {writer.lost_rows} rows not written: {writer.problem}")
+        return Captured(writer.path, counters, tuple(run.sink.marks), trouble)
+
+
+def _filters(order: Order) -> list[tuple[int, int]]:
+    wanted = [COB_SYNC, *(cob_id for stream in order.streams for cob_id in stream.bus.cob_ids)]
+    return [(can_id, COB_MASK) for can_id in wanted]
+
+
+class _Run:
+    """The state of one capture while it runs."""
+
+    def __init__(
+        self,
+        order: Order,
+        bus: FrameBus,
+        sink: Sink,
+        publisher: Publisher,
+        stop: threading.Event,
+        say: Callable[[str], None],
+    ) -> None:
+        self.sink = sink
+        self._order, self._bus, self._publisher, self._stop, self._say = order, bus, publisher, stop, say
+        session = order.session
+        self._assembler = Assembler(
+            [stream.bus for stream in order.streams],
+            [joint.name for joint in order.robot.joints],
+            session.sync.period_us * 1000,
+            session.sync.counter,
+            1 if order.producing else None,
+        )
+        self._batch = frames(BATCH)
+        self._producer: SyncProducer | None = None
+        self._master: DriveMaster | None = None
+        self._motion: Motion | None = None
+        self._span: tuple[int, int] | None = None
+        self._frames_before = 0
+        self._events = {"emcy": 0, "heartbeat_lost": 0}
+
+    def start(self, stack: ExitStack) -> None:
+        """Configure and enable the drives, and start SYNC; whatever was started is stopped when the stack unwinds."""
+        order, session = self._order, self._order.session
+        if order.listen_only:
+            return
+        self._master = stack.enter_context(DriveMaster(session, order.robot))
+        self._say(f"configuring {len(session.drives)} drives on {session.bus.channel}")
+        self._master.configure()
+        # Whoever else produces SYNC also moves the arm.
+        self._master.start(enable=order.producing)
+        if order.trajectory is not None:
+            by_joint = dict(zip((d.joint for d in session.drives), self._master.positions(), strict=True))
+            actual = np.array([by_joint[joint.name] for joint in order.robot.joints], dtype=np.int64)
+            self._motion = plan_motion(session, order.robot, order.trajectory, actual)
+        if order.producing:
+            self._producer = SyncProducer(session.bus, session.sync.period_us, session.sync.counter)
+            self._producer.start()
+            stack.callback(self._producer.stop)
+
+    def record(self) -> ArmidentError | None:
+        """Drain, match, write and publish until it is over; what ended it early, if something did."""
+        trouble: ArmidentError | None = None
+        try:
+            self._play()
+            self._loop()
+        except ArmidentError as error:
+            trouble = error
+        self._come_to_rest(trouble is not None or self._stop.is_set())
+        self._mark_end(trouble)
+        return trouble
+
+    def counters(self) -> dict[str, int]:
+        """All counts of the capture."""
+        counters = self._assembler.counters | self._events
+        counters["kernel_drops"] = self._bus.dropped
+        if self._producer is not None:
+            stats = self._producer.stats()
+            counters |= {
+                "sync_sent": stats.sent,
+                "sync_late_p99_us": round(stats.late_p99_us),
+                "sync_late_max_us": round(stats.late_max_us),
+                "sync_overruns": stats.overruns,
+                "sync_skipped_periods": stats.skipped,
+            }
+        return counters
+
+    def _play(self) -> None:
+        if self._producer is not None and self._motion is not None:
+            self._span = self._motion.span(self._producer.play(self._motion.plan))
+            self.sink.mark("experiment_start", self._span[0])
+            self.sink.mark("experiment_end", self._span[1])
+            self._say(f"moving: {len(self._motion.plan.rows) * self._motion.plan.every * self._period:.1f} s")
+
+    @property
+    def _period(self) -> float:
+        return self._order.session.sync_period
+
+    def _last_wanted(self) -> float:
+        """Number of the SYNC after which the capture is over by itself."""
+        wanted = float("inf")
+        if self._order.duration is not None:
+            wanted = round(self._order.duration / self._period) - 1
+        if self._producer is not None and self._motion is not None and self._span is not None:
+            plan = self._motion.plan
+            wanted = min(wanted, self._span[1] + (len(plan.rows) - 1 - self._motion.last) * plan.every)
+        return wanted
+
+    def _loop(self) -> None:
+        last, drain = self._last_wanted(), self._order.session.recording.drain_ms * 1e-3
+        due = reported = time.monotonic()
+        deadline = None if self._order.duration is None else due + self._order.duration
+        while not self._stop.is_set() and self._assembler.last_sync < last:
+            due = max(due + drain, time.monotonic())
+            time.sleep(max(0.0, due - time.monotonic()))
+            self._drain()
+            self._watch()
+            now = time.monotonic()
+            if now - reported >= HEALTH_S:
+                self._report_health(now - reported)
+                reported = now
+            if deadline is not None and now > deadline and self._assembler.last_sync < 0:
+                raise ArmidentError(f"bus {self._bus.channel}: no SYNC within {self._order.duration:g} s")
+
+    def _drain(self) -> int:
+        total = 0
+        while True:
+            got = self._bus.receive(self._batch)
+            sent = self._producer.sent if self._producer is not None else None
+            if got:
+                self.sink.take(self._assembler.push(self._batch[:got], sent))
+                self._mark_start()
+            total += got
+            if got < BATCH:
+                return total
+
+    def _watch(self) -> None:
+        """Look after SYNC and drives; a drive that fails while we move the arm ends the capture."""
+        if self._producer is not None:
+            self._producer.check()
+        for event in self._master.supervise() if self._master is not None else ():
+            if event.kind in ("emcy", "heartbeat_lost"):
+                self._events[event.kind] += 1
+                self.sink.mark(event.kind, max(self._assembler.last_sync, 0), event.text)
+            else:
+                self.sink.mark("note", max(self._assembler.last_sync, 0), event.text)
+            self._say(event.text)
+            failed = event.kind == "heartbeat_lost" or (event.kind == "emcy" and event.code != 0)
+            if failed and self._motion is not None:
+                raise ArmidentError(f"{event.text}; the arm was stopped")
+
+    def _mark_start(self) -> None:
+        if self._span is None and self._motion is None and self.sink.first_sync is not None:
+            self._span = self.sink.first_sync, -1
+            self.sink.mark("experiment_start", self.sink.first_sync)
+
+    def _come_to_rest(self, early: bool) -> None:
+        """Stop and disable the drives, then SYNC, and take the last answers; never raises."""
+        with suppress(ArmidentError):
+            if self._master is not None:
+                if early and self._motion is not None:
+                    self._master.quick_stop()
+                    self._rest(QUICK_STOP_S)
+                self._rest(0.0)
+                self._master.stop()
+        if self._producer is not None:
+            self._producer.stop()
+        with suppress(ArmidentError):
+            self._rest(LAST_ANSWERS_S)
+        sent = self._producer.sent if self._producer is not None else None
+        self.sink.take(self._assembler.finish(sent))
+
+    def _rest(self, seconds: float) -> None:
+        """Go on recording for so long."""
+        until = time.monotonic() + seconds
+        self._drain()
+        while time.monotonic() < until:
+            time.sleep(min(0.01, max(0.0, until - time.monotonic())))
+            self._drain()
+
+    def _mark_end(self, trouble: ArmidentError | None) -> None:
+        if self._span is None:
+            return
+        if self._motion is None:
+            self.sink.mark("experiment_end", self.sink.last_sync)
+        elif self._span[0] <= self.sink.last_sync < self._span[1]:
+            why = str(trouble) if trouble is not None else "stopped"
+            self.sink.move_mark("experiment_end", self.sink.last_sync, f"before its end: {why}")
+
+    def _report_health(self, seconds: float) -> None:
+        counters = self._assembler.counters
+        rate = (counters["frames"] - self._frames_before) / seconds
+        self._frames_before = counters["frames"]
+        self._publisher.health(
+            {
+                "sync": self._assembler.last_sync,
+                "frames_per_s": round(rate, 1),
+                "rows": counters["samples.rows"],
+                "rows_in_gaps": counters["samples.in_gaps"],
+                "kernel_drops": self._bus.dropped,
+                "queue_depth": self._publisher.depth,
+                "blocks_dropped": self._publisher.dropped,
+            }
+        )
+        self._publisher.status({"state": "recording", "sync": self._assembler.last_sync})
+
+
+def run_capture(config: str, out: Path | None, duration: float | None, listen_only: bool, as_json: bool) -> None:
+    """``armident capture``: runs until it is over, SIGINT or SIGTERM, and tells how it went.
+
+    Raises
+    ------
+    ConfigError
+        If it could not start.
+    ArmidentError
+        If the bus or a drive failed on the way; the file is finished then too.
+    """
+    order = prepare(config, out, duration, listen_only)
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+
+    def say(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    done = capture(order, stop, say)
+    rows, gaps = done.counters["samples.rows"], done.counters["samples.in_gaps"]
+    say(f"recorded {rows} samples, {gaps} in gaps, {done.counters['kernel_drops']} frames dropped by the kernel")
+    if as_json:
+        print(json.dumps({"recording": str(done.path), "counters": done.counters}))
+    else:
+        print(done.path)
+    sys.stdout.flush()
+    if done.trouble is not None:
+        raise done.trouble

@@ -1,0 +1,47 @@
+"""Facts about the machine and the program that a recording keeps."""
+
+import datetime
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+_CLOCK = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+_GIT_TIMEOUT_S = 2.0
+
+
+def host_facts(now: datetime.datetime) -> dict[str, str]:
+    """Host, kernel, clock, program version and git revision, as far as they can be told."""
+    facts = {
+        "started_utc": now.astimezone(datetime.UTC).isoformat(timespec="microseconds"),
+        "host": platform.node(),
+        "kernel": platform.release(),
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+    }
+    try:
+        facts["armident"] = version("armident")
+    except PackageNotFoundError:
+        facts["armident"] = "unpackaged"
+    revision = git_revision(Path(__file__).resolve().parent)
+    if revision is not None:
+        facts["git_revision"] = revision
+    if _CLOCK.is_file():
+        facts["clocksource"] = _CLOCK.read_text().strip()
+    return facts
+
+
+def git_revision(folder: Path) -> str | None:
+    """Revision of the working tree that ``folder`` is in, with ``+`` if it was changed; ``None`` if it is in none."""
+    try:
+        head = _git(folder, "rev-parse", "HEAD")
+        changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", ".")
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return head + ("+" if changed else "")
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(folder), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=_GIT_TIMEOUT_S)
+    return done.stdout.strip()

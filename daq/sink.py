@@ -1,0 +1,113 @@
+"""Where captured rows go: the recording, and Zenoh."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from configs import RobotConfig, SessionConfig
+from daq.assembler import Batch, Rows
+from daq.publisher import Publisher
+from daq.recording import Gap, Mark, RecordingWriter
+from daq.recording.model import MarkKind
+from daq.streams import CapturedStream
+from daq.zenoh_keys import Block, encode_event
+from daq.zenoh_keys.codec import end_content, start_content
+
+
+class Sink:
+    """Writes batches to the recording, offers them to Zenoh, and places marks at their SYNC.
+
+    Parameters
+    ----------
+    writer
+        The recording being written.
+    publisher
+        Where blocks are offered.
+    streams
+        The session's streams.
+    capture
+        Name of this capture, the same in all its events.
+    """
+
+    def __init__(
+        self, writer: RecordingWriter, publisher: Publisher, streams: Sequence[CapturedStream], capture: str
+    ) -> None:
+        self.gaps: list[Gap] = []
+        self.marks: list[Mark] = []
+        self.first_sync: int | None = None
+        self.last_sync = -1
+        self.last_ns = 0
+        self._writer, self._publisher = writer, publisher
+        self._streams, self._capture = tuple(streams), capture
+        self._blocks = 0
+        self._planned: list[tuple[MarkKind, int, str]] = []
+
+    def announce(
+        self, robot: RobotConfig, session: SessionConfig, sample_rate_hz: float, metadata: dict[str, str]
+    ) -> None:
+        """Say on Zenoh what is about to come."""
+        layouts = [stream.layout for stream in self._streams]
+        content = start_content(self._capture, robot, session, sample_rate_hz, layouts, metadata)
+        self._publisher.event(encode_event("experiment_start", content))
+
+    def mark(self, kind: MarkKind, sync: int, text: str = "") -> None:
+        """Place a mark at a SYNC, now or when that SYNC has come."""
+        self._planned.append((kind, sync, text))
+        self._place_marks(False)
+
+    def move_mark(self, kind: MarkKind, sync: int, text: str) -> None:
+        """Bring a mark forward that was planned for later."""
+        self._planned = [planned for planned in self._planned if planned[0] != kind]
+        self.mark(kind, sync, text)
+
+    def take(self, batch: Batch) -> None:
+        """Write and publish what became certain."""
+        for stream in self._streams:
+            rows = batch.rows[stream.bus.name]
+            if rows.sync.size == 0:
+                continue
+            raw = stream.decode(rows)
+            self._writer.append(stream.bus.name, rows.sync, rows.t_ns, raw)
+            self._publisher.offer(Block(stream.layout, self._blocks, rows.sync, rows.t_ns, raw))
+            self._blocks += 1
+            if stream.bus.name == "samples":
+                if self.first_sync is None:
+                    self.first_sync = int(rows.sync[0])
+                self.last_sync, self.last_ns = int(rows.sync[-1]), int(rows.t_ns[-1])
+                self._place_marks(False, rows)
+        if batch.gaps:
+            self.gaps += batch.gaps
+            self._writer.add_gaps(batch.gaps, self.last_ns)
+            found = [asdict(gap) for gap in batch.gaps]
+            self._publisher.event(encode_event("gaps", {"capture": self._capture, "gaps": found}))
+
+    def finish(self, counters: dict[str, int]) -> None:
+        """Place the last marks, close the recording, and say on Zenoh what it holds."""
+        self._place_marks(True)
+        self._writer.flush()
+        counters["writer.rows_lost"] = self._writer.lost_rows
+        counters["zenoh.blocks"] = self._blocks
+        counters["zenoh.blocks_dropped"] = self._publisher.dropped
+        counters["gaps"] = len(self.gaps)
+        self._writer.close(counters)
+        path = self._writer.path.resolve()
+        content = end_content(self._capture, self._blocks, counters, self.gaps, self.marks, path)
+        self._publisher.event(encode_event("experiment_end", content))
+
+    def _place_marks(self, final: bool, rows: Rows | None = None) -> None:
+        due = [planned for planned in self._planned if final or planned[1] <= self.last_sync]
+        self._planned = [planned for planned in self._planned if planned not in due]
+        for kind, sync, text in due:
+            row = len(rows.sync) if rows is None else int(np.searchsorted(rows.sync, sync))
+            t_ns = int(rows.t_ns[row]) if rows is not None and row < len(rows.sync) else self.last_ns
+            mark = Mark(kind, sync, t_ns, text)
+            self.marks.append(mark)
+            self._writer.add_marks([mark])
+            self._publisher.event(encode_event("mark", {"capture": self._capture, **asdict(mark, dict_factory=_mark)}))
+
+
+def _mark(entries: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The entries of a mark, its kind under a name that the event's own kind leaves free."""
+    return {("mark" if key == "kind" else key): value for key, value in entries}
