@@ -22,7 +22,7 @@ Frames = NDArray[Any]
 """An array of ``FRAME`` of shape (N,)."""
 
 
-class BusDown(ArmidentError):  # noqa: N818
+class BusDown(ArmidentError):
     """The bus went down, or its interface was removed, while it was in use."""
 
 

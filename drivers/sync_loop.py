@@ -4,7 +4,7 @@ import errno
 from typing import Any
 
 import numpy as np
-from numba import carray, njit, types  # type: ignore[attr-defined]
+from numba import carray, njit, types
 from numpy.typing import NDArray
 
 from drivers.objects import COB_SYNC
