@@ -43,7 +43,7 @@ class ArmModel:
 
     @classmethod
     def from_config(cls, robot: RobotConfig) -> Self:
-        """The model of a robot configuration."""
+        """Build the model of a robot configuration."""
         chain = chain_of(robot)
         names = standard_names(robot)
         columns = columns_of(robot, names)
@@ -123,7 +123,7 @@ class ArmModel:
         return out
 
     def standard_from_base(self, theta_base: ArrayLike) -> Floats:
-        """Standard parameters (p,) with the same dynamics as the base ones: the eliminated ones are zero."""
+        """Fill standard parameters (p,) with the base ones, the others zero: the dynamics are the same."""
         theta = np.zeros(len(self.names))
         theta[self.base.independent] = theta_base
         return theta

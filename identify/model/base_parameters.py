@@ -53,7 +53,7 @@ class BaseParameters:
 
 
 def base_parameters(robot: RobotConfig, chain: Chain, columns: Columns, names: tuple[str, ...]) -> BaseParameters:
-    """Base parameters of a robot: Khalil's rules, completed where a random regressor shows more dependences."""
+    """Find base parameters: Khalil's rules, completed where a random regressor shows more dependences."""
     forms = khalil_rules(robot, chain, names)
     lengths = lengths_of(chain)
     where = {name: k for k, name in enumerate(names)}

@@ -52,12 +52,13 @@ class DiscreteController:
     @property
     def n(self) -> int:
         """Number of motors."""
-        return int(self.saturation.shape[0])
+        return int(self.saturation.size)
 
     @property
     def memory(self) -> int:
         """How many samples back the controller looks, the present one included."""
-        return max(1, self.error_taps.shape[1], self.position_taps.shape[1], self.output_taps.shape[1] + 1)
+        widths = (self.error_taps.shape[1], self.position_taps.shape[1], self.output_taps.shape[1] + 1)
+        return max(int(width) for width in widths)
 
     @classmethod
     def cascade(

@@ -20,14 +20,14 @@ def smooth_sign(x: float, smoothing: float) -> float:
 
 @inlined
 def into_child(ca: float, sa: float, c: float, s: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A vector of frame j-1 written in frame j."""
+    """Write a vector of frame j-1 in frame j."""
     t = ca * y + sa * z
     return c * x + s * t, c * t - s * x, ca * z - sa * y
 
 
 @inlined
 def into_parent(ca: float, sa: float, c: float, s: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A vector of frame j written in frame j-1."""
+    """Write a vector of frame j in frame j-1."""
     t = s * x + c * y
     return c * x - s * y, ca * t - sa * z, sa * t + ca * z
 

@@ -23,7 +23,7 @@ PARALLEL = 1e-9
 
 
 def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> dict[str, Form]:
-    """Base parameters as forms in the standard ones, by the rules of thesis section A.3.
+    """Derive base parameters as forms in the standard ones (thesis section A.3).
 
     Returns
     -------
@@ -87,7 +87,7 @@ def lengths_of(chain: Chain) -> dict[str, float]:
 
 
 def text_of(name: str, form: Form, names: tuple[str, ...]) -> str:
-    """A form as a formula, as in table B.3: ``name`` first, then by ``names``, equal coefficients bracketed."""
+    """Write a form as in table B.3: ``name`` first, then by ``names``, equal coefficients bracketed."""
     groups: dict[str, list[str]] = {}
     polynomials: dict[str, Polynomial] = {}
     for parameter in (name, *(other for other in names if other in form and other != name)):
@@ -215,7 +215,7 @@ def _axes(chain: Chain) -> tuple[list[Floats], list[Floats]]:
 
 
 def _in_link_frame(chain: Chain, j: int, direction: Floats, axes: list[Floats]) -> Floats:
-    """A direction of the base frame, at the zero posture, in the frame of link j."""
+    """Write a direction of the base frame, at the zero posture, in the frame of link j."""
     rotation = np.eye(3)
     for k in range(j + 1):
         ca, sa = chain.cos_alpha[k], chain.sin_alpha[k]

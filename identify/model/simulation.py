@@ -29,10 +29,10 @@ RUNAWAY = 10.0
 NEAR_STANDSTILL = 4.0
 """``g |qd|`` under which the smoothed sign bends so much that its slope changes within a sample."""
 
-STEPS_PER_UNIT = 2.0
+STEPS_PER_UNIT = 4.0
 """Steps per unit of ``g qd`` passed within one sample near standstill."""
 
-MOST_STEPS = 8
+MOST_STEPS = 16
 """Most steps within one sample."""
 
 
