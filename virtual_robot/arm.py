@@ -89,7 +89,7 @@ class Arm:
         self._age, self._steps = np.zeros(n, np.int64), np.ones(n, np.int64)
         self._held = np.ones(n, np.bool_)
         self._error, self._error_rate, self._current = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._disturbance = np.zeros(n)
+        self._tau = np.zeros(n)
         self.position, self.current, self.demand = np.zeros(n, np.int32), np.zeros(n, np.int16), np.zeros(n, np.int32)
         self.plant.brake[:] = BRAKE
         self._control()
@@ -114,15 +114,16 @@ class Arm:
     def advance(self) -> None:
         """Move on by one SYNC period."""
         for _ in range(self._periods):
-            self.plant.advance(self._torque @ self._current + self._disturbance, servo.CONTROL_PERIOD)
+            self.plant.advance(self._tau, servo.CONTROL_PERIOD)
             self._control()
 
     def _control(self) -> None:
-        measured, self._disturbance = self._noise.next()
+        measured, disturbance = self._noise.next()
         servo.control(
             self.plant.q, self._ratio, self._per_rad, self._origin, self._target, self._age, self._steps, self._held,
             self._kp, self._kv, self._smooth, self._limit, measured, self._permille,
             self._error, self._error_rate, self._current, self.position, self.current, self.demand,
+            self._torque, disturbance, self._tau,
         )  # fmt: skip
 
 

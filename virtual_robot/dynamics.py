@@ -20,13 +20,13 @@ M2, M3 = 6.1697947043828245592553615689730, -0.42772256543218573326238373806514
 def resist(q, qd, friction, smoothing, pairs, pair_friction, brake, ratio, code, joint, parameters, out, slope):  # type: ignore[no-untyped-def]
     """Friction, couplings (eq. B.1), brakes and hidden effects: torque ``out`` (n,) and ``slope`` (n, n).
 
-    ``friction`` (n, 2) holds fv and fc; ``pairs`` (C, 2) and ``pair_friction`` (C, 2) the couplings.
+    ``friction`` (n, 3) holds fv, fc and the offset; ``pairs`` (C, 2) and ``pair_friction`` (C, 2) the couplings.
     """
     n = q.size
     slope[:, :] = 0.0
     for i in range(n):
         x = smoothing * qd[i]
-        out[i] = (friction[i, 0] + brake[i]) * qd[i] + friction[i, 1] * 2.0 / math.pi * math.atan(x)
+        out[i] = (friction[i, 0] + brake[i]) * qd[i] + friction[i, 1] * 2.0 / math.pi * math.atan(x) + friction[i, 2]
         slope[i, i] = friction[i, 0] + brake[i] + friction[i, 1] * 2.0 / math.pi * smoothing / (1.0 + x * x)
     for c in range(pairs.shape[0]):
         i, j = pairs[c, 0], pairs[c, 1]
@@ -90,7 +90,8 @@ def advance(  # type: ignore[no-untyped-def]
     period,
     q,
     qd,
-    qdd,
+    middle,
+    speed,
     tau,
     mass,
     bias,
@@ -108,7 +109,8 @@ def advance(  # type: ignore[no-untyped-def]
     """Move ``q``, ``qd`` on by ``period`` under the held torque ``tau`` (all (n,)), in place.
 
     ``mass`` (upper triangle) and ``bias`` are Pinocchio's mass matrix and nonlinear effects at the predicted
-    middle of the period; ``rotor`` (n, n) is added to the mass matrix. ``qdd`` gets the mean acceleration.
+    ``middle`` of the period; ``rotor`` (n, n) is added to the mass matrix. ``middle`` and ``speed`` get
+    the positions and velocities predicted for the middle of the next period.
     """
     n = q.size
     full = np.empty((n, n))
@@ -154,4 +156,6 @@ def advance(  # type: ignore[no-untyped-def]
             q[i] += x1[i] + M2 * x2[i] + M3 * x3[i]
             qd[i] += k1[i] + M2 * k2[i] + M3 * k3[i]
     for i in range(n):
-        qdd[i] = (qd[i] - before[i]) / period
+        half = 0.5 * (qd[i] - before[i])
+        speed[i] = qd[i] + half
+        middle[i] = q[i] + 0.5 * period * (qd[i] + 0.5 * half)

@@ -1,6 +1,7 @@
 """PDO exchange of all drives, compiled: frames to set points and live values to frames."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -40,65 +41,73 @@ IDENTIFIERS = 2048
 
 
 @njit(cache=True, error_model="numpy")
-def _answer(counter, kinds, first, row, drive, offset, size, values, due, data):  # type: ignore[no-untyped-def]
-    """Write the data of every TPDO that is due at this SYNC; their numbers into ``due``, how many is returned."""
-    count = 0
-    for p in range(kinds.size):
-        if counter % kinds[p]:
-            continue
-        for e in range(first[p], first[p + 1]):
-            value = values[row[e], drive[e]]
-            for b in range(size[e]):
-                data[count, offset[e] + b] = np.uint8(value & 0xFF)
-                value >>= 8
-        due[count] = p
-        count += 1
-    return count
+def _exchange(  # type: ignore[no-untyped-def]
+    ids, lengths, data, start, stop, sequence, period, position, before, current, demand, values,
+    tx_kinds, tx_first, tx_row, tx_drive, tx_offset, tx_size, tx_ids, tx_lengths, out_ids, out_lengths, out_data,
+    rx_kinds, rx_first, rx_what, rx_drive, rx_offset, rx_size, table, need, stored, fresh, short,
+    targets, targets_fresh, control, result,
+):  # fmt: skip
+    """Take frames from ``start`` on up to the next SYNC and answer it; returns its place, or ``stop``.
 
-
-@njit(cache=True, error_model="numpy")
-def _scan(ids, lengths, data, start, stop, table, need, stored, fresh, short):  # type: ignore[no-untyped-def]
-    """Keep RPDOs from frame ``start`` on, up to the next SYNC; its place is returned, or ``stop``."""
+    ``sequence`` is the counter of a SYNC that carries none. ``result`` (2,) gets how many frames are to be sent,
+    and whether set points (1) and controlwords (2) act at this SYNC: ``targets`` and ``control`` hold them.
+    """
+    at = stop
     for k in range(start, stop):
-        can_id = ids[k]
-        if can_id == COB_SYNC:
-            return k
-        if can_id >= IDENTIFIERS:
+        if ids[k] == COB_SYNC:
+            at = k
+            break
+        if ids[k] >= IDENTIFIERS or table[ids[k]] < 0:
             continue
-        p = table[can_id]
-        if p < 0:
-            continue
+        p = table[ids[k]]
         if lengths[k] < need[p]:
             short[p] += 1
             continue
         for b in range(8):
             stored[p, b] = data[k, b]
         fresh[p] = True
-    return stop
+    result[0] = result[1] = 0
+    if at == stop:
+        return at
+    counter = np.int64(data[at, 0]) if lengths[at] else np.int64(sequence)
 
+    for j in range(position.size):
+        values[POSITION, j] = position[j]
+        values[CURRENT, j] = current[j]
+        values[DEMAND, j] = demand[j]
+        values[VELOCITY, j] = np.int64((position[j] - before[j]) / period)
+        values[ERROR, j] = np.int64(demand[j]) - position[j]
+        before[j] = position[j]
+    count = 0
+    for p in range(tx_kinds.size):
+        if counter % tx_kinds[p]:
+            continue
+        out_ids[count] = tx_ids[p]
+        out_lengths[count] = tx_lengths[p]
+        for e in range(tx_first[p], tx_first[p + 1]):
+            value = values[tx_row[e], tx_drive[e]]
+            for b in range(tx_size[e]):
+                out_data[count, tx_offset[e] + b] = np.uint8(value & 0xFF)
+                value >>= 8
+        count += 1
+    result[0] = count
 
-@njit(cache=True, error_model="numpy")
-def _accept(counter, kinds, stored, fresh, first, what, drive, offset, size, targets, targets_fresh, control):  # type: ignore[no-untyped-def]
-    """Decode the RPDOs that act at this SYNC; returns whether there are targets (1) and controlwords (2)."""
-    found = 0
-    for p in range(kinds.size):
-        if not fresh[p] or (0 < kinds[p] <= 240 and counter % kinds[p]):
+    for p in range(rx_kinds.size):
+        if not fresh[p] or (0 < rx_kinds[p] <= 240 and counter % rx_kinds[p]):
             continue
         fresh[p] = False
-        for e in range(first[p], first[p + 1]):
-            if what[e] == IGNORED:
-                continue
+        for e in range(rx_first[p], rx_first[p + 1]):
             value = np.int64(0)
-            for b in range(size[e]):
-                value |= np.int64(stored[p, offset[e] + b]) << (8 * b)
-            if what[e] == TARGET:
-                targets[drive[e]] = np.int32(value)
-                targets_fresh[drive[e]] = True
-                found |= 1
-            else:
-                control[drive[e]] = value
-                found |= 2
-    return found
+            for b in range(rx_size[e]):
+                value |= np.int64(stored[p, rx_offset[e] + b]) << (8 * b)
+            if rx_what[e] == TARGET:
+                targets[rx_drive[e]] = np.int32(value)
+                targets_fresh[rx_drive[e]] = True
+                result[1] |= 1
+            elif rx_what[e] == CONTROL:
+                control[rx_drive[e]] = value
+                result[1] |= 2
+    return at
 
 
 class Exchange:
@@ -120,6 +129,9 @@ class Exchange:
         self._before = motion.position.copy()
         self._targets, self._targets_fresh = np.zeros(n, np.int32), np.zeros(n, np.bool_)
         self._control = np.full(n, -1, np.int64)
+        self._result = np.zeros(2, np.int64)
+        self.out = frames(0)
+        """Frames that answer the SYNC taken last."""
         self.rebuild()
 
     def rebuild(self) -> None:
@@ -154,9 +166,7 @@ class Exchange:
         self._tx_kinds, self._tx_first, self._tx = _flat(tx)
         self._tx_ids = np.array([cob_id for cob_id, _, _ in tx], np.uint32)
         self._tx_lengths = np.array([sum(e[3] for e in entries) for _, _, entries in tx], np.uint8)
-        self._due = np.zeros(len(tx), np.int64)
         self._out = frames(len(tx))
-        self._out_data = self._out["data"]
         self._rx_kinds, self._rx_first, self._rx = _flat(rx)
         self._table = np.full(IDENTIFIERS, -1, np.int64)
         for p, (cob_id, _, _) in enumerate(rx):
@@ -169,48 +179,32 @@ class Exchange:
         values[CONSTANT:] = np.array(constants).reshape(-1, n)
         self.values = values
         self.refresh_status()
-        self._fill()
-
-    def refresh(self) -> None:
-        """Take over what the motion has become."""
-        self._fill()
-        np.copyto(self._before, self._motion.position)
+        self._arrange()
 
     def refresh_status(self) -> None:
         """Take over the statuswords."""
         for drive in self._drives:
             self.values[STATUS, drive.index] = drive.status
 
-    def _fill(self) -> None:
-        motion, values = self._motion, self.values
-        values[POSITION] = motion.position
-        values[CURRENT] = motion.current
-        values[DEMAND] = motion.demand
-        values[VELOCITY] = (motion.position - self._before) / self._period
-        values[ERROR] = motion.demand - motion.position
-
-    def scan(self, batch: NDArray[np.void], start: int, stop: int) -> int:
-        """Take RPDOs from ``batch[start:stop]`` up to the next SYNC; its place, or ``stop``."""
-        return int(
-            _scan(
-                batch["can_id"], batch["length"], batch["data"], start, stop,
-                self._table, self._need, self._stored, self._fresh, self._short,
-            )
+    def _arrange(self) -> None:
+        """Put the arguments of the compiled exchange together, once per mapping."""
+        motion, out = self._motion, self._out
+        self._arguments = (
+            self._period, motion.position, self._before, motion.current, motion.demand, self.values,
+            self._tx_kinds, self._tx_first, *self._tx, self._tx_ids, self._tx_lengths,
+            out["can_id"], out["length"], out["data"],
+            self._rx_kinds, self._rx_first, *self._rx, self._table, self._need, self._stored, self._fresh, self._short,
+            self._targets, self._targets_fresh, self._control, self._result,
         )  # fmt: skip
 
-    def answer(self, counter: int) -> NDArray[np.void]:
-        """Frames of the TPDOs due at the SYNC with this counter."""
-        count = _answer(
-            counter, self._tx_kinds, self._tx_first, *self._tx, self.values, self._due, self._out_data
-        )  # fmt: skip
-        out = self._out[:count]
-        if count < self._due.size:
-            out["can_id"] = self._tx_ids[self._due[:count]]
-            out["length"] = self._tx_lengths[self._due[:count]]
-        else:
-            out["can_id"] = self._tx_ids
-            out["length"] = self._tx_lengths
-        return out
+    def take(self, ids: Any, lengths: Any, data: Any, start: int, stop: int, sequence: int) -> int:
+        """Take frames ``start`` to ``stop`` up to the next SYNC; returns its place, or ``stop``.
+
+        ``out`` then holds what answers the SYNC; :meth:`act` lets the set points act that are due at it.
+        """
+        at = int(_exchange(ids, lengths, data, start, stop, sequence, *self._arguments))
+        self.out = self._out[: self._result[0]]
+        return at
 
     def take_short(self) -> list[int]:
         """Joints whose RPDOs were ignored for having too few bytes since the last call."""
@@ -218,12 +212,9 @@ class Exchange:
         self._short[:] = 0
         return joints
 
-    def accept(self, counter: int) -> None:
-        """Let the RPDOs act that are due at the SYNC with this counter."""
-        found = _accept(
-            counter, self._rx_kinds, self._stored, self._fresh, self._rx_first, *self._rx,
-            self._targets, self._targets_fresh, self._control,
-        )  # fmt: skip
+    def act(self) -> None:
+        """Let the RPDOs act that were due at the SYNC just taken."""
+        found = self._result[1]
         if found & 1:
             self._motion.set_targets(self._targets, self._targets_fresh)
             self._targets_fresh[:] = False

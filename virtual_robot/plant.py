@@ -43,21 +43,22 @@ class Plant:
         self._data = self.model.createData()
         self.q = np.array(q, dtype=np.float64)
         self.qd = np.zeros(n)
-        self.qdd = np.zeros(n)
+        self._middle, self._speed = self.q.copy(), np.zeros(n)
         names = [joint.name for joint in robot.joints]
         self.rotor = np.diag([standard[f"ia{j + 1}"] for j in range(n)])
-        self._friction = np.array([[standard[f"fv{j + 1}"], standard[f"fc{j + 1}"]] for j in range(n)])
-        self._offset = np.array([standard[f"off{j + 1}"] for j in range(n)])
-        self._pairs = np.array([[names.index(j) for j in c.joints] for c in robot.couplings], np.int64).reshape(-1, 2)
-        self._pair_friction = np.array(
-            [[standard[f"{k}{c.name}"] for k in ("fv", "fc")] for c in robot.couplings]
-        ).reshape(-1, 2)
-        for c, (i, j) in zip(robot.couplings, self._pairs, strict=True):
+        friction = np.array([[standard[f"{k}{j + 1}"] for k in ("fv", "fc", "off")] for j in range(n)])
+        pairs = np.array([[names.index(j) for j in c.joints] for c in robot.couplings], np.int64).reshape(-1, 2)
+        pair_friction = np.array([[standard[f"{k}{c.name}"] for k in ("fv", "fc")] for c in robot.couplings]).reshape(
+            -1, 2
+        )
+        for c, (i, j) in zip(robot.couplings, pairs, strict=True):
             self.rotor[i, j] = self.rotor[j, i] = standard[f"ia{c.name}"]
-        self._smoothing = robot.friction.sign_smoothing
-        self._ratio = robot.transmission_matrix
-        self._effects = effect_table(scenario, robot)
         self.brake = np.zeros(n)
+        effects = effect_table(scenario, robot)
+        self._resisting: tuple[Any, ...] = (
+            friction, robot.friction.sign_smoothing, pairs, pair_friction, self.brake, robot.transmission_matrix,
+            effects.code, effects.joint, effects.parameters,
+        )  # fmt: skip
 
     def mass_matrix(self) -> NDArray[np.float64]:
         """Joint-side mass matrix (n, n) at the present position, rotors included."""
@@ -68,7 +69,7 @@ class Plant:
     def resistance(self, q: NDArray[np.float64], qd: NDArray[np.float64]) -> NDArray[np.float64]:
         """Friction, brakes and hidden effects (n,): the torque that resists the motion."""
         out, slope = np.empty(q.size), np.empty((q.size, q.size))
-        arguments = (q, qd, *self._resisting(), out, slope)
+        arguments = (q, qd, *self._resisting, out, slope)
         dynamics.resist(*arguments)
         return out
 
@@ -79,23 +80,13 @@ class Plant:
         upper = np.triu(pin.crba(self.model, self._data, q))
         mass = upper + np.triu(upper, 1).T + self.rotor
         bias = pin.nonLinearEffects(self.model, self._data, q, qd)
-        out: NDArray[np.float64] = np.linalg.solve(mass, tau - self._offset - bias - self.resistance(q, qd))
+        out: NDArray[np.float64] = np.linalg.solve(mass, tau - bias - self.resistance(q, qd))
         return out
 
     def advance(self, tau: NDArray[np.float64], period: float) -> None:
         """Hold the joint torques ``tau`` (n,) for ``period`` seconds."""
-        half = 0.5 * period
-        middle = self.q + half * (self.qd + 0.5 * half * self.qdd)
-        speed = self.qd + half * self.qdd
-        mass = pin.crba(self.model, self._data, middle)
-        bias = pin.nonLinearEffects(self.model, self._data, middle, speed)
+        mass = pin.crba(self.model, self._data, self._middle)
+        bias = pin.nonLinearEffects(self.model, self._data, self._middle, self._speed)
         dynamics.advance(
-            period, self.q, self.qd, self.qdd, tau - self._offset, mass, bias, self.rotor, *self._resisting()
+            period, self.q, self.qd, self._middle, self._speed, tau, mass, bias, self.rotor, *self._resisting
         )
-
-    def _resisting(self) -> tuple[Any, ...]:
-        effects = self._effects
-        return (
-            self._friction, self._smoothing, self._pairs, self._pair_friction, self.brake, self._ratio,
-            effects.code, effects.joint, effects.parameters,
-        )  # fmt: skip

@@ -24,12 +24,13 @@ SHARE_OF_POLE = 0.6436
 @njit(cache=True, error_model="numpy")
 def control(  # type: ignore[no-untyped-def]
     q, ratio, counts_per_rad, origin, target, age, steps, held, kp, kv, smooth, limit, noise, permille,
-    error, error_rate, current, position, reported, demand,
+    error, error_rate, current, position, reported, demand, torque, disturbance, tau,
 ):  # fmt: skip
     """One control period of all drives (arrays (n,), motor side); state and outputs change in place.
 
     Velocity loop around position loop (thesis figure B.1), its reference completed by the demand's velocity, as
     drives in cyclic synchronous position mode do: ``current = kv (kp e + de/dt)``, ``e = demand - position``.
+    ``tau`` (n,) gets the joint torques until the next period, ``torque`` (n, n) being N m per ampere.
     ``held`` drives (not enabled) give no current and let their demand follow the position.
     """
     n = q.size
@@ -57,6 +58,10 @@ def control(  # type: ignore[no-untyped-def]
         age[j] += 1
         measured = math.floor((current[j] + noise[j]) * permille[j] + 0.5)
         reported[j] = np.int16(min(max(measured, -32768.0), 32767.0))
+    for i in range(n):
+        tau[i] = disturbance[i]
+        for j in range(n):
+            tau[i] += torque[i, j] * current[j]
 
 
 def gains(robot: RobotConfig, mass: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
