@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -40,6 +40,9 @@ RUNAWAY = 3.0
 
 RELEVANT = 0.3
 """Relative velocity error of the auxiliary model below which its instruments are relevant enough."""
+
+CONTRADICTION = 5.0
+"""Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before it is disbelieved."""
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -213,7 +216,7 @@ def identify_experiment(
         if options.method == "idim-iv":
             estimate = idim_iv(blocks, auxiliary, start)
         else:
-            estimate = idim_piv(blocks, auxiliary, start, max_order=options.max_ar_order)
+            estimate, blocks = _prefiltered(blocks, auxiliary, start, options, model, experiments, signals, ls_decimation, warnings)
         warnings += estimate.warnings
         if not estimate.converged:
             warnings.append(f"{options.method} did not converge: {estimate.stop_reason}")
@@ -269,6 +272,39 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> None:
 def _cutoff(dt: float, wanted: float, factor: int | None) -> float:
     """Cut-off (Hz) of a decimation: as wanted, or what a factor given by hand leaves."""
     return wanted if factor is None else 0.5 / (dt * factor)
+
+
+def _prefiltered(
+    blocks: list[Block],
+    auxiliary: AuxiliaryModel,
+    start: Array,
+    options: Options,
+    model: ArmModel,
+    experiments: Sequence[Experiment],
+    signals: Sequence[Derivatives],
+    ls_decimation: Decimation,
+    warnings: list[str],
+) -> tuple[Estimate, list[Block]]:
+    """IDIM-PIV, unless the prefilter contradicts IDIM-IV.
+
+    A noise model may move the estimate within its uncertainty only. Where it moves it further, the residual
+    is not noise but what the model lacks, and its inverse filter amplifies that (thesis section 6.2.3); then, as in
+    SEP-PEM, the dynamic model is estimated without it and it only enters the covariance (6.2.1).
+    """
+    estimate = idim_piv(blocks, auxiliary, start, max_order=options.max_ar_order)
+    plain_blocks = equations(model, experiments, signals, ls_decimation)
+    plain_auxiliary = replace(auxiliary, decimation=ls_decimation, warnings=[])
+    plain = idim_iv(plain_blocks, plain_auxiliary, start, serial_order=options.max_ar_order)
+    shift = np.abs(estimate.theta - plain.theta) / plain.std
+    worst = int(np.argmax(shift))
+    if shift[worst] <= CONTRADICTION:
+        return estimate, blocks
+    warnings.append(
+        f"the prefilter of idim-piv moves {model.base.names[worst]} by {shift[worst]:.0f} standard deviations from idim-iv: "
+        "the residuals are model error, not noise; the parameters are those of idim-iv, the noise model only enters their "
+        "standard deviations"
+    )
+    return plain, plain_blocks
 
 
 def _auxiliary(

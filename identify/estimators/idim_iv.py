@@ -13,8 +13,10 @@ from identify.estimators.regression import (
     iterate,
     iv_covariance,
     joint_variances,
-    residuals,
+    noise_models,
+    serial_covariance,
     weighted_rows,
+    whitened_residuals,
 )
 
 ITERATIONS = 20
@@ -23,7 +25,12 @@ TOLERANCE = 1e-4
 
 
 def idim_iv(
-    blocks: Sequence[Block], auxiliary: AuxiliaryModel, start: NDArray[np.float64], iterations: int = ITERATIONS
+    blocks: Sequence[Block],
+    auxiliary: AuxiliaryModel,
+    start: NDArray[np.float64],
+    iterations: int = ITERATIONS,
+    *,
+    serial_order: int = 0,
 ) -> Estimate:
     """Iterate 2.33 with weights 2.24 to 2.26 on the instruments, the regressor and the torques alike.
 
@@ -37,6 +44,9 @@ def idim_iv(
         First theta of the auxiliary model, shape (b,).
     iterations
         Most iterations.
+    serial_order
+        Highest order of an AR model of each joint's residuals, used for the covariance alone; 0: the residuals
+        count as white (2.34).
 
     Raises
     ------
@@ -59,12 +69,19 @@ def idim_iv(
         return estimate, norm
 
     theta, done, converged, reason = iterate(step, start, iterations, TOLERANCE)
-    z = weighted_rows(auxiliary.instruments(theta), keep, noise)
-    x = weighted_rows([b.x for b in blocks], keep, noise)
-    white = tuple(
-        tuple(r[b.keep[:, j], j] / noise[j].variance**0.5 for r, b in zip(residuals(blocks, theta), blocks, strict=True))
-        for j in range(len(noise))
-    )
+    zeta, x = auxiliary.instruments(theta), [b.x for b in blocks]
+    if serial_order:
+        weights, noise = noise, noise_models(blocks, theta, serial_order)
+        covariance = serial_covariance(zeta, x, keep, weights, noise)
+    else:
+        covariance = iv_covariance(weighted_rows(zeta, keep, noise), weighted_rows(x, keep, noise))
     return Estimate(
-        theta, iv_covariance(z, x), tuple(noise), white, done, converged, reason, tuple(auxiliary.warnings)
+        theta,
+        covariance,
+        tuple(noise),
+        whitened_residuals(blocks, theta, noise),
+        done,
+        converged,
+        reason,
+        tuple(auxiliary.warnings),
     )

@@ -9,9 +9,9 @@ from identify.estimators.regression import (
     joint_variances,
     least_squares,
     require_excitation,
-    residuals,
     unweighted,
     weighted_rows,
+    whitened_residuals,
 )
 
 
@@ -41,8 +41,4 @@ def idim_ls(blocks: Sequence[Block], names: Sequence[str]) -> Estimate:
     x = weighted_rows([b.x for b in blocks], keep, noise)
     theta = least_squares(x, weighted_rows([b.y for b in blocks], keep, noise))  # 2.23
 
-    white = tuple(
-        tuple((r[b.keep[:, j], j]) / noise[j].variance ** 0.5 for r, b in zip(residuals(blocks, theta), blocks, strict=True))
-        for j in range(len(noise))
-    )
-    return Estimate(theta, inverse_gram(x), tuple(noise), white)  # 2.27
+    return Estimate(theta, inverse_gram(x), tuple(noise), whitened_residuals(blocks, theta, noise))  # 2.27

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from identify.estimators.auxiliary import AuxiliaryModel
 from identify.estimators.idim_iv import ITERATIONS, TOLERANCE
-from identify.estimators.noise import ArModel, fit_ar
+from identify.estimators.noise import ArModel
 from identify.estimators.regression import (
     Block,
     Estimate,
@@ -15,8 +15,10 @@ from identify.estimators.regression import (
     iterate,
     iv_covariance,
     joint_variances,
+    noise_models,
     residuals,
     weighted_rows,
+    whitened_residuals,
 )
 
 MAX_AR_ORDER = 60
@@ -55,8 +57,8 @@ def idim_piv(
         If no auxiliary model runs, not even the first.
     """
     keep = [b.keep for b in blocks]
-    n = len(keep[0][0])
-    noise: list[ArModel] = joint_variances(blocks, start)  # step 1: H = 1
+    scale = joint_variances(blocks, start)
+    noise: list[ArModel] = scale  # step 1: H = 1, lambda from the start
 
     def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise
@@ -65,30 +67,19 @@ def idim_piv(
         x = weighted_rows([b.x for b in blocks], keep, noise)
         y = weighted_rows([b.y for b in blocks], keep, noise)
         estimate = instrumental_variable(z, x, y)  # step 2b, 6.30
-        noise = noise_models(blocks, estimate, n, max_order)  # step 2c
-        weighted = [r for r in residuals(blocks, estimate)]
-        norm = float(np.linalg.norm(weighted_rows(weighted, keep, joint_variances(blocks, start))))
-        return estimate, norm
+        noise = noise_models(blocks, estimate, max_order)  # step 2c
+        return estimate, float(np.linalg.norm(weighted_rows(residuals(blocks, estimate), keep, scale)))
 
     theta, done, converged, reason = iterate(step, start, iterations, TOLERANCE)
     z = weighted_rows(auxiliary.instruments(theta), keep, noise)
     x = weighted_rows([b.x for b in blocks], keep, noise)
-    errors = residuals(blocks, theta)
-    white = tuple(
-        tuple(noise[j].whiten(e[:, j])[b.keep[noise[j].order :, j]] for e, b in zip(errors, blocks, strict=True))
-        for j in range(n)
-    )
     return Estimate(
-        theta, iv_covariance(z, x), tuple(noise), white, done, converged, reason, tuple(auxiliary.warnings)
+        theta,
+        iv_covariance(z, x),
+        tuple(noise),
+        whitened_residuals(blocks, theta, noise),
+        done,
+        converged,
+        reason,
+        tuple(auxiliary.warnings),
     )
-
-
-def noise_models(blocks: Sequence[Block], theta: NDArray[np.float64], n: int, max_order: int) -> list[ArModel]:
-    """AR model of each joint's residual (6.21 to 6.25), its variance corrected for the parameters estimated."""
-    errors = residuals(blocks, theta)
-    total = sum(b.y.size for b in blocks)
-    models = []
-    for j in range(n):
-        ar = fit_ar([e[:, j] for e in errors], max_order)
-        models.append(ArModel(ar.coefficients, ar.variance / (1 - theta.size / total), ar.aic))
-    return models

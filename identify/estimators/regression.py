@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, signal
 
 from configs import DataError
-from identify.estimators.noise import WHITE, ArModel
+from identify.estimators.noise import WHITE, ArModel, fit_ar
 from identify.model.arm import ArmModel
 from identify.signals.decimate import Decimation
 from identify.signals.differentiate import Derivatives
@@ -120,6 +120,28 @@ def joint_variances(blocks: Sequence[Block], theta: NDArray[np.float64]) -> list
     return models
 
 
+def noise_models(blocks: Sequence[Block], theta: NDArray[np.float64], max_order: int) -> list[ArModel]:
+    """AR model of each joint's residual (6.21 to 6.25), its variance corrected for the parameters estimated."""
+    errors = residuals(blocks, theta)
+    spent = 1 - theta.size / sum(b.y.size for b in blocks)
+    models = []
+    for j in range(blocks[0].y.shape[1]):
+        ar = fit_ar([e[:, j] for e in errors], max_order)
+        models.append(ArModel(ar.coefficients, ar.variance / spent, ar.aic))
+    return models
+
+
+def whitened_residuals(
+    blocks: Sequence[Block], theta: NDArray[np.float64], noise: Sequence[ArModel]
+) -> tuple[tuple[NDArray[np.float64], ...], ...]:
+    """Residuals of each joint in standard deviations of its noise model, one array per experiment."""
+    errors = residuals(blocks, theta)
+    return tuple(
+        tuple(ar.whiten(e[:, j])[b.keep[ar.order :, j]] for e, b in zip(errors, blocks, strict=True))
+        for j, ar in enumerate(noise)
+    )
+
+
 def least_squares(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """Solve ``min |y - x theta|`` by QR of the column-normalised regressor."""
     scale = np.linalg.norm(x, axis=0)
@@ -157,6 +179,31 @@ def iv_covariance(z: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.
     q, _ = linalg.qr(z / zs, mode="economic")
     inverse = linalg.inv(q.T @ (x / xs)) / xs[:, None]
     covariance: NDArray[np.float64] = inverse @ inverse.T
+    return covariance
+
+
+def serial_covariance(
+    zeta: Sequence[NDArray[np.float64]],
+    x: Sequence[NDArray[np.float64]],
+    keep: Sequence[NDArray[np.bool_]],
+    weights: Sequence[ArModel],
+    noise: Sequence[ArModel],
+) -> NDArray[np.float64]:
+    """Covariance of an IV estimate with weights 2.24 whose residuals are serially correlated.
+
+    ``A = (Z' W X)^-1 Z' W`` maps the noise to the estimate and ``A Omega A'`` is its covariance, with ``Omega`` given by
+    the AR model of each joint: ``Z' W Omega W Z`` is the Gram matrix of ``H' W Z``.
+    """
+    z = weighted_rows(zeta, keep, weights)
+    zs = np.linalg.norm(z, axis=0)
+    bread = linalg.inv((z / zs).T @ weighted_rows(x, keep, weights))
+    meat = np.zeros((zs.size, zs.size))
+    for j, (weight, ar) in enumerate(zip(weights, noise, strict=True)):
+        for value, kept in zip(zeta, keep, strict=True):
+            rows = value[:, j] * kept[:, j, None] / (weight.variance * zs)
+            coloured = signal.lfilter([np.sqrt(ar.variance)], np.append(1.0, ar.coefficients), rows[::-1], axis=0)
+            meat += coloured.T @ coloured
+    covariance: NDArray[np.float64] = bread @ meat @ bread.T
     return covariance
 
 
