@@ -1,0 +1,95 @@
+"""Commands of this package: identify, worker, diagnose, trajectory."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result document on stdout, and nothing else there.")]
+OutDirectory = Annotated[
+    Path | None, typer.Option("--out", help="Folder for the results. [default: RECORDING without .mcap, plus a suffix]")
+]
+Robot = Annotated[
+    Path | None, typer.Option("--config", help="Robot configuration. [default: the one inside the recording]")
+]
+
+
+def identify(
+    recording: Annotated[Path, typer.Argument(help="Recording to identify from (.mcap).")],
+    config: Robot = None,
+    method: Annotated[str, typer.Option(help="idim-piv, idim-iv or idim-ls.")] = "idim-piv",
+    derivatives: Annotated[
+        str | None, typer.Option(help="irwsm, irwsm2 or bandpass. [default: irwsm, or the published filters]")
+    ] = None,
+    controller: Annotated[str, typer.Option(help="crc (identified) or known (configured).")] = "crc",
+    decimation: Annotated[
+        int | None, typer.Option(min=1, help="Keep one sample of so many. [default: from the data]")
+    ] = None,
+    out: OutDirectory = None,
+    json: Json = False,
+) -> None:
+    """Identify the dynamic model of a robot from a recording.
+
+    Example: armident identify tx40.mcap --out results
+    """
+    from identify.service import identify_command
+
+    identify_command(recording, config, method, derivatives, controller, decimation, out, as_json=json)
+
+
+def worker(
+    config: Annotated[Path, typer.Option("--config", help="Session configuration.")],
+    once: Annotated[bool, typer.Option("--once", help="End after one experiment, with its exit code.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the results. [default: the session's recording directory]")
+    ] = None,
+) -> None:
+    """Identify every experiment of a cell as it is recorded, and publish the results.
+
+    Example: armident worker --config configs/tx40_cell.yaml
+    """
+    from identify.worker import run_worker
+
+    code = run_worker(config, once=once, out=out)
+    if code:
+        raise typer.Exit(code)
+
+
+def diagnose(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings to fit.")],
+    config: Robot = None,
+    validate: Annotated[
+        Path | None, typer.Option(help="Recording to judge by. [default: the last part of the data, held out]")
+    ] = None,
+    baseline: Annotated[
+        Path | None, typer.Option(help="An identification.json whose numbers are to be judged too.")
+    ] = None,
+    out: OutDirectory = None,
+    json: Json = False,
+) -> None:
+    """Find what a model lacks: where it disagrees with the data, which effect is missing, what is left.
+
+    Exit code 4 if something was found or stays unexplained.
+
+    Example: armident diagnose monday.mcap --validate tuesday.mcap
+    """
+    from identify.service import diagnose_command
+
+    code = diagnose_command(recordings, config, validate, baseline, out, as_json=json)
+    if code:
+        raise typer.Exit(code)
+
+
+def trajectory(
+    config: Annotated[Path, typer.Option("--config", help="Robot configuration.")],
+    out: Annotated[Path, typer.Option("--out", help="Trajectory file to write (.yaml).")],
+    duration: Annotated[float, typer.Option(min=1.0, help="Length, s.")] = 7.5,
+    seed: Annotated[int, typer.Option(help="Start of the random search.")] = 0,
+) -> None:
+    """Design an exciting trajectory inside the limits of a robot.
+
+    Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --duration 8
+    """
+    from identify.service import trajectory_command
+
+    trajectory_command(config, out, duration, seed)

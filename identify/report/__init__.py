@@ -1,0 +1,1 @@
+"""Reports: one self-contained HTML file each, for whoever runs the plant."""

@@ -1,0 +1,164 @@
+"""The report of an identification: what was recorded, what came out, and how far to trust it."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import RobotConfig
+from daq.recording import Recording
+from identify.document import IdentificationDocument
+from identify.report.page import BAND, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
+from identify.run import Identification
+
+Array = NDArray[np.float64]
+
+GOOD_PCT = 5.0
+"""Relative standard deviation (percent) up to which a parameter counts as well determined."""
+FAIR_PCT = 20.0
+
+
+def identification_report(
+    recording: Recording, robot: RobotConfig, result: Identification, document: IdentificationDocument
+) -> str:
+    """HTML page of an identification, complete in one file."""
+    joints = [joint.name for joint in robot.joints]
+    return render(
+        "identification.html",
+        document=document,
+        robot=robot,
+        recorded=recorded(recording),
+        essential=_rows(document),
+        others=[p for p in document.parameters if not p.essential],
+        torques=torque_figure(result.t, result.tau_measured, result.tau_predicted, joints, _units(robot)),
+        autocorrelation=_autocorrelation_figure(result.residual_autocorrelation, result.autocorrelation_bound, joints),
+        controller=_controller_figure(document.controller),
+        beside={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
+        white=_white_words(document),
+    )
+
+
+def recorded(recording: Recording) -> dict[str, Any]:
+    """What a reader asks first about a recording."""
+    samples = recording.samples
+    spans = recording.experiments()
+    lost = sum(g.last - g.first + 1 for g in recording.gaps if g.stream == "samples" and g.joint is None)
+    inside = sum(int(((samples.sync >= a) & (samples.sync <= b)).sum()) for a, b in spans)
+    expected = sum(b - a + 1 for a, b in spans)
+    return {
+        "file": "(from the stream)" if recording.path is None else recording.path.name,
+        "rate_hz": recording.sample_rate_hz,
+        "rows": int(samples.sync.size),
+        "joints": recording.robot.n,
+        "duration_s": float(samples.sync[-1] - samples.sync[0] + 1) / recording.sample_rate_hz,
+        "experiments": len(spans),
+        "experiment_s": expected / recording.sample_rate_hz,
+        "missing": expected - inside,
+        "gaps": len(recording.gaps),
+        "lost": lost,
+        "streams": [
+            (s.name, recording.sample_rate_hz / s.every, int(s.sync.size), ", ".join(s.fields))
+            for s in recording.streams.values()
+        ],
+        "counters": sorted(recording.counters.items()),
+        "torn": recording.missing,
+    }
+
+
+def torque_figure(t: Array, measured: Array, predicted: Array, joints: list[str], units: list[str]) -> str:
+    """Measured and predicted torque and their difference, one row per joint."""
+    t = t - t[0]
+    breaks = np.flatnonzero(np.diff(t) <= 0)
+    measured, predicted = measured.copy(), predicted.copy()
+    measured[breaks], predicted[breaks] = np.nan, np.nan
+    t = _continued(t)
+    columns = 2 if len(joints) > 1 else 1
+    rows = -(-len(joints) // columns)
+    with figure(rows, columns, 1.9) as (_, axes, picture):
+        for j, name in enumerate(joints):
+            axis = axes.flat[j]
+            axis.plot(t, measured[:, j], color=MEASURED, linewidth=2.2, label="measured")
+            axis.plot(t, predicted[:, j], color=MODEL, linewidth=0.9, label="model")
+            axis.plot(t, measured[:, j] - predicted[:, j], color=RESIDUAL, linewidth=0.7, label="difference")
+            axis.set_title(f"{name}  [{units[j]}]")
+            axis.margins(x=0.01)
+        for axis in axes[-1]:
+            axis.set_xlabel("s")
+        axes.flat[0].legend(frameon=False, ncols=3, loc="upper right", fontsize=8)
+        for axis in axes.flat[len(joints) :]:
+            axis.set_visible(False)
+    return picture[0]
+
+
+def _autocorrelation_figure(values: Array, bounds: Array, joints: list[str]) -> str:
+    columns = min(3, len(joints))
+    rows = -(-len(joints) // columns)
+    with figure(rows, columns, 1.6) as (_, axes, picture):
+        for j, name in enumerate(joints):
+            axis, lags = axes.flat[j], np.arange(1, values.shape[1] + 1)
+            axis.axhspan(-bounds[j], bounds[j], color=BAND)
+            axis.vlines(lags, 0, values[j], color=RESIDUAL, linewidth=1.6)
+            axis.axhline(0, color=MUTED, linewidth=0.6)
+            limit = max(0.2, 1.2 * float(np.abs(values[j]).max()))
+            axis.set_ylim(-limit, limit)
+            axis.set_title(name)
+        for axis in axes[-1]:
+            axis.set_xlabel("lag")
+        for axis in axes.flat[len(joints) :]:
+            axis.set_visible(False)
+    return picture[0]
+
+
+def _controller_figure(controller: dict[str, Any]) -> str | None:
+    described = [joint for joint in controller.get("joints", []) if joint.get("error_taps")]
+    if not described:
+        return None
+    columns = min(3, len(described))
+    rows = -(-len(described) // columns)
+    with figure(rows, columns, 1.6) as (_, axes, picture):
+        for axis, joint in zip(axes.flat, described, strict=False):
+            taps = np.asarray(joint["error_taps"], dtype=np.float64)
+            axis.vlines(np.arange(taps.size), 0, taps, color=MODEL, linewidth=1.6)
+            axis.axhline(0, color=MUTED, linewidth=0.6)
+            fit = joint.get("fit_pct")
+            axis.set_title(joint["joint"] + ("" if fit is None else f"   fit {fit:.1f} %"))
+        for axis in axes[-1]:
+            axis.set_xlabel("samples after the error")
+        for axis in axes.flat[len(described) :]:
+            axis.set_visible(False)
+    return picture[0]
+
+
+def _rows(document: IdentificationDocument) -> list[dict[str, Any]]:
+    rows = []
+    for p in document.parameters:
+        if not p.essential:
+            continue
+        relative = p.relative_std_pct if p.relative_std_pct is not None else 100.0
+        grade = "good" if relative <= GOOD_PCT else "fair" if relative <= FAIR_PCT else "poor"
+        rows.append({"p": p, "bar": min(100.0, 100.0 * relative / FAIR_PCT), "grade": grade})
+    return rows
+
+
+def _units(robot: RobotConfig) -> list[str]:
+    return ["N m" if joint.type == "revolute" else "N" for joint in robot.joints]
+
+
+def _white_words(document: IdentificationDocument) -> str:
+    worst = max(document.whiteness, key=lambda w: w.fraction_outside_2sigma, default=None)
+    if worst is None:
+        return "not tested"
+    outside = 100 * worst.fraction_outside_2sigma
+    if worst.fraction_outside_2sigma <= 0.15:
+        return f"white (at most {outside:.0f} % of the lags outside, on {worst.joint}): the uncertainties can be trusted"
+    return (
+        f"not white ({outside:.0f} % of the lags outside on {worst.joint}): something the model lacks is left, "
+        "and the uncertainties may be too small"
+    )
+
+
+def _continued(t: Array) -> Array:
+    """Time of one experiment after the other on one axis."""
+    steps = np.diff(t, prepend=t[0])
+    typical = float(np.median(steps[1:])) if t.size > 1 else 0.0
+    return np.cumsum(np.where(steps <= 0, typical, steps))

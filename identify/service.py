@@ -1,0 +1,188 @@
+"""What the commands and the worker do with a recording: identify it, diagnose it, write the results."""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from configs import ConfigError, DataError, RobotConfig, load_robot
+from daq.recording import Recording, read_recording
+from identify.document import (
+    IdentificationDocument,
+    identification_document,
+    load_document,
+    reference,
+    to_json,
+    write_atomically,
+)
+from identify.experiment import Experiment
+from identify.from_recording import experiments_from_recording
+from identify.run import Identification, Options, identify_experiment
+
+FOUND = 4
+"""Exit code: done, and the answer is that something changed or stays unexplained."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """An identification with everything its report shows."""
+
+    recording: Recording
+    robot: RobotConfig
+    result: Identification
+    document: IdentificationDocument
+
+
+def identify_recording(
+    recording: Recording,
+    robot: RobotConfig | None = None,
+    options: Options | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Outcome:
+    """Identify a recording, whether it was read from a file or assembled from the stream.
+
+    Parameters
+    ----------
+    recording
+        The recording.
+    robot
+        Configuration to use; ``None``: the one inside the recording.
+    options
+        Of the estimator.
+    progress
+        Called with a stage and the share done.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If configuration or data cannot support the request.
+    """
+    robot = robot or recording.robot
+    experiments, notes = experiments_from_recording(recording, robot)
+    result = identify_experiment(experiments, robot, options or Options(), progress)
+    return Outcome(recording, robot, result, identification_document(result, recording, robot, notes))
+
+
+def write_identification(outcome: Outcome, out: Path) -> tuple[Path, Path]:
+    """Write ``identification.json`` and ``report.html`` into a folder; returns their paths."""
+    from identify.report.identification import identification_report
+
+    document, report = out / "identification.json", out / "report.html"
+    write_atomically(document, to_json(outcome.document))
+    write_atomically(report, identification_report(outcome.recording, outcome.robot, outcome.result, outcome.document))
+    return document, report
+
+
+def identify_command(
+    path: Path,
+    config: Path | None,
+    method: str,
+    derivatives: str | None,
+    controller: str,
+    decimation: int | None,
+    out: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Carry out ``armident identify``."""
+    from identify.terminal import identification_table, progress, warn
+
+    chosen: dict[str, Any] = {
+        "method": method,
+        "derivatives": derivatives,
+        "controller": controller,
+        "decimation": decimation,
+    }
+    options = Options(**chosen)
+    robot = None if config is None else load_robot(config)
+    recording = read_recording(path)
+    with progress(f"identify {path.name}") as report:
+        outcome = identify_recording(recording, robot, options, report)
+    document, html = write_identification(outcome, out or _beside(path, "identification"))
+    if as_json:
+        sys.stdout.write(to_json(outcome.document))
+        return
+    warn(outcome.document.warnings)
+    identification_table(outcome.document)
+    print(f"result: {document}\nreport: {html}")
+
+
+def diagnose_command(
+    paths: Sequence[Path],
+    config: Path | None,
+    validate: Path | None,
+    baseline: Path | None,
+    out: Path | None,
+    *,
+    as_json: bool,
+) -> int:
+    """Carry out ``armident diagnose``; returns the exit code."""
+    from identify.discrepancy.diagnose import diagnose
+    from identify.report.diagnosis import diagnosis_report
+    from identify.terminal import diagnosis_table, progress, warn
+
+    numbers = None if baseline is None else load_document(baseline, IdentificationDocument)
+    recordings = [read_recording(path) for path in paths]
+    robot = recordings[0].robot if config is None else load_robot(config)
+    if numbers is not None and numbers.robot != robot.name:
+        raise DataError(f"{baseline}: the numbers of robot {numbers.robot!r}, the recording is of {robot.name!r}")
+    notes: list[str] = []
+    training = [e for recording in recordings for e in _experiments(recording, robot, notes)]
+    validation: list[Experiment] = []
+    if validate is not None:
+        recordings.append(read_recording(validate))
+        validation = _experiments(recordings[-1], robot, notes)
+    with progress("diagnose") as report:
+        found = diagnose(
+            training, validation, robot, [reference(r) for r in recordings], numbers, list(dict.fromkeys(notes)), report
+        )
+    folder = out or _beside(paths[0], "diagnosis")
+    document = found.document
+    if found.robot.effects != robot.effects:
+        model = folder / "model.yaml"
+        write_atomically(model, robot_yaml(found.robot))
+        document = document.model_copy(update={"model": str(model)})
+    write_atomically(folder / "diagnosis.json", to_json(document))
+    write_atomically(folder / "report.html", diagnosis_report(found, document))
+    if as_json:
+        sys.stdout.write(to_json(document))
+    else:
+        warn(document.warnings)
+        diagnosis_table(document)
+        print(f"result: {folder / 'diagnosis.json'}\nreport: {folder / 'report.html'}")
+        if document.model is not None:
+            print(f"model:  {document.model}")
+    return 0 if document.verdict == "no_gap" else FOUND
+
+
+def trajectory_command(config: Path, out: Path, duration: float, seed: int) -> None:
+    """Carry out ``armident trajectory``."""
+    from identify.excitation import design_trajectory
+    from identify.terminal import progress
+
+    robot = load_robot(config)
+    with progress("trajectory") as report:
+        design = design_trajectory(robot, duration, seed, progress=lambda share: report("searching", share))
+    if out.suffix not in {".yaml", ".yml"}:
+        raise ConfigError(f"--out {out}: expected a file name that ends in .yaml")
+    text = yaml.safe_dump(design.trajectory.model_dump(mode="json", by_alias=True), sort_keys=False)
+    write_atomically(out, text)
+    print(f"{out}: {design.trajectory.duration:.2f} s, condition number {design.condition:.0f}")
+
+
+def robot_yaml(robot: RobotConfig) -> str:
+    """A robot configuration as its file."""
+    return yaml.safe_dump(robot.model_dump(mode="json", by_alias=True), sort_keys=False)
+
+
+def _experiments(recording: Recording, robot: RobotConfig, notes: list[str]) -> list[Experiment]:
+    experiments, found = experiments_from_recording(recording, robot)
+    notes += found
+    return experiments
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    return path.with_name(f"{path.name.removesuffix('.mcap')}.{suffix}")

@@ -1,0 +1,107 @@
+"""What the commands show on a terminal: progress on stderr, tables on stdout."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from identify.document import DiagnosisDocument, IdentificationDocument
+
+SHOW_AFTER_S = 2.0
+"""Work that takes no longer needs no progress."""
+
+Report = Callable[[str, float], None]
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Report]:
+    """Report stages: a bar where stderr is a terminal, otherwise one plain line per stage; neither before two seconds."""
+    begin = time.monotonic()
+    if not sys.stderr.isatty():
+        yield lambda stage, share: _plain_line(what, stage, share, begin)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0, visible=False)
+
+        def show(stage: str, share: float) -> None:
+            visible = time.monotonic() - begin > SHOW_AFTER_S
+            bar.update(task, completed=share, description=f"{what}: {stage}", visible=visible)
+
+        yield show
+
+
+def warn(lines: list[str]) -> None:
+    """One line each on stderr."""
+    for line in lines:
+        print(f"armident: warning: {line}", file=sys.stderr)
+
+
+def identification_table(document: IdentificationDocument) -> None:
+    """Essential parameters with their standard deviations, IDIM-LS beside another method's estimate."""
+    beside = {} if document.comparison is None else {p.name: p for p in document.comparison.parameters}
+    table = Table(title=f"{document.robot}: {document.method}, essential parameters", title_justify="left")
+    table.add_column("parameter")
+    table.add_column("value", justify="right")
+    table.add_column("std", justify="right")
+    table.add_column("std %", justify="right")
+    table.add_column("unit")
+    if beside:
+        table.add_column("idim-ls", justify="right")
+    for p in document.parameters:
+        if not p.essential:
+            continue
+        relative = "" if p.relative_std_pct is None else f"{p.relative_std_pct:.2f}"
+        row = [p.name, f"{p.value:.4f}", f"{p.std:.4f}", relative, p.unit]
+        table.add_row(*row, *([f"{beside[p.name].value:.4f}"] if beside else []))
+    console = Console()
+    console.print(table)
+    essential = sum(p.essential for p in document.parameters)
+    errors = ", ".join(f"{name} {value:.1f}" for name, value in document.relative_error_pct_by_joint.items())
+    outside = max((w.fraction_outside_2sigma for w in document.whiteness), default=0.0)
+    console.print(
+        f"{essential} of {len(document.parameters)} base parameters are essential; "
+        f"relative torque error {document.relative_error_pct:.4f} % ({errors})",
+        highlight=False,
+        soft_wrap=True,
+    )
+    console.print(
+        f"{document.iterations} iterations, {'converged' if document.converged else 'not converged'}; "
+        f"residual autocorrelation outside 2 sigma at most at {100 * outside:.0f} % of the lags (white: 5 %)",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def diagnosis_table(document: DiagnosisDocument) -> None:
+    """The verdict, the findings in the order found, and the gap on held-out data."""
+    console = Console()
+    console.print(f"verdict: {document.verdict}", highlight=False)
+    if document.findings:
+        table = Table(title="findings", title_justify="left")
+        for heading in ("joint", "effect", "parameters", "confidence", "held-out gap"):
+            table.add_column(heading)
+        for f in document.findings:
+            values = ", ".join(f"{k} {v:.4g}" for k, v in f.parameters.items())
+            table.add_row(
+                f.joint, f.effect, values, f"{100 * f.confidence:.0f} %", f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
+            )
+        console.print(table)
+    for u in document.unexplained:
+        console.print(
+            f"unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % of its residual varies with {u.varies_with}",
+            highlight=False,
+        )
+    gap = document.gap.validation
+    console.print(
+        f"torque error on held-out data: {gap.before.all:.2f} % before, {gap.after.all:.2f} % after", highlight=False
+    )
+
+
+def _plain_line(what: str, stage: str, share: float, begin: float) -> None:
+    if time.monotonic() - begin > SHOW_AFTER_S:
+        print(f"{what}: {stage} ({100 * share:.0f} %)", file=sys.stderr, flush=True)
