@@ -20,6 +20,7 @@ from drivers.objects import (
     TORQUE_ACTUAL,
     TPDO_COMMUNICATION,
     VELOCITY_ACTUAL,
+    DriveState,
 )
 from virtual_robot.arm import Motion
 from virtual_robot.node import FOLLOWING_ERROR, Drive
@@ -130,6 +131,7 @@ class Exchange:
         self._targets, self._targets_fresh = np.zeros(n, np.int32), np.zeros(n, np.bool_)
         self._control = np.full(n, -1, np.int64)
         self._result = np.zeros(2, np.int64)
+        self._follows = np.zeros(n, np.bool_)
         self.out = frames(0)
         """Frames that answer the SYNC taken last."""
         self.rebuild()
@@ -182,9 +184,10 @@ class Exchange:
         self._arrange()
 
     def refresh_status(self) -> None:
-        """Take over the statuswords."""
+        """Take over the statuswords; only enabled drives follow set points (a quick stop holds the last one)."""
         for drive in self._drives:
             self.values[STATUS, drive.index] = drive.status
+            self._follows[drive.index] = drive.state is DriveState.ENABLED
 
     def _arrange(self) -> None:
         """Put the arguments of the compiled exchange together, once per mapping."""
@@ -216,7 +219,7 @@ class Exchange:
         """Let the RPDOs act that were due at the SYNC just taken."""
         found = self._result[1]
         if found & 1:
-            self._motion.set_targets(self._targets, self._targets_fresh)
+            self._motion.set_targets(self._targets, self._targets_fresh & self._follows)
             self._targets_fresh[:] = False
         if found & 2:
             for drive in self._drives:

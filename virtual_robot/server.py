@@ -100,6 +100,9 @@ class Server:
             self._bus.close()
             raise
         self._exchange = Exchange(self.drives, motion, session.sync_period)
+        self._batch = frames(BATCH)
+        # Compile before anybody waits for an answer.
+        self._take(0, 0, 1)
 
     def _changed(self) -> None:
         self._dirty = True
@@ -137,8 +140,7 @@ class Server:
         BusDown
             If the bus goes down.
         """
-        batch = frames(BATCH)
-        ids, lengths, data = batch["can_id"], batch["length"], batch["data"]
+        batch = self._batch
         begin, cpu = time.monotonic(), time.process_time()
         sequence = 0
         exchange, bus = self._exchange, self._bus
@@ -154,7 +156,7 @@ class Server:
             count = bus.receive(batch)
             at = backlog = 0
             while at < count:
-                at = exchange.take(ids, lengths, data, at, count, sequence % self._session.sync.counter + 1)
+                at = self._take(at, count, sequence % self._session.sync.counter + 1)
                 if at >= count:
                     break
                 if exchange.out.size:
@@ -173,6 +175,10 @@ class Server:
         self._seconds += time.monotonic() - begin
         self._cpu += time.process_time() - cpu
         return self.report()
+
+    def _take(self, start: int, stop: int, sequence: int) -> int:
+        batch = self._batch
+        return self._exchange.take(batch["can_id"], batch["length"], batch["data"], start, stop, sequence)
 
     def _note(self, late_ns: int) -> None:
         late = max(late_ns // 1000, 0)
