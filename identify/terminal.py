@@ -84,7 +84,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
     if document.findings:
         table = Table(title="findings", title_justify="left")
         for heading in ("joint", "effect", "parameters", "confidence", "held-out gap"):
-            table.add_column(heading)
+            table.add_column(heading, overflow="fold")
         for f in document.findings:
             values = ", ".join(f"{k} {v:.4g}" for k, v in f.parameters.items())
             table.add_row(

@@ -9,9 +9,15 @@ from scipy import linalg
 
 from configs import DataError, RobotConfig
 from identify.discrepancy.catalogue import JointSignals, effect_regressor, joint_signals
-from identify.estimators.idim_piv import noise_models
 from identify.estimators.noise import ArModel
-from identify.estimators.regression import Block, filtered_regressor, joint_variances, require_excitation, weighted_rows
+from identify.estimators.regression import (
+    Block,
+    filtered_regressor,
+    joint_variances,
+    noise_models,
+    require_excitation,
+    weighted_rows,
+)
 from identify.experiment import Experiment
 from identify.model.arm import ArmModel
 from identify.signals.decimate import Decimation, design
@@ -163,7 +169,6 @@ def fit(problem: Problem) -> Fit:
     """
     blocks = [piece.block for piece in problem.train]
     x, y, keep = [b.x for b in blocks], [b.y for b in blocks], [b.keep for b in blocks]
-    n = problem.robot.n
     flat = np.concatenate([b.reshape(-1, b.shape[-1]) for b in x])
     require_excitation(flat, problem.names)
     theta = np.linalg.lstsq(flat, np.concatenate([b.reshape(-1) for b in y]), rcond=None)[0]
@@ -175,7 +180,7 @@ def fit(problem: Problem) -> Fit:
         theta = linalg.solve_triangular(r, q.T @ target) / scale
         residual = target - rows @ theta
         final = noise
-        noise = noise_models(blocks, theta, n, MAX_AR_ORDER)
+        noise = noise_models(blocks, theta, MAX_AR_ORDER)
     held = [piece.block for piece in problem.held_out]
     held_x = weighted_rows([b.x for b in held], [b.keep for b in held], final)
     held_y = weighted_rows([b.y for b in held], [b.keep for b in held], final)

@@ -74,7 +74,7 @@ def torque_figure(t: Array, measured: Array, predicted: Array, joints: list[str]
     t = _continued(t)
     columns = 2 if len(joints) > 1 else 1
     rows = -(-len(joints) // columns)
-    with figure(rows, columns, 1.9) as (_, axes, picture):
+    with figure(rows, columns, 1.9) as (drawing, axes, picture):
         for j, name in enumerate(joints):
             axis = axes.flat[j]
             axis.plot(t, measured[:, j], color=MEASURED, linewidth=2.2, label="measured")
@@ -84,7 +84,8 @@ def torque_figure(t: Array, measured: Array, predicted: Array, joints: list[str]
             axis.margins(x=0.01)
         for axis in axes[-1]:
             axis.set_xlabel("s")
-        axes.flat[0].legend(frameon=False, ncols=3, loc="upper right", fontsize=8)
+        handles, labels = axes.flat[0].get_legend_handles_labels()
+        drawing.legend(handles, labels, frameon=False, ncols=3, loc="outside upper right", fontsize=8.5)
         for axis in axes.flat[len(joints) :]:
             axis.set_visible(False)
     return picture[0]

@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-INK, MUTED, MEASURED, MODEL, RESIDUAL, BAND = "#1d2733", "#6b7785", "#9fb3c8", "#c2410c", "#2f6f9f", "#dfe8f1"
+INK, MUTED, MEASURED, MODEL, RESIDUAL, BAND = "#1d2733", "#6b7785", "#b3bac4", "#c2410c", "#2f6f9f", "#dfe8f1"
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",
     "font.size": 9,
