@@ -61,11 +61,13 @@ MASS_MARGIN = 0.02
 
 def base_parameters(standard: Mapping[str, float]) -> dict[str, float]:
     """Compute the 40 base inertial parameters of the TX40 from its standard ones (tables B.2 and B.3)."""
-    return {name: sum(c * standard[k] for k, c in terms.items()) for name, terms in _regrouping().items()}
+    return {name: sum(c * standard[k] for k, c in terms.items()) for name, terms in regrouping().items()}
 
 
 @cache
-def _regrouping() -> dict[str, dict[str, float]]:
+def regrouping() -> dict[str, dict[str, float]]:
+    """Return the base inertial parameters as sums of standard ones, ``{base: {standard: factor}}`` (table B.3)."""
+
     def outer(first: int, factor: float) -> dict[str, float]:
         return {f"m{k}": factor for k in range(first, JOINTS + 1)}
 
@@ -120,9 +122,9 @@ def solve() -> dict[str, float]:
             out[at[name]] = factor
         return out
 
-    regrouping = _regrouping()
-    equal = np.array([row(regrouping[name]) for name in ESSENTIAL])
-    within = np.array([row(regrouping[name]) for name in WITHIN_STD])
+    groups = regrouping()
+    equal = np.array([row(groups[name]) for name in ESSENTIAL])
+    within = np.array([row(groups[name]) for name in WITHIN_STD])
     value, std = np.array(list(WITHIN_STD.values())).T
     total = row({f"m{j}": 1.0 for j in range(1, JOINTS + 1)})
     rotors = np.array([row({f"ia{j}": 1.0}) for j in range(1, JOINTS + 1)])
@@ -151,7 +153,7 @@ def solve() -> dict[str, float]:
         quadratic += np.outer(direction, direction) / scale**2
         linear -= direction * target / scale**2
 
-    for name, terms in regrouping.items():
+    for name, terms in groups.items():
         if name not in ESSENTIAL and name not in WITHIN_STD:
             prefer(row(terms), 0.0, 1e-3)
     for direction, centre, spread in zip(within, value, std, strict=True):
