@@ -15,4 +15,4 @@ def compiled(function: F) -> F:
 
 def inlined(function: F) -> F:
     """Compile a small helper into every kernel that calls it."""
-    return cast(F, numba.njit(inline="always")(function))
+    return cast(F, numba.njit(fastmath={"contract", "nsz"}, error_model="numpy")(function))
