@@ -54,7 +54,7 @@ lint: install
 	$(VENV)/bin/lint-imports
 
 check: lint ## ruff, mypy, import-linter and the quick tests, under two minutes
-	@$(PYTEST) -q -n auto --dist worksteal -m "not vcan and not slow"
+	@$(PYTEST) -q -n auto --dist loadfile -m "not vcan and not slow"
 
 test: lint ## everything, the tests on vcan included
 	@mkdir -p .cache
