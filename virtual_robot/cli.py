@@ -12,6 +12,7 @@ def robot(
     replay: Annotated[Path | None, typer.Option(help="Recording to play instead of the plant.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     noise: Annotated[float, typer.Option(min=0.0, help="Amplitude of the noise; 0 switches it off.")] = 1.0,
+    truth: Annotated[Path | None, typer.Option(help="Write the arm's own parameters to this file (JSON).")] = None,
     duration: Annotated[float | None, typer.Option(min=0.0, help="Seconds to run; without it until Ctrl-C.")] = None,
 ) -> None:
     """Put the virtual arm on a bus: six CiA 402 drives, or a measured recording behind them.
@@ -23,4 +24,6 @@ def robot(
 
     if scenario is not None and replay is not None:
         raise ConfigError("--scenario hides effects in the plant, --replay has no plant: give one of them")
-    run_robot(config, scenario, replay, seed, noise, duration)
+    if truth is not None and replay is not None:
+        raise ConfigError("--truth: a replayed recording does not know the parameters of its arm")
+    run_robot(config, scenario, replay, seed, noise, duration, truth)

@@ -1,5 +1,6 @@
 """``armident robot``: the virtual arm, or a measured recording, on the bus of a session."""
 
+import json
 import signal
 import sys
 from pathlib import Path
@@ -8,7 +9,7 @@ from types import FrameType
 from configs import RobotConfig, SessionConfig, load_robot, load_session
 from daq.recording import read_recording
 from virtual_robot.arm import Arm, Motion
-from virtual_robot.inertias import rest_posture
+from virtual_robot.inertias import base_parameters, plant_parameters, rest_posture
 from virtual_robot.replay import Replay
 from virtual_robot.scenario import load_scenario
 from virtual_robot.server import Server
@@ -21,8 +22,11 @@ def run_robot(
     seed: int = 0,
     noise: float = 1.0,
     duration: float | None = None,
+    truth: Path | None = None,
 ) -> None:
     """Serve the drives of a session until SIGINT or SIGTERM, or for ``duration`` seconds.
+
+    ``truth`` names a file for the plant's own parameters: standard ones, and base ones where several act as one.
 
     Raises
     ------
@@ -41,6 +45,9 @@ def run_robot(
         hidden = load_scenario(scenario) if scenario is not None else None
         motion = Arm(robot, rest_posture(robot), session.sync_period, seed, noise, hidden)
         _warm_up(robot, session)
+        if truth is not None:
+            parameters = plant_parameters(robot)
+            truth.write_text(json.dumps(parameters | base_parameters(parameters), indent=1) + "\n", encoding="utf-8")
     stop = _Stop()
     with Server(session, robot, motion) as server:
         nodes = ", ".join(str(drive.node_id) for drive in server.drives)
