@@ -93,9 +93,7 @@ def test_integration_stays_within_an_encoder_count_of_a_tight_reference(tx40: Ro
         plant.advance(tau, PERIOD)
         moved[k] = plant.q
     error = np.abs(moved - reference(Plant(tx40, start), start, torques)).max(axis=0)
-    counts = (
-        [j.drive.counts_per_unit or 0.0 for j in tx40.joints] * np.abs(np.diag(tx40.transmission_matrix)) / (2 * np.pi)
-    )
+    counts = counts_per_si(tx40) * np.abs(np.diag(tx40.transmission_matrix))
     assert np.ptp(moved, axis=0).min() > 5e-3
     assert (error < 1.0 / counts).all()
 

@@ -1,0 +1,222 @@
+"""The virtual arm on a real (virtual) SocketCAN bus, driven by the project's own master and SYNC producer."""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import canopen
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from configs import SessionConfig, load_robot, load_session, load_trajectory
+from daq.recording import write_recording
+from drivers.frames import frames
+from drivers.master import DriveMaster
+from drivers.objects import COB_MASK, COB_SYNC, NmtCommand
+from drivers.socketcan import RawSocket
+from drivers.sync import SetpointPlan, SyncProducer
+from virtual_robot.offline import simulate_recording
+
+pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+RUN = "import sys; from pathlib import Path; from virtual_robot.cli import robot; robot(config=Path(sys.argv[1]), "
+SHORT_MOVE = [0.15, 0.1, 1.45, 0.2, 0.2, -0.2]
+
+
+@dataclass
+class Output:
+    """What the robot process printed on stderr when it ended, and its exit code."""
+
+    text: str = ""
+    code: int | None = None
+
+
+@contextmanager
+def robot_process(config: Path, options: str = "noise=0.0") -> Iterator[Output]:
+    """Run the virtual arm in a process of its own until the block ends, then stop it with SIGTERM."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", RUN + options + ")", str(config)],
+        cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    output = Output()
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready:")
+        yield output
+    finally:
+        process.send_signal(signal.SIGTERM)
+        _, output.text = process.communicate(timeout=20)
+        output.code = process.returncode
+
+
+@pytest.fixture
+def config(vcan_bus: str, tmp_path: Path) -> Path:
+    """The session file of the demonstration cell, on the bus of this test."""
+    text = (REPOSITORY / "configs" / "tx40_cell.yaml").read_text()
+    for relative in ("tx40.yaml", "eds/cia402_servo.eds", "trajectories/tx40_excitation.yaml"):
+        text = re.sub(rf"(?<![\w/]){relative}", str(REPOSITORY / "configs" / relative), text)
+    path = tmp_path / "cell.yaml"
+    path.write_text(text.replace("vcan0", vcan_bus))
+    return path
+
+
+def collect(bus: RawSocket, seconds: float, sync: SyncProducer | None = None) -> NDArray[np.void]:
+    """All frames of the next seconds."""
+    batch, out, end = frames(4096), [], time.monotonic() + seconds
+    while time.monotonic() < end:
+        bus.poll(0.02)
+        while count := bus.receive(batch):
+            out.append(batch[:count].copy())
+        if sync is not None:
+            sync.check()
+    return np.concatenate(out) if out else frames(0)
+
+
+def column(log: NDArray[np.void], can_id: int, offset: int, kind: str) -> NDArray[np.int64]:
+    """One object of all frames with this identifier."""
+    data = np.ascontiguousarray(log[log["can_id"] == can_id]["data"])
+    size = np.dtype(kind).itemsize
+    return np.ascontiguousarray(data[:, offset : offset + size]).view(kind)[:, 0].astype(np.int64)
+
+
+def setpoint_rows(session: SessionConfig, start: list[int], seconds: float) -> NDArray[np.int32]:
+    """A slow swing of all motors about where they stand, a row a millisecond."""
+    t = np.arange(round(seconds * 1000)) * 1e-3
+    amplitude = np.full(len(start), 20_000.0)
+    rows: NDArray[np.int32] = np.rint(
+        np.array(start) + np.outer(np.sin(2 * np.pi * t / seconds) ** 3, amplitude)
+    ).astype(np.int32)
+    return rows
+
+
+def test_every_sync_is_answered_by_every_drive_and_set_points_are_followed(config: Path) -> None:
+    session = load_session(config)
+    robot = load_robot(session.robot)
+    with robot_process(config) as output, DriveMaster(session, robot) as master:
+        master.configure()
+        master.start()
+        start = master.positions()
+        rows = setpoint_rows(session, start, 1.0)
+        cobs = tuple(0x200 + drive.node_id for drive in session.drives)
+        sync = SyncProducer(session.bus, session.sync.period_us, session.sync.counter, SetpointPlan(rows, cobs, 5))
+        with RawSocket(session.bus.channel, filters=((COB_SYNC, COB_MASK), (0x180, 0x780), (0x280, 0x780))) as bus:
+            sync.start()
+            log = collect(bus, 1.5, sync)
+            sync.stop()
+            # Late on a busy machine is allowed, lost is not.
+            log = np.concatenate([log, collect(bus, 3.0)])
+            assert bus.dropped == 0
+        events = master.supervise()
+        master.stop()
+    assert output.code == 0, output.text
+    assert f"{sync.sent} SYNC answered" in output.text
+    assert [event for event in events if event.kind == "emcy"] == []
+    assert np.count_nonzero(log["can_id"] == COB_SYNC) == sync.sent
+    first = sync.first
+    assert first is not None
+    for j, drive in enumerate(session.drives):
+        position = column(log, 0x180 + drive.node_id, 0, "<i4")
+        demand = column(log, 0x280 + drive.node_id, 0, "<i4")
+        assert position.size == sync.sent
+        assert demand.size == sync.sent // 5
+        # Row m becomes the target at SYNC first + 5 m and is reached five SYNC later.
+        knot = (first - 4) // 5 + 1
+        np.testing.assert_array_equal(demand[knot : knot + len(rows)], rows[: demand.size - knot, j])
+        # The loosest loop lags a 1 s swing by far less than a tenth of it once friction is overcome.
+        assert np.abs(position[4::5][: demand.size] - demand).max() < 12_000
+
+
+def test_mappings_are_refused_as_cia_301_prescribes(config: Path) -> None:
+    session = load_session(config)
+    with robot_process(config):
+        network = canopen.Network()
+        network.connect(interface="socketcan", channel=session.bus.channel)
+        try:
+            node = network.add_node(1, str(session.drives[0].eds))
+            node.sdo.RESPONSE_TIMEOUT = 2.0
+
+            def refused(index: int, subindex: int, value: int) -> int:
+                entry = node.sdo[index] if index >= 0x6000 else node.sdo[index][subindex]
+                with pytest.raises(canopen.SdoAbortedError) as caught:
+                    entry.raw = value
+                return int(caught.value.code)
+
+            assert refused(0x1A00, 0, 0) == 0x08000022, "mapping while the PDO is valid"
+            node.sdo[0x1800][1].raw = 0x80000181
+            assert refused(0x1A00, 1, 0x60640020) == 0x06010000, "entry while the number of entries is not 0"
+            node.sdo[0x1A00][0].raw = 0
+            assert refused(0x1A00, 1, 0x10080020) == 0x06040041, "device name is not mappable"
+            assert refused(0x1A00, 1, 0x60640010) == 0x06040041, "position has 32 bits"
+            for subindex in (1, 2, 3):
+                node.sdo[0x1A00][subindex].raw = 0x60640020
+            assert refused(0x1A00, 0, 3) == 0x06040042, "twelve bytes"
+            node.sdo[0x1A00][0].raw = 2
+            assert refused(0x1800, 2, 245) == 0x06090030, "reserved transmission type"
+            assert refused(0x6060, 0, 1) == 0x06090030, "profile position mode is not supported"
+            assert node.sdo[0x6075].raw == 2500, "rated current, mA"
+        finally:
+            network.disconnect()
+
+
+def test_nmt_states_govern_boot_up_heartbeat_sdo_and_pdo(config: Path) -> None:
+    session = load_session(config)
+    channel = session.bus.channel
+    with RawSocket(channel) as bus, robot_process(config):
+        boot = collect(bus, 0.3)
+        assert {int(f["can_id"]) for f in boot if f["length"] == 1 and f["data"][0] == 0} >= set(range(0x701, 0x707))
+        network = canopen.Network()
+        network.connect(interface="socketcan", channel=channel)
+        try:
+            node = network.add_node(3, str(session.drives[0].eds))
+            node.sdo.RESPONSE_TIMEOUT, node.sdo.MAX_RETRIES = 0.5, 1
+            node.sdo[0x1017].raw = 50
+            collect(bus, 0.05)
+            beats = column(collect(bus, 0.6), 0x703, 0, "<u1")
+            assert 8 <= beats.size <= 14
+            assert set(beats) == {127}
+            network.send_message(0, bytes([NmtCommand.STOP, 3]))
+            time.sleep(0.1)
+            with pytest.raises(canopen.SdoCommunicationError):
+                _ = node.sdo[0x1000].raw
+            assert set(column(collect(bus, 0.3), 0x703, 0, "<u1")[1:]) == {4}
+            network.send_message(0, bytes([NmtCommand.RESET_NODE, 3]))
+            assert 0 in column(collect(bus, 0.3), 0x703, 0, "<u1"), "boot-up message"
+            assert node.sdo[0x1017].raw == 0, "back to power-on values"
+        finally:
+            network.disconnect()
+
+
+def test_a_replayed_recording_arrives_sample_by_sample(config: Path, tmp_path: Path) -> None:
+    session = load_session(config)
+    robot = load_robot(session.robot)
+    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
+    move = trajectory.moves[0].model_copy(update={"to": tuple(SHORT_MOVE), "duration": 0.4})
+    recording = simulate_recording(robot, trajectory.model_copy(update={"moves": (move,)}), seed=4, settle=0.1)
+    path = tmp_path / "measured.mcap"
+    write_recording(recording, path)
+    with robot_process(config, f"replay=Path({str(path)!r})") as output, DriveMaster(session, robot) as master:
+        master.configure()
+        master.start()
+        sync = SyncProducer(session.bus, session.sync.period_us, session.sync.counter)
+        with RawSocket(session.bus.channel, filters=((0x180, 0x780),)) as bus:
+            sync.start()
+            log = collect(bus, 1.0, sync)
+            sync.stop()
+            log = np.concatenate([log, collect(bus, 2.0)])
+        master.stop()
+    assert output.code == 0, output.text
+    position, current = recording.samples.raw["position"], recording.samples.raw["current"]
+    for j, drive in enumerate(session.drives):
+        sent = column(log, 0x180 + drive.node_id, 0, "<i4")
+        assert sent.size == sync.sent > len(position)
+        np.testing.assert_array_equal(sent[: len(position)], position[:, j])
+        np.testing.assert_array_equal(column(log, 0x180 + drive.node_id, 4, "<i2")[: len(current)], current[:, j])
+        assert set(sent[len(position) :]) == {int(position[-1, j])}, "the last sample stands"
