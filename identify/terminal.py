@@ -19,12 +19,17 @@ Report = Callable[[str, float], None]
 
 @contextmanager
 def progress(what: str) -> Iterator[Report]:
-    """Report stages: a bar where stderr is a terminal, otherwise one plain line per stage; neither before two seconds."""
+    """Report stages after two seconds: a bar where stderr is a terminal, otherwise one plain line per stage."""
     begin = time.monotonic()
     if not sys.stderr.isatty():
         yield lambda stage, share: _plain_line(what, stage, share, begin)
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=1.0, visible=False)
 

@@ -98,7 +98,7 @@ class Worker:
         """Subscribe, answer queries, and say that the worker is alive."""
         self._thread.start()
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=HISTORY_BLOCKS)
-        recovery = zenoh.ext.RecoveryConfig(heartbeat=True)
+        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
         self._subscribers = [
             zenoh.ext.declare_advanced_subscriber(
                 self._session, key, handler, history=history, recovery=recovery, subscriber_detection=True

@@ -1,4 +1,4 @@
-"""The effects a rigid model with symmetric friction can lack: one entry each, with its regressor and its explanation."""
+"""The effects a rigid model with symmetric friction can lack: one entry each, with regressor and explanation."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -145,7 +145,9 @@ CATALOGUE: dict[str, CatalogueEffect] = {
 }
 
 
-def joint_signals(robot: RobotConfig, joint: int, q: Array, qd: Array, sign: Literal["smooth", "sharp"]) -> JointSignals:
+def joint_signals(
+    robot: RobotConfig, joint: int, q: Array, qd: Array, sign: Literal["smooth", "sharp"]
+) -> JointSignals:
     """What the effects of joint number ``joint`` (from 0) depend on; ``q`` and ``qd`` have shape (N, n)."""
     speed = qd[:, joint]
     smooth = np.sign(speed) if sign == "sharp" else 2 / np.pi * np.arctan(robot.friction.sign_smoothing * speed)

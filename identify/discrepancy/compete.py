@@ -107,7 +107,9 @@ def attempt(
     tuple or None
         Drop of the training sum of squares and the trial; ``None`` if the model already contains the candidate.
     """
-    rows = whitened_rows(problem, fit.noise, joint, joint_columns(problem, joint, columns, held_out=False), held_out=False)
+    rows = whitened_rows(
+        problem, fit.noise, joint, joint_columns(problem, joint, columns, held_out=False), held_out=False
+    )
     inside = fit.q.T @ rows
     beside = rows - fit.q @ inside
     scale = np.linalg.norm(rows, axis=0)
@@ -121,7 +123,9 @@ def attempt(
     coefficients = (vt[kept].T @ (projected / s[kept])) / scale
     dropped = float(projected @ projected)
 
-    held = whitened_rows(problem, fit.noise, joint, joint_columns(problem, joint, columns, held_out=True), held_out=True)
+    held = whitened_rows(
+        problem, fit.noise, joint, joint_columns(problem, joint, columns, held_out=True), held_out=True
+    )
     delta = held @ coefficients - fit.held_x @ (fit.solve(rows) @ coefficients)
     before = fit.held_residual
     gain = float(before @ before - (before - delta) @ (before - delta))

@@ -150,16 +150,16 @@ def diagnose(
         measured=np.concatenate([piece.block.y for piece in held]),
         before=np.concatenate([x @ first.theta for x in before]),
         after=np.concatenate([piece.block.x @ current.theta for piece in held]),
-        qd=np.concatenate(
-            [piece.signals.qd[problem.decimation.instants(piece.signals.qd.shape[0])] for piece in held]
-        ),
+        qd=np.concatenate([piece.signals.qd[problem.decimation.instants(piece.signals.qd.shape[0])] for piece in held]),
     )
 
 
 def _add_winner(problem: Problem, current: Fit) -> tuple[Finding, Problem, Fit] | None:
     """Add the candidate that predicts the held-out data best, if any passes and really makes it smaller."""
     trials = try_catalogue(problem, current)
-    passing = [t for t in trials if t.score >= MIN_SCORE and t.share >= MIN_SHARE and t.p_value * len(trials) < FALSE_ALARMS]
+    passing = [
+        t for t in trials if t.score >= MIN_SCORE and t.share >= MIN_SHARE and t.p_value * len(trials) < FALSE_ALARMS
+    ]
     for winner in passing:
         name = problem.robot.joints[winner.joint].name
         stanza = Effect(effect=winner.effect, joint=name, parameters=winner.shape)

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from configs import DataError, RobotConfig
-from identify.discrepancy.catalogue import JointSignals, effect_regressor, joint_signals
-from identify.estimators.noise import ArModel
+from identify.discrepancy.catalogue import JointSignals, effect_names, effect_regressor, joint_signals
+from identify.estimators.noise import ArModel, fit_ar
 from identify.estimators.regression import (
     Block,
     filtered_regressor,
     joint_variances,
-    noise_models,
     require_excitation,
+    residuals,
     weighted_rows,
 )
 from identify.experiment import Experiment
@@ -40,7 +40,8 @@ REWEIGHTINGS = 3
 class Piece:
     """One uninterrupted stretch of motion, SI on the joint side.
 
-    ``signals`` (N, n) are smoothed positions, velocities and accelerations, ``tau`` (N, n) the torques aligned with them.
+    ``signals`` (N, n) are smoothed positions, velocities and accelerations, ``tau`` (N, n) the torques aligned
+    with them.
     """
 
     signals: Derivatives
@@ -152,8 +153,6 @@ def with_effects(problem: Problem, robot: RobotConfig) -> Problem:
         block = Block(piece.block.y, np.concatenate([base, extra], axis=2), piece.block.keep, piece.block.t)
         return Piece(piece.signals, piece.tau, block)
 
-    from identify.discrepancy.catalogue import effect_names
-
     names = (*problem.model.base.names, *effect_names(robot))
     train, held = tuple(map(extended, problem.train)), tuple(map(extended, problem.held_out))
     return Problem(robot, problem.model, names, problem.decimation, train, held)
@@ -180,25 +179,27 @@ def fit(problem: Problem) -> Fit:
         theta = linalg.solve_triangular(r, q.T @ target) / scale
         residual = target - rows @ theta
         final = noise
-        noise = noise_models(blocks, theta, MAX_AR_ORDER)
+        noise = _noise_models(blocks, theta)
     held = [piece.block for piece in problem.held_out]
     held_x = weighted_rows([b.x for b in held], [b.keep for b in held], final)
     held_y = weighted_rows([b.y for b in held], [b.keep for b in held], final)
     return Fit(theta, tuple(final), q, r, scale, residual, held_x, held_y - held_x @ theta)
 
 
-def joint_columns(problem: Problem, joint: int, columns: Callable[[JointSignals], Array], *, held_out: bool) -> list[Array]:
+def joint_columns(
+    problem: Problem, joint: int, columns: Callable[[JointSignals], Array], *, held_out: bool
+) -> list[Array]:
     """Filtered columns (M, k) that a function of the signals of one joint adds to that joint's equations."""
     pieces = problem.held_out if held_out else problem.train
     return [
-        problem.decimation(
-            columns(joint_signals(problem.robot, joint, piece.signals.q, piece.signals.qd, "smooth"))
-        )
+        problem.decimation(columns(joint_signals(problem.robot, joint, piece.signals.q, piece.signals.qd, "smooth")))
         for piece in pieces
     ]
 
 
-def whitened_rows(problem: Problem, noise: Sequence[ArModel], joint: int, columns: list[Array], *, held_out: bool) -> Array:
+def whitened_rows(
+    problem: Problem, noise: Sequence[ArModel], joint: int, columns: list[Array], *, held_out: bool
+) -> Array:
     """Columns of one joint as rows of the whitened stack: zero in the equations of the other joints."""
     pieces = problem.held_out if held_out else problem.train
     rows = []
@@ -219,6 +220,14 @@ def relative_errors(problem: Problem, theta: Array, *, held_out: bool) -> tuple[
     return 100 * float(np.linalg.norm(error) / np.linalg.norm(torque)), [float(v) for v in each]
 
 
+def _noise_models(blocks: Sequence[Block], theta: Array) -> list[ArModel]:
+    """AR model of each joint's residual (6.21 to 6.25), its variance corrected for the parameters estimated."""
+    errors = residuals(blocks, theta)
+    free = 1 - theta.size / sum(block.y.size for block in blocks)
+    models = [fit_ar([e[:, j] for e in errors], MAX_AR_ORDER) for j in range(blocks[0].y.shape[1])]
+    return [ArModel(ar.coefficients, ar.variance / free, ar.aic) for ar in models]
+
+
 def _derived(experiment: Experiment, method: Method, bandwidth: float) -> tuple[Derivatives, Array]:
     # A torque is held from one sample to the next: the mean of two neighbours sits at the sample between them.
     tau = experiment.tau.copy()
@@ -226,9 +235,7 @@ def _derived(experiment: Experiment, method: Method, bandwidth: float) -> tuple[
     return differentiate(experiment.q, experiment.dt, method, bandwidth_hz=bandwidth), tau
 
 
-def _piece(
-    whole: tuple[Derivatives, Array], span: slice, model: ArmModel, decimation: Decimation, dt: float
-) -> Piece:
+def _piece(whole: tuple[Derivatives, Array], span: slice, model: ArmModel, decimation: Decimation, dt: float) -> Piece:
     derived, tau = whole[0], np.ascontiguousarray(whole[1][span])
     signals = Derivatives(
         np.ascontiguousarray(derived.q[span]),
@@ -238,5 +245,5 @@ def _piece(
     )
     y = decimation(tau)
     x = filtered_regressor(model, signals, decimation)
-    t = decimation.instants(tau.shape[0]) * dt
+    t = np.asarray(decimation.instants(tau.shape[0]) * dt, dtype=np.float64)
     return Piece(signals, tau, Block(y, x, np.ones(y.shape, dtype=bool), t))

@@ -151,7 +151,9 @@ def _white_words(document: IdentificationDocument) -> str:
         return "not tested"
     outside = 100 * worst.fraction_outside_2sigma
     if worst.fraction_outside_2sigma <= 0.15:
-        return f"white (at most {outside:.0f} % of the lags outside, on {worst.joint}): the uncertainties can be trusted"
+        return (
+            f"white (at most {outside:.0f} % of the lags outside, on {worst.joint}): the uncertainties can be trusted"
+        )
     return (
         f"not white ({outside:.0f} % of the lags outside on {worst.joint}): something the model lacks is left, "
         "and the uncertainties may be too small"

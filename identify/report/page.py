@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, MUTED, MEASURED, MODEL, RESIDUAL, BAND = "#1d2733", "#6b7785", "#b3bac4", "#c2410c", "#2f6f9f", "#dfe8f1"
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "font.family": "sans-serif",
     "font.size": 9,
     "axes.spines.top": False,

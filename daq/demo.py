@@ -1,0 +1,369 @@
+"""``armident demo``: the whole story on one machine, told by the real processes of a plant."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any, NoReturn
+
+import yaml
+
+from configs import ArmidentError, ConfigError, SessionConfig, load_session
+from drivers.vcan import ensure_vcan, have_socketcan, launcher_available, launcher_command
+
+CELL = "tx40_cell.yaml"
+SCENARIO = "scenarios/tx40_worn_joint2.yaml"
+GUEST_VARIABLE = "ARMIDENT_GUEST"
+REPEATS = 3
+"""How often the second chapter runs the trajectory: an effect as small as its own needs more than one pass."""
+UDP_GROUP = "239.74.163.2"
+UDP_PERIOD_US = 4000
+READY_S = 120.0
+"""How long a process may take to say that it is ready; compiling its loops for the first time takes most of it."""
+CHAPTER_S = 300.0
+STOP_S = 10.0
+TAIL_LINES = 8
+_CHAPTER = re.compile(r"<!-- chapter begins -->(.*?)<!-- chapter ends -->", re.DOTALL)
+
+
+def demo(*, out: Path, keep_going: bool = False, quick: bool = False) -> None:
+    """Run both chapters and write the report.
+
+    Parameters
+    ----------
+    out
+        Directory of recordings, results and the report.
+    keep_going
+        Leave the virtual cell of the last chapter running until Ctrl-C.
+    quick
+        Only the first chapter.
+
+    Raises
+    ------
+    ConfigError
+        If the bus cannot be set up.
+    ArmidentError
+        If a process fails; says which, and the end of what it printed.
+    """
+    session = _session_for_this_machine(out, keep_going, quick)
+    out = out.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    begin = time.monotonic()
+
+    def say(line: str) -> None:
+        print(f"[{time.monotonic() - begin:5.1f} s] {line}", flush=True)
+
+    with ExitStack() as stack:
+        first = _first_chapter(session, out, say, stack)
+        second = None if quick else _second_chapter(session, out, say, stack)
+        report = _write_report(out, first, second)
+        _print_table(first, second)
+        print(f"report: {report}", flush=True)
+        if keep_going:
+            robot = _start_robot(_write_session(session, out, "running"), out, say, stack)
+            say("the virtual cell keeps running; Ctrl-C ends it")
+            robot.process.wait()
+
+
+@dataclass(frozen=True)
+class Identified:
+    """The first chapter's results: the document, the page, and what the virtual arm says its parameters are."""
+
+    document: dict[str, Any]
+    report: Path
+    truth: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Diagnosed:
+    """The second chapter's results."""
+
+    document: dict[str, Any]
+    report: Path
+
+
+def _session_for_this_machine(out: Path, keep_going: bool, quick: bool) -> SessionConfig:
+    """The demo's session on the best bus there is; starts over inside the guest where that has it."""
+    session = load_session(CELL)
+    if have_socketcan():
+        ensure_vcan(session.bus.channel)
+        return session
+    reason = "the guest has no SocketCAN" if os.environ.get(GUEST_VARIABLE) else launcher_available()
+    if reason is None:
+        print("this kernel has no SocketCAN: running under a User-Mode Linux guest that has", flush=True)
+        _start_over_in_guest(out, keep_going, quick)
+    print(f"no vcan here ({reason}): running on udp_multicast at a lower rate, which may lose frames", flush=True)
+    return session.model_copy(
+        update={
+            "bus": session.bus.model_copy(update={"interface": "udp_multicast", "channel": UDP_GROUP}),
+            "sync": session.sync.model_copy(update={"period_us": UDP_PERIOD_US}),
+            "streams": {name: s.model_copy(update={"every": 1}) for name, s in session.streams.items()},
+            "setpoints": session.setpoints and session.setpoints.model_copy(update={"every": 1}),
+        }
+    )
+
+
+def _start_over_in_guest(out: Path, keep_going: bool, quick: bool) -> NoReturn:
+    options = ["--keep-going"] * keep_going + ["--quick"] * quick
+    out = out.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    if out.is_relative_to(Path.cwd()) or out.is_relative_to("/tmp"):
+        command = launcher_command([*_armident(), "demo", "--out", str(out), *options])
+        raise SystemExit(subprocess.run(command, check=False).returncode)
+    # The guest can write below the working directory only: there the results go first.
+    raise ConfigError(
+        f"--out {out}: expected a folder below the working directory or /tmp, the guest writes nowhere else"
+    )
+
+
+def _armident() -> list[str]:
+    return [sys.executable, "-m", "daq.cli"]
+
+
+def _first_chapter(session: SessionConfig, out: Path, say: Callable[[str], None], stack: ExitStack) -> Identified:
+    say("chapter 1: a virtual TX40 is recorded at "
+        f"{1 / session.sync_period:.0f} Hz and identified")  # fmt: skip
+    config = _write_session(session, out, "cell")
+    truth_file = out / "truth.json"
+    with ExitStack() as chapter:
+        worker = chapter.enter_context(
+            _running("worker", ["worker", "--config", str(config), "--once", "--out", str(out)], out, "worker: ready")
+        )
+        say("worker: ready")
+        robot = _start_robot(config, out, say, chapter, ["--truth", str(truth_file)])
+        capture = chapter.enter_context(
+            _running("capture", ["capture", "--config", str(config), "--out", str(out / "recordings")], out)
+        )
+        capture.wait(CHAPTER_S, say)
+        robot.stop()
+        say("worker: identifying what it heard")
+        worker.wait(CHAPTER_S, say)
+        log = worker.text()
+    result, report = _line_after(log, "result: ", worker.name), _line_after(log, "report: ", worker.name)
+    document = json.loads(Path(result).read_text(encoding="utf-8"))
+    essential = sum(1 for p in document["parameters"] if p["essential"])
+    say(f"identified: {essential} essential parameters, relative torque error {document['relative_error_pct']:.1f} %")
+    return Identified(document, Path(report), json.loads(truth_file.read_text(encoding="utf-8")))
+
+
+def _second_chapter(session: SessionConfig, out: Path, say: Callable[[str], None], stack: ExitStack) -> Diagnosed:
+    say("chapter 2: the same arm with an effect hidden in it; nobody tells the diagnosis which")
+    if session.setpoints is not None:
+        session = session.model_copy(update={"setpoints": session.setpoints.model_copy(update={"repeat": REPEATS})})
+    config = _write_session(session, out, "cell_worn")
+    with ExitStack() as chapter:
+        robot = _start_robot(config, out, say, chapter, ["--scenario", SCENARIO])
+        capture = chapter.enter_context(
+            _running(
+                "capture_worn", ["capture", "--config", str(config), "--out", str(out / "recordings"), "--json"], out
+            )
+        )
+        capture.wait(CHAPTER_S, say)
+        robot.stop()
+        recording = json.loads(capture.text().splitlines()[-1])["recording"]
+        say("diagnosing")
+        folder = out / "diagnosis"
+        diagnosis = chapter.enter_context(
+            _running("diagnose", ["diagnose", recording, "--out", str(folder), "--json"], out)
+        )
+        diagnosis.wait(CHAPTER_S, say, accepted=(0, 4))
+    document = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    for finding in document["findings"]:
+        say(
+            f"found: {finding['effect'].replace('_', ' ')} in {finding['joint']}; torque error of that joint on held-out "
+            f"data {finding['gap_before']:.2f} % -> {finding['gap_after']:.2f} %"
+        )
+    if not document["findings"]:
+        say(f"nothing found: verdict {document['verdict']}")
+    return Diagnosed(document, folder / "report.html")
+
+
+def _start_robot(
+    config: Path, out: Path, say: Callable[[str], None], stack: ExitStack, options: Sequence[str] = ()
+) -> "_Process":
+    robot = stack.enter_context(_running("robot", ["robot", "--config", str(config), *options], out, "ready"))
+    say(f"robot: {robot.text().strip().splitlines()[-1]}")
+    return robot
+
+
+def _write_session(session: SessionConfig, out: Path, name: str) -> Path:
+    """A session file with absolute paths."""
+    path = out / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(session.model_dump(mode="json", by_alias=True), sort_keys=False), encoding="utf-8")
+    return path
+
+
+class _Process:
+    """A command of ours, running, with everything it prints in a file."""
+
+    def __init__(self, name: str, arguments: Sequence[str], out: Path) -> None:
+        self.name = name
+        logs = out / "logs"
+        logs.mkdir(parents=True, exist_ok=True)
+        self.log = logs / f"{name}.log"
+        with self.log.open("wb") as output:
+            self.process = subprocess.Popen(
+                [*_armident(), *arguments], stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
+            )
+
+    def text(self) -> str:
+        return self.log.read_text(encoding="utf-8", errors="replace")
+
+    def wait_for(self, line_start: str, seconds: float) -> None:
+        """Wait until it prints a line that begins so."""
+        until = time.monotonic() + seconds
+        while not any(line.startswith(line_start) for line in self.text().splitlines()):
+            if self.process.poll() is not None:
+                raise self._failed(f"ended with exit code {self.process.returncode} before it was ready")
+            if time.monotonic() > until:
+                raise self._failed(f"was not ready within {seconds:.0f} s")
+            time.sleep(0.1)
+
+    def wait(self, seconds: float, say: Callable[[str], None], accepted: Sequence[int] = (0,)) -> None:
+        """Wait for its end and pass on what it prints on the way."""
+        until, shown = time.monotonic() + seconds, 0
+        while True:
+            code = self.process.poll()
+            lines = self.text().splitlines()
+            for line in lines[shown:]:
+                if not line.startswith(("{", " ", "}")) and len(line) < 160:
+                    say(f"{self.name}: {line.removeprefix(self.name + ': ')}")
+            shown = len(lines)
+            if code is not None:
+                break
+            if time.monotonic() > until:
+                raise self._failed(f"did not end within {seconds:.0f} s")
+            time.sleep(0.2)
+        if code not in accepted:
+            raise self._failed(f"ended with exit code {code}")
+
+    def stop(self) -> None:
+        """Ask it to end, and make it."""
+        if self.process.poll() is None:
+            self.process.terminate()
+            try:
+                self.process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+
+    def _failed(self, how: str) -> ArmidentError:
+        tail = [line.strip() for line in self.text().splitlines() if line.strip()][-TAIL_LINES:]
+        return ArmidentError(f"demo: {self.name} {how} (log: {self.log}): {' | '.join(tail) or 'it printed nothing'}")
+
+
+@contextmanager
+def _running(name: str, arguments: Sequence[str], out: Path, ready: str | None = None) -> Iterator[_Process]:
+    process = _Process(name, arguments, out)
+    try:
+        if ready is not None:
+            process.wait_for(ready, READY_S)
+        yield process
+    finally:
+        process.stop()
+
+
+def _line_after(text: str, start: str, who: str) -> str:
+    for line in text.splitlines():
+        if line.startswith(start):
+            return line.removeprefix(start).strip()
+    raise ArmidentError(f"demo: {who} did not say where its {start.strip(': ')} is")
+
+
+def _write_report(out: Path, first: Identified, second: Diagnosed | None) -> Path:
+    """One page of both chapters, from the pages that the commands wrote."""
+    page = first.report.read_text(encoding="utf-8")
+    chapters = [_chapter(page)] + ([] if second is None else [_chapter(second.report.read_text(encoding="utf-8"))])
+    head = page[: page.index("<!-- chapter begins -->")]
+    tail = page[page.index("<!-- chapter ends -->") :].removeprefix("<!-- chapter ends -->")
+    path = out / "report.html"
+    handle, temporary = tempfile.mkstemp(dir=out, prefix=".report.")
+    with os.fdopen(handle, "w", encoding="utf-8") as file:
+        file.write(head + _SUMMARY.substitute(_summary(first, second)))
+        file.write("".join(f'<section style="margin-top:56px">{chapter}</section>' for chapter in chapters) + tail)
+    os.chmod(temporary, 0o644)
+    os.replace(temporary, path)
+    return path
+
+
+def _chapter(page: str) -> str:
+    found = _CHAPTER.search(page)
+    if found is None:
+        raise ArmidentError("demo: a report has no chapter to take over")
+    return found.group(1)
+
+
+_SUMMARY = Template("""
+<h1>armident: what just happened on this machine</h1>
+<p class="sub">A virtual Staubli TX40, its drives and its bus were started; everything else is what runs in a plant.</p>
+<ol>
+<li>The arm's six drives were configured over CANopen and recorded at $rate samples per second: $rows samples of each of
+$joints joints, $gaps lost.</li>
+<li>A worker heard the samples on Zenoh and identified the arm's dynamic model: $essential parameters matter, the model predicts the
+torques to $error %, and $close of the $compared parameters that can be compared with the virtual arm's own
+lie within three standard deviations of them (the farthest: $worst).</li>
+$second
+</ol>
+""")
+
+
+def _summary(first: Identified, second: Diagnosed | None) -> dict[str, str]:
+    document = first.document
+    compared = _against_truth(first)
+    worst = max(compared, key=lambda row: abs(row[4]), default=None)
+    line = ""
+    if second is not None:
+        found = second.document["findings"]
+        names = ", ".join(f"{f['effect'].replace('_', ' ')} in {f['joint']}" for f in found) or "nothing"
+        gap = second.document["gap"]["validation"]
+        line = (
+            f"<li>Then an effect was hidden in the arm. The diagnosis, which was not told, found: <b>{escape(names)}</b>. "
+            f"On data it had not seen the torque error went from {gap['before']['all']:.2f} % to "
+            f"{gap['after']['all']:.2f} %, the noise floor is {second.document['noise_floor']['all']:.2f} %.</li>"
+        )
+    counters = {} if worst is None else {"worst": f"{worst[0]}, {abs(worst[4]):.1f}"}
+    return {
+        "rate": f"{document['recording']['sample_rate_hz']:.0f}",
+        "rows": str(document["recording"]["samples"]),
+        "joints": str(len(document["relative_error_pct_by_joint"])),
+        "gaps": "none" if not any("missing" in w for w in document["warnings"]) else "some",
+        "essential": str(sum(1 for p in document["parameters"] if p["essential"])),
+        "error": f"{document['relative_error_pct']:.1f}",
+        "close": str(sum(1 for row in compared if abs(row[4]) <= 3)),
+        "compared": str(len(compared)),
+        "worst": "none",
+        "second": line,
+        **counters,
+    }
+
+
+def _against_truth(first: Identified) -> list[tuple[str, float, float, float, float]]:
+    """Essential parameters: name, value, standard deviation, the plant's own, and the distance in deviations."""
+    return [
+        (p["name"], p["value"], p["std"], first.truth[p["name"]], (p["value"] - first.truth[p["name"]]) / p["std"])
+        for p in first.document["parameters"]
+        if p["essential"] and p["name"] in first.truth and p["std"] > 0
+    ]
+
+
+def _print_table(first: Identified, second: Diagnosed | None) -> None:
+    print(f"\n{'parameter':>10} {'identified':>11} {'+- std':>9} {'true':>9} {'off by':>9}")
+    for name, value, std, truth, distance in _against_truth(first):
+        print(f"{name:>10} {value:11.4f} {std:9.4f} {truth:9.4f} {distance:5.1f} std")
+    if second is not None:
+        gap = second.document["gap"]["validation"]
+        print(f"\nhidden effect: {second.document['verdict'].replace('_', ' ')}")
+        for f in second.document["findings"]:
+            print(
+                f"  {f['effect']} in {f['joint']}: {f['gap_before']:.2f} % -> {f['gap_after']:.2f} % on held-out data"
+            )
+        print(f"  all joints: {gap['before']['all']:.2f} % -> {gap['after']['all']:.2f} %\n")
