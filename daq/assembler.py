@@ -134,7 +134,7 @@ class Assembler:
         sent
             How many SYNC were sent so far, where we send them: no gap is longer than that.
         """
-        columns = frames["can_id"], frames["length"], frames["t_ns"], frames["data"]
+        columns = _columns(frames)
         longest = self._longest if sent is None else min(self._longest, sent - self.last_sync)
         out = room_for(self._books, count_sync(*columns, *self._timing, longest, self._books))
         match(*columns, *self._timing, longest, self._books, out)
@@ -146,6 +146,18 @@ class Assembler:
         out = room_for(self._books, total - self.last_sync)
         finish(total, self._books, out)
         return self._batch(out, True)
+
+    def warm_up(self, frames: NDArray[Any]) -> None:
+        """Compile the loops for frames like these (two or more), so that no SYNC waits for the compiler."""
+        late = [int(w) for w in self._books.window]
+        nobody = np.full(1, -1, np.int64)
+        scratch = open_books(
+            self._books.every.tolist(), late, self._books.length.tolist(), nobody, self._books.settled.shape[1]
+        )
+        columns = _columns(frames)
+        out = room_for(scratch, count_sync(*columns, *self._timing, self._longest, scratch))
+        match(*columns, *self._timing, self._longest, scratch, out)
+        finish(0, scratch, out)
 
     def _batch(self, out: Decided, final: bool) -> Batch:
         rows, gaps = {}, []
@@ -160,9 +172,9 @@ class Assembler:
                 self._totals[f"{stream.name}.in_gaps"] += whole.size - complete
                 self._totals[f"{stream.name}.discarded"] += int(np.count_nonzero(code[~whole] == RECEIVED))
                 gaps += self._gaps(stream, sync[~whole], t_ns[~whole], code[~whole])
-                rows[stream.name] = Rows(sync[whole], t_ns[whole], out.data[s, part][whole])
+                rows[stream.name] = Rows(sync[whole], t_ns[whole], _bytes(out.data[s, part][whole]))
             else:
-                rows[stream.name] = Rows(sync, t_ns, out.data[s, part])
+                rows[stream.name] = Rows(sync, t_ns, _bytes(out.data[s, part]))
             gaps += self._ended(stream, int(sync[-1]) if sync.size else None, final)
         return Batch(rows, tuple(sorted(gaps, key=lambda g: (g.first, g.stream, g.joint or ""))))
 
@@ -171,7 +183,7 @@ class Assembler:
     ) -> list[Gap]:
         """Gaps that are over, of the incomplete rows given; what may go on is kept open."""
         unseen = t_ns == UNSEEN
-        found = [(None, SYNC_LOST, sync[unseen])]
+        found: list[tuple[str | None, str, NDArray[np.int64]]] = [(None, SYNC_LOST, sync[unseen])]
         for value, reason in REASONS.items():
             hit = (code == value) & ~unseen[:, None]
             everyone = hit.all(axis=1)
@@ -202,3 +214,13 @@ class Assembler:
                 del self._open[key]
                 gaps.append(Gap(stream.name, begin, end, key[1], key[2]))
         return gaps
+
+
+def _columns(frames: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """Identifiers, lengths, times and data (as one number each) of frames."""
+    return frames["can_id"], frames["length"], frames["t_ns"], frames["data"].view("<u8")[:, 0]
+
+
+def _bytes(data: NDArray[np.uint64]) -> NDArray[np.uint8]:
+    """Numbers (N, n) as the bytes (N, n, 8) they were read from."""
+    return data.view(np.uint8).reshape(*data.shape, 8)

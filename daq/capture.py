@@ -183,6 +183,7 @@ class _Run:
             1 if order.producing else None,
         )
         self._batch = frames(BATCH)
+        self._assembler.warm_up(self._batch[:2])
         self._producer: SyncProducer | None = None
         self._master: DriveMaster | None = None
         self._motion: Motion | None = None

@@ -56,12 +56,12 @@ class Books(NamedTuple):
     pending: NDArray[np.int64]
     fresh: NDArray[np.int64]
     label: NDArray[np.int64]
-    answer: NDArray[np.uint8]
+    answer: NDArray[np.uint64]
     answer_code: NDArray[np.uint8]
     row_sync: NDArray[np.int64]
     row_t: NDArray[np.int64]
     row_code: NDArray[np.uint8]
-    row_data: NDArray[np.uint8]
+    row_data: NDArray[np.uint64]
 
 
 class Decided(NamedTuple):
@@ -71,7 +71,7 @@ class Decided(NamedTuple):
     sync: NDArray[np.int64]
     t_ns: NDArray[np.int64]
     code: NDArray[np.uint8]
-    data: NDArray[np.uint8]
+    data: NDArray[np.uint64]
 
 
 def open_books(every: list[int], window: list[int], length: list[int], channel_of: NDArray[np.int64], n: int) -> Books:
@@ -91,12 +91,12 @@ def open_books(every: list[int], window: list[int], length: list[int], channel_o
         pending=np.zeros((streams, n), np.int64),
         fresh=np.zeros((streams, n), np.int64),
         label=np.zeros((streams, n, answers), np.int64),
-        answer=np.zeros((streams, n, answers, 8), np.uint8),
+        answer=np.zeros((streams, n, answers), np.uint64),
         answer_code=np.zeros((streams, n, answers), np.uint8),
         row_sync=np.zeros((streams, rows), np.int64),
         row_t=np.zeros((streams, rows), np.int64),
         row_code=np.zeros((streams, rows, n), np.uint8),
-        row_data=np.zeros((streams, rows, n, 8), np.uint8),
+        row_data=np.zeros((streams, rows, n), np.uint64),
     )
 
 
@@ -109,7 +109,7 @@ def room_for(books: Books, syncs: int) -> Decided:
         sync=np.empty((streams, rows), np.int64),
         t_ns=np.empty((streams, rows), np.int64),
         code=np.empty((streams, rows, n), np.uint8),
-        data=np.empty((streams, rows, n, 8), np.uint8),
+        data=np.empty((streams, rows, n), np.uint64),
     )
 
 
@@ -183,8 +183,9 @@ def _settle_all(b: Books, s: int, final: bool, out: Decided) -> None:
         o = out.count[s]
         out.sync[s, o] = b.row_sync[s, slot]
         out.t_ns[s, o] = b.row_t[s, slot]
-        out.code[s, o] = b.row_code[s, slot]
-        out.data[s, o] = b.row_data[s, slot]
+        for j in range(b.settled.shape[1]):
+            out.code[s, o, j] = b.row_code[s, slot, j]
+            out.data[s, o, j] = b.row_data[s, slot, j]
         out.count[s] += 1
         b.emitted[s] += 1
 
@@ -196,7 +197,8 @@ def _owe(b: Books, s: int, k: int, t_ns: int) -> None:
         slot = b.head[s] % b.row_sync.shape[1]
         b.row_sync[s, slot] = k
         b.row_t[s, slot] = t_ns
-        b.row_code[s, slot, :] = LOST
+        for j in range(b.settled.shape[1]):
+            b.row_code[s, slot, j] = LOST
         b.head[s] += 1
 
 
@@ -231,9 +233,9 @@ def count_sync(
             if length[i] > 0:
                 if counter >= 0:
                     elapsed = (t_ns[i] - time) / period_ns if time != UNSEEN else 0.0
-                    step = sync_step(np.int64(data[i, 0]), counter, elapsed, overflow, longest)
+                    step = sync_step(np.int64(data[i] & np.uint64(0xFF)), counter, elapsed, overflow, longest)
                 if step > 0:
-                    counter = np.int64(data[i, 0])
+                    counter = np.int64(data[i] & np.uint64(0xFF))
             if step > 0:
                 time = t_ns[i]
                 total += step
@@ -261,7 +263,7 @@ def match(
         if identifier == sync_id:
             step = 1
             if length[i] > 0:
-                counter = np.int64(data[i, 0])
+                counter = np.int64(data[i] & np.uint64(0xFF))
                 if b.state[COUNTER] >= 0:
                     elapsed = (t_ns[i] - b.state[TIME]) / period_ns if b.state[TIME] != UNSEEN else 0.0
                     step = sync_step(counter, b.state[COUNTER], elapsed, overflow, longest)
