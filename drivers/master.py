@@ -13,6 +13,7 @@ from typing import Literal, Self
 import can
 import canopen
 from canopen.emcy import EmcyError
+from canopen.network import MessageListener
 
 from configs.errors import ArmidentError, ConfigError
 from configs.robot import RobotConfig
@@ -66,6 +67,13 @@ class DriveEvent:
     """EMCY error code, or NMT state."""
 
 
+class _QuietListener(MessageListener):
+    """Keeps a failing bus from printing a traceback in canopen's thread; ``supervise`` raises the error."""
+
+    def on_error(self, exc: Exception) -> None:
+        """Take the exception as handled; python-can keeps it for :meth:`canopen.Network.check`."""
+
+
 class DriveMaster:
     """The master of the drives of one session; use it in a ``with`` block.
 
@@ -97,6 +105,7 @@ class DriveMaster:
         self._enabled = False
         self._network = canopen.Network(bus=self._open())
         self._network.NOTIFIER_CYCLE = 0.05
+        self._network.listeners = [_QuietListener(self._network)]
         self._network.connect()
         self._drives = {d.node_id: self._add(d) for d in session.drives}
 
@@ -244,7 +253,8 @@ class DriveMaster:
                 time.sleep(POLL_INTERVAL)
 
     def _order(self, controls: tuple[Control, ...]) -> None:
-        for sdo in self._drives.values():
+        # A lost drive would cost a timeout each; NMT reaches it too, if anything does.
+        for sdo in [sdo for node_id, sdo in self._drives.items() if node_id not in self._lost]:
             try:
                 for control in controls:
                     sdo.order(od.CONTROLWORD, 0, control, "H")

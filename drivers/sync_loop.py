@@ -127,7 +127,6 @@ def _run(descriptor, period, counter, state, late, address, body, rows, every, s
         if lateness > MAX_LATE_PERIODS * period:
             state[SKIPPED] += lateness // period
             state[BASE_NS] += lateness // period * period
-        state[LAST_NS] = now
         body[0, 2] = k % counter + 1
         count = 1
         if state[ROW] < rows.shape[0] and (k + 2) % every == 0:
@@ -139,4 +138,6 @@ def _run(descriptor, period, counter, state, late, address, body, rows, every, s
         if code != 0:
             state[ERROR] = code
             return
+        # Read again: the process may have been held up between the deadline and here.
+        state[LAST_NS] = _now(spec)
         state[SENT] = k + 1

@@ -1,0 +1,122 @@
+"""The SYNC producer on a real SocketCAN bus."""
+
+import subprocess
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from configs.session import Bus
+from drivers.frames import BusDown, Frames, frames
+from drivers.objects import COB_SYNC
+from drivers.socketcan import RawSocket
+from drivers.sync import SetpointPlan, SyncProducer
+
+pytestmark = pytest.mark.vcan
+
+PERIOD_US = 1000
+COBS = (0x201, 0x202)
+
+
+def record(vcan: str, producer: SyncProducer, until: Callable[[], bool]) -> Frames:
+    """Everything on the bus from the first SYNC until ``until()``, and until the producer has stopped."""
+    batch, parts = frames(4096), []
+    deadline = time.monotonic() + 60
+
+    def drain(socket: RawSocket) -> None:
+        while n := socket.receive(batch):
+            parts.append(batch[:n].copy())
+
+    with RawSocket(vcan) as socket:
+        with producer:
+            while not until():
+                assert time.monotonic() < deadline
+                socket.poll(0.1)
+                drain(socket)
+        drain(socket)
+    return np.concatenate(parts)
+
+
+def producer_on(vcan: str, counter: int = 240, plan: SetpointPlan | None = None) -> SyncProducer:
+    return SyncProducer(Bus(channel=vcan), PERIOD_US, counter, plan)
+
+
+def test_every_sync_number_is_sent_once_with_its_counter(vcan_bus: str) -> None:
+    producer = producer_on(vcan_bus, counter=10)
+    got = record(vcan_bus, producer, lambda: producer.sent >= 300)
+    assert (got["can_id"] == COB_SYNC).all()
+    assert (got["length"] == 1).all()
+    assert got["data"][:, 0].tolist() == [k % 10 + 1 for k in range(producer.sent)]
+
+
+def test_syncs_stay_on_the_time_grid_but_for_the_periods_counted_as_skipped(vcan_bus: str) -> None:
+    producer = producer_on(vcan_bus)
+    got = record(vcan_bus, producer, lambda: producer.sent >= 500)
+    stats = producer.stats()
+    grid = (got.size - 1 + stats.skipped) * PERIOD_US
+    elapsed = (got["t_ns"][-1] - got["t_ns"][0]) / 1000
+    # first and last SYNC may each be late, by no more than the producer itself says
+    assert abs(elapsed - grid) <= stats.late_max_us + 2000
+    assert 0 <= stats.late_p50_us <= stats.late_p99_us <= stats.late_max_us + 5
+
+
+def test_two_syncs_are_never_closer_than_half_a_period(vcan_bus: str) -> None:
+    producer = producer_on(vcan_bus)
+    got = record(vcan_bus, producer, lambda: producer.sent >= 500)
+    # 50 us: the two clocks, and the granularity of the guest's
+    assert np.diff(got["t_ns"]).min() > PERIOD_US * 500 - 50_000
+
+
+def rows_of(got: Frames, cob: int) -> list[int]:
+    return [int(v) for v in got[got["can_id"] == cob]["data"][:, :4].copy().view("<i4")[:, 0]]
+
+
+def test_row_m_is_on_the_bus_between_the_sync_before_its_knot_and_the_knot(vcan_bus: str) -> None:
+    rows = np.array([[-7 * m, 100_000 + m] for m in range(20)], dtype=np.int32)
+    producer = producer_on(vcan_bus, plan=SetpointPlan(rows, COBS, every=5))
+    got = record(vcan_bus, producer, lambda: producer.finished)
+    assert producer.first == 4
+    assert producer.last == 4 + 19 * 5
+    number = np.cumsum(got["can_id"] == COB_SYNC) - 1
+    for column, cob in enumerate(COBS):
+        assert rows_of(got, cob) == rows[:, column].tolist()
+        assert number[got["can_id"] == cob].tolist() == [4 + 5 * m - 1 for m in range(20)]
+
+
+def test_a_plan_given_later_starts_at_the_knot_that_play_returns(vcan_bus: str) -> None:
+    plan = SetpointPlan(np.arange(20, dtype=np.int32).reshape(10, 2), COBS, every=5)
+    producer, first = producer_on(vcan_bus), -1
+
+    def until() -> bool:
+        nonlocal first
+        if first < 0 and producer.sent > 100:
+            first = producer.play(plan)
+        return producer.finished
+
+    got = record(vcan_bus, producer, until)
+    number = np.cumsum(got["can_id"] == COB_SYNC) - 1
+    assert first > 100
+    assert (first + 1) % 5 == 0
+    assert number[got["can_id"] == COBS[0]].tolist() == [first + 5 * m - 1 for m in range(10)]
+
+
+def test_after_the_last_row_the_drives_hear_no_more_set_points(vcan_bus: str) -> None:
+    plan = SetpointPlan(np.zeros((2, 2), dtype=np.int32), COBS, every=5)
+    producer = producer_on(vcan_bus, plan=plan)
+    got = record(vcan_bus, producer, lambda: producer.sent >= 60)
+    assert len(rows_of(got, COBS[0])) == 2
+
+
+def test_a_bus_that_goes_down_ends_the_producer_with_a_reason(vcan_bus: str) -> None:
+    producer = producer_on(vcan_bus)
+    with producer:
+        while producer.sent < 10:
+            time.sleep(0.01)
+        producer.check()
+        subprocess.run(["ip", "link", "set", "dev", vcan_bus, "down"], check=True)
+        time.sleep(0.2)
+        with pytest.raises(BusDown, match="SYNC cannot be sent"):
+            producer.check()
+        with pytest.raises(BusDown):
+            producer.play(SetpointPlan(np.zeros((2, 2), dtype=np.int32), COBS))
