@@ -7,7 +7,7 @@ from configs import ConfigError, DataError, RobotConfig
 from identify.model.arm import ArmModel
 from identify.model.controller import DiscreteController
 
-STIFFNESS = 4.0
+STIFFNESS = 8.0
 """Natural frequency of the stand-in, in closed-loop bandwidths of the robot."""
 
 HIGHEST = 0.3

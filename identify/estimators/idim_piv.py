@@ -23,6 +23,9 @@ from identify.estimators.regression import (
 
 MAX_AR_ORDER = 60
 
+NOISE_UPDATES = 6
+"""Iterations after which the noise models are held: an order that flips between two equal AICs never settles."""
+
 
 def idim_piv(
     blocks: Sequence[Block],
@@ -60,14 +63,15 @@ def idim_piv(
     scale = joint_variances(blocks, start)
     noise: list[ArModel] = scale  # step 1: H = 1, lambda from the start
 
-    def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
+    def step(previous: NDArray[np.float64], k: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise
         zeta = auxiliary.instruments(previous)  # step 2a
         z = weighted_rows(zeta, keep, noise)
         x = weighted_rows([b.x for b in blocks], keep, noise)
         y = weighted_rows([b.y for b in blocks], keep, noise)
         estimate = instrumental_variable(z, x, y)  # step 2b, 6.30
-        noise = noise_models(blocks, estimate, max_order)  # step 2c
+        if k <= NOISE_UPDATES:
+            noise = noise_models(blocks, estimate, iv_covariance(z, x), max_order)  # step 2c
         return estimate, float(np.linalg.norm(weighted_rows(residuals(blocks, estimate), keep, scale)))
 
     theta, done, converged, reason = iterate(step, start, iterations, TOLERANCE)

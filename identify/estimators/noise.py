@@ -53,24 +53,26 @@ class Whiteness:
         return float(np.mean(np.abs(self.autocorrelation) > self.bound))
 
 
-def fit_ar(series: Sequence[NDArray[np.float64]], max_order: int) -> ArModel:
+def fit_ar(
+    series: Sequence[NDArray[np.float64]], max_order: int, absorbed: NDArray[np.float64] | None = None
+) -> ArModel:
     """AR model of residuals by Levinson-Durbin on the Yule-Walker equations, order by AIC (6.21 to 6.25).
 
     Parameters
     ----------
     series
-        Residuals of one joint, one array (M,) per experiment; each is centred by the common mean.
+        Residuals of one joint, one array (M,) per experiment. Their mean is not removed: it is noise like the rest.
     max_order
         Highest order tried; limited to a tenth of the samples.
+    absorbed
+        Sums over the samples of the autocovariances that the fitted parameters took out of the residuals, at lags
+        0..``max_order``; ``None``: nothing.
     """
     total = sum(s.size for s in series)
-    mean = sum(float(s.sum()) for s in series) / total
     max_order = max(0, min(max_order, total // 10, min(s.size for s in series) - 1))
-    r = np.zeros(max_order + 1)
+    r = np.zeros(max_order + 1) if absorbed is None else absorbed[: max_order + 1].copy()
     for s in series:
-        centred = s - mean
-        for lag in range(max_order + 1):
-            r[lag] += centred[lag:] @ centred[: centred.size - lag]
+        r += lagged_sums(s[:, None], max_order)
     r /= total
     if r[0] <= 0:
         return ArModel(np.empty(0), np.finfo(np.float64).tiny, -np.inf)
@@ -86,6 +88,12 @@ def fit_ar(series: Sequence[NDArray[np.float64]], max_order: int) -> ArModel:
         if aic < best.aic:
             best = ArModel(c.copy(), variance, aic)
     return best
+
+
+def lagged_sums(x: NDArray[np.float64], max_lag: int) -> NDArray[np.float64]:
+    """``sum_t x(t) . x(t - k)`` for lags 0..max_lag of a vector series (M, m)."""
+    flat = np.ascontiguousarray(x, dtype=np.float64)
+    return np.array([float(np.vdot(flat[k:], flat[: flat.shape[0] - k])) for k in range(max_lag + 1)])
 
 
 def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whiteness:
