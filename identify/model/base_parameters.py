@@ -18,7 +18,7 @@ KEEP_FIRST = ("xx", "xy", "xz", "yz", "zz", "mx", "my", "m*", "fv", "fc", "off",
 """Within a link, the order in which columns may stay: that of tables B.2 and B.3. ``m*``: prismatic joints."""
 
 RANK_TOLERANCE = 1e-9
-"""A column is dependent if less than this share of it is new (1e-16 rounding, 1e-3 at the worst when new)."""
+"""A column is dependent if less than this share of it is new: far above rounding, far below any real effect."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,8 @@
 
 Every parameter of link j is a linear form in the standard parameters, its coefficients polynomials in
 the lengths ``d_j`` and ``r_j``. The rules hand what link j cannot show on its own to link j-1, from the
-tip to the base. Rule 7, on rotor inertias of prismatic joints, is used in its general form: it holds
+tip to the base. Rule 3 is printed with ``zz`` of link j, which rule 2 hands to link j-1: here it goes there
+at once. Rule 7, on rotor inertias of prismatic joints, is used in its general form: it holds
 whenever the earlier revolute joints are parallel to the prismatic one and the earlier prismatic ones
 orthogonal, and gravity then moves a constant into ``off``.
 """

@@ -15,7 +15,7 @@ from tests.pinocchio_oracle import TO_OURS, pinocchio_model, random_parameters, 
 chains = st.tuples(st.integers(0, 2**31), st.integers(1, 7), st.booleans())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(chains)
 def test_dynamics_agree_with_pinocchio_on_random_chains(chain: tuple[int, int, bool]) -> None:
     seed, n, right_angles = chain
@@ -47,7 +47,7 @@ def test_dynamics_agree_with_pinocchio_on_random_chains(chain: tuple[int, int, b
         )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(chains)
 def test_regressor_times_parameters_is_inverse_dynamics(chain: tuple[int, int, bool]) -> None:
     seed, n, right_angles = chain
@@ -65,7 +65,7 @@ def test_regressor_times_parameters_is_inverse_dynamics(chain: tuple[int, int, b
 
 
 @pytest.mark.parametrize("right_angles", [True, False])
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 7))
 def test_rules_and_qr_find_the_same_base_parameters(right_angles: bool, seed: int, n: int) -> None:
     robot = random_robot(np.random.default_rng(seed), n, right_angles)
