@@ -58,15 +58,15 @@ check: lint ## ruff, mypy, import-linter and the quick tests, under two minutes
 
 test: lint ## everything, the tests on vcan included
 	@mkdir -p .cache
-	$(PYTEST) -m "not vcan" 2>&1 | tee .cache/tests.log
-	if $(PY) -m drivers.vcan -n 2 --setup; then
-		$(WITH_VCAN) $(PYTEST) -m vcan tests/integration 2>&1 | tee .cache/tests-vcan.log
-	else
-		$(PYTEST) -m vcan tests/integration 2>&1 | tee .cache/tests-vcan.log
-	fi
+	failed=
+	$(PYTEST) -m "not vcan" 2>&1 | tee .cache/tests.log || failed=1
+	bus=
+	if $(PY) -m drivers.vcan -n 2 --setup; then bus="$(WITH_VCAN)"; fi
+	$$bus $(PYTEST) -m vcan tests/integration 2>&1 | tee .cache/tests-vcan.log || failed=1
 	echo
 	echo "Skipped:"
 	grep -hE '^SKIPPED' .cache/tests.log .cache/tests-vcan.log || echo "nothing"
+	[ -z "$$failed" ]
 
 vcan: install ## fetch what the vcan guest needs, where this kernel has no SocketCAN
 	@$(PY) -m drivers.vcan --setup
