@@ -80,20 +80,22 @@ class Loop:
 
 
 @njit(nogil=True, cache=True)
-def _now(spec):  # type: ignore[no-untyped-def]
+def monotonic_ns(spec):  # type: ignore[no-untyped-def]
+    """Read CLOCK_MONOTONIC (ns); ``spec`` (2,) int64 is room for a ``struct timespec``."""
     _clock_gettime(_MONOTONIC, spec.ctypes.data)
     return spec[0] * 1_000_000_000 + spec[1]
 
 
 @njit(nogil=True, cache=True)
-def _sleep_until(deadline, spec):  # type: ignore[no-untyped-def]
+def sleep_until(deadline, spec):  # type: ignore[no-untyped-def]
+    """Sleep until CLOCK_MONOTONIC reads ``deadline`` (ns)."""
     spec[0], spec[1] = deadline // 1_000_000_000, deadline % 1_000_000_000
     while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, spec.ctypes.data, 0) == _EINTR:
         pass
 
 
 @njit(nogil=True, cache=True)
-def _send(descriptor, address, count, spec):  # type: ignore[no-untyped-def]
+def send_messages(descriptor, address, count, spec):  # type: ignore[no-untyped-def]
     """Hand ``count`` messages to the kernel; 0, or errno if it will not take them."""
     sent, code = 0, 0
     for _ in range(_SEND_ATTEMPTS):
@@ -106,19 +108,19 @@ def _send(descriptor, address, count, spec):  # type: ignore[no-untyped-def]
         code = carray(_errno_location(), 1, np.int32)[0]
         if code not in (_EAGAIN, _ENOBUFS, _EINTR):
             return code
-        _sleep_until(_now(spec) + _RETRY_NS, spec)
+        sleep_until(monotonic_ns(spec) + _RETRY_NS, spec)
     return code
 
 
 @njit(nogil=True, cache=True)
 def _run(descriptor, period, counter, state, late, address, body, rows, every, spec):  # type: ignore[no-untyped-def]
     if state[BASE_NS] == 0:
-        state[BASE_NS] = _now(spec) + period
+        state[BASE_NS] = monotonic_ns(spec) + period
     while state[STOP] == 0:
         k = state[SENT]
         deadline = state[BASE_NS] + k * period
-        _sleep_until(max(deadline, state[LAST_NS] + period // 2), spec)
-        now = _now(spec)
+        sleep_until(max(deadline, state[LAST_NS] + period // 2), spec)
+        now = monotonic_ns(spec)
         lateness = now - deadline
         late[min(BINS - 1, lateness // BIN_NS)] += 1
         state[LATE_MAX] = max(state[LATE_MAX], lateness)
@@ -134,10 +136,10 @@ def _run(descriptor, period, counter, state, late, address, body, rows, every, s
                 body[1 + j, 2] = rows[state[ROW], j]
             state[ROW] += 1
             count += rows.shape[1]
-        code = _send(descriptor, address, count, spec)
+        code = send_messages(descriptor, address, count, spec)
         if code != 0:
             state[ERROR] = code
             return
         # Read again: the process may have been held up between the deadline and here.
-        state[LAST_NS] = _now(spec)
+        state[LAST_NS] = monotonic_ns(spec)
         state[SENT] = k + 1
