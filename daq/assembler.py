@@ -28,8 +28,8 @@ from daq.recording import Gap
 
 REASONS = {LOST: "lost", WRONG_LENGTH: "wrong length", AMBIGUOUS: "ambiguous order"}
 SYNC_LOST = "SYNC not received"
-LATE_S = 0.1
-"""An answer that is later than this is taken as lost, s."""
+LATE_S = 1.0
+"""An answer that is later than this is taken as lost, s; a busy host can hold up a virtual drive for long."""
 _FEWEST_LATE = 8
 _LONGEST_OUTAGE_S = 60.0
 
@@ -113,6 +113,11 @@ class Assembler:
     def last_sync(self) -> int:
         """Number of the last SYNC known of; -1 before the first."""
         return int(self._books.state[SYNC])
+
+    @property
+    def owed(self) -> int:
+        """Most SYNCs that any drive has still to answer."""
+        return int((self._books.head[:, None] - self._books.settled - self._books.pending).max())
 
     @property
     def counters(self) -> dict[str, int]:

@@ -23,7 +23,7 @@ from configs import (
     load_session,
     load_trajectory,
 )
-from daq.assembler import Assembler
+from daq.assembler import LATE_S, Assembler
 from daq.facts import host_facts
 from daq.motion import Motion, plan_motion
 from daq.publisher import Publisher
@@ -40,8 +40,6 @@ from drivers.udp import NOTE, open_bus
 
 BATCH = 4096
 HEALTH_S = 1.0
-LAST_ANSWERS_S = 0.1
-"""How long answers to the last SYNC are waited for."""
 QUICK_STOP_S = 0.3
 """How long a quick stop is given before the drives are disabled."""
 
@@ -307,26 +305,25 @@ class _Run:
             self.sink.mark("experiment_start", self.sink.first_sync)
 
     def _come_to_rest(self, early: bool) -> None:
-        """Stop and disable the drives, then SYNC, and take the last answers; never raises."""
+        """Stop the arm, then SYNC, take the last answers and disable the drives; never raises."""
         with suppress(ArmidentError):
-            if self._master is not None:
-                if early and self._motion is not None:
-                    self._master.quick_stop()
-                    self._rest(QUICK_STOP_S)
-                self._rest(0.0)
-                self._master.stop()
+            if self._master is not None and early and self._motion is not None:
+                self._master.quick_stop()
+                self._rest(QUICK_STOP_S)
         if self._producer is not None:
             self._producer.stop()
         with suppress(ArmidentError):
-            self._rest(LAST_ANSWERS_S)
+            self._rest(LATE_S, lambda: self._assembler.owed == 0)
+        if self._master is not None:
+            self._master.stop()
         sent = self._producer.sent if self._producer is not None else None
         self.sink.take(self._assembler.finish(sent))
 
-    def _rest(self, seconds: float) -> None:
-        """Go on recording for so long."""
+    def _rest(self, seconds: float, enough: Callable[[], bool] = lambda: False) -> None:
+        """Go on recording for so long, or until it is enough."""
         until = time.monotonic() + seconds
         self._drain()
-        while time.monotonic() < until:
+        while time.monotonic() < until and not enough():
             time.sleep(min(0.01, max(0.0, until - time.monotonic())))
             self._drain()
 

@@ -55,7 +55,7 @@ def plan_motion(
     options = session.setpoints
     period = session.sync_period * options.every
     scale = counts_per_si(robot)
-    actual = np.linalg.solve(robot.transmission_matrix, actual_counts / scale)
+    actual: NDArray[np.float64] = np.linalg.solve(robot.transmission_matrix, actual_counts / scale).astype(np.float64)
     start = np.array(trajectory.start)
     rest = np.repeat(start[None, :], int(np.ceil(options.settle_s / period)) + 1, axis=0)
     parts = [rest]

@@ -100,8 +100,9 @@ class Sink:
         due = [planned for planned in self._planned if final or planned[1] <= self.last_sync]
         self._planned = [planned for planned in self._planned if planned not in due]
         for kind, sync, text in due:
-            row = len(rows.sync) if rows is None else int(np.searchsorted(rows.sync, sync))
-            t_ns = int(rows.t_ns[row]) if rows is not None and row < len(rows.sync) else self.last_ns
+            t_ns = self.last_ns
+            if rows is not None and sync >= rows.sync[0]:
+                t_ns = int(rows.t_ns[np.searchsorted(rows.sync, sync)])
             mark = Mark(kind, sync, t_ns, text)
             self.marks.append(mark)
             self._writer.add_marks([mark])
