@@ -291,10 +291,10 @@ def _prefiltered(
     is not noise but what the model lacks, and its inverse filter amplifies that (thesis section 6.2.3); then, as in
     SEP-PEM, the dynamic model is estimated without it and it only enters the covariance (6.2.1).
     """
-    estimate = idim_piv(blocks, auxiliary, start, max_order=options.max_ar_order)
     plain_blocks = equations(model, experiments, signals, ls_decimation)
     plain_auxiliary = replace(auxiliary, decimation=ls_decimation, warnings=[])
     plain = idim_iv(plain_blocks, plain_auxiliary, start, serial_order=options.max_ar_order)
+    estimate = idim_piv(blocks, auxiliary, plain.theta, max_order=options.max_ar_order)
     shift = np.abs(estimate.theta - plain.theta) / plain.std
     worst = int(np.argmax(shift))
     if shift[worst] <= CONTRADICTION:

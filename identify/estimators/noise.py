@@ -86,7 +86,7 @@ def fit_ar(
             break
         aic = 2 * order + total * float(np.log(variance))
         if aic < best.aic:
-            best = ArModel(c.copy(), variance, aic)
+            best = ArModel(c.copy(), float(variance), aic)
     return best
 
 

@@ -1,0 +1,63 @@
+"""AR models: found, applied, and tested for what they leave."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from identify.estimators.noise import ArModel, fit_ar, lagged_sums, whiteness
+
+COEFFICIENTS = np.array([-1.5, 0.7])
+
+
+def coloured(samples: int, seed: int = 0) -> NDArray[np.float64]:
+    white = 0.3 * np.random.default_rng(seed).standard_normal(samples + 500)
+    return np.asarray(signal.lfilter([1.0], np.append(1.0, COEFFICIENTS), white))[500:]
+
+
+def test_order_and_coefficients_of_an_ar_process_are_found() -> None:
+    models = [fit_ar([coloured(20000, seed)], 30) for seed in range(9)]
+    # AIC overestimates the order now and then; the coefficients beyond are noise of 1 / sqrt(N).
+    assert 2 <= np.median([model.order for model in models]) <= 5
+    model = models[0]
+    np.testing.assert_allclose(model.coefficients[:2], COEFFICIENTS, atol=0.03)
+    assert abs(model.variance / 0.09 - 1) < 0.03
+
+
+def test_white_noise_needs_no_filter() -> None:
+    orders = [fit_ar([np.random.default_rng(seed).standard_normal(2000)], 30).order for seed in range(20)]
+    assert np.median(orders) <= 1
+
+
+def test_whitened_residuals_are_white_and_of_unit_variance() -> None:
+    x = coloured(5000)
+    white = fit_ar([x], 30).whiten(x)
+    assert whiteness([x]).fraction_outside > 0.2
+    assert whiteness([white]).fraction_outside <= 0.15
+    assert abs(white.std() - 1) < 0.03
+
+
+def test_whitening_is_the_filter_c_of_6_19_along_time() -> None:
+    x = np.random.default_rng(1).standard_normal((200, 3, 2))
+    model = ArModel(COEFFICIENTS, 4.0, 0.0)
+    expected = signal.lfilter(np.append(1.0, COEFFICIENTS), [1.0], x, axis=0)[2:] / 2.0
+    np.testing.assert_allclose(model.whiten(x), expected, atol=1e-12)
+
+
+def test_experiments_are_not_joined_end_to_end() -> None:
+    a, b = coloured(3000, 1), coloured(3000, 2)
+    jump = fit_ar([a, b + 0.0], 5)
+    np.testing.assert_allclose(lagged_sums(np.array([[1.0], [2.0], [3.0]]), 1), [14.0, 8.0])
+    np.testing.assert_allclose(jump.coefficients[:2], COEFFICIENTS, atol=0.06)
+
+
+def test_what_the_parameters_absorbed_is_given_back() -> None:
+    x = coloured(4000)
+    r = lagged_sums(x[:, None], 10)
+    assert fit_ar([x], 10, absorbed=r).variance > 1.9 * fit_ar([x], 10).variance
+
+
+def test_a_residual_of_zeros_gives_a_model_and_no_nan() -> None:
+    model = fit_ar([np.zeros(100)], 5)
+    assert model.order == 0
+    assert model.variance > 0
+    assert whiteness([np.zeros(100)]).fraction_outside == 0.0

@@ -1,0 +1,109 @@
+"""The measured TX40 (no reference, no controller recorded) against two published estimates of the same kind of arm."""
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from configs import load_robot
+from identify.experiment import Experiment
+from identify.run import Identification, Method, Options, identify_experiment
+
+STANDSTILL_S = 7.5
+DT = 2e-4
+TABLE_B4 = {
+    "zz1r": (1.24, 1.45), "fv1": (8.0, 0.91), "fc1": (7.34, 2.66), "xx2r": (-0.48, 3.28), "xz2r": (-0.16, 5.4),
+    "zz2r": (1.09, 1.29), "mx2r": (2.21, 3.01), "fv2": (5.5, 1.45), "fc2": (8.24, 2.26), "xx3r": (0.13, 10.6),
+    "zz3r": (0.11, 9.57), "my3r": (-0.6, 2.52), "ia3": (0.09, 9.39), "fv3": (1.93, 2.05), "fc3": (6.48, 2.06),
+    "mx4": (-0.02, 35.1), "ia4": (0.03, 9.1), "fv4": (1.09, 1.62), "fc4": (2.57, 2.46), "my5r": (-0.03, 15.2),
+    "ia5": (0.04, 10.6), "fv5": (1.79, 2.33), "fc5": (3.07, 3.59), "ia6": (0.01, 13.3), "fv6": (0.65, 1.85),
+    "fc6": (0.3, 32.9), "fvm6": (0.61, 1.97), "fcm6": (1.9, 4.4),
+}  # fmt: skip
+"""Brunot 2017, table B.4: value and relative standard deviation in percent."""
+
+
+@pytest.fixture(scope="module")
+def tx40(shared_data: Path) -> Experiment:
+    folder = shared_data / "tx40"
+    if not folder.is_dir():
+        pytest.skip("no tx40 folder in the measured data")
+    q, tau = (
+        np.loadtxt(folder / name, delimiter=",", skiprows=1)[: round(STANDSTILL_S / DT)]
+        for name in ("pos_read_data.csv", "curr_data.csv")
+    )
+    ratios = load_robot("tx40").transmission_matrix
+    return Experiment(q=np.linalg.solve(ratios, q.T).T, tau=tau @ ratios, q_ref=None, dt=DT)
+
+
+@pytest.fixture(scope="module")
+def results(tx40: Experiment) -> dict[str, Identification]:
+    methods: tuple[Method, ...] = ("idim-ls", "idim-iv", "idim-piv")
+    return {method: identify_experiment(tx40, load_robot("tx40"), Options(method=method)) for method in methods}
+
+
+@pytest.fixture(scope="module")
+def published(shared_data: Path) -> dict[str, tuple[tuple[float, float], tuple[float, float]]]:
+    """By standard name: (value, relative std %) of the source's OLS and of its WLS."""
+    rows = {}
+    with (shared_data / "tx40" / "TX40_bp_5.csv").open() as file:
+        for expression, ols, ols_pct, wls, wls_pct in csv.reader(file):
+            first = re.split(r" [+-] ", expression)[0].lower().replace("fs", "fc")
+            name = re.sub(r"^i([xyz][xyz]\d)", r"\1", first)
+            rows[name] = ((float(ols), float(ols_pct)), (float(wls), float(wls_pct)))
+    return rows
+
+
+@pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
+def test_all_61_base_parameters_are_determined_with_5_1_percent_error(
+    results: dict[str, Identification], method: str
+) -> None:
+    found = results[method]
+    assert len(found.names) == 61
+    assert np.isfinite(found.covariance).all()
+    assert found.relative_error_pct <= 5.1
+
+
+@pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
+@pytest.mark.parametrize("column", [0, 1], ids=["OLS", "WLS"])
+def test_parameters_the_source_is_sure_of_agree_within_three_of_its_std(
+    results: dict[str, Identification],
+    published: dict[str, tuple[tuple[float, float], tuple[float, float]]],
+    method: str,
+    column: int,
+) -> None:
+    theta = dict(zip(results[method].names, results[method].theta, strict=True))
+    sure = {name: row[column] for name, row in published.items() if row[column][1] < 10}
+    assert len(sure) >= 23
+    for name, (value, percent) in sure.items():
+        ours = theta[name] if name in theta else theta[f"{name}r"]
+        assert abs(ours - value) <= 3 * abs(value) * percent / 100, name
+
+
+@pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
+def test_parameters_agree_with_table_b4_within_three_of_the_theses_std(
+    results: dict[str, Identification], method: str
+) -> None:
+    theta = dict(zip(results[method].names, results[method].theta, strict=True))
+    for name, (value, percent) in TABLE_B4.items():
+        assert abs(theta[name] - value) <= 3 * abs(value) * percent / 100, name
+
+
+def test_without_a_reference_it_says_so_and_uses_the_smoothed_motion(results: dict[str, Identification]) -> None:
+    found = results["idim-iv"]
+    assert found.controller["kind"] == "nominal"
+    assert any("no reference trajectory" in warning for warning in found.warnings)
+
+
+def test_residuals_are_white_once_their_noise_model_is_known(results: dict[str, Identification]) -> None:
+    outside = [w.fraction_outside_2sigma for w in results["idim-piv"].whiteness]
+    # Of 20 lags one in 20 is expected outside; three of 120 joints and lags more is chance.
+    assert np.mean(outside) <= 0.075
+
+
+def test_wrist_coupling_is_seen(results: dict[str, Identification]) -> None:
+    found = results["idim-piv"]
+    essential = dict(zip(found.names, found.essential, strict=True))
+    assert essential["fvm6"]
+    assert essential["fcm6"]
