@@ -77,7 +77,7 @@ bench: install ## figures of ours beside those of named alternatives
 lock: install ## write requirements.lock anew from the ranges in pyproject.toml
 	@$(PY) -m pip install -qq --disable-pip-version-check uv
 	$(VENV)/bin/uv pip compile --upgrade --universal --python-version 3.11 --extra dev --generate-hashes --no-header \
-		--no-annotate --no-emit-index-url --no-emit-find-links -q -o requirements.lock pyproject.toml
+		--no-annotate -q -o requirements.lock pyproject.toml
 
 clean: ## remove what make and the tools created
 	@rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out
