@@ -7,7 +7,7 @@ regressor. The numbers decide; the rules give the formulas.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import qr, solve_triangular
+from scipy.linalg import solve_triangular
 
 from configs import RobotConfig
 from identify.model.chain import Chain, Columns, Floats, Ints
@@ -119,21 +119,22 @@ def independent_columns(
     scaled = x[:, order] / scale[order]
     # A dependent column must not enter the factor, or its rounding errors become directions.
     chosen: list[int] = []
-    basis = np.empty((x.shape[0], 0))
-    for position in range(len(order)):
-        rest = scaled[:, position]
+    q1 = np.zeros((x.shape[0], len(order)))
+    for position, column in enumerate(order):
+        basis, rest = q1[:, : len(chosen)], scaled[:, position]
+        # Twice is enough (Kahan and Parlett) for orthogonality to rounding.
         for _ in range(2):
             rest = rest - basis @ (basis.T @ rest)
         norm = np.linalg.norm(rest)
         if norm > RANK_TOLERANCE:
-            chosen.append(order[position])
-            basis = np.column_stack([basis, rest / norm])
-    chosen.sort(key=lambda k: int(candidates[k]))
-    q1, r1 = qr(x[:, chosen] / scale[chosen], mode="economic")
-    dependence = solve_triangular(r1, q1.T @ x)
-    mixing = dependence / scale[chosen][:, None]
+            q1[:, len(chosen)] = rest / norm
+            chosen.append(column)
+    r = q1[:, : len(chosen)].T @ x
+    mixing = solve_triangular(r[:, chosen], r)
     mixing[np.abs(mixing) < RANK_TOLERANCE] = 0.0
     mixing[:, chosen] = np.eye(len(chosen))
+    by_column = np.argsort(candidates[chosen])
+    chosen, mixing = [chosen[k] for k in by_column], mixing[by_column]
     return candidates[chosen], mixing
 
 
