@@ -80,4 +80,4 @@ lock: install ## write requirements.lock anew from the ranges in pyproject.toml
 		--no-annotate -q -o requirements.lock pyproject.toml
 
 clean: ## remove what make and the tools created
-	@rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out
+	@rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out demo
