@@ -30,6 +30,7 @@ from drivers.sync_loop import (
     FIRST,
     LATE_MAX,
     OVERRUNS,
+    RETURN,
     ROW,
     SENT,
     SKIPPED,
@@ -160,7 +161,7 @@ class SyncProducer:
         """
         self._taken.clear()
         self._pending = plan
-        self._state[STOP] = 2 if self._state[STOP] == 0 else self._state[STOP]
+        self._state[RETURN] = 1
         while not self._taken.wait(0.05):
             self.check()
             if self._thread is None or not self._thread.is_alive():
@@ -229,7 +230,7 @@ class SyncProducer:
     def _run_compiled(self) -> None:
         assert self._loop is not None
         self._realtime = _be_punctual()
-        while self._state[STOP] != 1:
+        while not self._state[STOP]:
             self._take_plan()
             rows, cob_ids, every = self._rows()
             self._loop(Messages(1 + len(cob_ids), control=False), rows, cob_ids, every)
@@ -241,7 +242,7 @@ class SyncProducer:
         assert self._bus is not None
         state, period = self._state, self._period_ns * 1e-9
         base = time.monotonic() + period
-        while state[STOP] != 1:
+        while not state[STOP]:
             self._take_plan()
             rows, cob_ids, every = self._rows()
             k = int(state[SENT])
@@ -275,11 +276,10 @@ class SyncProducer:
 
     def _take_plan(self) -> None:
         """Begin with row 0 of a new plan at the first knot whose row can still be sent in time."""
+        self._state[RETURN] = 0
         if self._pending is not None:
             self._plan, self._pending = self._pending, None
             self._state[FIRST] = -1
-        if self._state[STOP] == 2:
-            self._state[STOP] = 0
         if self._plan is not None and self._state[FIRST] < 0:
             knot = int(self._state[SENT]) + 1
             while not is_knot(knot, self._plan.every):

@@ -19,10 +19,10 @@ BIN_NS = 5_000
 BINS = 10_000
 """Bins of the lateness histogram; the last one also holds everything later."""
 
-STOP, SENT, ERROR, SKIPPED, OVERRUNS, ROW, FIRST, LATE_MAX, BASE_NS, LAST_NS = range(10)
-"""Places in the shared state. ``STOP``: 0 run, 1 end, 2 return to take a new plan. ``ERROR``: errno."""
+STOP, RETURN, SENT, ERROR, SKIPPED, OVERRUNS, ROW, FIRST, LATE_MAX, BASE_NS, LAST_NS = range(11)
+"""Places in the shared state. ``STOP``: end. ``RETURN``: leave the loop to take a new plan. ``ERROR``: errno."""
 
-STATE_SIZE = 10
+STATE_SIZE = 11
 
 _SEND_ATTEMPTS = 5000
 _RETRY_NS = 100_000
@@ -60,7 +60,7 @@ class Loop:
         )
 
     def __call__(self, messages: Messages, rows: NDArray[np.int32], cob_ids: NDArray[np.uint32], every: int) -> None:
-        """Send SYNCs, and ``rows`` from ``state[ROW]`` on, until ``state[STOP]`` or an error says otherwise.
+        """Send SYNCs, and ``rows`` from ``state[ROW]`` on, until ``state[STOP]``, ``state[RETURN]`` or an error.
 
         Parameters
         ----------
@@ -116,7 +116,7 @@ def send_messages(descriptor, address, count, spec):  # type: ignore[no-untyped-
 def _run(descriptor, period, counter, state, late, address, body, rows, every, spec):  # type: ignore[no-untyped-def]
     if state[BASE_NS] == 0:
         state[BASE_NS] = monotonic_ns(spec) + period
-    while state[STOP] == 0:
+    while state[STOP] == 0 and state[RETURN] == 0:
         k = state[SENT]
         deadline = state[BASE_NS] + k * period
         sleep_until(max(deadline, state[LAST_NS] + period // 2), spec)
