@@ -44,7 +44,8 @@ def equations(
         keep = np.ones(y.shape, dtype=np.bool_)
         if threshold is not None:
             keep = np.abs(s.qd[kept]) >= np.asarray(threshold)
-        blocks.append(Block(y, filtered_regressor(model, s, decimation), keep, kept * experiment.dt))
+        t = np.asarray(kept * experiment.dt, dtype=np.float64)
+        blocks.append(Block(y, filtered_regressor(model, s, decimation), keep, t))
     return blocks
 
 
@@ -61,6 +62,6 @@ def published_equations(
         x = model.base_regressor(q, qd, qdd, sharp_sign=True)[p.drop :]
         filters = (p.decimation, p.decimation_order, p.decimation_ripple_db, p.decimation_padlen)
         y = chebyshev_decimate(experiment.tau[p.drop :], *filters)
-        t = (p.drop + kept_samples(x.shape[0], p.decimation)) * experiment.dt
+        t = np.asarray((p.drop + kept_samples(x.shape[0], p.decimation)) * experiment.dt, dtype=np.float64)
         blocks.append(Block(y, chebyshev_decimate(x, *filters), np.ones(y.shape, dtype=np.bool_), t))
     return blocks

@@ -154,8 +154,8 @@ def identify_experiment(
 ) -> Identification:
     """Identify the base parameters of a robot.
 
-    The steps are the thesis's: derivatives (5.1), IDIM-LS (2.3.2), controller (5.2), auxiliary closed loop, IDIM-IV (2.3.3)
-    or IDIM-PIV (6.2.2). IDIM-LS is always computed: it starts the iterations and stands beside their result.
+    The steps are the thesis's: derivatives (5.1), IDIM-LS (2.3.2), controller (5.2), auxiliary closed loop, IDIM-IV
+    (2.3.3) or IDIM-PIV (6.2.2). IDIM-LS is always computed: it starts the iterations and stands beside their result.
 
     Parameters
     ----------
@@ -216,7 +216,9 @@ def identify_experiment(
         if options.method == "idim-iv":
             estimate = idim_iv(blocks, auxiliary, start)
         else:
-            estimate, blocks = _prefiltered(blocks, auxiliary, start, options, model, experiments, signals, ls_decimation, warnings)
+            estimate, blocks = _prefiltered(
+                blocks, auxiliary, start, options, model, experiments, signals, ls_decimation, warnings
+            )
         warnings += estimate.warnings
         if not estimate.converged:
             warnings.append(f"{options.method} did not converge: {estimate.stop_reason}")
@@ -260,7 +262,9 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> None:
             if values is None:
                 continue
             if values.ndim != 2 or values.shape != (e.q.shape[0], robot.n):
-                raise DataError(f"experiment {number}: {name} has shape {values.shape}, {robot.name} has {robot.n} joints")
+                raise DataError(
+                    f"experiment {number}: {name} has shape {values.shape}, {robot.name} has {robot.n} joints"
+                )
             bad = ~np.isfinite(values)
             if bad.any():
                 k, j = np.argwhere(bad)[0]
@@ -277,12 +281,11 @@ def _cutoff(dt: float, wanted: float, factor: int | None) -> float:
 def _prefiltered(
     blocks: list[Block],
     auxiliary: AuxiliaryModel,
+    plain_blocks: list[Block],
+    plain_decimation: Decimation,
     start: Array,
     options: Options,
-    model: ArmModel,
-    experiments: Sequence[Experiment],
-    signals: Sequence[Derivatives],
-    ls_decimation: Decimation,
+    names: Sequence[str],
     warnings: list[str],
 ) -> tuple[Estimate, list[Block]]:
     """IDIM-PIV, unless the prefilter contradicts IDIM-IV.
@@ -291,8 +294,7 @@ def _prefiltered(
     is not noise but what the model lacks, and its inverse filter amplifies that (thesis section 6.2.3); then, as in
     SEP-PEM, the dynamic model is estimated without it and it only enters the covariance (6.2.1).
     """
-    plain_blocks = equations(model, experiments, signals, ls_decimation)
-    plain_auxiliary = replace(auxiliary, decimation=ls_decimation, warnings=[])
+    plain_auxiliary = replace(auxiliary, decimation=plain_decimation, warnings=[])
     plain = idim_iv(plain_blocks, plain_auxiliary, start, serial_order=options.max_ar_order)
     estimate = idim_piv(blocks, auxiliary, plain.theta, max_order=options.max_ar_order)
     shift = np.abs(estimate.theta - plain.theta) / plain.std
@@ -300,9 +302,9 @@ def _prefiltered(
     if shift[worst] <= CONTRADICTION:
         return estimate, blocks
     warnings.append(
-        f"the prefilter of idim-piv moves {model.base.names[worst]} by {shift[worst]:.0f} standard deviations from idim-iv: "
-        "the residuals are model error, not noise; the parameters are those of idim-iv, the noise model only enters their "
-        "standard deviations"
+        f"the prefilter of idim-piv moves {names[worst]} by {shift[worst]:.0f} standard deviations from "
+        "idim-iv: the residuals are model error, not noise; the parameters are those of idim-iv, the noise model only "
+        "enters their standard deviations"
     )
     return plain, plain_blocks
 
@@ -323,7 +325,9 @@ def _auxiliary(
     fastest = RUNAWAY * np.max([np.abs(s.qd).max(axis=0) for s in signals], axis=0) + 1e-3
     surrogate = [butterworth(s.q, dt, min(PIV_CUTOFF * bandwidth, 0.4 / dt)) for s in signals]
     closest: tuple[float, AuxiliaryModel, Array, dict[str, Any]] | None = None
-    for controller, references, description in _controllers(model, experiments, signals, options, ls, bandwidth, surrogate):
+    for controller, references, description in _controllers(
+        model, experiments, signals, options, ls, bandwidth, surrogate
+    ):
         for origin, start in starts:
             auxiliary = AuxiliaryModel(
                 model, controller, references, [(s.q[0], s.qd[0]) for s in signals], dt, decimation, fastest
@@ -378,7 +382,9 @@ def _controllers(
             )
             yield found.controller, references, {"kind": "crc"} | _describe(found, robot)
         reason = "the identified controller does not move the simulated arm like the real one: a stiff stand-in is used"
-    stand_in = nominal_controller(model, ls, np.concatenate([s.q[:: max(1, s.q.shape[0] // 200)] for s in signals]), dt, bandwidth)
+    stand_in = nominal_controller(
+        model, ls, np.concatenate([s.q[:: max(1, s.q.shape[0] // 200)] for s in signals]), dt, bandwidth
+    )
     yield stand_in, surrogate, {"kind": "nominal", "reason": reason, "error_taps": stand_in.error_taps.tolist()}
 
 
@@ -468,19 +474,21 @@ def _relative_errors(blocks: Sequence[Block], theta: Array) -> tuple[float, Arra
     return 100 * float(np.sqrt(np.sum(miss) / np.sum(power))), 100 * np.sqrt(miss / np.maximum(power, 1e-300))
 
 
+UNITS = {"ia": ("kg m^2", "kg"), "fv": ("N m s/rad", "N s/m"), "fc": ("N m", "N"), "of": ("N m", "N")}
+"""Of friction, offset and rotor inertia of a revolute and of a prismatic joint, by the first two letters."""
+
+
 def unit(name: str, robot: RobotConfig) -> str:
     """SI unit of a base parameter, joint side."""
-    kind = name.rstrip("0123456789r").removesuffix("m") if name[:2] in ("ia", "fv", "fc") else name.rstrip("0123456789r")
-    digits = name.rstrip("r")
-    prismatic = digits[-1].isdigit() and robot.joints[int(digits[-1]) - 1].type == "prismatic" and "m6" not in name
-    if kind in ("xx", "xy", "xz", "yy", "yz", "zz"):
-        return "kg m^2"
+    kind = name[:2]
     if kind in ("mx", "my", "mz"):
         return "kg m"
-    if kind == "m":
+    if kind in ("xx", "xy", "xz", "yy", "yz", "zz"):
+        return "kg m^2"
+    if kind not in UNITS:
         return "kg"
-    if kind == "ia":
-        return "kg" if prismatic else "kg m^2"
-    if kind == "fv":
-        return "N s/m" if prismatic else "N m s/rad"
-    return "N" if prismatic else "N m"
+    coupled = {c.name: c.joints[0] for c in robot.couplings}
+    joints = {str(k): joint for k, joint in enumerate(robot.joints, start=1)}
+    joints |= {c: joint for c, first in coupled.items() for joint in robot.joints if joint.name == first}
+    joint = joints.get(name.removeprefix("off").removeprefix(kind).removesuffix("r"))
+    return UNITS[kind][joint is not None and joint.type == "prismatic"]

@@ -24,6 +24,9 @@ GAIN_WORTH_A_TAP = 0.002
 """Relative gain in held-out error below which the shorter response is taken."""
 
 
+NO_FILTER = ArModel(np.empty(0), 1.0, 0.0)
+
+
 @dataclass(frozen=True)
 class JointResponse:
     """Impulse response of one motor's controller.
@@ -115,24 +118,24 @@ def _identify_joint(
     lengths: Sequence[int],
     structures: Sequence[bool],
 ) -> JointResponse:
-    whitener = fit_ar(error, PREWHITENING_ORDER)
+    longest = max(lengths)
     best: tuple[float, JointResponse] | None = None
     for velocity in structures:
         inputs = [error, motion] if velocity else [error]
-        for ar in (ArModel(np.empty(0), 1.0, 0.0), whitener):
-            pieces = [_lagged(ar, [u[k] for u in inputs], nu[k], max(lengths)) for k in range(len(nu))]
-            train, test = _split(pieces)
-            gram = [sum(a.T @ a for a, _ in train), sum(a.T @ b for a, b in train)]
-            raw = _split([_lagged(ArModel(np.empty(0), 1.0, 0.0), [u[k] for u in inputs], nu[k], max(lengths))
-                          for k in range(len(nu))])[1] if ar.order else test
-            power = sum(float(np.sum((b - b.mean()) ** 2)) for _, b in raw)
+        plain = [_lagged(NO_FILTER, [u[k] for u in inputs], nu[k], longest) for k in range(len(nu))]
+        judge = _split(plain)[1]
+        power = sum(float(np.sum((b - b.mean()) ** 2)) for _, b in judge)
+        for ar in (NO_FILTER, fit_ar(error, PREWHITENING_ORDER)):
+            pieces = plain
+            if ar.order:
+                pieces = [_lagged(ar, [u[k] for u in inputs], nu[k], longest) for k in range(len(nu))]
+            part, whole = _correlations(_split(pieces)[0]), _correlations(pieces)
             for m in lengths:
-                chosen = np.concatenate([np.arange(m) + i * max(lengths) for i in range(len(inputs))])
-                taps = _solve(gram[0][np.ix_(chosen, chosen)], gram[1][chosen])
-                miss = sum(float(np.sum((b - a[:, chosen] @ taps) ** 2)) for a, b in raw)
+                chosen = np.concatenate([np.arange(m) + i * longest for i in range(len(inputs))])
+                taps = _solve(part, chosen)
+                miss = sum(float(np.sum((b - a[:, chosen] @ taps) ** 2)) for a, b in judge)
                 if best is None or miss < best[0] * (1 - GAIN_WORTH_A_TAP):
-                    full = sum(a.T @ a for a, _ in pieces), sum(a.T @ b for a, b in pieces)
-                    taps = _solve(full[0][np.ix_(chosen, chosen)], full[1][chosen])
+                    taps = _solve(whole, chosen)
                     response = JointResponse(
                         error_taps=taps[:m],
                         position_taps=np.diff(taps[m:], prepend=0.0, append=0.0) if velocity else np.empty(0),
@@ -167,8 +170,21 @@ def _split(pieces: _Pieces) -> tuple[_Pieces, _Pieces]:
     )
 
 
-def _solve(gram: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+def _correlations(pieces: _Pieces) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``R_eps,eps`` and ``R_nu,eps`` of 5.31 and 5.32 over all experiments."""
+    columns = pieces[0][0].shape[1]
+    auto, cross = np.zeros((columns, columns)), np.zeros(columns)
+    for a, b in pieces:
+        auto += a.T @ a
+        cross += a.T @ b
+    return auto, cross
+
+
+def _solve(
+    correlations: tuple[NDArray[np.float64], NDArray[np.float64]], chosen: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Solve the correlation equations; directions that the input does not contain get no response."""
+    gram, right = correlations[0][np.ix_(chosen, chosen)], correlations[1][chosen]
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = linalg.eigh(gram / np.outer(scale, scale))
     used = values > 1e-11 * values[-1]

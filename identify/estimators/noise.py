@@ -108,7 +108,7 @@ def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whitenes
     return Whiteness(r[1:] / r[0] if r[0] > 0 else np.zeros(lags), 2 / float(np.sqrt(total)))
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _convolve(x, coefficients):  # type: ignore[no-untyped-def]
     order = coefficients.size
     out = x[order:].copy()

@@ -125,8 +125,8 @@ def noise_models(
 ) -> list[ArModel]:
     """AR model of each joint's noise from the residuals (6.21 to 6.25).
 
-    The residuals lack what the parameters have absorbed, and they absorb the low frequencies, where the motion is and the
-    precision is decided: ``cov(e - X d) = Omega - X C X'`` for an efficient estimate of covariance C. The
+    The residuals lack what the parameters have absorbed, and they absorb the low frequencies, where the motion is and
+    the precision is decided: ``cov(e - X d) = Omega - X C X'`` for an efficient estimate of covariance C. The
     autocovariances of ``X C X'`` are given back; without, standard deviations come out a fifth too small.
     """
     errors = residuals(blocks, theta)
@@ -208,8 +208,8 @@ def serial_covariance(
 ) -> NDArray[np.float64]:
     """Covariance of an IV estimate with weights 2.24 whose residuals are serially correlated.
 
-    ``A = (Z' W X)^-1 Z' W`` maps the noise to the estimate and ``A Omega A'`` is its covariance, with ``Omega`` given by
-    the AR model of each joint: ``Z' W Omega W Z`` is the Gram matrix of ``H' W Z``.
+    ``A = (Z' W X)^-1 Z' W`` maps the noise to the estimate and ``A Omega A'`` is its covariance, with ``Omega`` given
+    by the AR model of each joint: ``Z' W Omega W Z`` is the Gram matrix of ``H' W Z``.
     """
     z = weighted_rows(zeta, keep, weights)
     zs = np.linalg.norm(z, axis=0)
@@ -262,7 +262,7 @@ def iterate(
     theta, norm = start, np.inf
     for k in range(1, iterations + 1):
         new, new_norm = step(theta, k)
-        change = float(np.linalg.norm(new - theta) / max(np.linalg.norm(new), 1e-300))
+        change = float(np.linalg.norm(new - theta)) / max(float(np.linalg.norm(new)), 1e-300)
         drift = abs(new_norm - norm) / max(new_norm, 1e-300)
         theta, norm = new, new_norm
         if change < tolerance and drift < tolerance:

@@ -71,7 +71,7 @@ def negative_log_likelihood(y: NDArray[np.float64], order: int, nvr: float) -> f
     Equals ``(N - order) log(s2) + sum log nu(k)`` of a Kalman filter started from a diffuse state.
     """
     w = np.diff(_checked(y, order), n=order)
-    return _profile(w, _band(order, nvr))
+    return float(_profile(w, _band(order, nvr)))
 
 
 def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
@@ -142,7 +142,7 @@ def _band(order: int, nvr: float) -> NDArray[np.float64]:
     return band
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
     """Row i of ``V = L diag(d) L'``: fills ``low[i % p]`` (distance 1..p) and returns d_i; rings of length p."""
     for j in range(min(p, i), 0, -1):
@@ -156,7 +156,7 @@ def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
     return pivot
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _profile(w, band):  # type: ignore[no-untyped-def]
     """``m log(w' V^-1 w) + log|V|`` in one forward sweep; the factors of a Toeplitz band become constant."""
     m, p = w.size, band.size - 1
@@ -190,7 +190,7 @@ def _profile(w, band):  # type: ignore[no-untyped-def]
     return m * np.log(quadratic) + logdet
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _correction(w, band, stencil):  # type: ignore[no-untyped-def]
     """``D' V^-1 w``, shape (m + order,)."""
     m, p = w.size, band.size - 1

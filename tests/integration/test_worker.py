@@ -1,0 +1,172 @@
+"""The worker hears a capture on Zenoh and identifies it as `armident identify` does its file."""
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+
+from configs import SessionConfig, load_robot, load_session, load_trajectory
+from daq.publisher import Publisher
+from daq.recording import Recording, StreamLayout, read_recording, write_recording
+from daq.zenoh_keys import Block, Keys, encode_event, open_session
+from daq.zenoh_keys.codec import end_content, start_content
+from identify.document import IdentificationDocument, from_json, load_document
+from identify.service import identify_recording
+from identify.worker import Worker
+from virtual_robot.offline import simulate_recording
+
+BLOCK_ROWS = 500
+LONGEST_S = 240.0
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A recording of the virtual arm as capture would have left it, in its file."""
+    robot = load_robot("tx40.yaml")
+    recording = simulate_recording(robot, load_trajectory("trajectories/tx40_excitation.yaml"), seed=5)
+    rows = {f"{name}.rows": int(s.sync.size) for name, s in recording.streams.items()}
+    path = tmp_path_factory.mktemp("recordings") / "tx40-test.mcap"
+    write_recording(replace(recording, session=load_session("tx40_cell.yaml"), counters=rows), path)
+    return read_recording(path)
+
+
+@pytest.fixture
+def session(request: pytest.FixtureRequest) -> SessionConfig:
+    """A cell of its own, so that tests beside each other do not hear each other."""
+    quick = IdentificationOptions(method="idim-ls")
+    return load_session("tx40_cell.yaml").model_copy(
+        update={"cell": f"test_{os.getpid()}_{abs(hash(request.node.name)) % 10**6}"}
+    )
+
+
+def blocks_of(recording: Recording) -> Iterator[Block]:
+    joints = [joint.name for joint in recording.robot.joints]
+    sequence = 0
+    for stream in recording.streams.values():
+        layout = StreamLayout.of(stream, joints)
+        for first in range(0, stream.sync.size, BLOCK_ROWS):
+            rows = slice(first, first + BLOCK_ROWS)
+            raw = {name: values[rows] for name, values in stream.raw.items()}
+            yield Block(layout, sequence, stream.sync[rows], stream.t_ns[rows], raw)
+            sequence += 1
+
+
+def publish(
+    recording: Recording, session: SessionConfig, *, leave_out: int | None = None, path: Path | None = None
+) -> None:
+    """Say on Zenoh what a capture of this recording says."""
+    joints = [joint.name for joint in recording.robot.joints]
+    layouts = [StreamLayout.of(stream, joints) for stream in recording.streams.values()]
+    publisher = Publisher(session, Keys(session.cell, recording.robot.name))
+    start = start_content("c1", recording.robot, session, recording.sample_rate_hz, layouts, {})
+    publisher.event(encode_event("experiment_start", start))
+    made = list(blocks_of(recording))
+    for block in made:
+        if block.sequence != leave_out:
+            publisher.offer(block)
+    assert path or recording.path
+    end = end_content("c1", len(made), recording.counters, recording.gaps, recording.marks, path or recording.path)  # type: ignore[arg-type]
+    publisher.event(encode_event("experiment_end", end))
+    publisher.close()
+
+
+def answers(session: SessionConfig, key: str) -> list[zenoh.Reply]:
+    """Replies to a query, asked again until the observer has found the worker."""
+    with open_session(session, "observer") as observer:
+        until = time.monotonic() + 10.0
+        while not (replies := list(observer.get(key))) and time.monotonic() < until:
+            time.sleep(0.1)
+    return replies
+
+
+def test_stream_and_file_give_the_same_numbers_to_the_last_bit(
+    captured: Recording, session: SessionConfig, tmp_path: Path
+) -> None:
+    with Worker(session, captured.robot, tmp_path) as worker:
+        publish(captured, session)
+        assert worker.result(LONGEST_S) == 0
+        replies = answers(session, Keys(session.cell, "tx40").identification)
+    streamed = load_document(tmp_path / "tx40-test.identification" / "identification.json", IdentificationDocument)
+    outcome = identify_recording(captured)
+    assert streamed.recording.sha256 == outcome.document.recording.sha256
+    assert streamed.parameters == outcome.document.parameters
+    assert streamed.covariance == outcome.document.covariance
+    assert (tmp_path / "tx40-test.identification" / "report.html").stat().st_size > 10_000
+    answered = from_json(bytes(replies[0].ok.payload).decode(), IdentificationDocument, "answer")
+    assert answered.parameters == streamed.parameters
+
+
+def test_a_block_that_never_comes_is_fetched_from_the_file(
+    captured: Recording, session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("identify.worker.MAX_WAITING_S", 1.0)
+    with Worker(session, captured.robot, tmp_path) as worker:
+        publish(captured, session, leave_out=3)
+        assert worker.result(LONGEST_S) == 0
+    document = load_document(tmp_path / "tx40-test.identification" / "identification.json", IdentificationDocument)
+    assert document.recording.sha256 == captured.sha256
+
+
+def test_missing_blocks_without_a_file_end_with_exit_code_3_and_say_how_many(
+    captured: Recording,
+    session: SessionConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("identify.worker.MAX_WAITING_S", 1.0)
+    with Worker(session, captured.robot, tmp_path) as worker:
+        publish(captured, session, leave_out=3, path=tmp_path / "gone.mcap")
+        assert worker.result(LONGEST_S) == 3
+    assert "1 of " in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_payloads_that_are_not_ours_do_no_harm(captured: Recording, session: SessionConfig, tmp_path: Path) -> None:
+    keys = Keys(session.cell, "tx40")
+    with Worker(session, captured.robot, tmp_path) as worker:
+        with open_session(session, "capture") as stranger:
+            for junk in (b"", b"ARMB", np.random.default_rng(0).bytes(1000), b"{}"):
+                stranger.put(keys.samples, junk)
+                stranger.put(keys.events, junk)
+        assert worker.result(1.0) is None
+        publish(captured, session, leave_out=0, path=tmp_path / "gone.mcap")
+
+
+def test_status_tells_what_the_worker_does(captured: Recording, session: SessionConfig, tmp_path: Path) -> None:
+    heard: queue.Queue[dict[str, object]] = queue.Queue()
+
+    def listen(sample: zenoh.Sample) -> None:
+        heard.put(json.loads(bytes(sample.payload)))
+
+    with Worker(session, captured.robot, tmp_path) as worker, open_session(session, "observer") as observer:
+        observer.declare_subscriber(Keys(session.cell, "tx40").status, listen)
+        until = time.monotonic() + 10.0
+        while not (tokens := list(observer.liveliness().get(Keys(session.cell, "tx40").alive("*")))):
+            assert time.monotonic() < until, "the worker's token was never seen"
+            time.sleep(0.1)
+        assert [str(t.ok.key_expr).rsplit("/", 1)[-1] for t in tokens] == ["worker"]
+        publish(captured, session)
+        assert worker.result(LONGEST_S) == 0
+    states = [m["state"] for m in list(heard.queue) if m.get("component") == "worker"]
+    assert "identifying" in states
+    assert states[-1] == "done"
+
+
+def test_sigterm_ends_a_waiting_worker_cleanly(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "daq.cli", "worker", "--config", "tx40_replay.yaml", "--out", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == "worker: ready"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
