@@ -27,10 +27,15 @@ RECEIVE_BUFFER = 64 << 20
 BATCH = 4096
 """Most frames that one system call moves."""
 
+RECEIVE_TIMEOUT = 0.05
+"""Longest wait of a receive call that waits, s."""
+
 SEND_TIMEOUT = 0.5
 """Longest wait for a full transmit queue to drain, s."""
 
 SO_RCVBUFFORCE = 33
+SO_RCVTIMEO = 20
+MSG_WAITFORONE = 0x10000
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 CAN_RAW_ERR_FILTER = 2
@@ -155,6 +160,8 @@ class RawSocket:
         self._socket.setsockopt(raw, socket.CAN_RAW_LOOPBACK, int(loopback))
         self._socket.setsockopt(raw, socket.CAN_RAW_RECV_OWN_MSGS, int(own))
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        timeout = struct.pack("ll", 0, round(RECEIVE_TIMEOUT * 1e6))
+        self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVTIMEO, timeout)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, receive_buffer)
@@ -188,13 +195,15 @@ class RawSocket:
         """Descriptor of the socket, for ``select`` and for compiled loops."""
         return self._socket.fileno()
 
-    def receive(self, batch: Frames) -> int:
-        """Fill the beginning of ``batch`` with the frames that have arrived; never waits.
+    def receive(self, batch: Frames, wait: bool = False) -> int:
+        """Fill the beginning of ``batch`` with the frames that have arrived.
 
         Parameters
         ----------
         batch
             Array of ``FRAME``, shape (N,), written in place.
+        wait
+            Wait up to ``RECEIVE_TIMEOUT`` for the first of them, without a system call more.
 
         Returns
         -------
@@ -209,7 +218,8 @@ class RawSocket:
         if self._in is None:
             self._in = Messages(BATCH)
         messages = self._in
-        got = _recvmmsg(self._socket.fileno(), messages.address, min(batch.size, BATCH), socket.MSG_DONTWAIT, None)
+        flags = MSG_WAITFORONE if wait else socket.MSG_DONTWAIT
+        got = _recvmmsg(self._socket.fileno(), messages.address, min(batch.size, BATCH), flags, None)
         if got <= 0:
             if got < 0:
                 self._failed(ctypes.get_errno(), (errno.EAGAIN, errno.EINTR))

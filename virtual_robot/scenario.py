@@ -3,8 +3,10 @@
 from pathlib import Path
 
 from configs import ConfigError, config_path
-from configs.loading import parse
+from configs.loading import HERE, parse
 from configs.scenario import Scenario
+
+SCENARIOS = HERE / "scenarios"
 
 
 def load_scenario(name: str | Path) -> Scenario:
@@ -18,7 +20,10 @@ def load_scenario(name: str | Path) -> Scenario:
     try:
         path = config_path(name)
     except ConfigError:
-        path = config_path(Path("configs/scenarios") / Path(name).name)
+        path = (SCENARIOS / Path(name).name).with_suffix(".yaml")
+        if not path.is_file():
+            shipped = ", ".join(sorted(p.name for p in SCENARIOS.glob("*.yaml")))
+            raise ConfigError(f"{name}: no such scenario (shipped with armident: {shipped})") from None
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from configs import ConfigError, RobotConfig, SessionConfig
 from drivers.frames import FrameBus, frames
 from drivers.objects import COB_MASK, COB_NMT, COB_SDO_REQUEST, COB_SYNC, DriveState
+from drivers.socketcan import RECEIVE_TIMEOUT, RawSocket
 from drivers.udp import open_bus
 from virtual_robot.arm import Motion, counts_per_si
 from virtual_robot.exchange import Exchange
@@ -21,8 +22,6 @@ from virtual_robot.node import Drive
 PDO_FILTERS = ((0x180, 0x780), (0x200, 0x700), (0x300, 0x700), (0x400, 0x700), (0x500, 0x780))
 """Identifiers 180h to 57Fh, which PDOs may have; a socket does not receive what it sends itself."""
 BATCH = 1024
-POLL_S = 0.05
-"""How long the loop waits for a frame before it looks whether it has to stop, s."""
 SUPERVISION_SYNCS = 64
 """Following errors are checked every so many SYNC."""
 FOLLOWING_ERROR_LIMIT = 0.5
@@ -145,15 +144,11 @@ class Server:
         sequence = 0
         exchange, bus = self._exchange, self._bus
         while not stopped():
-            arrived = bus.poll(POLL_S)
+            count = self._receive()
             self._catch_up()
-            # In a guest kernel every look at the clock is a system call: once a poll will do.
-            now = time.time_ns()
             if duration is not None and time.monotonic() - begin > duration:
                 break
-            if not arrived:
-                continue
-            count = bus.receive(batch)
+            now = time.time_ns()
             at = backlog = 0
             while at < count:
                 at = self._take(at, count, sequence % self._session.sync.counter + 1)
@@ -179,6 +174,12 @@ class Server:
     def _take(self, start: int, stop: int, sequence: int) -> int:
         batch = self._batch
         return self._exchange.take(batch["can_id"], batch["length"], batch["data"], start, stop, sequence)
+
+    def _receive(self) -> int:
+        """Wait for frames; in a guest kernel system calls are dear, so with one where the bus can."""
+        if isinstance(self._bus, RawSocket):
+            return self._bus.receive(self._batch, wait=True)
+        return self._bus.receive(self._batch) if self._bus.poll(RECEIVE_TIMEOUT) else 0
 
     def _note(self, late_ns: int) -> None:
         late = max(late_ns // 1000, 0)
