@@ -369,8 +369,9 @@ def _summary(first: Identified, second: Diagnosed | None) -> dict[str, str]:
         gap = second.document["gap"]["validation"]
         line = (
             f"<li>Then an effect was hidden in the arm. The diagnosis, which was not told, found: "
-            f"<b>{escape(names)}</b>. On data it had not seen the torque error went "
-            f"from {gap['before']['all']:.2f} % to {gap['after']['all']:.2f} %, the noise floor is {second.document['noise_floor']['all']:.2f} %.</li>"
+            f"<b>{escape(names)}</b>. On data it had not seen the torque error went from "
+            f"{gap['before']['all']:.2f} % to {gap['after']['all']:.2f} %; "
+            f"the noise floor is {second.document['noise_floor']['all']:.2f} %.</li>"
         )
     counters = {} if worst is None else {"worst": f"{worst[0]}, {abs(worst[4]):.1f}"}
     return {

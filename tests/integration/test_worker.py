@@ -16,6 +16,7 @@ import pytest
 import zenoh
 
 from configs import SessionConfig, load_robot, load_session, load_trajectory
+from configs.session import IdentificationOptions
 from daq.publisher import Publisher
 from daq.recording import Recording, StreamLayout, read_recording, write_recording
 from daq.zenoh_keys import Block, Keys, encode_event, open_session
@@ -43,9 +44,11 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 @pytest.fixture
 def session(request: pytest.FixtureRequest) -> SessionConfig:
     """A cell of its own, so that tests beside each other do not hear each other."""
-    quick = IdentificationOptions(method="idim-ls")
     return load_session("tx40_cell.yaml").model_copy(
-        update={"cell": f"test_{os.getpid()}_{abs(hash(request.node.name)) % 10**6}"}
+        update={
+            "cell": f"test_{os.getpid()}_{abs(hash(request.node.name)) % 10**6}",
+            "identification": IdentificationOptions(method="idim-ls"),
+        }
     )
 
 
@@ -92,6 +95,7 @@ def answers(session: SessionConfig, key: str) -> list[zenoh.Reply]:
 def test_stream_and_file_give_the_same_numbers_to_the_last_bit(
     captured: Recording, session: SessionConfig, tmp_path: Path
 ) -> None:
+    session = session.model_copy(update={"identification": IdentificationOptions()})
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session)
         assert worker.result(LONGEST_S) == 0

@@ -1,0 +1,93 @@
+"""What a diagnosis finds in the virtual arm, and what it leaves alone."""
+
+import numpy as np
+import pytest
+
+from configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
+from configs.robot import Effect
+from configs.scenario import HiddenEffect, Scenario
+from identify.discrepancy.catalogue import CATALOGUE, effect_names, effect_regressor, effect_values
+from identify.discrepancy.diagnose import Diagnosis, diagnose
+from identify.from_recording import experiments_from_recording
+from identify.service import robot_yaml
+from virtual_robot.offline import simulate_recording
+
+REPEATS = 3
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotConfig:
+    return load_robot("tx40.yaml")
+
+
+@pytest.fixture(scope="module")
+def trajectory() -> Trajectory:
+    once = load_trajectory("trajectories/tx40_excitation.yaml")
+    return once.model_copy(update={"moves": once.moves * REPEATS})
+
+
+def diagnosed(robot: RobotConfig, trajectory: Trajectory, seed: int, *effects: HiddenEffect) -> Diagnosis:
+    scenario = Scenario(schema="armident/scenario/1", effects=effects) if effects else None
+    recording = simulate_recording(robot, trajectory, seed, scenario=scenario)
+    experiments, notes = experiments_from_recording(recording, robot)
+    return diagnose(experiments, [], robot, notes=notes)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_plant_without_hidden_effects_has_no_gap(robot: RobotConfig, trajectory: Trajectory, seed: int) -> None:
+    document = diagnosed(robot, trajectory, seed).document
+    assert document.verdict == "no_gap"
+    assert document.gap.validation.before == document.gap.validation.after
+
+
+def test_a_worn_joint_is_named_and_its_size_is_right(robot: RobotConfig, trajectory: Trajectory) -> None:
+    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
+    found = diagnosed(robot, trajectory, 0, worn)
+    (finding,) = found.document.findings
+    assert (finding.effect, finding.joint) == ("asymmetric_viscous_friction", "joint_2")
+    assert finding.gap_after < finding.gap_before
+    # 20 % of the 5.53 N m s/rad of table B.4; three of the estimate's own standard deviations.
+    assert finding.parameters["fva"] == pytest.approx(0.2 * 5.53, abs=3 * finding.evidence["std"]["fva"])
+    assert found.document.verdict == "explained"
+
+
+def test_a_cogging_motor_is_named_with_its_harmonic(robot: RobotConfig, trajectory: Trajectory) -> None:
+    cogging = HiddenEffect(effect="cogging_torque", joint="joint_3", parameters={"amplitude": 1.2, "harmonic": 1.0})
+    finding = diagnosed(robot, trajectory, 1, cogging).document.findings[0]
+    assert (finding.effect, finding.joint) == ("cogging_torque", "joint_3")
+    assert finding.parameters["harmonic"] == 1.0
+
+
+def test_held_out_error_of_the_joint_falls_with_every_finding(robot: RobotConfig, trajectory: Trajectory) -> None:
+    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.4})
+    document = diagnosed(robot, trajectory, 2, worn).document
+    assert document.findings
+    assert all(f.gap_after < f.gap_before for f in document.findings)
+    assert document.gap.validation.after.all < document.gap.validation.before.all
+
+
+def test_a_diagnosed_model_is_a_robot_configuration_again(robot: RobotConfig) -> None:
+    from configs.loading import parse
+
+    stanza = Effect(effect="stribeck_friction", joint="joint_4", parameters={"relative_speed": 0.04, "fst": 0.5})
+    changed = robot.model_copy(update={"effects": (stanza,)})
+    assert parse(robot_yaml(changed), RobotConfig, "model.yaml") == changed
+    assert effect_names(changed) == ["fst4"]
+    np.testing.assert_array_equal(effect_values(changed), [0.5])
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_every_effect_acts_on_its_joint_only(robot: RobotConfig, name: str) -> None:
+    shape = CATALOGUE[name].grid()[0]
+    changed = robot.model_copy(update={"effects": (Effect(effect=name, joint="joint_3", parameters=shape),)})
+    rng = np.random.default_rng(0)
+    columns = effect_regressor(changed, rng.normal(size=(50, 6)), rng.normal(size=(50, 6)))
+    assert columns.shape == (50, 6, len(CATALOGUE[name].linear))
+    assert np.abs(columns[:, 2]).max() > 0
+    assert np.abs(np.delete(columns, 2, axis=1)).max() == 0
+
+
+def test_an_unknown_effect_is_refused_naming_the_known_ones(robot: RobotConfig) -> None:
+    changed = robot.model_copy(update={"effects": (Effect(effect="gremlins", joint="joint_1"),)})
+    with pytest.raises(ConfigError, match=r"'gremlins'.*stribeck_friction"):
+        effect_names(changed)
