@@ -216,8 +216,9 @@ def identify_experiment(
         if options.method == "idim-iv":
             estimate = idim_iv(blocks, auxiliary, start)
         else:
+            plain_blocks = equations(model, experiments, signals, ls_decimation)
             estimate, blocks = _prefiltered(
-                blocks, auxiliary, start, options, model, experiments, signals, ls_decimation, warnings
+                blocks, auxiliary, plain_blocks, ls_decimation, start, options, model.base.names, warnings
             )
         warnings += estimate.warnings
         if not estimate.converged:

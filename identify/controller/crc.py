@@ -70,8 +70,8 @@ def identify_crc(
 ) -> IdentifiedController:
     """Impulse response of each motor's controller from tracking error to torque.
 
-    Correlation analysis solves ``R_nu,eps(tau) = sum_k h(k) R_eps,eps(tau - k)`` (5.31, 5.32), once as it stands and once
-    with both signals prewhitened by an AR model of the error; what predicts the held-out torque best is kept.
+    Correlation analysis solves ``R_nu,eps(tau) = sum_k h(k) R_eps,eps(tau - k)`` (5.31, 5.32), once as it stands and
+    once with both signals prewhitened by an AR model of the error; what predicts the held-out torque best is kept.
     A cascade also feeds back the measured velocity, which the tracking error does not contain; so a second
     response, from position changes, is tried, and kept where the held-out data want it.
 

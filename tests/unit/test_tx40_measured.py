@@ -34,7 +34,9 @@ def tx40(shared_data: Path) -> Experiment:
         for name in ("pos_read_data.csv", "curr_data.csv")
     )
     ratios = load_robot("tx40").transmission_matrix
-    return Experiment(q=np.linalg.solve(ratios, q.T).T, tau=tau @ ratios, q_ref=None, dt=DT)
+    return Experiment(
+        q=np.asarray(np.linalg.solve(ratios, q.T).T, dtype=np.float64), tau=tau @ ratios, q_ref=None, dt=DT
+    )
 
 
 @pytest.fixture(scope="module")
