@@ -142,9 +142,11 @@ def _boot(folder: Path, root: Path, cpu: int, memory: str) -> None:
     def pin_and_tie() -> None:
         os.sched_setaffinity(0, {cpu})
         libc.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-        # a bus at 5 kHz does not wait for what else this machine does; only root may
-        with suppress(PermissionError):
+        # a bus at 5 kHz does not wait for what else this machine does; only root may. Where the scheduler
+        # groups processes by session, the group's niceness counts
+        with suppress(OSError):
             os.nice(NICENESS)
+            Path("/proc/self/autogroup").write_text(str(NICENESS))
 
     sys.stdout.flush()
     sys.stderr.flush()
