@@ -141,15 +141,15 @@ class Assembler:
         """
         columns = _columns(frames)
         longest = self._longest if sent is None else min(self._longest, sent - self.last_sync)
-        out = room_for(self._books, count_sync(*columns, *self._timing, longest, self._books))
-        match(*columns, *self._timing, longest, self._books, out)
+        out = room_for(self._books, _count_sync(*columns, *self._timing, longest, self._books))
+        _match(*columns, *self._timing, longest, self._books, out)
         return self._batch(out, False)
 
     def finish(self, sent: int | None = None) -> Batch:
         """No more frames come; ``sent`` SYNC were sent in all, if we know."""
         total = self.last_sync + 1 if sent is None else max(sent, self.last_sync + 1)
         out = room_for(self._books, total - self.last_sync)
-        finish(total, self._books, out)
+        _finish(total, self._books, out)
         return self._batch(out, True)
 
     def warm_up(self, frames: NDArray[Any]) -> None:
@@ -160,14 +160,14 @@ class Assembler:
             self._books.every.tolist(), late, self._books.length.tolist(), nobody, self._books.settled.shape[1]
         )
         columns = _columns(frames)
-        out = room_for(scratch, count_sync(*columns, *self._timing, self._longest, scratch))
-        match(*columns, *self._timing, self._longest, scratch, out)
-        finish(0, scratch, out)
+        out = room_for(scratch, _count_sync(*columns, *self._timing, self._longest, scratch))
+        _match(*columns, *self._timing, self._longest, scratch, out)
+        _finish(0, scratch, out)
 
     def _batch(self, out: Decided, final: bool) -> Batch:
         rows, gaps = {}, []
         for s, stream in enumerate(self._streams):
-            part = slice(0, int(out.count[s]))
+            part = slice(0, int(out.rows[s]))
             sync, t_ns, code = out.sync[s, part], out.t_ns[s, part], out.code[s, part]
             whole = (t_ns != UNSEEN) & (code == RECEIVED).all(axis=1)
             self._totals[f"{stream.name}.expected"] += whole.size
@@ -219,6 +219,12 @@ class Assembler:
                 del self._open[key]
                 gaps.append(Gap(stream.name, begin, end, key[1], key[2]))
         return gaps
+
+
+# numba's dispatchers are typed by their Python signatures, which a tuple of columns cannot be checked against.
+_match: Any = match
+_count_sync: Any = count_sync
+_finish: Any = finish
 
 
 def _columns(frames: NDArray[Any]) -> tuple[NDArray[Any], ...]:

@@ -102,4 +102,4 @@ def _write_parquet(table: dict[str, NDArray[np.float64]], path: Path) -> None:
         import pyarrow.parquet
     except ImportError as error:
         raise ConfigError(f"{path}: Parquet needs the package pyarrow (pip install pyarrow)") from error
-    pyarrow.parquet.write_table(pyarrow.table(table), path)
+    pyarrow.parquet.write_table(pyarrow.table(table), path)  # type: ignore[no-untyped-call]

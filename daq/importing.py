@@ -87,8 +87,10 @@ def import_recording(
     source = _pair(path, effort, robot) if effort is not None else _load(path)
     rate = rate_hz if rate_hz is not None else _rate(source, names)
     side: Side = "motor" if motor_side else "joint"
-    fields, raw = {}, {}
-    for quantity in ("position", *EFFORTS, "demand"):
+    fields: dict[str, Field] = {}
+    raw: dict[str, NDArray[Any]] = {}
+    quantities: tuple[Quantity, ...] = ("position", *EFFORTS, "demand")
+    for quantity in quantities:
         values = _pick(source, quantity, robot.n, names)
         if values is None or (quantity in EFFORTS and any(e in raw for e in EFFORTS)):
             continue

@@ -65,9 +65,9 @@ class Books(NamedTuple):
 
 
 class Decided(NamedTuple):
-    """Rows whose fate is decided, ``count[s]`` of each stream."""
+    """Rows whose fate is decided, ``rows[s]`` of each stream."""
 
-    count: NDArray[np.int64]
+    rows: NDArray[np.int64]
     sync: NDArray[np.int64]
     t_ns: NDArray[np.int64]
     code: NDArray[np.uint8]
@@ -105,7 +105,7 @@ def room_for(books: Books, syncs: int) -> Decided:
     streams, slots, n = books.row_code.shape
     rows = slots + syncs
     return Decided(
-        count=np.zeros(streams, np.int64),
+        rows=np.zeros(streams, np.int64),
         sync=np.empty((streams, rows), np.int64),
         t_ns=np.empty((streams, rows), np.int64),
         code=np.empty((streams, rows, n), np.uint8),
@@ -113,7 +113,7 @@ def room_for(books: Books, syncs: int) -> Decided:
     )
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longest: int) -> int:
     """By how many SYNCs the counter advanced; zero or less for a repeated SYNC.
 
@@ -128,14 +128,14 @@ def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longes
     return int(step)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _place(b: Books, s: int, j: int, u: int, i: int) -> None:
     slot = u % b.row_sync.shape[1]
     b.row_data[s, slot, j] = b.answer[s, j, i]
     b.row_code[s, slot, j] = b.answer_code[s, j, i]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _settle(b: Books, s: int, j: int, final: bool) -> None:
     """Close the books of one TPDO of one drive: match what is certain, give up what is older than the window."""
     owed = b.head[s] - b.settled[s, j]
@@ -172,7 +172,7 @@ def _settle(b: Books, s: int, j: int, final: bool) -> None:
     b.settled[s, j] = keep
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _settle_all(b: Books, s: int, final: bool, out: Decided) -> None:
     end = b.head[s]
     for j in range(b.settled.shape[1]):
@@ -180,17 +180,17 @@ def _settle_all(b: Books, s: int, final: bool, out: Decided) -> None:
         end = min(end, b.settled[s, j])
     while b.emitted[s] < end:
         slot = b.emitted[s] % b.row_sync.shape[1]
-        o = out.count[s]
+        o = out.rows[s]
         out.sync[s, o] = b.row_sync[s, slot]
         out.t_ns[s, o] = b.row_t[s, slot]
         for j in range(b.settled.shape[1]):
             out.code[s, o, j] = b.row_code[s, slot, j]
             out.data[s, o, j] = b.row_data[s, slot, j]
-        out.count[s] += 1
+        out.rows[s] += 1
         b.emitted[s] += 1
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _owe(b: Books, s: int, k: int, t_ns: int) -> None:
     """SYNC ``k`` asks for an answer, if the stream sends on it."""
     if (b.state[ORIGIN] + k) % b.every[s] == 0:
@@ -202,7 +202,7 @@ def _owe(b: Books, s: int, k: int, t_ns: int) -> None:
         b.head[s] += 1
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _miss(b: Books, s: int, until: int, out: Decided) -> None:
     """The SYNCs after the last one and before ``until`` were sent, but not received."""
     first = b.state[SYNC] + 1
@@ -221,7 +221,7 @@ def _miss(b: Books, s: int, until: int, out: Decided) -> None:
                 b.label[s, j, i] = b.head[s] - 1
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def count_sync(
     can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int, longest: int, b: Books
 ) -> int:
@@ -233,16 +233,16 @@ def count_sync(
             if length[i] > 0:
                 if counter >= 0:
                     elapsed = (t_ns[i] - time) / period_ns if time != UNSEEN else 0.0
-                    step = sync_step(np.int64(data[i] & np.uint64(0xFF)), counter, elapsed, overflow, longest)
+                    step = sync_step(int(np.int64(data[i] & np.uint64(0xFF))), counter, elapsed, overflow, longest)
                 if step > 0:
-                    counter = np.int64(data[i] & np.uint64(0xFF))
+                    counter = int(np.int64(data[i] & np.uint64(0xFF)))
             if step > 0:
                 time = t_ns[i]
                 total += step
     return int(total)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def match(
     can_id: Any,
     length: Any,
@@ -263,7 +263,7 @@ def match(
         if identifier == sync_id:
             step = 1
             if length[i] > 0:
-                counter = np.int64(data[i] & np.uint64(0xFF))
+                counter = int(np.int64(data[i] & np.uint64(0xFF)))
                 if b.state[COUNTER] >= 0:
                     elapsed = (t_ns[i] - b.state[TIME]) / period_ns if b.state[TIME] != UNSEEN else 0.0
                     step = sync_step(counter, b.state[COUNTER], elapsed, overflow, longest)
@@ -305,7 +305,7 @@ def match(
             b.fresh[s, j] += 1
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def finish(total: int, b: Books, out: Decided) -> None:
     """No more frames come: SYNCs ``0 .. total - 1`` were sent, and what is still owed is lost."""
     for s in range(b.every.size):

@@ -1,7 +1,8 @@
 """Blocks of samples and events as bytes, and how they become a recording again.
 
-A block is ``ARMB``, version (u16), length of the head (u32), CRC-32 of all that follows it, the head (JSON: sequence
-number, rows, stream layout), then ``sync`` and ``t_ns`` as int64 and every field's raw values, little endian, row by row.
+A block is ``ARMB``, version (u16), length of the head (u32), CRC-32 of all that follows it, the head (JSON:
+sequence number, rows, stream layout), then ``sync`` and ``t_ns`` as int64 and every field's raw values, little
+endian, row by row.
 """
 
 import json

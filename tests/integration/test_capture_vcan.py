@@ -1,0 +1,168 @@
+"""Capture on a real bus: nothing lost, everything accounted for, and every ending is a clean one."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from configs import config_path
+from daq.recording import read_recording
+
+pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
+
+ARMIDENT = [sys.executable, "-c", "from daq.cli import main; main()"]
+COUNTED = ("samples.expected", "samples.rows", "samples.in_gaps", "kernel_drops")
+
+
+def session_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
+    """The shipped cell on another bus, under a name of its own."""
+    shipped = config_path("tx40_cell.yaml")
+    data = yaml.safe_load(shipped.read_text()) | changes
+    data |= {"cell": cell, "robot": str(shipped.parent / data["robot"]), "bus": {"channel": bus}}
+    for drive in data["drives"]:
+        drive["eds"] = str(shipped.parent / drive["eds"])
+    if data.get("setpoints"):
+        data["setpoints"]["trajectory"] = str(shipped.parent / data["setpoints"]["trajectory"])
+    path = folder / f"{cell}.yaml"
+    path.write_text(yaml.safe_dump({key: value for key, value in data.items() if value is not None}))
+    return path
+
+
+def run(*arguments: Any, **options: Any) -> subprocess.Popen[str]:
+    """An armident command as a process."""
+    command = ARMIDENT + [str(a) for a in arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+@pytest.fixture
+def robot(vcan_bus: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """The virtual arm on the bus, ready."""
+    process = run("robot", "--config", session_file(tmp_path, vcan_bus, "robot"))
+    assert process.stdout is not None
+    assert "ready" in process.stdout.readline()
+    yield process
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=60)
+
+
+def wait_for_file(folder: Path, size: int, process: subprocess.Popen[str]) -> Path:
+    """The recording, once it holds something."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and process.poll() is None:
+        for path in folder.glob("*.mcap"):
+            if path.stat().st_size > size:
+                return path
+        time.sleep(0.05)
+    raise AssertionError(f"no recording: {process.communicate(timeout=10)}")
+
+
+@pytest.mark.usefixtures("robot")
+def test_ten_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path: Path) -> None:
+    """`armident capture --duration 60` on the replay cell is the same for a minute."""
+    session = session_file(tmp_path, vcan_bus, "ten_seconds")
+    process = run("capture", "--config", session, "--out", tmp_path / "out", "--json")
+    out, err = process.communicate(timeout=200)
+    assert process.returncode == 0, err
+    document = json.loads(out)
+    recording = read_recording(document["recording"])
+    assert recording.missing is None
+    assert recording.counters == document["counters"]
+    assert recording.counters["kernel_drops"] == 0
+    assert recording.counters["sync_seen"] == recording.counters["sync_sent"]
+    assert recording.counters["samples.rows"] == recording.counters["sync_sent"]
+    assert recording.gaps == ()
+    assert np.array_equal(recording.samples.sync, np.arange(recording.counters["sync_sent"]))
+    ((first, last),) = recording.experiments()
+    assert (first + 1) % 5 == (last + 1) % 5 == 0
+    assert recording.metadata["cell"] == "ten_seconds"
+    # At both marks the demand stands at the ends of the trajectory, which are the same posture.
+    demand = recording.streams["demand"]
+    ends = demand.raw["demand"][np.isin(demand.sync, [first, last])]
+    assert np.array_equal(ends[0], ends[1])
+
+
+@pytest.mark.usefixtures("robot")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_with_a_finished_file(vcan_bus: str, tmp_path: Path, number: signal.Signals) -> None:
+    session = session_file(tmp_path, vcan_bus, "signal", sync={"period_us": 1000}, setpoints=None)
+    process = run("capture", "--config", session, "--out", tmp_path / "out")
+    path = wait_for_file(tmp_path / "out", 20_000, process)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    recording = read_recording(path)
+    assert recording.missing is None
+    assert [mark.kind for mark in recording.marks] == ["experiment_start", "experiment_end"]
+    expected, rows, gaps, drops = (recording.counters[name] for name in COUNTED)
+    assert expected == rows + gaps == recording.counters["sync_sent"]
+    assert drops == 0
+
+
+def refused(process: subprocess.Popen[str], out: Path, code: int) -> str:
+    """The one line that a command ended with, and that it left nothing."""
+    _, err = process.communicate(timeout=120)
+    lines = [line for line in err.splitlines() if line.startswith("armident:")]
+    assert process.returncode == code, err
+    assert len(lines) == 1, err
+    assert "Traceback" not in err
+    assert not list(out.glob("*")) if out.exists() else True
+    return lines[0]
+
+
+def test_a_missing_drive_is_one_line_and_leaves_nothing(vcan_bus: str, tmp_path: Path) -> None:
+    session = session_file(tmp_path, vcan_bus, "nobody", sdo_timeout_s=0.2)
+    line = refused(run("capture", "--config", session, "--out", tmp_path / "out"), tmp_path / "out", 2)
+    assert "node 1" in line
+    assert "joint_1" in line
+
+
+def test_a_missing_bus_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+    session = session_file(tmp_path, "vcan77", "nobus")
+    line = refused(run("capture", "--config", session, "--out", tmp_path / "out"), tmp_path / "out", 2)
+    assert "vcan77" in line
+    assert "ip link" in line
+
+
+@pytest.mark.usefixtures("robot")
+def test_a_bus_that_goes_down_ends_with_a_finished_file_and_one_line(vcan_bus: str, tmp_path: Path) -> None:
+    session = session_file(tmp_path, vcan_bus, "down", sync={"period_us": 1000}, setpoints=None)
+    process = run("capture", "--config", session, "--out", tmp_path / "out")
+    path = wait_for_file(tmp_path / "out", 20_000, process)
+    subprocess.run(["ip", "link", "set", vcan_bus, "down"], check=True)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 1, err
+    lines = [line for line in err.splitlines() if line.startswith("armident:")]
+    assert len(lines) == 1
+    assert vcan_bus in lines[0]
+    assert read_recording(path).missing is None
+
+
+@pytest.mark.usefixtures("robot")
+def test_listen_only_records_the_same_and_sends_nothing(vcan_bus: str, tmp_path: Path) -> None:
+    one = session_file(tmp_path, vcan_bus, "active", sync={"period_us": 1000}, setpoints=None)
+    two = session_file(tmp_path, vcan_bus, "silent", sync={"period_us": 1000}, setpoints=None)
+    silent = run("capture", "--config", two, "--out", tmp_path / "two", "--listen-only", "--json")
+    wait_for_file(tmp_path / "two", 1000, silent)
+    sent_before = int(Path(f"/sys/class/net/{vcan_bus}/statistics/tx_packets").read_text())
+    time.sleep(1.0)
+    heartbeats = int(Path(f"/sys/class/net/{vcan_bus}/statistics/tx_packets").read_text()) - sent_before
+    assert heartbeats <= 6 * 12, "with nobody else there, only the drives' heartbeats are on the bus"
+    active = run("capture", "--config", one, "--out", tmp_path / "one", "--duration", "3", "--json")
+    out, err = active.communicate(timeout=120)
+    assert active.returncode == 0, err
+    os.kill(silent.pid, signal.SIGINT)
+    silent_out, silent_err = silent.communicate(timeout=60)
+    assert silent.returncode == 0, silent_err
+    a, b = (read_recording(json.loads(text)["recording"]) for text in (out, silent_out))
+    assert np.array_equal(a.samples.sync, b.samples.sync)
+    assert np.array_equal(a.samples.raw["position"], b.samples.raw["position"])
