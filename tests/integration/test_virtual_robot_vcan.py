@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import SessionConfig, load_robot, load_session, load_trajectory
+from configs import SessionConfig, Trajectory, load_robot, load_session
+from configs.trajectory import Move
 from daq.recording import write_recording
 from drivers.frames import frames
 from drivers.master import DriveMaster
@@ -28,7 +29,6 @@ pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 RUN = "import sys; from pathlib import Path; from virtual_robot.cli import robot; robot(config=Path(sys.argv[1]), "
-SHORT_MOVE = [0.15, 0.1, 1.45, 0.2, 0.2, -0.2]
 
 
 @dataclass
@@ -197,9 +197,12 @@ def test_nmt_states_govern_boot_up_heartbeat_sdo_and_pdo(config: Path) -> None:
 def test_a_replayed_recording_arrives_sample_by_sample(config: Path, tmp_path: Path) -> None:
     session = load_session(config)
     robot = load_robot(session.robot)
-    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
-    move = trajectory.moves[0].model_copy(update={"to": tuple(SHORT_MOVE), "duration": 0.4})
-    recording = simulate_recording(robot, trajectory.model_copy(update={"moves": (move,)}), seed=4, settle=0.1)
+    trajectory = Trajectory(
+        schema="armident/trajectory/1",
+        start=(0.0, 0.0, 1.57, 0.0, 0.0, 0.0),
+        moves=(Move(to=(0.15, 0.1, 1.45, 0.2, 0.2, -0.2), duration=0.4),),
+    )
+    recording = simulate_recording(robot, trajectory, seed=4, settle=0.1)
     path = tmp_path / "measured.mcap"
     write_recording(recording, path)
     with robot_process(config, f"replay=Path({str(path)!r})") as output, DriveMaster(session, robot) as master:

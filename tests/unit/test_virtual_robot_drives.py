@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot, load_trajectory
+from configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot
 from configs.scenario import HiddenEffect, Scenario
+from configs.trajectory import Move
 from daq.recording import Recording
 from drivers.objects import Control, DriveState, drive_state
 from virtual_robot.arm import Arm, counts_per_si
@@ -31,9 +32,11 @@ def tx40() -> RobotConfig:
 
 @pytest.fixture(scope="module")
 def short() -> Trajectory:
-    full = load_trajectory("trajectories/tx40_excitation.yaml")
-    move = full.moves[0].model_copy(update={"to": (0.3, 0.2, 1.3, 0.4, 0.4, -0.4), "duration": 0.5})
-    return full.model_copy(update={"moves": (move,)})
+    return Trajectory(
+        schema="armident/trajectory/1",
+        start=(0.0, 0.0, 1.57, 0.0, 0.0, 0.0),
+        moves=(Move(to=(0.3, 0.2, 1.3, 0.4, 0.4, -0.4), duration=0.5),),
+    )
 
 
 @pytest.fixture(scope="module")
