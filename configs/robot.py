@@ -90,7 +90,7 @@ class Effect(Frozen):
 
     effect: Name
     joint: Name
-    parameters: dict[str, float] = {}
+    parameters: dict[str, float] = Field(default_factory=dict)
 
 
 class Friction(Frozen):
