@@ -249,9 +249,17 @@ class _Process:
         logs = out / "logs"
         logs.mkdir(parents=True, exist_ok=True)
         self.log = logs / f"{name}.log"
+        environment = dict(os.environ)
+        if cache := environment.get("NUMBA_CACHE_DIR"):
+            # The one cache folder that a guest can write to serves matplotlib's fonts too.
+            environment.setdefault("MPLCONFIGDIR", str(Path(cache) / "matplotlib"))
         with self.log.open("wb") as output:
             self.process = subprocess.Popen(
-                [*_armident(), *arguments], stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
+                [*_armident(), *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=environment,
             )
 
     def text(self) -> str:

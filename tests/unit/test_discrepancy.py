@@ -9,7 +9,8 @@ from configs.scenario import HiddenEffect, Scenario
 from identify.discrepancy.catalogue import CATALOGUE, effect_names, effect_regressor, effect_values
 from identify.discrepancy.diagnose import Diagnosis, diagnose
 from identify.from_recording import experiments_from_recording
-from identify.service import robot_yaml
+from identify.run import Options
+from identify.service import identify_recording, robot_yaml
 from virtual_robot.offline import simulate_recording
 
 REPEATS = 3
@@ -91,3 +92,17 @@ def test_an_unknown_effect_is_refused_naming_the_known_ones(robot: RobotConfig) 
     changed = robot.model_copy(update={"effects": (Effect(effect="gremlins", joint="joint_1"),)})
     with pytest.raises(ConfigError, match=r"'gremlins'.*stribeck_friction"):
         effect_names(changed)
+
+
+def test_identifying_with_the_effect_inside_brings_the_torque_error_down(
+    robot: RobotConfig, trajectory: Trajectory
+) -> None:
+    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.4})
+    scenario = Scenario(schema="armident/scenario/1", effects=(worn,))
+    recording = simulate_recording(robot, trajectory, 3, scenario=scenario)
+    experiments, _ = experiments_from_recording(recording, robot)
+    model = diagnose(experiments, [], robot).robot
+    plain = identify_recording(recording, robot, Options(method="idim-ls")).document
+    better = identify_recording(recording, model, Options(method="idim-ls")).document
+    assert better.relative_error_pct_by_joint["joint_2"] < plain.relative_error_pct_by_joint["joint_2"]
+    assert any("asymmetric_viscous_friction of joint_2" in warning for warning in better.warnings)
