@@ -102,8 +102,8 @@ def open_books(every: list[int], window: list[int], length: list[int], channel_o
 
 def room_for(books: Books, syncs: int) -> Decided:
     """Room for what can be decided when ``syncs`` more SYNC are known of."""
-    streams, slots, n = books.row_code.shape
-    rows = slots + syncs
+    streams, _, n = books.row_code.shape
+    rows = int((books.head - books.emitted).max()) + syncs
     return Decided(
         rows=np.zeros(streams, np.int64),
         sync=np.empty((streams, rows), np.int64),
