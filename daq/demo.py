@@ -37,6 +37,8 @@ READY_S = 120.0
 CHAPTER_S = 300.0
 STOP_S = 10.0
 TAIL_LINES = 8
+PATIENCE = "10"
+"""Nice value of the worker: arm and capture come first where all share one CPU."""
 Say = Callable[[str], None]
 _CHAPTER = re.compile(r"<!-- chapter begins -->(.*?)<!-- chapter ends -->", re.DOTALL)
 
@@ -146,7 +148,7 @@ def _first_chapter(session: SessionConfig, out: Path, say: Say) -> tuple[Identif
     while True:
         config = _write_session(session, out, "cell")
         options = ["--config", str(config), "--once", "--out", str(out)]
-        with _running("worker", ["worker", *options], out, "worker: ready") as worker:
+        with _running("worker", ["worker", *options], out, "worker: ready", patient=True) as worker:
             say("worker: ready")
             recorded = _record("capture", config, out, say, ["--truth", str(truth_file)])
             slower = _slower(session)
@@ -243,7 +245,7 @@ def _write_session(session: SessionConfig, out: Path, name: str) -> Path:
 class _Process:
     """A command of ours, running, with everything it prints in a file."""
 
-    def __init__(self, name: str, arguments: Sequence[str], out: Path) -> None:
+    def __init__(self, name: str, arguments: Sequence[str], out: Path, patient: bool) -> None:
         self.name = name
         self._seen: list[str] = []
         logs = out / "logs"
@@ -255,7 +257,7 @@ class _Process:
             environment.setdefault("MPLCONFIGDIR", str(Path(cache) / "matplotlib"))
         with self.log.open("wb") as output:
             self.process = subprocess.Popen(
-                [*_armident(), *arguments],
+                [*(("nice", "-n", PATIENCE) if patient else ()), *_armident(), *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -312,8 +314,10 @@ class _Process:
 
 
 @contextmanager
-def _running(name: str, arguments: Sequence[str], out: Path, ready: str | None = None) -> Iterator[_Process]:
-    process = _Process(name, arguments, out)
+def _running(
+    name: str, arguments: Sequence[str], out: Path, ready: str | None = None, *, patient: bool = False
+) -> Iterator[_Process]:
+    process = _Process(name, arguments, out, patient)
     try:
         if ready is not None:
             process.wait_for(ready, READY_S)
