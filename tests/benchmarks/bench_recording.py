@@ -4,12 +4,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
+from numpy.typing import NDArray
 
 from configs import load_robot
 from daq.recording import Field, RecordingWriter, StreamLayout, read_recording
@@ -28,7 +30,7 @@ def run() -> list[Row]:
     layout = StreamLayout("samples", 1, tuple(j.name for j in robot.joints), fields, ("int32", "int16"))
     sync = np.arange(SAMPLES, dtype=np.int64)
     t_ns = 1_700_000_000_000_000_000 + sync * 200_000
-    raw = {
+    raw: dict[str, NDArray[Any]] = {
         "position": np.cumsum(rng.integers(-50, 50, (SAMPLES, robot.n)), axis=0).astype(np.int32),
         "current": rng.integers(-300, 300, (SAMPLES, robot.n)).astype(np.int16),
     }
