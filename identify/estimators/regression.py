@@ -127,7 +127,8 @@ def noise_models(
 
     The residuals lack what the parameters have absorbed, and they absorb the low frequencies, where the motion is and
     the precision is decided: ``cov(e - X d) = Omega - X C X'`` for an efficient estimate of covariance C. The
-    autocovariances of ``X C X'`` are given back; without, standard deviations come out a fifth too small.
+    autocovariances of ``X C X'`` are given back; without, standard deviations of the virtual TX40 come
+    out 9 % too small (median, 20 seeds).
     """
     errors = residuals(blocks, theta)
     factor = _square_root(covariance)
