@@ -26,7 +26,7 @@ GUEST_VARIABLE = "ARMIDENT_GUEST"
 REPEATS = 3
 """How often the second chapter runs the trajectory: an effect as small as its own needs more than one pass."""
 UDP_GROUP = "239.74.163.2"
-UDP_PERIOD_US = 4000
+UDP_PERIOD_US = 2000
 SLOW_PERIOD_US = 1000
 """For a machine that cannot run arm, bus, capture and worker at once at 5 kHz."""
 MAX_LOST_SHARE = 0.02
@@ -121,7 +121,8 @@ def _session_for_this_machine(out: Path, keep_going: bool, quick: bool) -> Sessi
         _start_over_in_guest(out, keep_going, quick)
     print(f"no vcan here ({reason}): running on udp_multicast at a lower rate, which may lose frames", flush=True)
     bus = session.bus.model_copy(update={"interface": "udp_multicast", "channel": UDP_GROUP})
-    return _at_period(session.model_copy(update={"bus": bus}), UDP_PERIOD_US)
+    sync = session.sync.model_copy(update={"period_us": UDP_PERIOD_US})
+    return session.model_copy(update={"bus": bus, "sync": sync})
 
 
 def _start_over_in_guest(out: Path, keep_going: bool, quick: bool) -> NoReturn:

@@ -22,7 +22,7 @@ def progress(what: str) -> Iterator[Report]:
     """Report stages after two seconds: a bar where stderr is a terminal, otherwise one plain line per stage."""
     begin = time.monotonic()
     if not sys.stderr.isatty():
-        yield lambda stage, share: _plain_line(what, stage, share, begin)
+        yield _plain_lines(what, begin)
         return
     columns = (
         TextColumn("{task.description}"),
@@ -107,6 +107,15 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
     )
 
 
-def _plain_line(what: str, stage: str, share: float, begin: float) -> None:
-    if time.monotonic() - begin > SHOW_AFTER_S:
-        print(f"{what}: {stage} ({100 * share:.0f} %)", file=sys.stderr, flush=True)
+def _plain_lines(what: str, begin: float) -> Report:
+    """Lines on stderr: one per stage, and one for every further fifth of the work."""
+    last: tuple[str, int] | None = None
+
+    def show(stage: str, share: float) -> None:
+        nonlocal last
+        now = stage, int(5 * share)
+        if now != last and time.monotonic() - begin > SHOW_AFTER_S:
+            print(f"{what}: {stage} ({100 * share:.0f} %)", file=sys.stderr, flush=True)
+            last = now
+
+    return show
