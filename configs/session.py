@@ -59,7 +59,7 @@ class RecordingOptions(Frozen):
 
     directory: Path = Path("recordings")
     chunk_ms: Annotated[int, Field(ge=10, le=1000)] = 100
-    drain_ms: Annotated[int, Field(ge=1, le=100)] = 10
+    drain_ms: Annotated[int, Field(ge=1, le=100)] = 20
 
 
 class ZenohOptions(Frozen):

@@ -39,6 +39,8 @@ from drivers.sync import SyncProducer
 from drivers.udp import NOTE, open_bus
 
 BATCH = 4096
+DRAINS = 16
+"""Batches taken in a row before anything else is looked at."""
 HEALTH_S = 1.0
 QUICK_STOP_S = 0.3
 """How long a quick stop is given before the drives are disabled."""
@@ -274,7 +276,8 @@ class _Run:
 
     def _drain(self) -> int:
         total = 0
-        while True:
+        # Bounded, so that a bus faster than we are cannot keep the capture from ending.
+        for _ in range(DRAINS):
             got = self._bus.receive(self._batch)
             sent = self._producer.sent if self._producer is not None else None
             if got:
@@ -282,7 +285,8 @@ class _Run:
                 self._mark_start()
             total += got
             if got < BATCH:
-                return total
+                break
+        return total
 
     def _watch(self) -> None:
         """Look after SYNC and drives; a drive that fails while we move the arm ends the capture."""

@@ -140,6 +140,5 @@ def _run(descriptor, period, counter, state, late, address, body, rows, every, s
         if code != 0:
             state[ERROR] = code
             return
-        # Read again: the process may have been held up between the deadline and here.
-        state[LAST_NS] = monotonic_ns(spec)
+        state[LAST_NS] = now
         state[SENT] = k + 1

@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from configs import RobotConfig
 
@@ -12,7 +13,7 @@ DECIMATED_VARIANCE = (1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523)
 DECIMATION_HZ = 20.0
 DISTURBANCE_HZ = 20.0
 """Corner of the first-order spectrum of the disturbance: nearly white after decimation, as the thesis found."""
-BLOCK = 4096
+BLOCK = 1024
 
 
 class Noise:
@@ -52,7 +53,6 @@ class Noise:
         n = self._last.size
         self.current[:] = self._random.standard_normal((BLOCK, n)) * self._current
         fresh = self._random.standard_normal((BLOCK, n)) * (self._disturbance * np.sqrt(1 - self._keep**2))
-        for k in range(BLOCK):
-            self._last = self._keep * self._last + fresh[k]
-            self.disturbance[k] = self._last
+        self.disturbance[:], state = lfilter([1.0], [1.0, -self._keep], fresh, axis=0, zi=self._keep * self._last[None])
+        self._last = state[0] / self._keep
         self._row = 0
