@@ -59,7 +59,7 @@ check: lint ## ruff, mypy, import-linter and the quick tests, under two minutes
 test: lint ## everything, the tests on vcan included
 	@mkdir -p .cache
 	failed=
-	$(PYTEST) -m "not vcan" 2>&1 | tee .cache/tests.log || failed=1
+	$(PYTEST) -n auto --dist loadfile -m "not vcan" 2>&1 | tee .cache/tests.log || failed=1
 	bus=
 	if $(PY) -m drivers.vcan -n 2 --setup; then bus="$(WITH_VCAN)"; fi
 	$$bus $(PYTEST) -m vcan tests/integration 2>&1 | tee .cache/tests-vcan.log || failed=1

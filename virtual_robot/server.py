@@ -104,7 +104,7 @@ class Server:
             raise
         self._exchange = Exchange(self.drives, motion, session.sync_period)
         self._batch = frames(BATCH)
-        self._columns = tuple(self._batch[name] for name in ("can_id", "length", "data"))
+        self._columns = self._batch["can_id"], self._batch["length"], self._batch["data"]
         # Compile before anybody waits for an answer.
         self._take(0, 0, 1)
 
