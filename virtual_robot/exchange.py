@@ -168,7 +168,8 @@ class Exchange:
         self._tx_kinds, self._tx_first, self._tx = _flat(tx)
         self._tx_ids = np.array([cob_id for cob_id, _, _ in tx], np.uint32)
         self._tx_lengths = np.array([sum(e[3] for e in entries) for _, _, entries in tx], np.uint8)
-        self._out = frames(len(tx))
+        # Arrays of one frame or none count as contiguous, which would compile the exchange anew for the others.
+        self._out = frames(max(len(tx), 2))
         self._rx_kinds, self._rx_first, self._rx = _flat(rx)
         self._table = np.full(IDENTIFIERS, -1, np.int64)
         for p, (cob_id, _, _) in enumerate(rx):
