@@ -37,8 +37,8 @@ READY_S = 120.0
 CHAPTER_S = 300.0
 STOP_S = 10.0
 TAIL_LINES = 8
-PATIENCE = "10"
-"""Nice value of the worker: arm and capture come first where all share one CPU."""
+PATIENT, URGENT = 19, -10
+"""Nice values of the worker, and of the arm where we may: all share one CPU, and an arm cannot wait as a reader can."""
 Say = Callable[[str], None]
 _CHAPTER = re.compile(r"<!-- chapter begins -->(.*?)<!-- chapter ends -->", re.DOTALL)
 
@@ -149,7 +149,7 @@ def _first_chapter(session: SessionConfig, out: Path, say: Say) -> tuple[Identif
     while True:
         config = _write_session(session, out, "cell")
         options = ["--config", str(config), "--once", "--out", str(out)]
-        with _running("worker", ["worker", *options], out, "worker: ready", patient=True) as worker:
+        with _running("worker", ["worker", *options], out, "worker: ready", PATIENT) as worker:
             say("worker: ready")
             recorded = _record("capture", config, out, say, ["--truth", str(truth_file)])
             slower = _slower(session)
@@ -231,7 +231,8 @@ def _rate(session: SessionConfig) -> str:
 
 
 def _start_robot(config: Path, out: Path, say: Say, stack: ExitStack, options: Sequence[str] = ()) -> "_Process":
-    robot = stack.enter_context(_running("robot", ["robot", "--config", str(config), *options], out, "ready"))
+    niceness = URGENT if os.geteuid() == 0 else 0
+    robot = stack.enter_context(_running("robot", ["robot", "--config", str(config), *options], out, "ready", niceness))
     say(f"robot: {robot.text().strip().splitlines()[-1]}")
     return robot
 
@@ -246,7 +247,7 @@ def _write_session(session: SessionConfig, out: Path, name: str) -> Path:
 class _Process:
     """A command of ours, running, with everything it prints in a file."""
 
-    def __init__(self, name: str, arguments: Sequence[str], out: Path, patient: bool) -> None:
+    def __init__(self, name: str, arguments: Sequence[str], out: Path, niceness: int) -> None:
         self.name = name
         self._seen: list[str] = []
         logs = out / "logs"
@@ -258,7 +259,7 @@ class _Process:
             environment.setdefault("MPLCONFIGDIR", str(Path(cache) / "matplotlib"))
         with self.log.open("wb") as output:
             self.process = subprocess.Popen(
-                [*(("nice", "-n", PATIENCE) if patient else ()), *_armident(), *arguments],
+                [*(("nice", "-n", str(niceness)) if niceness else ()), *_armident(), *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -316,9 +317,9 @@ class _Process:
 
 @contextmanager
 def _running(
-    name: str, arguments: Sequence[str], out: Path, ready: str | None = None, *, patient: bool = False
+    name: str, arguments: Sequence[str], out: Path, ready: str | None = None, niceness: int = 0
 ) -> Iterator[_Process]:
-    process = _Process(name, arguments, out, patient)
+    process = _Process(name, arguments, out, niceness)
     try:
         if ready is not None:
             process.wait_for(ready, READY_S)
