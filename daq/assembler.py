@@ -28,7 +28,7 @@ from daq.recording import Gap
 
 REASONS = {LOST: "lost", WRONG_LENGTH: "wrong length", AMBIGUOUS: "ambiguous order"}
 SYNC_LOST = "SYNC not received"
-LATE_S = 1.0
+LATE_S = 4.0
 """An answer that is later than this is taken as lost, s; a busy host can hold up a virtual drive for long."""
 _FEWEST_LATE = 8
 _LONGEST_OUTAGE_S = 60.0
