@@ -29,7 +29,11 @@ from daq.recording import Gap
 REASONS = {LOST: "lost", WRONG_LENGTH: "wrong length", AMBIGUOUS: "ambiguous order"}
 SYNC_LOST = "SYNC not received"
 LATE_S = 4.0
-"""An answer that is later than this is taken as lost, s; a busy host can hold up a virtual drive for long."""
+"""A drive that owes an answer for longer than this while others have answered has lost it, s."""
+PATIENCE_S = 120.0
+"""The same where all drives are behind and no frame is known to be missing: a busy host can hold up virtual drives.
+
+Only drives that owe nothing at some SYNC prove that nothing was lost, so what came since the last such SYNC is kept."""
 _FEWEST_LATE = 8
 _LONGEST_OUTAGE_S = 60.0
 
@@ -96,11 +100,11 @@ class Assembler:
         for s, stream in enumerate(streams):
             for j, cob_id in enumerate(stream.cob_ids):
                 channel_of[cob_id] = s * len(joints) + j
-        late = int(LATE_S * 1e9 / period_ns)
-        window = [max(_FEWEST_LATE, late // stream.every) for stream in streams]
-        self._books = open_books(
-            [s.every for s in streams], window, [s.length for s in streams], channel_of, len(joints)
+        every = [stream.every for stream in streams]
+        window, patience = (
+            [max(_FEWEST_LATE, int(seconds * 1e9 / period_ns) // e) for e in every] for seconds in (LATE_S, PATIENCE_S)
         )
+        self._books = open_books(every, window, patience, [s.length for s in streams], channel_of, len(joints))
         if first_counter is not None:
             self._books.state[COUNTER] = (first_counter - 1) % overflow
             self._books.state[ORIGIN] = first_counter
@@ -129,7 +133,7 @@ class Assembler:
         counts = dict(zip(COUNT_NAMES, (int(c) for c in self._books.counts), strict=True))
         return counts | self._totals
 
-    def push(self, frames: NDArray[Any], sent: int | None = None) -> Batch:
+    def push(self, frames: NDArray[Any], sent: int | None = None, dropped: bool = False) -> Batch:
         """Take frames in the order they came.
 
         Parameters
@@ -138,10 +142,15 @@ class Assembler:
             Structured array with ``t_ns``, ``can_id``, ``length`` and ``data`` (8 bytes), as the socket gives it.
         sent
             How many SYNC were sent so far, where we send them: no gap is longer than that.
+        dropped
+            Whether the kernel dropped frames between the last call and the end of these.
         """
         columns = _columns(frames)
         longest = self._longest if sent is None else min(self._longest, sent - self.last_sync)
-        out = room_for(self._books, _count_sync(*columns, *self._timing, longest, self._books))
+        syncs = _count_sync(*columns, *self._timing, longest, self._books)
+        if dropped:
+            self._books.hole[:] = self._books.head + syncs + 1
+        out = room_for(self._books, syncs)
         _match(*columns, *self._timing, longest, self._books, out)
         return self._batch(out, False)
 
@@ -154,11 +163,9 @@ class Assembler:
 
     def warm_up(self, frames: NDArray[Any]) -> None:
         """Compile the loops for frames like these (two or more), so that no SYNC waits for the compiler."""
-        late = [int(w) for w in self._books.window]
+        every, few = self._books.every.tolist(), [_FEWEST_LATE] * self._books.every.size
         nobody = np.full(1, -1, np.int64)
-        scratch = open_books(
-            self._books.every.tolist(), late, self._books.length.tolist(), nobody, self._books.settled.shape[1]
-        )
+        scratch = open_books(every, few, few, self._books.length.tolist(), nobody, self._books.settled.shape[1])
         columns = _columns(frames)
         out = room_for(scratch, _count_sync(*columns, *self._timing, self._longest, scratch))
         _match(*columns, *self._timing, self._longest, scratch, out)

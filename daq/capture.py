@@ -42,6 +42,10 @@ BATCH = 4096
 DRAINS = 16
 """Batches taken in a row before anything else is looked at."""
 HEALTH_S = 1.0
+REST_S = 0.01
+"""Time between two looks at the bus when the capture comes to its end."""
+TELL_BEHIND_S = 0.5
+"""Drives that are farther behind than this at the end are worth a line."""
 QUICK_STOP_S = 0.3
 """How long a quick stop is given before the drives are disabled."""
 
@@ -278,10 +282,11 @@ class _Run:
         total = 0
         # Bounded, so that a bus faster than we are cannot keep the capture from ending.
         for _ in range(DRAINS):
+            before = self._bus.dropped
             got = self._bus.receive(self._batch)
             sent = self._producer.sent if self._producer is not None else None
             if got:
-                self.sink.take(self._assembler.push(self._batch[:got], sent))
+                self.sink.take(self._assembler.push(self._batch[:got], sent, self._bus.dropped > before))
                 self._mark_start()
             total += got
             if got < BATCH:
@@ -317,19 +322,34 @@ class _Run:
         if self._producer is not None:
             self._producer.stop()
         with suppress(ArmidentError):
-            self._rest(LATE_S, lambda: self._assembler.owed == 0)
+            self._await_answers()
         if self._master is not None:
             self._master.stop()
         sent = self._producer.sent if self._producer is not None else None
         self.sink.take(self._assembler.finish(sent))
 
-    def _rest(self, seconds: float, enough: Callable[[], bool] = lambda: False) -> None:
-        """Go on recording for so long, or until it is enough."""
+    def _rest(self, seconds: float) -> None:
+        """Go on recording for so long."""
         until = time.monotonic() + seconds
         self._drain()
-        while time.monotonic() < until and not enough():
-            time.sleep(min(0.01, max(0.0, until - time.monotonic())))
+        while time.monotonic() < until:
+            time.sleep(min(REST_S, max(0.0, until - time.monotonic())))
             self._drain()
+
+    def _await_answers(self) -> None:
+        """Go on recording until no drive owes an answer, or none has come for ``LATE_S``."""
+        told = False
+        until = time.monotonic() + LATE_S
+        while True:
+            if self._drain():
+                until = time.monotonic() + LATE_S
+            owed = self._assembler.owed
+            if owed == 0 or time.monotonic() > until:
+                return
+            if not told and owed * self._period > TELL_BEHIND_S:
+                self._say(f"the drives are {owed * self._period:.1f} s behind: waiting for their answers")
+                told = True
+            time.sleep(REST_S)
 
     def _mark_end(self, trouble: ArmidentError | None) -> None:
         if self._span is None:
@@ -351,6 +371,7 @@ class _Run:
                 "rows": counters["samples.rows"],
                 "rows_in_gaps": counters["samples.in_gaps"],
                 "kernel_drops": self._bus.dropped,
+                "answers_owed": self._assembler.owed,
                 "queue_depth": self._publisher.depth,
                 "blocks_dropped": self._publisher.dropped,
             }

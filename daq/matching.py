@@ -2,9 +2,11 @@
 
 A TPDO carries no number, only an order: each drive answers its SYNCs one after the other. So per drive and TPDO, SYNCs
 and answers are matched first to first. As long as a drive owes nothing when the books are closed (at the next SYNC) the
-match is certain, also where answers came late. A debt older than a window of SYNCs is a loss; then every answer is
-taken as prompt (the latest SYNC it can belong to), and where answers also came in bursts the matter is undecidable
-and the samples in question are given up as ``AMBIGUOUS``, never guessed.
+match is certain, however late the answers came. A drive that owes while another has answered, for longer than a window of
+SYNCs, has lost something; then every answer is taken as prompt (the latest SYNC it can belong to), and where answers
+also came in bursts the matter is undecidable and the samples in question are given up as ``AMBIGUOUS``, never guessed.
+While all drives owe at every SYNC and no frame is known to be missing, the bus is behind and nothing is lost: then the
+window is ``patience`` SYNCs.
 """
 
 from typing import Any, NamedTuple
@@ -41,16 +43,22 @@ _DISORDER = 8
 class Books(NamedTuple):
     """What is owed and what has come; streams ``s``, joints ``j``, a stream's own SYNCs counted by ordinals ``u``.
 
-    Rows ``u`` of stream ``s`` stand in ring slots ``u % C`` until every joint has settled them.
+    Rows ``u`` of stream ``s`` stand in ring slots ``(u - base) % C`` until every joint has settled them; with nothing
+    open the ring begins anew, so that memory is only touched where answers are late. ``behind`` is the last ordinal
+    at which all joints owed, ``hole`` the last before which a frame is known to be missing.
     """
 
     state: NDArray[np.int64]
     counts: NDArray[np.int64]
     every: NDArray[np.int64]
     window: NDArray[np.int64]
+    patience: NDArray[np.int64]
     length: NDArray[np.int64]
     channel_of: NDArray[np.int64]
     head: NDArray[np.int64]
+    base: NDArray[np.int64]
+    behind: NDArray[np.int64]
+    hole: NDArray[np.int64]
     emitted: NDArray[np.int64]
     settled: NDArray[np.int64]
     pending: NDArray[np.int64]
@@ -74,18 +82,29 @@ class Decided(NamedTuple):
     data: NDArray[np.uint64]
 
 
-def open_books(every: list[int], window: list[int], length: list[int], channel_of: NDArray[np.int64], n: int) -> Books:
+def open_books(
+    every: list[int],
+    window: list[int],
+    patience: list[int],
+    length: list[int],
+    channel_of: NDArray[np.int64],
+    n: int,
+) -> Books:
     """Empty books for streams of ``n`` joints; ``channel_of`` maps a COB-ID to ``s n + j``, or -1."""
-    streams, rows = len(every), 2 * max(window) + 8
+    streams, rows = len(every), 2 * max(patience) + 8
     answers = rows + 64
     return Books(
         state=np.array([-1, -1, UNSEEN, 1]),
         counts=np.zeros(len(COUNT_NAMES), np.int64),
         every=np.array(every),
         window=np.array(window),
+        patience=np.array(patience),
         length=np.array(length),
         channel_of=channel_of,
         head=np.zeros(streams, np.int64),
+        base=np.zeros(streams, np.int64),
+        behind=np.zeros(streams, np.int64),
+        hole=np.zeros(streams, np.int64),
         emitted=np.zeros(streams, np.int64),
         settled=np.zeros((streams, n), np.int64),
         pending=np.zeros((streams, n), np.int64),
@@ -129,8 +148,13 @@ def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longes
 
 
 @njit(cache=True, nogil=True)
+def _slot(b: Books, s: int, u: int) -> int:
+    return int((u - b.base[s]) % b.row_sync.shape[1])
+
+
+@njit(cache=True, nogil=True)
 def _place(b: Books, s: int, j: int, u: int, i: int) -> None:
-    slot = u % b.row_sync.shape[1]
+    slot = _slot(b, s, u)
     b.row_data[s, slot, j] = b.answer[s, j, i]
     b.row_code[s, slot, j] = b.answer_code[s, j, i]
 
@@ -151,7 +175,8 @@ def _settle(b: Books, s: int, j: int, final: bool) -> None:
         b.settled[s, j] = b.head[s]
         b.pending[s, j] = 0
         return
-    if owed <= b.window[s] and not final:
+    late = owed > b.window[s] and b.head[s] - b.behind[s] > b.window[s]
+    if not (late or owed > b.patience[s] or final):
         return
     keep = b.head[s] if final else b.head[s] - b.window[s]
     u = b.head[s]
@@ -165,7 +190,7 @@ def _settle(b: Books, s: int, j: int, final: bool) -> None:
         label = b.label[s, j, i]
         if i + 1 < count and b.label[s, j, i + 1] == label:
             for v in range(previous + 1, label + 1):
-                b.row_code[s, v % b.row_code.shape[1], j] = AMBIGUOUS
+                b.row_code[s, _slot(b, s, v), j] = AMBIGUOUS
         else:
             previous = label
     b.pending[s, j] = 0
@@ -174,12 +199,18 @@ def _settle(b: Books, s: int, j: int, final: bool) -> None:
 
 @njit(cache=True, nogil=True)
 def _settle_all(b: Books, s: int, final: bool, out: Decided) -> None:
-    end = b.head[s]
-    for j in range(b.settled.shape[1]):
+    n, end = b.settled.shape[1], b.head[s]
+    oldest, all_owe = end, n > 1
+    for j in range(n):
+        oldest = min(oldest, b.settled[s, j])
+        all_owe = all_owe and b.settled[s, j] + b.pending[s, j] < b.head[s]
+    if all_owe and oldest >= b.hole[s]:
+        b.behind[s] = b.head[s]
+    for j in range(n):
         _settle(b, s, j, final)
         end = min(end, b.settled[s, j])
     while b.emitted[s] < end:
-        slot = b.emitted[s] % b.row_sync.shape[1]
+        slot = _slot(b, s, b.emitted[s])
         o = out.rows[s]
         out.sync[s, o] = b.row_sync[s, slot]
         out.t_ns[s, o] = b.row_t[s, slot]
@@ -188,13 +219,15 @@ def _settle_all(b: Books, s: int, final: bool, out: Decided) -> None:
             out.data[s, o, j] = b.row_data[s, slot, j]
         out.rows[s] += 1
         b.emitted[s] += 1
+    if b.emitted[s] == b.head[s]:
+        b.base[s] = b.head[s]
 
 
 @njit(cache=True, nogil=True)
 def _owe(b: Books, s: int, k: int, t_ns: int) -> None:
     """SYNC ``k`` asks for an answer, if the stream sends on it."""
     if (b.state[ORIGIN] + k) % b.every[s] == 0:
-        slot = b.head[s] % b.row_sync.shape[1]
+        slot = _slot(b, s, b.head[s])
         b.row_sync[s, slot] = k
         b.row_t[s, slot] = t_ns
         for j in range(b.settled.shape[1]):
@@ -206,6 +239,8 @@ def _owe(b: Books, s: int, k: int, t_ns: int) -> None:
 def _miss(b: Books, s: int, until: int, out: Decided) -> None:
     """The SYNCs after the last one and before ``until`` were sent, but not received."""
     first = b.state[SYNC] + 1
+    if until > first:
+        b.hole[s] = b.head[s] + (until - first) // b.every[s] + 1
     long = (until - first) // b.every[s] > b.window[s] // 2
     if long:
         _settle_all(b, s, False, out)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -153,6 +154,41 @@ def test_late_answers_are_no_loss(faults: Faults, cuts: list[int]) -> None:
     for stream in STREAMS:
         expected = [[list(payload(int(k), j)) for j in range(3)] for k in sync[stream.name]]
         assert np.array_equal(data[stream.name], np.array(expected, np.uint8))
+
+
+@pytest.mark.parametrize("cuts", [[], list(range(0, 10_000, 97))])
+def test_drives_that_are_all_behind_for_a_minute_and_a_half_lose_nothing(cuts: list[int]) -> None:
+    behind = Faults(late={k: max(1, min(k, 1500, 4800 - k)) for k in range(300, 4700)})
+    sync, data, gaps, counters = run(bus(5000, behind), 5000, cuts)
+    assert gaps == []
+    assert counters["samples.rows"] == sync["samples"].size == 5000
+    assert np.array_equal(data["samples"][:, 1, :4].copy().view("<u4")[:, 0], np.arange(5000))
+
+
+def test_a_sample_lost_while_all_are_behind_costs_none_that_came_prompt() -> None:
+    """The burst that was lost in is undecidable, nothing before it and nothing after it."""
+    faults = Faults(tpdo={(600, 1)}, late={k: 1800 - k for k in range(500, 1800)})
+    sync, data, gaps, _ = run(bus(5000, faults), 5000, [])
+    assert {(g.joint, g.reason) for g in gaps} <= {("joint_2", "lost"), ("joint_2", "ambiguous order")}
+    assert set(range(500)) | set(range(1801, 5000)) <= set(sync["samples"].tolist())
+    assert np.array_equal(data["samples"][:, 1, :4].copy().view("<u4")[:, 0], sync["samples"])
+
+
+def test_dropped_frames_end_the_patience() -> None:
+    """Nobody answers SYNC 100 as far as we know: waited for if nothing is known to be missing, given up if it is."""
+    frames = bus(1000, Faults(tpdo={(100, j) for j in range(3)}))
+    patient, told = Assembler(STREAMS, JOINTS, PERIOD_NS), Assembler(STREAMS, JOINTS, PERIOD_NS)
+    half = len(frames) // 2
+    assert patient.push(frames[:half]).rows["samples"].sync[-1] < 100
+    told.push(frames[:half], dropped=True)
+    told.push(frames[half:])
+    patient.push(frames[half:])
+    assert patient.owed == 1
+    assert told.counters["samples.rows"] > 700
+    for assembler in (patient, told):
+        gaps = assembler.finish(1000).gaps
+        assert assembler.counters["samples.rows"] == 999
+        assert patient is not assembler or gaps == (Gap("samples", 100, 100, None, "lost"),)
 
 
 def test_a_single_lost_tpdo_is_one_gap_of_one_joint() -> None:
