@@ -1,12 +1,12 @@
 """The compiled part of the assembler: which TPDO answers which SYNC.
 
-A TPDO carries no number, only an order: each drive answers its SYNCs one after the other. So per drive and TPDO, SYNCs
-and answers are matched first to first. As long as a drive owes nothing when the books are closed (at the next SYNC) the
-match is certain, however late the answers came. A drive that owes while another has answered, for longer than a window of
-SYNCs, has lost something; then every answer is taken as prompt (the latest SYNC it can belong to), and where answers
-also came in bursts the matter is undecidable and the samples in question are given up as ``AMBIGUOUS``, never guessed.
-While all drives owe at every SYNC and no frame is known to be missing, the bus is behind and nothing is lost: then the
-window is ``patience`` SYNCs.
+A TPDO carries no number, only an order: each drive answers its SYNCs one after the other. So per drive and TPDO,
+SYNCs and answers are matched first to first. As long as a drive owes nothing when the books are closed (at the next
+SYNC) the match is certain, however late the answers came. A drive that owes while another has answered, for longer
+than a window of SYNCs, has lost something; then every answer is taken as prompt (the latest SYNC it can belong to),
+and where answers also came in bursts the matter is undecidable and the samples in question are given up as
+``AMBIGUOUS``, never guessed. While all drives owe at every SYNC and no frame is known to be missing, the bus is
+behind and nothing is lost: then the window is ``patience`` SYNCs.
 """
 
 from typing import Any, NamedTuple

@@ -18,7 +18,7 @@ from configs import DataError, RobotConfig
 from daq.recording import Recording
 
 if TYPE_CHECKING:
-    from identify.run import Identification
+    from identify.result import Identification
 
 LIBRARIES = ("armident", "numpy", "scipy", "numba")
 T = TypeVar("T", bound=BaseModel)

@@ -17,6 +17,9 @@ from identify.signals.differentiate import Derivatives
 LS_CUTOFF = 2.0
 """Cut-off of the least-squares decimation in closed-loop bandwidths (thesis 2.3.1: ``w_Fp >= 2 w_dyn``)."""
 
+PIV_CUTOFF = 5.0
+"""Cut-off of the rough decimation before IDIM-PIV, in closed-loop bandwidths (thesis section 7.2)."""
+
 
 def aligned_torque(tau: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of the torques held before and after each position sample, shape (N, n).

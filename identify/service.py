@@ -20,7 +20,9 @@ from identify.document import (
 )
 from identify.experiment import Experiment
 from identify.from_recording import experiments_from_recording
-from identify.run import Identification, Options, identify_experiment
+from identify.options import Options
+from identify.result import Identification
+from identify.run import identify_experiment
 
 FOUND = 4
 """Exit code: done, and the answer is that something changed or stays unexplained."""

@@ -18,7 +18,7 @@ from configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_r
 from daq.recording import Recording, read_recording
 from daq.zenoh_keys import Block, Keys, assemble, decode_block, decode_event, open_session
 from identify.document import to_json
-from identify.run import Options
+from identify.options import Options
 from identify.service import identify_recording, write_identification
 
 MAX_WAITING_S = 10.0

@@ -9,7 +9,7 @@ from configs import RobotConfig
 from daq.recording import Recording
 from identify.document import IdentificationDocument
 from identify.report.page import BAND, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
-from identify.run import Identification
+from identify.result import Identification
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,8 @@ MEASURE = """
 import json, resource, time
 from configs import config_path, load_robot, load_trajectory
 from identify.from_recording import experiments_from_recording
-from identify.run import Options, identify_experiment
+from identify.options import Options
+from identify.run import identify_experiment
 from virtual_robot.offline import simulate_recording
 
 robot = load_robot("tx40")

@@ -9,7 +9,7 @@ from configs.scenario import HiddenEffect, Scenario
 from identify.discrepancy.catalogue import CATALOGUE, effect_names, effect_regressor, effect_values
 from identify.discrepancy.diagnose import Diagnosis, diagnose
 from identify.from_recording import experiments_from_recording
-from identify.run import Options
+from identify.options import Options
 from identify.service import identify_recording, robot_yaml
 from virtual_robot.offline import simulate_recording
 

@@ -9,8 +9,10 @@ from scipy.io import loadmat
 from configs import load_robot
 from identify.experiment import Experiment
 from identify.model.arm import ArmModel
+from identify.options import Options
 from identify.preparation import published_equations
-from identify.run import Identification, Options, identify_experiment
+from identify.result import Identification
+from identify.run import identify_experiment
 
 FORCE_PER_VOLT = 35.15065
 NAMES = ("m1", "fv1", "fc1", "off1")

@@ -7,7 +7,7 @@ import pytest
 
 from configs import load_robot, load_trajectory
 from identify.document import IdentificationDocument, load_document
-from identify.run import Options
+from identify.options import Options
 from identify.service import Outcome, identify_recording, write_identification
 from virtual_robot.offline import simulate_recording
 

@@ -7,7 +7,9 @@ import pytest
 
 from configs import load_robot
 from identify.experiment import Experiment
-from identify.run import Identification, Method, Options, identify_experiment
+from identify.options import Method, Options
+from identify.result import Identification
+from identify.run import identify_experiment
 from tests.tx40_reference import TABLE_B4, published_estimate
 
 STANDSTILL_S = 7.5

@@ -11,7 +11,9 @@ from configs import RobotConfig, Trajectory, config_path, load_robot, load_traje
 from identify.experiment import Experiment
 from identify.from_recording import experiments_from_recording
 from identify.model.arm import ArmModel
-from identify.run import Identification, Options, identify_experiment
+from identify.options import Options
+from identify.result import Identification
+from identify.run import identify_experiment
 from virtual_robot.inertias import plant_parameters
 from virtual_robot.offline import simulate_recording
 
