@@ -70,6 +70,7 @@ def simulate(
     q0: ArrayLike | None = None,
     qd0: ArrayLike | None = None,
     max_velocity: ArrayLike | None = None,
+    disturbance: ArrayLike | None = None,
 ) -> Simulation:
     """Simulate the arm under its controller along a reference (thesis equation 2.9, section B.3).
 
@@ -89,6 +90,9 @@ def simulate(
     max_velocity
         Joint velocities, scalar or (n,), beyond which the simulation counts as diverged; by default ten
         times the limits of the configuration.
+    disturbance
+        Motor torques (N, n), N m or N, that something else adds to those of the controller, after their saturation;
+        ``tau`` contains them.
 
     Raises
     ------
@@ -101,6 +105,9 @@ def simulate(
         raise ValueError(f"reference (N, {n}) and controller of {controller.n} for an arm of {model.n} joints")
     if abs(controller.dt - dt) > 1e-9 * dt:
         raise ValueError(f"the controller runs every {controller.dt} s, the simulation every {dt} s")
+    pushed = np.zeros((0, n)) if disturbance is None else np.ascontiguousarray(disturbance, dtype=np.float64)
+    if disturbance is not None and pushed.shape != reference.shape:
+        raise ValueError(f"disturbance {pushed.shape} for a reference of shape {reference.shape}")
     if max_velocity is None:
         max_velocity = [RUNAWAY * joint.limits.velocity for joint in model.robot.joints]
     start = reference[0] if q0 is None else np.asarray(q0, dtype=np.float64)
@@ -119,6 +126,7 @@ def simulate(
         controller.saturation,
         controller.memory,
         reference,
+        pushed,
         dt,
         np.broadcast_to(np.asarray(max_velocity, dtype=np.float64), (n,)).copy(),
         q,
@@ -181,6 +189,7 @@ def run(
     saturation: Floats,
     memory: int,
     reference: Floats,
+    disturbance: Floats,
     dt: float,
     max_velocity: Floats,
     q: Floats,
@@ -240,6 +249,8 @@ def run(
             torque = 0.0
             for i in range(n):
                 torque += transmission[i, j] * output[i, now]
+                if disturbance.shape[0] > 0:
+                    torque += transmission[i, j] * disturbance[k, i]
             tau[k, j] = torque
             qdd[k, j] = 0.5 * (before[j] + torque) - bias[j] - force[j]
         for i in range(n):
