@@ -14,14 +14,30 @@ def robot(
     noise: Annotated[float, typer.Option(min=0.0, help="Amplitude of the noise; 0 switches it off.")] = 1.0,
     truth: Annotated[Path | None, typer.Option(help="Write the arm's own parameters to this file (JSON).")] = None,
     duration: Annotated[float | None, typer.Option(min=0.0, help="Seconds to run; without it until Ctrl-C.")] = None,
+    to_file: Annotated[
+        Path | None, typer.Option(help="Without a bus: write a recording of one trajectory, as fast as it computes.")
+    ] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option(help="Trajectory of --to-file. [default: that of the session's set points]")
+    ] = None,
+    encoder_counts: Annotated[
+        int | None, typer.Option(min=1, help="Counts per motor turn, with --to-file. [default: those of the robot]")
+    ] = None,
 ) -> None:
     """Put the virtual arm on a bus: six CiA 402 drives, or a measured recording behind them.
 
     Example: armident robot --config tx40_cell.yaml --scenario scenarios/tx40_worn_joint2.yaml
     """
     from configs import ConfigError
-    from virtual_robot.run import run_robot
+    from virtual_robot.run import record_robot, run_robot
 
+    if to_file is None and (trajectory is not None or encoder_counts is not None):
+        raise ConfigError("--trajectory and --encoder-counts belong to --to-file")
+    if to_file is not None:
+        if replay is not None or duration is not None:
+            raise ConfigError("--to-file simulates one trajectory: --replay and --duration have no meaning with it")
+        record_robot(config, to_file, scenario, seed, noise, trajectory, encoder_counts, truth)
+        return
     if scenario is not None and replay is not None:
         raise ConfigError("--scenario hides effects in the plant, --replay has no plant: give one of them")
     if truth is not None and replay is not None:

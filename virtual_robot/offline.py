@@ -98,6 +98,15 @@ def simulate_recording(
     return Recording(None, robot, None, 1.0 / period, {"samples": samples, "demand": demands}, marks=marks)
 
 
+def with_encoder_counts(robot: RobotConfig, counts: float) -> RobotConfig:
+    """Return the robot with encoders of ``counts`` per turn (or metre) on every motor."""
+    joints = tuple(
+        joint.model_copy(update={"drive": joint.drive.model_copy(update={"counts_per_unit": float(counts)})})
+        for joint in robot.joints
+    )
+    return robot.model_copy(update={"joints": joints})
+
+
 def sample_fields(robot: RobotConfig) -> dict[str, Field]:
     """Fields of the ``samples`` stream: motor positions, currents, statuswords."""
     rated = tuple(joint.drive.rated / 1000.0 for joint in robot.joints)

@@ -6,10 +6,15 @@ import sys
 from pathlib import Path
 from types import FrameType
 
-from configs import RobotConfig, SessionConfig, load_robot, load_session
-from daq.recording import read_recording
+from numpy.typing import ArrayLike
+
+from configs import ConfigError, RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
+from daq.recording import read_recording, write_recording
+from virtual_robot import servo
 from virtual_robot.arm import Arm, Motion
 from virtual_robot.inertias import base_parameters, plant_parameters, rest_posture
+from virtual_robot.offline import simulate_recording, with_encoder_counts
+from virtual_robot.plant import Plant
 from virtual_robot.replay import Replay
 from virtual_robot.scenario import load_scenario
 from virtual_robot.server import Server
@@ -26,7 +31,8 @@ def run_robot(
 ) -> None:
     """Serve the drives of a session until SIGINT or SIGTERM, or for ``duration`` seconds.
 
-    ``truth`` names a file for the plant's own parameters: standard ones, and base ones where several act as one.
+    ``truth`` names a file for the arm's own parameters: standard ones, base ones where several act as one, and the
+    gains of the drives (``kp``, 1/s; ``kv``, A s/rad at the motor; ``velocity_filter_hz``).
 
     Raises
     ------
@@ -46,14 +52,73 @@ def run_robot(
         motion = Arm(robot, rest_posture(robot), session.sync_period, seed, noise, hidden)
         _warm_up(robot, session)
         if truth is not None:
-            parameters = plant_parameters(robot)
-            truth.write_text(json.dumps(parameters | base_parameters(parameters), indent=1) + "\n", encoding="utf-8")
+            _write_truth(robot, rest_posture(robot), truth)
     stop = _Stop()
     with Server(session, robot, motion) as server:
         nodes = ", ".join(str(drive.node_id) for drive in server.drives)
         print(f"ready: {robot.name} on {session.bus.channel}, nodes {nodes}", flush=True)
         report = server.run(lambda: stop.asked, duration)
     print(report, file=sys.stderr, flush=True)
+
+
+def record_robot(
+    config: Path,
+    out: Path,
+    scenario: Path | None = None,
+    seed: int = 0,
+    noise: float = 1.0,
+    trajectory: Path | None = None,
+    encoder_counts: int | None = None,
+    truth: Path | None = None,
+) -> None:
+    """Write a recording of one trajectory of the virtual arm to ``out``, without a bus.
+
+    Parameters
+    ----------
+    config
+        Session: robot, SYNC period, set points.
+    trajectory
+        File of the trajectory; ``None``: the session's.
+    encoder_counts
+        Counts per motor turn in place of the robot's; the drives see them too.
+    truth
+        As for ``run_robot``.
+
+    Raises
+    ------
+    ConfigError
+        If a file is wrong, no trajectory is given, or ``out`` exists already.
+    """
+    if out.exists():
+        raise ConfigError(f"{out}: there is such a file already")
+    session = load_session(config)
+    robot = load_robot(session.robot)
+    setpoints = session.setpoints
+    if setpoints is None:
+        raise ConfigError(f"{config}: setpoints: --to-file needs them, they say how the arm moves")
+    motion = load_trajectory(trajectory or setpoints.trajectory)
+    if encoder_counts is not None:
+        robot = with_encoder_counts(robot, encoder_counts)
+    recording = simulate_recording(
+        robot, motion, seed, noise,
+        None if scenario is None else load_scenario(scenario),
+        session.sync_period, setpoints.every, setpoints.settle_s,
+    )  # fmt: skip
+    if truth is not None:
+        _write_truth(robot, motion.start, truth)
+    write_recording(recording, out)
+    print(f"{recording.samples.sync.size} samples of {robot.name} in {out}", file=sys.stderr)
+
+
+def _write_truth(robot: RobotConfig, q: ArrayLike, path: Path) -> None:
+    """Parameters of the plant, and gains of the drives tuned at posture ``q`` (n,)."""
+    parameters = plant_parameters(robot)
+    kp, kv = servo.gains(robot, Plant(robot, q).mass_matrix())
+    drives = {"velocity_filter_hz": servo.VELOCITY_FILTER_HZ}
+    for j in range(robot.n):
+        drives |= {f"kp{j + 1}": float(kp[j]), f"kv{j + 1}": float(kv[j])}
+    values = parameters | base_parameters(parameters) | drives
+    path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
 
 
 def _replay(session: SessionConfig, robot: RobotConfig, path: Path) -> Motion:
