@@ -62,11 +62,17 @@ class DiscreteController:
 
     @classmethod
     def cascade(
-        cls, kp: ArrayLike, kv: ArrayLike, gain: ArrayLike, dt: float, saturation: ArrayLike | None = None
+        cls,
+        kp: ArrayLike,
+        kv: ArrayLike,
+        gain: ArrayLike,
+        dt: float,
+        saturation: ArrayLike | None = None,
+        velocity_samples: int = 1,
     ) -> Self:
         """Position loop around a velocity loop: ``nu = gain kv (kp eps - qd_motor)`` (thesis section B.3).
 
-        The velocity is the backward difference of the motor position.
+        The velocity is the difference of the motor position over ``velocity_samples`` periods.
 
         Parameters
         ----------
@@ -76,14 +82,26 @@ class DiscreteController:
             (n,), units of the drive's signal per rad/s or m/s of the motor.
         gain
             (n,), motor torque or force per unit of the drive's signal.
+        velocity_samples
+            At least 1; 2 is the mean of the last two backward differences.
+
+        Raises
+        ------
+        ValueError
+            If ``velocity_samples`` is not positive.
         """
+        if velocity_samples < 1:
+            raise ValueError(f"velocity_samples: expected at least 1, got {velocity_samples}")
         kp, kv, gain = np.broadcast_arrays(
             *(np.atleast_1d(np.asarray(value, dtype=np.float64)) for value in (kp, kv, gain))
         )
         loop = gain * kv
+        position = np.zeros((loop.size, velocity_samples + 1))
+        position[:, 0] = -loop / (velocity_samples * dt)
+        position[:, -1] = loop / (velocity_samples * dt)
         return cls(
             error_taps=(loop * kp)[:, None],
-            position_taps=np.stack([-loop / dt, loop / dt], axis=1),
+            position_taps=position,
             output_taps=np.zeros((loop.size, 0)),
             saturation=_limits(saturation, loop.size),
             dt=dt,
