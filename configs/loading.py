@@ -11,6 +11,7 @@ from configs.errors import ConfigError
 from configs.robot import RobotConfig
 from configs.session import SessionConfig
 from configs.trajectory import Trajectory
+from configs.urdf import UrdfGeometry, geometry_from_urdf
 
 HERE = Path(__file__).parent
 T = TypeVar("T", bound=BaseModel)
@@ -41,12 +42,21 @@ def config_path(name: str | Path) -> Path:
 def load_robot(name: str | Path) -> RobotConfig:
     """A robot configuration from a file.
 
+    Where the file has a key ``urdf`` (see `configs.urdf`), joints and geometry come from there: ``joints`` then only
+    adds to them, by name, and ``gravity`` is that of the URDF's base link.
+
     Raises
     ------
     ConfigError
         Naming file, key and what was expected.
     """
-    return _load(config_path(name), RobotConfig)
+    path = config_path(name)
+    data = _read_mapping(_read_text(path), str(path))
+    if "urdf" in data:
+        concerned = {key: data[key] for key in UrdfGeometry.model_fields if key in data}
+        geometry = geometry_from_urdf(_checked(concerned, UrdfGeometry, str(path)), path)
+        data = {key: value for key, value in data.items() if key not in concerned} | geometry
+    return _checked(data, RobotConfig, str(path))
 
 
 def load_trajectory(name: str | Path) -> Trajectory:
@@ -102,11 +112,7 @@ def load_session(name: str | Path) -> SessionConfig:
 
 
 def _load(path: Path, kind: type[T]) -> T:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
-    return parse(text, kind, str(path))
+    return parse(_read_text(path), kind, str(path))
 
 
 def parse(text: str, kind: type[T], where: str) -> T:
@@ -117,6 +123,17 @@ def parse(text: str, kind: type[T], where: str) -> T:
     ConfigError
         Naming ``where``, the key and what was expected.
     """
+    return _checked(_read_mapping(text, where), kind, where)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+
+
+def _read_mapping(text: str, where: str) -> dict[str, Any]:
     try:
         data = yaml.safe_load(text)
     except yaml.YAMLError as error:
@@ -125,6 +142,10 @@ def parse(text: str, kind: type[T], where: str) -> T:
         raise ConfigError(f"{where}:{line} not valid YAML: {getattr(error, 'problem', error)}") from error
     if not isinstance(data, dict):
         raise ConfigError(f"{where}: expected keys and values, found {type(data).__name__}")
+    return data
+
+
+def _checked(data: dict[str, Any], kind: type[T], where: str) -> T:
     try:
         return kind.model_validate(data)
     except ValidationError as error:
