@@ -1,15 +1,19 @@
 """The auxiliary model: the closed loop simulated with the last estimate, source of the instruments."""
 
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from configs import DataError
-from identify.estimators.regression import filtered_regressor
+from identify.estimators.regression import Block, filtered_regressor
 from identify.model.arm import ArmModel
 from identify.model.controller import DiscreteController
+from identify.model.physical import damp_to_physical
 from identify.model.simulation import Simulation, simulate
 from identify.signals.decimate import Decimation
 from identify.signals.differentiate import Derivatives
@@ -17,13 +21,33 @@ from identify.signals.differentiate import Derivatives
 HALVINGS = 8
 """Step halvings towards the last estimate that could be simulated."""
 
+POSTURES = 100
+"""Postures of the references at which the mass matrix of an iterate that diverged is examined."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """What the simulated loop does, filtered and decimated like the equations.
+
+    Parameters
+    ----------
+    torque
+        Joint torques at the samples, one (M, n) array per experiment, N m or N.
+    position
+        Joint positions, one (M, n) array per experiment, rad or m.
+    """
+
+    torque: tuple[NDArray[np.float64], ...]
+    position: tuple[NDArray[np.float64], ...]
+
 
 @dataclass
 class AuxiliaryModel:
     """Simulates every experiment's reference through controller and arm, and filters the regressor.
 
-    An estimate that cannot be simulated is moved half-way, and half-way again, towards the last one that could
-    (``warnings`` says so); the estimate itself is left alone, only the instruments use the damped one.
+    An estimate that cannot be simulated is made physical (no negative friction, a positive definite mass matrix), and,
+    if that is not enough, moved half-way, and half-way again, towards the last one that could
+    (``warnings`` says so); the estimate itself is left alone, only the simulation uses the damped one.
 
     Parameters
     ----------
@@ -33,6 +57,8 @@ class AuxiliaryModel:
         Position and velocity (n,) each at the start of every experiment.
     max_velocity
         Joint speeds (n,) beyond which a simulation counts as diverged.
+    anchor
+        A theta that is known to simulate, to move towards while there is no last one.
     """
 
     model: ArmModel
@@ -43,7 +69,32 @@ class AuxiliaryModel:
     decimation: Decimation
     max_velocity: NDArray[np.float64]
     warnings: list[str] = field(default_factory=list)
+    anchor: NDArray[np.float64] | None = None
     _last: NDArray[np.float64] | None = None
+
+    def fresh(self) -> Self:
+        """The same loop without memory of estimates and warnings: what an estimator starts with."""
+        return replace(self, warnings=[], _last=None)
+
+    def said(self) -> tuple[str, ...]:
+        """Warnings so far, each once."""
+        return tuple(dict.fromkeys(self.warnings))
+
+    def with_gear_ratios(self, share: float) -> Self:
+        """The loop as someone simulates it who takes the gear ratios for ``share`` of what they are (section 4.2.3).
+
+        Controller, reference and encoders live on the motor side, so the simulated joints move ``1 / share`` as far as
+        the real ones and get ``share`` of the drives' torques.
+        """
+        robot = self.model.robot
+        ratios = tuple(tuple(share * ratio for ratio in row) for row in robot.transmission)
+        return replace(
+            self.fresh(),
+            model=replace(self.model, robot=robot.model_copy(update={"transmission": ratios})),
+            references=[q_ref / share for q_ref in self.references],
+            initial=[(q / share, qd / share) for q, qd in self.initial],
+            max_velocity=self.max_velocity / share,
+        )
 
     def simulate(self, theta: NDArray[np.float64]) -> list[Simulation] | None:
         """All experiments with these base parameters, or ``None`` if one diverges or theta is not finite."""
@@ -59,6 +110,16 @@ class AuxiliaryModel:
             runs.append(run)
         return runs
 
+    def respond(self, theta: NDArray[np.float64]) -> Response | None:
+        """Simulated torques and positions after the parallel filter, or ``None`` if the simulation diverges."""
+        runs = self.simulate(theta)
+        return None if runs is None else self._filtered(runs)
+
+    def respond_many(self, thetas: Sequence[NDArray[np.float64]]) -> list[Response | None]:
+        """`respond` for many parameter vectors at once, on all processors: simulations hold no interpreter lock."""
+        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+            return list(pool.map(self.respond, thetas))
+
     def instruments(self, theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Filtered regressor at simulated signals, one (M, n, b) per experiment.
 
@@ -67,20 +128,66 @@ class AuxiliaryModel:
         DataError
             If neither theta nor any point between it and the last good estimate can be simulated.
         """
-        target = theta
+        _, runs = self._nearest(theta)
+        return [filtered_regressor(self.model, Derivatives(r.q, r.qd, r.qdd, None), self.decimation) for r in runs]
+
+    def equations(self, blocks: Sequence[Block], theta: NDArray[np.float64]) -> list[Block]:
+        """The equations with the simulated regressor in place of the measured one (2.32).
+
+        Raises
+        ------
+        DataError
+            As `instruments`.
+        """
+        return [replace(block, x=zeta) for block, zeta in zip(blocks, self.instruments(theta), strict=True)]
+
+    def reachable(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], Response]:
+        """Theta and its response, or the nearest point towards the last good estimate that has one.
+
+        Raises
+        ------
+        DataError
+            As `instruments`.
+        """
+        near, runs = self._nearest(theta)
+        return near, self._filtered(runs)
+
+    def _filtered(self, runs: Sequence[Simulation]) -> Response:
+        return Response(
+            tuple(self.decimation(_at_samples(run.tau)) for run in runs),
+            tuple(self.decimation(run.q) for run in runs),
+        )
+
+    def _nearest(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[Simulation]]:
+        """Theta, or the first point on the way back from it that can be simulated."""
+        runs = self.simulate(theta)
+        if runs is not None:
+            self._last = theta
+            return theta, runs
+        previous = self.anchor if self._last is None else self._last
+        if previous is None:
+            raise DataError("the auxiliary closed loop cannot be simulated: it diverges with the first estimate")
+        damped = damp_to_physical(self.model, theta, previous, self._postures())
+        reason = damped.reason or "its simulation diverged"
         for halving in range(HALVINGS + 1):
+            target = previous + (damped.theta - previous) * 0.5**halving
             runs = self.simulate(target)
             if runs is not None:
-                if halving:
-                    self.warnings.append(
-                        f"an iterate was not physical: its simulation diverged; instruments from a point "
-                        f"{100 * 0.5**halving:.1f} % of the way to it"
-                    )
                 self._last = target
-                return [
-                    filtered_regressor(self.model, Derivatives(r.q, r.qd, r.qdd, None), self.decimation) for r in runs
-                ]
-            if self._last is None:
-                break
-            target = self._last + (theta - self._last) * 0.5 ** (halving + 1)
-        raise DataError("the auxiliary closed loop cannot be simulated: it diverges with the first estimate")
+                share = 100 * damped.step * 0.5**halving
+                self.warnings.append(
+                    f"an iterate was not physical: {reason}; simulated a point {share:.1f} % of the way to it"
+                )
+                return target, runs
+        raise DataError("the auxiliary closed loop cannot be simulated: it diverges between all estimates tried")
+
+    def _postures(self) -> NDArray[np.float64]:
+        total = sum(q_ref.shape[0] for q_ref in self.references)
+        return np.concatenate([q_ref[:: max(1, total // POSTURES)] for q_ref in self.references])
+
+
+def _at_samples(held: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Torques (N, n) at the samples: the mean of those held before and after, as the simulated accelerations are."""
+    at = held.copy()
+    at[1:] = 0.5 * (held[1:] + held[:-1])
+    return at

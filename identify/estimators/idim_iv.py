@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from identify.estimators.auxiliary import AuxiliaryModel
 from identify.estimators.regression import (
+    COVARIANCE_PASSES,
+    ITERATIONS,
     Block,
     Estimate,
     instrumental_variable,
@@ -14,17 +16,11 @@ from identify.estimators.regression import (
     iv_covariance,
     joint_variances,
     noise_models,
+    residual_norm,
     serial_covariance,
-    weighted_rows,
+    stacked,
     whitened_residuals,
 )
-
-ITERATIONS = 20
-TOLERANCE = 1e-4
-"""Relative change of theta and of the residual norm that ends the iterations; far below one standard deviation."""
-
-COVARIANCE_PASSES = 3
-"""Noise model and covariance need each other; the third pass changes standard deviations by less than 1 %."""
 
 
 def idim_iv(
@@ -56,36 +52,25 @@ def idim_iv(
     DataError
         If no auxiliary model runs, not even the first.
     """
-    keep = [b.keep for b in blocks]
-    noise = joint_variances(blocks, start)
-    theta = start
+    auxiliary = auxiliary.fresh()
+    scale = noise = joint_variances(blocks, start)
 
     def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise
-        zeta = auxiliary.instruments(previous)
-        z = weighted_rows(zeta, keep, noise)
-        x = weighted_rows([b.x for b in blocks], keep, noise)
-        y = weighted_rows([b.y for b in blocks], keep, noise)
-        estimate = instrumental_variable(z, x, y)  # 2.33
-        norm = float(np.linalg.norm(y - x @ estimate))
+        z, _y = stacked(auxiliary.equations(blocks, previous), noise)
+        estimate = instrumental_variable(z, *stacked(blocks, noise))  # 2.33
         noise = joint_variances(blocks, estimate)
-        return estimate, norm
+        return estimate, residual_norm(blocks, estimate, scale)
 
-    theta, done, converged, reason = iterate(step, start, iterations, TOLERANCE)
-    zeta, x = auxiliary.instruments(theta), [b.x for b in blocks]
-    covariance = iv_covariance(weighted_rows(zeta, keep, noise), weighted_rows(x, keep, noise))
+    theta, done, converged, reason = iterate(step, start, iterations)
+    noise = joint_variances(blocks, theta)
+    simulated = auxiliary.equations(blocks, theta)
+    covariance = iv_covariance(stacked(simulated, noise)[0], stacked(blocks, noise)[0])
     if serial_order:
-        weights = noise
+        weights, keep = noise, [b.keep for b in blocks]
+        zeta, x = [b.x for b in simulated], [b.x for b in blocks]
         for _ in range(COVARIANCE_PASSES):
             noise = noise_models(blocks, theta, covariance, serial_order)
             covariance = serial_covariance(zeta, x, keep, weights, noise)
-    return Estimate(
-        theta,
-        covariance,
-        tuple(noise),
-        whitened_residuals(blocks, theta, noise),
-        done,
-        converged,
-        reason,
-        tuple(auxiliary.warnings),
-    )
+    residuals = whitened_residuals(blocks, theta, noise)
+    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())

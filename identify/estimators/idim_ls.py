@@ -9,13 +9,14 @@ from identify.estimators.regression import (
     joint_variances,
     least_squares,
     require_excitation,
+    serial_covariance,
+    stacked,
     unweighted,
-    weighted_rows,
     whitened_residuals,
 )
 
 
-def idim_ls(blocks: Sequence[Block], names: Sequence[str]) -> Estimate:
+def idim_ls(blocks: Sequence[Block], names: Sequence[str], *, weighted: bool = True) -> Estimate:
     """Ordinary, then weighted least squares.
 
     Parameters
@@ -24,21 +25,25 @@ def idim_ls(blocks: Sequence[Block], names: Sequence[str]) -> Estimate:
         Filtered and decimated equations.
     names
         Base parameters, shape (b,), for messages.
+    weighted
+        Weight each joint by its residual variance (2.23); otherwise the ordinary solution (2.22) is the result, its
+        covariance still that under residual variances which differ between joints.
 
     Raises
     ------
     DataError
         If the motion leaves parameters undetermined.
     """
-    keep = [b.keep for b in blocks]
-    noise = unweighted(blocks[0].y.shape[1])
-
-    x = weighted_rows([b.x for b in blocks], keep, noise)
+    plain = unweighted(blocks[0].y.shape[1])
+    x, y = stacked(blocks, plain)
     require_excitation(x, names)
-    theta = least_squares(x, weighted_rows([b.y for b in blocks], keep, noise))  # 2.22
-
+    theta = least_squares(x, y)  # 2.22
     noise = joint_variances(blocks, theta)  # 2.24 to 2.26
-    x = weighted_rows([b.x for b in blocks], keep, noise)
-    theta = least_squares(x, weighted_rows([b.y for b in blocks], keep, noise))  # 2.23
-
-    return Estimate(theta, inverse_gram(x), tuple(noise), whitened_residuals(blocks, theta, noise))  # 2.27
+    if weighted:
+        x, y = stacked(blocks, noise)
+        theta = least_squares(x, y)  # 2.23
+        covariance = inverse_gram(x)  # 2.27
+    else:
+        regressors = [b.x for b in blocks]
+        covariance = serial_covariance(regressors, regressors, [b.keep for b in blocks], plain, noise)
+    return Estimate(theta, covariance, tuple(noise), whitened_residuals(blocks, theta, noise))

@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.idim_iv import ITERATIONS, TOLERANCE
+from identify.estimators.grey_box import InverseController
 from identify.estimators.noise import ArModel
 from identify.estimators.regression import (
+    ITERATIONS,
+    MAX_AR_ORDER,
     Block,
     Estimate,
     instrumental_variable,
@@ -16,12 +18,10 @@ from identify.estimators.regression import (
     iv_covariance,
     joint_variances,
     noise_models,
-    residuals,
-    weighted_rows,
+    residual_norm,
+    stacked,
     whitened_residuals,
 )
-
-MAX_AR_ORDER = 60
 
 NOISE_UPDATES = 6
 """Iterations after which the noise models are held: an order that flips between two equal AICs never settles."""
@@ -33,6 +33,8 @@ def idim_piv(
     start: NDArray[np.float64],
     iterations: int = ITERATIONS,
     max_order: int = MAX_AR_ORDER,
+    *,
+    grey_box: bool = False,
 ) -> Estimate:
     """Alternate the IV estimate of the parameters and an AR model of the noise of each joint.
 
@@ -48,6 +50,9 @@ def idim_piv(
         Most iterations.
     max_order
         Highest AR order tried.
+    grey_box
+        Take the noise for position noise that the controller has turned into torque (6.28). ``noise`` and
+        ``residuals`` of the result then belong to the motors' positions (rad or m).
 
     Notes
     -----
@@ -59,31 +64,27 @@ def idim_piv(
     DataError
         If no auxiliary model runs, not even the first.
     """
-    keep = [b.keep for b in blocks]
-    scale = joint_variances(blocks, start)
+    auxiliary = auxiliary.fresh()
+    controller = InverseController.of(auxiliary, max_order) if grey_box else None
+
+    def seen(equations: Sequence[Block]) -> Sequence[Block]:
+        return equations if controller is None else controller(equations)
+
+    measured = seen(blocks)
+    scale = joint_variances(measured, start)
     noise: list[ArModel] = scale  # step 1: H = 1, lambda from the start
 
     def step(previous: NDArray[np.float64], k: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise
-        zeta = auxiliary.instruments(previous)  # step 2a
-        z = weighted_rows(zeta, keep, noise)
-        x = weighted_rows([b.x for b in blocks], keep, noise)
-        y = weighted_rows([b.y for b in blocks], keep, noise)
+        z, _y = stacked(seen(auxiliary.equations(blocks, previous)), noise)  # step 2a
+        x, y = stacked(measured, noise)
         estimate = instrumental_variable(z, x, y)  # step 2b, 6.30
         if k <= NOISE_UPDATES:
-            noise = noise_models(blocks, estimate, iv_covariance(z, x), max_order)  # step 2c
-        return estimate, float(np.linalg.norm(weighted_rows(residuals(blocks, estimate), keep, scale)))
+            noise = noise_models(measured, estimate, iv_covariance(z, x), max_order)  # step 2c
+        return estimate, residual_norm(measured, estimate, scale)
 
-    theta, done, converged, reason = iterate(step, start, iterations, TOLERANCE)
-    z = weighted_rows(auxiliary.instruments(theta), keep, noise)
-    x = weighted_rows([b.x for b in blocks], keep, noise)
-    return Estimate(
-        theta,
-        iv_covariance(z, x),
-        tuple(noise),
-        whitened_residuals(blocks, theta, noise),
-        done,
-        converged,
-        reason,
-        tuple(auxiliary.warnings),
-    )
+    theta, done, converged, reason = iterate(step, start, iterations)
+    z, _y = stacked(seen(auxiliary.equations(blocks, theta)), noise)
+    covariance = iv_covariance(z, stacked(measured, noise)[0])
+    residuals = whitened_residuals(measured, theta, noise)
+    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())

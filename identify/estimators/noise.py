@@ -1,11 +1,12 @@
 """Autoregressive noise models, whitening and whiteness (thesis section 6.1.3)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from identify.model.compiled import compiled
 
 
 @dataclass(frozen=True)
@@ -76,24 +77,43 @@ def fit_ar(
     r /= total
     if r[0] <= 0:
         return ArModel(np.empty(0), np.finfo(np.float64).tiny, -np.inf)
-    best = ArModel(np.empty(0), float(r[0]), total * float(np.log(r[0])))
+    models = list(_levinson(r))
+    criteria = [2 * order + total * float(np.log(variance)) for order, (_, variance) in enumerate(models)]
+    best = int(np.argmin(criteria))
+    return ArModel(*models[best], criteria[best])
+
+
+def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
+    """AR model of a given order whose spectrum ``variance / |C|^2`` follows a given one; its inverse is stable.
+
+    Parameters
+    ----------
+    power
+        Positive spectral density at equally spaced frequencies from zero to the Nyquist frequency.
+    order
+        Order; less where a shorter model is exact.
+    """
+    r = np.fft.irfft(power)[: order + 1]
+    coefficients, variance = list(_levinson(r))[-1]
+    return ArModel(coefficients, variance, -np.inf)
+
+
+def _levinson(r: NDArray[np.float64]) -> Iterator[tuple[NDArray[np.float64], float]]:
+    """Coefficients and variance of the AR models of order 0, 1, ... with autocovariances r (6.21 to 6.23)."""
     c, variance = np.zeros(0), float(r[0])
-    for order in range(1, max_order + 1):
+    yield c, variance
+    for order in range(1, r.size):
         reflection = -(r[order] + c @ r[order - 1 : 0 : -1]) / variance
         c = np.append(c + reflection * c[::-1], reflection)
         variance *= 1 - reflection**2
         if variance <= 1e-14 * r[0]:
-            break
-        aic = 2 * order + total * float(np.log(variance))
-        if aic < best.aic:
-            best = ArModel(c.copy(), float(variance), aic)
-    return best
+            return
+        yield c, variance
 
 
 def lagged_sums(x: NDArray[np.float64], max_lag: int) -> NDArray[np.float64]:
     """``sum_t x(t) . x(t - k)`` for lags 0..max_lag of a vector series (M, m)."""
-    flat = np.ascontiguousarray(x, dtype=np.float64)
-    return np.array([float(np.vdot(flat[k:], flat[: flat.shape[0] - k])) for k in range(max_lag + 1)])
+    return _lagged_sums(np.ascontiguousarray(x, dtype=np.float64), max_lag)
 
 
 def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whiteness:
@@ -108,8 +128,22 @@ def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whitenes
     return Whiteness(r[1:] / r[0] if r[0] > 0 else np.zeros(lags), 2 / float(np.sqrt(total)))
 
 
-@numba.njit(cache=True)
-def _convolve(x, coefficients):  # type: ignore[no-untyped-def]
+@compiled
+def _lagged_sums(x: NDArray[np.float64], max_lag: int) -> NDArray[np.float64]:
+    samples, width = x.shape
+    sums, products = np.zeros(max_lag + 1), np.empty(width)
+    for lag in range(max_lag + 1):
+        products[:] = 0.0
+        for k in range(lag, samples):
+            for c in range(width):
+                products[c] += x[k, c] * x[k - lag, c]
+        for c in range(width):
+            sums[lag] += products[c]
+    return sums
+
+
+@compiled
+def _convolve(x: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
     order = coefficients.size
     out = x[order:].copy()
     for k in range(out.shape[0]):

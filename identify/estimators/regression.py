@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +10,22 @@ from scipy import linalg, signal
 
 from configs import DataError
 from identify.estimators.noise import WHITE, ArModel, fit_ar, lagged_sums
+from identify.estimators.triangular import triangularize
 from identify.model.arm import ArmModel
 from identify.signals.decimate import Decimation
 from identify.signals.differentiate import Derivatives
+
+ITERATIONS = 20
+"""Most iterations of an iterative estimator."""
+
+TOLERANCE = 1e-4
+"""Relative change of theta and of the residual norm that ends the iterations; far below one standard deviation."""
+
+MAX_AR_ORDER = 60
+"""Highest order of the noise models that is tried."""
+
+COVARIANCE_PASSES = 3
+"""Noise model and covariance need each other; the third pass changes standard deviations by less than 1 %."""
 
 RANK_TOLERANCE = 1e-10
 """Smallest singular value of the column-normalised regressor, relative to the greatest, that counts as excited."""
@@ -99,24 +113,41 @@ def weighted_rows(
     return np.concatenate(rows)
 
 
+def stacked(blocks: Sequence[Block], noise: Sequence[ArModel]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Regressor (rows, b) and torques (rows,) of 2.20 and 2.21, whitened, without the equations left out."""
+    keep = [b.keep for b in blocks]
+    return weighted_rows([b.x for b in blocks], keep, noise), weighted_rows([b.y for b in blocks], keep, noise)
+
+
 def residuals(blocks: Sequence[Block], theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """``tau - phi theta`` of each experiment, shape (M, n)."""
     return [block.y - block.x @ theta for block in blocks]
 
 
 def joint_variances(blocks: Sequence[Block], theta: NDArray[np.float64]) -> list[ArModel]:
-    """Serially uncorrelated noise with the residual variance of each joint (2.25, 2.26).
+    """Serially uncorrelated noise with the residual variance of each joint (2.25, 2.26)."""
+    return error_variances(residuals(blocks, theta), [b.keep for b in blocks], theta.size)
+
+
+def residual_norm(blocks: Sequence[Block], theta: NDArray[np.float64], scale: Sequence[ArModel]) -> float:
+    """Norm of the residuals, each joint in the units of ``scale``."""
+    keep = [b.keep for b in blocks]
+    return float(np.linalg.norm(weighted_rows(residuals(blocks, theta), keep, scale)))
+
+
+def error_variances(
+    errors: Sequence[NDArray[np.float64]], keep: Sequence[NDArray[np.bool_]], parameters: int
+) -> list[ArModel]:
+    """White noise of the variance of each joint's errors, (M, n) per experiment (2.25, 2.26).
 
     The degrees of freedom spent on the parameters are shared by the joints in proportion to their equations.
     """
-    n = blocks[0].y.shape[1]
-    errors = residuals(blocks, theta)
-    total = sum(int(b.keep.sum()) for b in blocks)
-    free = max(1 - theta.size / total, 1.0 / total)
+    total = sum(int(kept.sum()) for kept in keep)
+    free = max(1 - parameters / total, 1.0 / total)
     models = []
-    for j in range(n):
-        e = np.concatenate([r[b.keep[:, j], j] for r, b in zip(errors, blocks, strict=True)])
-        models.append(ArModel(np.empty(0), max(float(e @ e) / (e.size * free), 1e-300), 0.0))
+    for j in range(errors[0].shape[1]):
+        e = np.concatenate([error[kept[:, j], j] for error, kept in zip(errors, keep, strict=True)])
+        models.append(ArModel(np.empty(0), max(float(e @ e) / (max(e.size, 1) * free), 1e-300), 0.0))
     return models
 
 
@@ -153,18 +184,25 @@ def whitened_residuals(
     blocks: Sequence[Block], theta: NDArray[np.float64], noise: Sequence[ArModel]
 ) -> tuple[tuple[NDArray[np.float64], ...], ...]:
     """Residuals of each joint in standard deviations of its noise model, one array per experiment."""
-    errors = residuals(blocks, theta)
+    return whitened(residuals(blocks, theta), [b.keep for b in blocks], noise)
+
+
+def whitened(
+    errors: Sequence[NDArray[np.float64]], keep: Sequence[NDArray[np.bool_]], noise: Sequence[ArModel]
+) -> tuple[tuple[NDArray[np.float64], ...], ...]:
+    """Errors (M, n) of every experiment in standard deviations of each joint's noise model."""
     return tuple(
-        tuple(ar.whiten(e[:, j])[b.keep[ar.order :, j]] for e, b in zip(errors, blocks, strict=True))
+        tuple(ar.whiten(e[:, j])[kept[ar.order :, j]] for e, kept in zip(errors, keep, strict=True))
         for j, ar in enumerate(noise)
     )
 
 
 def least_squares(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """Solve ``min |y - x theta|`` by QR of the column-normalised regressor."""
-    scale = np.linalg.norm(x, axis=0)
-    q, r = linalg.qr(x / scale, mode="economic")
-    theta: NDArray[np.float64] = linalg.solve_triangular(r, q.T @ y) / scale
+    b = x.shape[1]
+    scale = column_norms(x)
+    top = triangularize(x / scale, y, columns=b)
+    theta: NDArray[np.float64] = linalg.solve_triangular(top[:, :b], top[:, b]) / scale
     return theta
 
 
@@ -172,17 +210,18 @@ def instrumental_variable(
     z: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Solve ``z' (y - x theta) = 0`` (2.33) through the QR factors of ``z``: no product ``z' x`` is formed."""
-    q, _ = linalg.qr(z / np.linalg.norm(z, axis=0), mode="economic")
-    scale = np.linalg.norm(x, axis=0)
-    theta: NDArray[np.float64] = linalg.solve(q.T @ (x / scale), q.T @ y) / scale
+    b = x.shape[1]
+    scale = column_norms(x)
+    top = triangularize(z / column_norms(z), x / scale, y, columns=b)
+    theta: NDArray[np.float64] = np.linalg.solve(top[:, b : 2 * b], top[:, 2 * b]) / scale
     return theta
 
 
 def inverse_gram(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """``(x' x)^-1`` from the triangular factor of ``x``."""
-    scale = np.linalg.norm(x, axis=0)
-    (r,) = linalg.qr(x / scale, mode="r")
-    inverse = linalg.solve_triangular(r[: x.shape[1]], np.eye(x.shape[1])) / scale[:, None]
+    scale = column_norms(x)
+    factor = triangularize(x / scale, columns=x.shape[1])
+    inverse = linalg.solve_triangular(factor, np.eye(x.shape[1])) / scale[:, None]
     gram: NDArray[np.float64] = inverse @ inverse.T
     return gram
 
@@ -193,11 +232,17 @@ def iv_covariance(z: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.
     It equals ``(z' z)^-1`` (2.34, 6.31) where the simulator is exact and stays right where the controller is only
     approximate, as an identified impulse response is.
     """
-    zs, xs = np.linalg.norm(z, axis=0), np.linalg.norm(x, axis=0)
-    q, _ = linalg.qr(z / zs, mode="economic")
-    inverse = linalg.inv(q.T @ (x / xs)) / xs[:, None]
+    scale = column_norms(x)
+    top = triangularize(z / column_norms(z), x / scale, columns=x.shape[1])
+    inverse = np.linalg.inv(top[:, x.shape[1] :]) / scale[:, None]
     covariance: NDArray[np.float64] = inverse @ inverse.T
     return covariance
+
+
+def column_norms(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Norm of each column, 1 where a column is zero."""
+    norms = np.sqrt(np.einsum("ij,ij->j", x, x))
+    return np.where(norms > 0.0, norms, 1.0)
 
 
 def serial_covariance(
@@ -213,8 +258,8 @@ def serial_covariance(
     by the AR model of each joint: ``Z' W Omega W Z`` is the Gram matrix of ``H' W Z``.
     """
     z = weighted_rows(zeta, keep, weights)
-    zs = np.linalg.norm(z, axis=0)
-    bread = linalg.inv((z / zs).T @ weighted_rows(x, keep, weights))
+    zs = column_norms(z)
+    bread = np.linalg.inv((z / zs).T @ weighted_rows(x, keep, weights))
     meat = np.zeros((zs.size, zs.size))
     for j, (weight, ar) in enumerate(zip(weights, noise, strict=True)):
         for value, kept in zip(zeta, keep, strict=True):
@@ -233,10 +278,9 @@ def require_excitation(x: NDArray[np.float64], names: Sequence[str]) -> int:
     DataError
         Naming the parameters that the motion did not excite.
     """
-    scale = np.linalg.norm(x, axis=0)
-    dead = [name for name, s in zip(names, scale, strict=True) if s == 0]
+    dead = [name for name, used in zip(names, np.any(x, axis=0).tolist(), strict=True) if not used]
     if not dead:
-        _, s, vt = np.linalg.svd(x / scale, full_matrices=False)
+        _, s, vt = np.linalg.svd(triangularize(x / column_norms(x), columns=x.shape[1]))
         rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
         if rank == len(names):
             return rank
@@ -247,28 +291,44 @@ def require_excitation(x: NDArray[np.float64], names: Sequence[str]) -> int:
     )
 
 
+class Iterations(NamedTuple):
+    """How an iteration ended: its theta, iterations done, whether it converged, and which rule ended it."""
+
+    theta: NDArray[np.float64]
+    done: int
+    converged: bool
+    reason: str
+
+
 def iterate(
     step: Callable[[NDArray[np.float64], int], tuple[NDArray[np.float64], float]],
     start: NDArray[np.float64],
-    iterations: int,
-    tolerance: float,
-) -> tuple[NDArray[np.float64], int, bool, str]:
+    iterations: int = ITERATIONS,
+    tolerance: float = TOLERANCE,
+) -> Iterations:
     """Repeat ``step(theta, k) -> (theta, residual norm)`` until neither changes by more than ``tolerance``.
 
-    Returns
-    -------
-    tuple
-        Last theta, iterations done, whether it converged, and which rule ended it.
+    Where that does not happen, the iterate of the smallest residual norm is kept. Equations without a finite
+    solution end the iterations.
     """
     theta, norm = start, np.inf
+    best, least = start, np.inf
     for k in range(1, iterations + 1):
-        new, new_norm = step(theta, k)
+        try:
+            new, new_norm = step(theta, k)
+        except np.linalg.LinAlgError:
+            new, new_norm = np.full_like(start, np.nan), np.nan
+        if not (np.isfinite(new).all() and np.isfinite(new_norm)):
+            return Iterations(best, k, False, f"the equations of iteration {k} have no finite solution")
         change = float(np.linalg.norm(new - theta)) / max(float(np.linalg.norm(new)), 1e-300)
         drift = abs(new_norm - norm) / max(new_norm, 1e-300)
         theta, norm = new, new_norm
+        if norm < least:
+            best, least = theta, norm
         if change < tolerance and drift < tolerance:
-            return theta, k, True, f"theta changed by {change:.1e} and the residual norm by {drift:.1e} (relative)"
-    return theta, iterations, False, f"stopped after {iterations} iterations"
+            reason = f"theta changed by {change:.1e} and the residual norm by {drift:.1e} (relative)"
+            return Iterations(theta, k, True, reason)
+    return Iterations(best, iterations, False, f"stopped after {iterations} iterations")
 
 
 def unweighted(n: int) -> list[ArModel]:

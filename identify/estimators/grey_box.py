@@ -1,0 +1,85 @@
+"""Residuals as the position noise that the controller has turned into torque (thesis equations 6.17 and 6.28)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from identify.estimators.auxiliary import AuxiliaryModel
+from identify.estimators.noise import ArModel, fit_spectrum
+from identify.estimators.regression import Block
+from identify.model.controller import DiscreteController
+
+FREQUENCIES = 2048
+"""Points of the controller's frequency response, zero to the Nyquist frequency of the decimated equations."""
+
+SMALLEST_GAIN = 1e-4
+"""Floor of the controller's gain as a share of its largest: a pure velocity loop does not feel a constant error."""
+
+
+@dataclass(frozen=True)
+class InverseController:
+    """Turns joint torque equations into equations of motor positions, ``C_j^-1`` applied to every term (6.28).
+
+    Noise models know spectra only. So ``C_j^-1`` is the stable, causal filter with the controller's inverse gain at
+    every frequency that the decimated equations hold: ``1 / D_j(z^-1)``, scaled.
+
+    Parameters
+    ----------
+    to_motor
+        (n, n), joint torques (row vector) to motor torques: the inverse of the transmission.
+    shapes
+        One ``D_j`` and its scale for each motor.
+    """
+
+    to_motor: NDArray[np.float64]
+    shapes: tuple[ArModel, ...]
+
+    @classmethod
+    def of(cls, auxiliary: AuxiliaryModel, order: int) -> Self:
+        """The inverse of the auxiliary model's controller at its decimated rate, ``D_j`` of at most this order."""
+        gain = controller_gain(auxiliary.controller, auxiliary.decimation.factor)
+        inverse: NDArray[np.float64] = np.linalg.inv(auxiliary.model.robot.transmission_matrix)
+        return cls(inverse, tuple(fit_spectrum(1.0 / row**2, order) for row in gain))
+
+    def __call__(self, blocks: Sequence[Block]) -> list[Block]:
+        """The same equations, torques (M, n) and regressor (M, n, b), at the motors and through ``C_j^-1``.
+
+        An equation of a motor is kept where those of all joints that load it are.
+        """
+        return [
+            Block(
+                self._filtered(block.y @ self.to_motor),
+                self._filtered(np.einsum("mjb,ji->mib", block.x, self.to_motor, optimize=True)),
+                ~((~block.keep).astype(float) @ np.abs(self.to_motor) > 0.0),
+                block.t,
+            )
+            for block in blocks
+        ]
+
+    def _filtered(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        out = np.empty_like(values)
+        for j, shape in enumerate(self.shapes):
+            recursion = np.append(1.0, shape.coefficients)
+            out[:, j] = signal.lfilter([np.sqrt(shape.variance)], recursion, values[:, j], axis=0)
+        return out
+
+
+def controller_gain(controller: DiscreteController, factor: int) -> NDArray[np.float64]:
+    """Gain of each motor's controller from position noise to torque, (n, K), up to the decimated Nyquist frequency.
+
+    Position noise enters with the tracking error and, in a velocity loop, with the position itself.
+    """
+    z = np.exp(-1j * np.pi * np.linspace(0.0, 1.0, FREQUENCIES) / factor)
+
+    def response(taps: NDArray[np.float64]) -> NDArray[np.complex128]:
+        total: NDArray[np.complex128] = taps @ z[None, :] ** np.arange(taps.shape[1])[:, None]
+        return total
+
+    forward = response(controller.error_taps) - response(controller.position_taps)
+    gain = np.abs(forward / (1.0 - z * response(controller.output_taps)))
+    floored: NDArray[np.float64] = np.maximum(gain, SMALLEST_GAIN * gain.max(axis=1, keepdims=True))
+    return floored

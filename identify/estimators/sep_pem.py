@@ -1,0 +1,64 @@
+"""SEP-PEM: the dynamic model by DIDIM, then the noise of each joint, then the covariance (thesis section 6.2.1)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.estimators.auxiliary import AuxiliaryModel
+from identify.estimators.didim import solve_didim
+from identify.estimators.regression import (
+    COVARIANCE_PASSES,
+    ITERATIONS,
+    MAX_AR_ORDER,
+    Block,
+    Estimate,
+    inverse_gram,
+    joint_variances,
+    noise_models,
+    stacked,
+    whitened_residuals,
+)
+
+
+def sep_pem(
+    blocks: Sequence[Block],
+    auxiliary: AuxiliaryModel,
+    start: NDArray[np.float64],
+    iterations: int = ITERATIONS,
+    max_order: int = MAX_AR_ORDER,
+) -> Estimate:
+    """DIDIM on equations with little or no decimation, whose residuals an AR model per joint whitens (6.26, 6.27).
+
+    Parameters
+    ----------
+    blocks
+        Equations at the recorded rate or roughly decimated; all rows, since a whitening filter needs a gapless record.
+    auxiliary
+        The simulated closed loop with the true controller, same filter.
+    start
+        First theta of the auxiliary model, shape (b,).
+    iterations
+        Most iterations.
+    max_order
+        Highest AR order tried; the thesis finds 141 on average at 5 kHz.
+
+    Notes
+    -----
+    The covariance 6.29 is that of an estimate which the noise models had weighted. DIDIM has not used them, so its own
+    scatter may be somewhat larger.
+
+    Raises
+    ------
+    DataError
+        If no auxiliary model runs, not even the first.
+    """
+    auxiliary = auxiliary.fresh()
+    (theta, done, converged, reason), simulated = solve_didim(blocks, auxiliary, start, iterations)  # step 1
+    noise = joint_variances(simulated, theta)
+    covariance = inverse_gram(stacked(simulated, noise)[0])
+    for _ in range(COVARIANCE_PASSES):
+        noise = noise_models(simulated, theta, covariance, max_order)  # step 2, 6.27
+        covariance = inverse_gram(stacked(simulated, noise)[0])  # step 3, 6.29
+    residuals = whitened_residuals(simulated, theta, noise)
+    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())
