@@ -7,11 +7,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
+from configs import DataError, RobotConfig
 from identify.signals.bandpass import butterworth, central_difference
-from identify.signals.irwsm import irwsm, optimal_nvr
+from identify.signals.irwsm import automatic_nvr, cross_validated_nvr, irwsm, optimal_nvr
 
 Method = Literal["irwsm", "irwsm2", "bandpass"]
+
+NvrRule = Literal["automatic", "cross-validation", "likelihood", "tracking-error"]
+"""How the noise-variance ratio is found where no number is given."""
+
+NVR_RULES: tuple[NvrRule, ...] = ("automatic", "cross-validation", "likelihood", "tracking-error")
 
 NVR_BY_HAND = 1e-5
 """The thesis's manual choice (section 5.3.1)."""
@@ -34,8 +39,11 @@ def differentiate(
     q: NDArray[np.float64],
     dt: float,
     derivatives: Method = "irwsm",
-    nvr: float | Sequence[float] | None = None,
+    nvr: float | Sequence[float] | NDArray[np.float64] | NvrRule | None = None,
     bandwidth_hz: float | None = None,
+    *,
+    q_ref: NDArray[np.float64] | None = None,
+    resolution: float | Sequence[float] | NDArray[np.float64] | None = None,
 ) -> Derivatives:
     """Differentiate measured positions twice.
 
@@ -49,9 +57,16 @@ def differentiate(
         ``irwsm``: IRWSM 1, the level-slope smoother applied twice; ``irwsm2``: IRWSM 2, three states at once;
         ``bandpass``: zero-phase Butterworth of order 4 at five times ``bandwidth_hz``, then central differences.
     nvr
-        Noise-variance ratio, one for all joints or one per joint; ``None``: by likelihood.
+        Noise-variance ratio, one for all joints or one per joint, or the rule to find it: ``automatic`` (the same as
+        ``None``, see :func:`identify.signals.irwsm.automatic_nvr`), ``cross-validation``, ``likelihood`` (thesis
+        5.21) or ``tracking-error`` (5.26, 5.27).
     bandwidth_hz
         Closed-loop bandwidth, Hz; needed by ``bandpass``.
+    q_ref
+        Reference positions, shape (N, n); needed by ``tracking-error``.
+    resolution
+        Encoder resolution on the joint side, one for all joints or one per joint, rad or m; needed by
+        ``tracking-error``, see :func:`encoder_resolution`.
 
     Notes
     -----
@@ -59,10 +74,14 @@ def differentiate(
     yields velocity midway between samples, whose smoothed difference is an acceleration at the sample; the
     velocity at the sample is the mean of its two neighbours.
 
+    The second pass of IRWSM 1 takes the ratio of the first, except with ``likelihood``, which estimates one for each
+    pass as the thesis does: what the first pass leaves is no white noise any more, so nothing can be learned from it.
+
     Raises
     ------
     DataError
-        If a series is too short or not finite, or ``bandpass`` lacks the bandwidth.
+        If a series is too short or not finite, ``bandpass`` lacks the bandwidth, ``tracking-error`` lacks the
+        reference or the resolution or has no error, or ``nvr`` is neither positive nor a rule.
     """
     if derivatives == "bandpass":
         if bandwidth_hz is None:
@@ -70,14 +89,11 @@ def differentiate(
         smooth = butterworth(q, dt, min(5 * bandwidth_hz, 0.45 / dt))
         qd = central_difference(smooth, dt)
         return Derivatives(smooth, qd, central_difference(qd, dt), None)
-    n = q.shape[1]
-    given: list[float | None]
-    if nvr is None:
-        given = [None] * n
+    rule, given = _ratios(q, derivatives, nvr, q_ref, resolution)
+    if derivatives == "irwsm":
+        columns = [_irwsm1(q[:, j], dt, rule, given[j]) for j in range(q.shape[1])]
     else:
-        given = [float(v) for v in np.broadcast_to(np.asarray(nvr, dtype=np.float64), (n,))]
-    one = _irwsm1 if derivatives == "irwsm" else _irwsm2
-    columns = [one(q[:, j], dt, given[j]) for j in range(n)]
+        columns = [_irwsm2(q[:, j], dt, rule, given[j]) for j in range(q.shape[1])]
     return Derivatives(
         q=np.stack([c[0] for c in columns], axis=1),
         qd=np.stack([c[1] for c in columns], axis=1),
@@ -86,20 +102,108 @@ def differentiate(
     )
 
 
+def tracking_error_nvr(
+    error: NDArray[np.float64], order: int, resolution: float | Sequence[float] | NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Noise-variance ratios approximated from the tracking error (thesis 5.25 to 5.27), shape (n,).
+
+    Parameters
+    ----------
+    error
+        ``q_ref - q``, shape (N, n), rad or m.
+    order
+        2: variance of its difference (5.26, IRWSM 1); 3: of its second difference (5.27, IRWSM 2).
+    resolution
+        Encoder resolution, one for all joints or one per joint, rad or m: what one count is worth.
+
+    Raises
+    ------
+    DataError
+        If a resolution is not positive, or a joint has no tracking error.
+    """
+    step = np.broadcast_to(np.asarray(resolution, dtype=np.float64), (error.shape[1],))
+    if not (step > 0).all():
+        raise DataError(
+            f"nvr by tracking error: the resolution of joint {int(np.argmin(step > 0)) + 1} is not positive"
+        )
+    ratios: NDArray[np.float64] = (np.std(np.diff(error, n=order - 1, axis=0), axis=0) / step) ** 2
+    if not (ratios > 0).all():
+        raise DataError(f"nvr by tracking error: joint {int(np.argmin(ratios > 0)) + 1} has none that varies")
+    return ratios
+
+
+def encoder_resolution(robot: RobotConfig) -> NDArray[np.float64]:
+    """What one count of the motor encoders is worth on the joint side, shape (n,), rad or m.
+
+    Where several motors move a joint, their steps add as independent errors do.
+
+    Raises
+    ------
+    DataError
+        If the configuration of a drive has no encoder resolution.
+    """
+    steps = []
+    for joint in robot.joints:
+        if joint.drive.counts_per_unit is None:
+            raise DataError(
+                f"robot {robot.name!r}: {joint.name}.drive.counts_per_unit: the encoder resolution is unknown"
+            )
+        steps.append((2 * np.pi if joint.type == "revolute" else 1.0) / joint.drive.counts_per_unit)
+    inverse = np.linalg.inv(robot.transmission_matrix)
+    resolution: NDArray[np.float64] = np.sqrt(inverse**2 @ np.square(steps))
+    return resolution
+
+
+def _ratios(
+    q: NDArray[np.float64],
+    derivatives: Method,
+    nvr: float | Sequence[float] | NDArray[np.float64] | NvrRule | None,
+    q_ref: NDArray[np.float64] | None,
+    resolution: float | Sequence[float] | NDArray[np.float64] | None,
+) -> tuple[NvrRule, list[float | None]]:
+    """The rule, and for every joint the ratio that is already known."""
+    n = q.shape[1]
+    if nvr is None:
+        return "automatic", [None] * n
+    if isinstance(nvr, str):
+        if nvr not in NVR_RULES:
+            raise DataError(f"nvr: {nvr!r} is neither a number nor one of {', '.join(NVR_RULES)}")
+        if nvr != "tracking-error":
+            return nvr, [None] * n
+        if q_ref is None or resolution is None:
+            missing = "reference trajectory" if q_ref is None else "encoder resolution"
+            raise DataError(f"nvr by tracking error: the {missing} is unknown; use automatic")
+        if q_ref.shape != q.shape:
+            raise DataError(f"nvr by tracking error: the reference has shape {q_ref.shape}, the positions {q.shape}")
+        order = 2 if derivatives == "irwsm" else 3
+        return "tracking-error", list(tracking_error_nvr(q_ref - q, order, resolution))
+    ratios = np.asarray(nvr, dtype=np.float64)
+    if ratios.ndim > 1 or ratios.size not in (1, n) or not (ratios > 0).all():
+        raise DataError(f"nvr: expected one positive number or {n}, got {nvr}")
+    return "automatic", [float(v) for v in np.broadcast_to(ratios, (n,))]
+
+
 _Column = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], list[float]]
 
 
-def _irwsm1(y: NDArray[np.float64], dt: float, nvr: float | None) -> _Column:
-    first = irwsm(y, 2, nvr if nvr is not None else optimal_nvr(y, 2))
-    second = irwsm(first.slope, 2, nvr if nvr is not None else optimal_nvr(first.slope, 2))
+def _irwsm1(y: NDArray[np.float64], dt: float, rule: NvrRule, nvr: float | None) -> _Column:
+    first = irwsm(y, 2, _found(y, 2, rule) if nvr is None else nvr)
+    again = nvr is None and rule == "likelihood"
+    second = irwsm(first.slope, 2, optimal_nvr(first.slope, 2) if again else first.nvr)
     qd = _to_samples(first.slope) / dt
     qdd = _extended(second.slope) / dt**2
     return first.level, qd, qdd, [first.nvr, second.nvr]
 
 
-def _irwsm2(y: NDArray[np.float64], dt: float, nvr: float | None) -> _Column:
-    smooth = irwsm(y, 3, nvr if nvr is not None else optimal_nvr(y, 3))
+def _irwsm2(y: NDArray[np.float64], dt: float, rule: NvrRule, nvr: float | None) -> _Column:
+    smooth = irwsm(y, 3, _found(y, 3, rule) if nvr is None else nvr)
     return smooth.level, _to_samples(smooth.slope) / dt, _extended(np.diff(smooth.slope)) / dt**2, [smooth.nvr]
+
+
+def _found(y: NDArray[np.float64], order: int, rule: NvrRule) -> float:
+    if rule == "likelihood":
+        return optimal_nvr(y, order)
+    return cross_validated_nvr(y, order) if rule == "cross-validation" else automatic_nvr(y, order)
 
 
 def _to_samples(slope: NDArray[np.float64]) -> NDArray[np.float64]:

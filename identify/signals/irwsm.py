@@ -3,8 +3,16 @@
 The fixed-interval smoother of an integrated random walk of order ``d`` minimises
 ``sum (y - x)^2 + (1/NVR) sum (D x)^2`` with ``D`` the d-th difference, so ``x = y - D' V^-1 D y`` with the banded
 ``V = NVR I + D D'``, and the concentrated likelihood (5.16, 5.21) needs only the factors of ``V``: O(N) throughout.
+
+The likelihood takes the random walk at its word: accelerations whose increments are white. Those of a robot are
+smooth, their spectrum falls faster, and at 100 dB of signal to noise the likeliest ratio follows the noise far beyond
+the frequency where the motion sinks into it (thesis section 5.3.1 saw the same). Cross-validation asks instead which
+smoother predicts a left-out sample best and needs no model of the motion (Craven and Wahba 1979; Wahba 1985 on the two
+criteria where the prior is wrong), but white noise. :func:`automatic_nvr` takes the smoother of cross-validation and
+the likelihood of the third order, whose walk is smooth enough to be believed; each errs towards too little smoothing.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numba
@@ -14,7 +22,10 @@ from numpy.typing import NDArray
 from configs import DataError
 
 LOG10_NVR_RANGE = {2: (-12.0, 4.0), 3: (-14.0, 4.0)}
-"""Where the likelihood is searched; below, third-order factors lose definiteness (about 1e-16)."""
+"""Where the ratio is searched; below, third-order factors lose definiteness (about 1e-16)."""
+
+SETTLED = 1e-14
+"""Relative change below which the pivots of a Toeplitz band count as constant."""
 
 _STENCIL = {2: np.array([1.0, -2.0, 1.0]), 3: np.array([-1.0, 3.0, -3.0, 1.0])}
 
@@ -78,7 +89,7 @@ def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> 
     """Noise-variance ratio of greatest likelihood, by a bounded search on ``log10(NVR)``.
 
     On measured positions the likelihood may follow the noise too closely (thesis section 5.3.1: modelling
-    error and vibration count as dynamics); the decimation filter that follows compensates.
+    error and vibration count as dynamics); see :func:`automatic_nvr`.
 
     Parameters
     ----------
@@ -94,33 +105,86 @@ def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> 
     float
         The ratio; 1.0 for a series whose differences are all zero (a standstill says nothing).
     """
-    w = np.diff(_checked(y, order), n=order)
-    if not np.any(w):
+    w = _scaled_differences(y, order)
+    if w is None:
         return 1.0
-    w = w / np.abs(w).max()
+    return _search(lambda nvr: float(_profile(w, _band(order, nvr))), order, tolerance)
+
+
+def cross_validation(y: NDArray[np.float64], order: int, nvr: float) -> float:
+    """Logarithm of the generalised cross-validation score of a noise-variance ratio, up to a constant.
+
+    ``log(|y - x|^2 / N) - 2 log(tr(I - A) / N)`` with the smoother ``x = A y``: the mean square error of predicting
+    each sample from all others, but for a constant, where the noise is white. The trace is that of a long series.
+    """
+    w = np.diff(_checked(y, order), n=order)
+    return _score(w, order, nvr)
+
+
+def cross_validated_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
+    """Noise-variance ratio that predicts left-out samples best, by a bounded search on ``log10(NVR)``.
+
+    It assumes white measurement noise, as quantisation is while a sample passes several counts, and nothing about the
+    motion. Parameters and result are those of :func:`optimal_nvr`.
+    """
+    w = _scaled_differences(y, order)
+    if w is None:
+        return 1.0
+    return _search(lambda nvr: _score(w, order, nvr), order, tolerance)
+
+
+def automatic_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
+    """Noise-variance ratio for positions of which nothing is known: the smoother of two choices.
+
+    Cross-validation is right where the measurement noise is white and follows it where it is not; the likelihood of
+    the third-order walk depends less on the colour of the noise and follows it a little too far where it is white. For
+    order 2 the ratio of the third order is taken to the same half-power frequency, ``NVR^(1 / (2 order))``.
+    Parameters and result are those of :func:`optimal_nvr`.
+    """
+    validated = cross_validated_nvr(y, order, tolerance)
+    likeliest = optimal_nvr(y, 3, tolerance)
+    return float(min(validated, likeliest ** (order / 3)))
+
+
+def kept_share(order: int, nvr: float) -> float:
+    """Degrees of freedom per sample that the smoother ``x = A y`` of a long series keeps, ``tr(A) / N``.
+
+    The mean over frequency of ``NVR / (NVR + (2 - 2 cos w)^order)``, by partial fractions.
+    """
+    poles = nvr ** (1 / order) * np.exp(1j * np.pi * (2 * np.arange(order) + 1) / order)
+    return float(np.sum(-poles / (np.sqrt(-poles) * np.sqrt(4 - poles))).real / order)
+
+
+def _score(w: NDArray[np.float64], order: int, nvr: float) -> float:
+    squares = float(_residual_sum(w, _band(order, nvr), _STENCIL[order]))
+    return float(np.log(squares) - 2 * np.log(1 - kept_share(order, nvr)))
+
+
+def _scaled_differences(y: NDArray[np.float64], order: int) -> NDArray[np.float64] | None:
+    """Differences of a series with the greatest one 1, or ``None`` for a standstill."""
+    w = np.diff(_checked(y, order), n=order)
+    return w / np.abs(w).max() if np.any(w) else None
+
+
+def _search(criterion: Callable[[float], float], order: int, tolerance: float) -> float:
+    """Minimise a criterion of the ratio: a grid of two decades, then a golden section between its neighbours."""
     low, high = LOG10_NVR_RANGE[order]
     grid = np.arange(low, high + 1e-9, 2.0)
-    values = [_profile(w, _band(order, 10.0**g)) for g in grid]
-    best = int(np.argmin(values))
-    a, b = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
-    return float(10.0 ** _golden(w, order, float(a), float(b), tolerance))
-
-
-def _golden(w: NDArray[np.float64], order: int, a: float, b: float, tolerance: float) -> float:
-    """Golden-section search of the likelihood on ``log10(NVR)`` in [a, b]."""
+    best = int(np.argmin([criterion(10.0**g) for g in grid]))
+    a, b = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, grid.size - 1)])
     share = (np.sqrt(5.0) - 1) / 2
     x1, x2 = b - share * (b - a), a + share * (b - a)
-    f1, f2 = _profile(w, _band(order, 10.0**x1)), _profile(w, _band(order, 10.0**x2))
+    f1, f2 = criterion(10.0**x1), criterion(10.0**x2)
     while b - a > tolerance:
         if f1 < f2:
             b, x2, f2 = x2, x1, f1
             x1 = b - share * (b - a)
-            f1 = _profile(w, _band(order, 10.0**x1))
+            f1 = criterion(10.0**x1)
         else:
             a, x1, f1 = x1, x2, f2
             x2 = a + share * (b - a)
-            f2 = _profile(w, _band(order, 10.0**x2))
-    return (a + b) / 2
+            f2 = criterion(10.0**x2)
+    return float(10.0 ** ((a + b) / 2))
 
 
 def _checked(y: NDArray[np.float64], order: int) -> NDArray[np.float64]:
@@ -166,7 +230,7 @@ def _profile(w, band):  # type: ignore[no-untyped-def]
         before = pivot
         pivot = _row(band, d, low, i, p)
         d[i % (p + 1)] = pivot
-        steady = steady + 1 if abs(pivot - before) <= 4e-16 * pivot else 0
+        steady = steady + 1 if abs(pivot - before) <= SETTLED * pivot else 0
         value = w[i]
         for k in range(1, min(p, i) + 1):
             value -= low[i % (p + 1), k] * z[(i - k) % (p + 1)]
@@ -215,3 +279,56 @@ def _correction(w, band, stencil):  # type: ignore[no-untyped-def]
         for k in range(p + 1):
             out[i + k] += stencil[k] * z[i]
     return out
+
+
+@numba.njit(cache=True)
+def _residual_sum(w, band, stencil):  # type: ignore[no-untyped-def]
+    """``|D' V^-1 w|^2``; as in :func:`_profile` the factors of a Toeplitz band become constant."""
+    m, p = w.size, band.size - 1
+    d, low, z = np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.empty(m)
+    # Rows of the factor until they are constant; row `last` stands for all that follow.
+    pivots, rows = np.empty(m), np.zeros((m, p + 1))
+    pivot, steady, last = 1.0, 0, -1
+    while last + 1 < m and steady <= p:
+        i = last + 1
+        before = pivot
+        pivot = _row(band, d, low, i, p)
+        d[i % (p + 1)] = pivot
+        steady = steady + 1 if abs(pivot - before) <= SETTLED * pivot else 0
+        pivots[i] = pivot
+        value = w[i]
+        for k in range(1, min(p, i) + 1):
+            rows[i, k] = low[i % (p + 1), k]
+            value -= rows[i, k] * z[i - k]
+        z[i] = value
+        last = i
+    l1, l2 = rows[last, 1], rows[last, 2]
+    l3 = rows[last, 3] if p == 3 else 0.0
+    if last + 1 < m:
+        z1, z2 = z[last], z[last - 1]
+        z3 = z[last - 2] if p == 3 else 0.0
+        for i in range(last + 1, m):
+            value = w[i] - l1 * z1 - l2 * z2 - l3 * z3
+            z[i] = value
+            z3, z2, z1 = z2, z1, value
+    total = 0.0
+    # Solved backwards: u1, u2, u3 are the solution one, two and three places later, zero beyond the end.
+    u1 = u2 = u3 = 0.0
+    s0, s1, s2 = stencil[0], stencil[1], stencil[2]
+    s3 = stencil[3] if p == 3 else 0.0
+    for i in range(m - 1, -1, -1):
+        j1, j2, j3 = min(i + 1, last), min(i + 2, last), min(i + 3, last)
+        if i > last:
+            value = z[i] / pivots[last] - l1 * u1 - l2 * u2 - l3 * u3
+        else:
+            value = z[i] / pivots[i] - rows[j1, 1] * u1 - rows[j2, 2] * u2
+            if p == 3:
+                value -= rows[j3, 3] * u3
+        # Element i + p of D' u.
+        out = s3 * value + s2 * u1 + s1 * u2 + s0 * u3 if p == 3 else s2 * value + s1 * u1 + s0 * u2
+        total += out * out
+        u3, u2, u1 = u2, u1, value
+    if p == 3:
+        ends = (s2 * u1 + s1 * u2 + s0 * u3, s1 * u1 + s0 * u2, s0 * u1)
+        return total + ends[0] ** 2 + ends[1] ** 2 + ends[2] ** 2
+    return total + (s1 * u1 + s0 * u2) ** 2 + (s0 * u1) ** 2

@@ -8,7 +8,14 @@ from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from configs import DataError
-from identify.signals.irwsm import irwsm, negative_log_likelihood, optimal_nvr
+from identify.signals.irwsm import (
+    cross_validated_nvr,
+    cross_validation,
+    irwsm,
+    kept_share,
+    negative_log_likelihood,
+    optimal_nvr,
+)
 
 TRANSITION = {2: np.array([[1.0, 1.0], [0.0, 1.0]]), 3: np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])}
 
@@ -68,6 +75,31 @@ def test_smoother_and_likelihood_equal_the_dense_definition(order: int, nvr: flo
     np.testing.assert_allclose(irwsm(y, order, nvr).level, level, atol=1e-9)
     dense = (y.size - order) * np.log(w @ np.linalg.solve(v, w)) + np.linalg.slogdet(v)[1]
     assert negative_log_likelihood(y, order, nvr) == pytest.approx(dense, rel=1e-9)
+
+
+@pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.parametrize("nvr", [1e-6, 1e-2, 10.0])
+def test_cross_validation_score_equals_the_dense_definition(order: int, nvr: float) -> None:
+    y = noisy_sine(1500)
+    d = np.diff(np.eye(y.size), n=order, axis=0)
+    smoother = np.linalg.inv(np.eye(y.size) + d.T @ d / nvr)
+    residual = np.sum((y - smoother @ y) ** 2)
+    score = np.log(residual) - 2 * np.log(1 - np.trace(smoother) / y.size)
+    # The trace is that of a series without ends, which add about as many degrees of freedom as the order.
+    assert cross_validation(y, order, nvr) == pytest.approx(score, abs=4 * order / y.size)
+    assert kept_share(order, nvr) == pytest.approx(np.trace(smoother) / y.size, abs=order / y.size)
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_cross_validated_ratio_is_a_minimum_near_the_least_true_error(order: int) -> None:
+    rng = np.random.default_rng(5)
+    truth = np.sin(2 * np.pi * np.arange(20000) / 2500)
+    y = truth + 1e-4 * rng.standard_normal(truth.size)
+    best = cross_validated_nvr(y, order)
+    for other in (best / 2, best * 2):
+        assert cross_validation(y, order, best) < cross_validation(y, order, other)
+    errors = {g: np.linalg.norm(irwsm(y, order, 10.0**g).level - truth) for g in np.arange(-14.0, 0.0, 0.5)}
+    assert np.linalg.norm(irwsm(y, order, best).level - truth) < 1.2 * min(errors.values())
 
 
 @pytest.mark.parametrize(("order", "truth"), [(2, 1e-4), (2, 1e-1), (3, 1e-3)])
