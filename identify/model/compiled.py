@@ -1,18 +1,27 @@
 """How the numeric kernels are compiled: cached on disk, no interpreter lock, ordinary IEEE arithmetic."""
 
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 
 F = TypeVar("F", bound=Callable[..., object])
 
+_ARITHMETIC: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
+# Without reference counts: the caller holds the arrays, and an atomic increment each costs as much as the arithmetic.
+_UNCOUNTED: dict[str, Any] = {"_nrt": False}
+
 
 def compiled(function: F) -> F:
     """Compile a kernel with numba; the machine code is cached beside the source or in ``NUMBA_CACHE_DIR``."""
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})(function))
+    return cast(F, numba.njit(cache=True, nogil=True, **_ARITHMETIC)(function))
+
+
+def leaf(function: F) -> F:
+    """Compile a kernel that allocates nothing, for other kernels to call once per sample."""
+    return cast(F, numba.njit(cache=True, nogil=True, **_ARITHMETIC, **_UNCOUNTED)(function))
 
 
 def inlined(function: F) -> F:
-    """Compile a small helper into every kernel that calls it."""
-    return cast(F, numba.njit(fastmath={"contract", "nsz"}, error_model="numpy")(function))
+    """Compile a small helper that allocates nothing into every kernel that calls it."""
+    return cast(F, numba.njit(**_ARITHMETIC, **_UNCOUNTED)(function))

@@ -7,7 +7,8 @@ acceleration ``-g`` of the base. Vectors of link j are written in frame j, scala
 import numpy as np
 
 from identify.model.chain import Chain, Columns, Floats, Values
-from identify.model.compiled import compiled, inlined
+from identify.model.compiled import compiled, inlined, leaf
+from identify.model.elementary import padded, sines_cosines
 
 TWO_OVER_PI = 2.0 / np.pi
 
@@ -32,6 +33,14 @@ def into_parent(ca: float, sa: float, c: float, s: float, x: float, y: float, z:
     return c * x - s * y, ca * t - sa * z, sa * t + ca * z
 
 
+@inlined
+def turn(chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: Floats) -> None:
+    """Joint angles at ``q`` (n,) with their sines and cosines, each in an array of `padded` length."""
+    for j in range(q.size):
+        angle[j] = chain.theta[j] + (0.0 if chain.prismatic[j] else q[j])
+    sines_cosines(angle, sine, cosine)
+
+
 @compiled
 def fill_regressor(
     chain: Chain, columns: Columns, smoothing: float, q: Floats, qd: Floats, qdd: Floats, out: Floats
@@ -40,16 +49,17 @@ def fill_regressor(
     n = chain.d.size
     lin = np.empty((n, 3))
     ang = np.empty((n, 3))
+    angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
     for k in range(q.shape[0]):
+        turn(chain, q[k], angle, sine, cosine)
         wx = wy = wz = bx = by = bz = 0.0
         ax, ay, az = -chain.gravity[0], -chain.gravity[1], -chain.gravity[2]
         for j in range(n):
             v, a = qd[k, j], qdd[k, j]
             ca, sa, d = chain.cos_alpha[j], chain.sin_alpha[j], chain.d[j]
             moves = chain.prismatic[j]
-            angle = chain.theta[j] + (0.0 if moves else q[k, j])
             r = chain.r[j] + (q[k, j] if moves else 0.0)
-            c, s = np.cos(angle), np.sin(angle)
+            c, s = cosine[j], sine[j]
             px, py, pz = d, -r * sa, r * ca
             # Acceleration of O_j before the joint's own motion: a + wd x P + w x (w x P).
             ux, uy, uz = wy * pz - wz * py, wz * px - wx * pz, wx * py - wy * px
@@ -131,7 +141,7 @@ def fill_regressor(
                 out[k, i, coulomb] = out[k, j, coulomb] = smooth_sign(qd[k, i] + qd[k, j], smoothing)
 
 
-@compiled
+@leaf
 def add_friction(values: Values, smoothing: float, qd: Floats, tau: Floats) -> None:
     """Add friction, offsets and coupled friction at velocity ``qd`` (n,) to ``tau`` (n,) (2.7, B.1)."""
     for j in range(qd.size):
@@ -145,9 +155,22 @@ def add_friction(values: Values, smoothing: float, qd: Floats, tau: Floats) -> N
         tau[j] += values.coupling[m, 1] * qd[i] + sign
 
 
-@compiled
-def rigid_torque(chain: Chain, values: Values, q: Floats, qd: Floats, qdd: Floats, work: Floats, tau: Floats) -> None:
-    """Torques of the rigid chain, without friction and rotors, for one sample; ``work`` is (n, 8)."""
+@leaf
+def rigid_torque(
+    chain: Chain,
+    values: Values,
+    q: Floats,
+    qd: Floats,
+    qdd: Floats,
+    sine: Floats,
+    cosine: Floats,
+    work: Floats,
+    tau: Floats,
+) -> None:
+    """Torques of the rigid chain, without friction and rotors, for one sample; ``work`` is (n, 6).
+
+    ``sine`` and ``cosine`` are of the joint angles, as `turn` leaves them.
+    """
     n = chain.d.size
     wx = wy = wz = bx = by = bz = 0.0
     ax, ay, az = -chain.gravity[0], -chain.gravity[1], -chain.gravity[2]
@@ -155,11 +178,8 @@ def rigid_torque(chain: Chain, values: Values, q: Floats, qd: Floats, qdd: Float
         v, a = qd[j], qdd[j]
         ca, sa, d = chain.cos_alpha[j], chain.sin_alpha[j], chain.d[j]
         moves = chain.prismatic[j]
-        angle = chain.theta[j] + (0.0 if moves else q[j])
         r = chain.r[j] + (q[j] if moves else 0.0)
-        c, s = np.cos(angle), np.sin(angle)
-        work[j, 6] = c
-        work[j, 7] = s
+        c, s = cosine[j], sine[j]
         px, py, pz = d, -r * sa, r * ca
         ux, uy, uz = wy * pz - wz * py, wz * px - wx * pz, wx * py - wy * px
         ax += by * pz - bz * py + wy * uz - wz * uy
@@ -198,7 +218,7 @@ def rigid_torque(chain: Chain, values: Values, q: Floats, qd: Floats, qdd: Float
         mz += work[j, 5]
         moves = chain.prismatic[j]
         tau[j] = fz if moves else mz
-        ca, sa, c, s = chain.cos_alpha[j], chain.sin_alpha[j], work[j, 6], work[j, 7]
+        ca, sa, c, s = chain.cos_alpha[j], chain.sin_alpha[j], cosine[j], sine[j]
         r = chain.r[j] + (q[j] if moves else 0.0)
         px, py, pz = chain.d[j], -r * sa, r * ca
         fx, fy, fz = into_parent(ca, sa, c, s, fx, fy, fz)
@@ -208,11 +228,11 @@ def rigid_torque(chain: Chain, values: Values, q: Floats, qd: Floats, qdd: Float
         mz += px * fy - py * fx
 
 
-@compiled
-def fill_mass_matrix(chain: Chain, values: Values, q: Floats, work: Floats, mass: Floats) -> None:
-    """Mass matrix (n, n) with rotors and couplings, by composite rigid bodies; ``work`` is (n, 8).
+@leaf
+def fill_mass_matrix(chain: Chain, values: Values, q: Floats, sine: Floats, cosine: Floats, mass: Floats) -> None:
+    """Mass matrix (n, n) with rotors and couplings, by composite rigid bodies.
 
-    Columns 6 and 7 of ``work`` hold the cosine and sine of the joint angles, as `rigid_torque` leaves them.
+    ``sine`` and ``cosine`` are of the joint angles, as `turn` leaves them.
     """
     n = chain.d.size
     xx = xy = xz = yy = yz = zz = hx = hy = hz = m = 0.0
@@ -236,7 +256,7 @@ def fill_mass_matrix(chain: Chain, values: Values, q: Floats, work: Floats, mass
             fx, fy, fz, tx, ty, tz = -hy, hx, 0.0, xz, yz, zz
             mass[j, j] = zz + values.ia[j]
         for i in range(j, 0, -1):
-            ca, sa, c, s = chain.cos_alpha[i], chain.sin_alpha[i], work[i, 6], work[i, 7]
+            ca, sa, c, s = chain.cos_alpha[i], chain.sin_alpha[i], cosine[i], sine[i]
             r = chain.r[i] + (q[i] if chain.prismatic[i] else 0.0)
             px, py, pz = chain.d[i], -r * sa, r * ca
             fx, fy, fz = into_parent(ca, sa, c, s, fx, fy, fz)
@@ -247,7 +267,7 @@ def fill_mass_matrix(chain: Chain, values: Values, q: Floats, work: Floats, mass
             mass[i - 1, j] = mass[j, i - 1] = fz if chain.prismatic[i - 1] else tz
         if j == 0:
             break
-        ca, sa, c, s = chain.cos_alpha[j], chain.sin_alpha[j], work[j, 6], work[j, 7]
+        ca, sa, c, s = chain.cos_alpha[j], chain.sin_alpha[j], cosine[j], sine[j]
         r = chain.r[j] + (q[j] if chain.prismatic[j] else 0.0)
         px, py, pz = chain.d[j], -r * sa, r * ca
         hx, hy, hz = into_parent(ca, sa, c, s, hx, hy, hz)
@@ -284,11 +304,14 @@ def fill_inverse_dynamics(
     chain: Chain, values: Values, smoothing: float, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
     """Joint torques ``out`` (N, n) of the whole model along a motion."""
-    work = np.empty((chain.d.size, 8))
+    n = chain.d.size
+    work = np.empty((n, 6))
+    angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
     for k in range(q.shape[0]):
-        rigid_torque(chain, values, q[k], qd[k], qdd[k], work, out[k])
+        turn(chain, q[k], angle, sine, cosine)
+        rigid_torque(chain, values, q[k], qd[k], qdd[k], sine, cosine, work, out[k])
         add_friction(values, smoothing, qd[k], out[k])
-        for j in range(chain.d.size):
+        for j in range(n):
             out[k, j] += values.ia[j] * qdd[k, j]
         for m in range(values.coupling_joints.shape[0]):
             i, j = values.coupling_joints[m]
@@ -300,51 +323,49 @@ def fill_inverse_dynamics(
 def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> None:
     """Mass matrices ``out`` (N, n, n) at postures ``q`` (N, n)."""
     n = chain.d.size
-    work = np.empty((n, 8))
+    angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
     for k in range(q.shape[0]):
-        for j in range(n):
-            angle = chain.theta[j] + (0.0 if chain.prismatic[j] else q[k, j])
-            work[j, 6] = np.cos(angle)
-            work[j, 7] = np.sin(angle)
-        fill_mass_matrix(chain, values, q[k], work, out[k])
+        turn(chain, q[k], angle, sine, cosine)
+        fill_mass_matrix(chain, values, q[k], sine, cosine, out[k])
 
 
-@compiled
-def cholesky(matrix: Floats, n: int) -> bool:
-    """Replace the lower triangle of ``matrix`` by its Cholesky factor; ``False`` if not positive definite.
+@leaf
+def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
+    """Factor the lower triangle of ``matrix`` as ``L D L'``; ``False`` if it is not positive definite.
 
-    The diagonal of the factor is stored inverted.
+    The lower triangle of ``factor`` gets L, its diagonal the inverse of D, its upper triangle ``D L'``.
     """
     for j in range(n):
         pivot = matrix[j, j]
         floor = 1e-12 * abs(pivot)
         for k in range(j):
-            pivot -= matrix[j, k] * matrix[j, k]
+            pivot -= factor[j, k] * factor[k, j]
         if not pivot > floor:
             return False
-        inverse = 1.0 / np.sqrt(pivot)
-        matrix[j, j] = inverse
+        inverse = 1.0 / pivot
+        factor[j, j] = inverse
         for i in range(j + 1, n):
             value = matrix[i, j]
             for k in range(j):
-                value -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = value * inverse
+                value -= factor[i, k] * factor[k, j]
+            factor[j, i] = value
+            factor[i, j] = value * inverse
     return True
 
 
-@compiled
+@leaf
 def solve_factored(factor: Floats, n: int, x: Floats) -> None:
-    """Solve in place with the factor left by `cholesky`."""
+    """Solve in place with the factors left by `cholesky`."""
     for i in range(n):
         value = x[i]
         for k in range(i):
             value -= factor[i, k] * x[k]
-        x[i] = value * factor[i, i]
+        x[i] = value
     for i in range(n - 1, -1, -1):
-        value = x[i]
+        value = x[i] * factor[i, i]
         for k in range(i + 1, n):
             value -= factor[k, i] * x[k]
-        x[i] = value * factor[i, i]
+        x[i] = value
 
 
 @compiled
@@ -353,17 +374,19 @@ def fill_forward_dynamics(
 ) -> int:
     """Joint accelerations ``out`` (N, n); returns the first sample whose mass matrix is singular, or -1."""
     n = chain.d.size
-    work = np.empty((n, 8))
-    mass = np.empty((n, n))
+    work = np.empty((n, 6))
+    angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
+    mass, factor = np.empty((n, n)), np.empty((n, n))
     bias = np.empty(n)
     still = np.zeros(n)
     for k in range(q.shape[0]):
-        rigid_torque(chain, values, q[k], qd[k], still, work, bias)
+        turn(chain, q[k], angle, sine, cosine)
+        rigid_torque(chain, values, q[k], qd[k], still, sine, cosine, work, bias)
         add_friction(values, smoothing, qd[k], bias)
-        fill_mass_matrix(chain, values, q[k], work, mass)
-        if not cholesky(mass, n):
+        fill_mass_matrix(chain, values, q[k], sine, cosine, mass)
+        if not cholesky(mass, factor, n):
             return k
         for j in range(n):
             out[k, j] = tau[k, j] - bias[j]
-        solve_factored(mass, n, out[k])
+        solve_factored(factor, n, out[k])
     return -1

@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike
 
 from identify.model.arm import ArmModel
 from identify.model.chain import Chain, Floats, Values
-from identify.model.compiled import compiled
+from identify.model.compiled import compiled, leaf
 from identify.model.controller import DiscreteController
-from identify.model.kernels import TWO_OVER_PI, cholesky, fill_mass_matrix, rigid_torque, solve_factored
+from identify.model.elementary import arctangents, padded
+from identify.model.kernels import TWO_OVER_PI, cholesky, fill_mass_matrix, rigid_torque, solve_factored, turn
 
 GAMMA = 1.0 / (2.0 + np.sqrt(2.0))
 """Rosenbrock parameter that makes the two-stage method of order two L-stable."""
@@ -34,6 +35,9 @@ STEPS_PER_UNIT = 4.0
 
 MOST_STEPS = 16
 """Most steps within one sample."""
+
+HISTORY = 1024
+"""Samples the controller's memory takes before it is moved to the front of its arrays again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,17 +119,19 @@ def simulate(
         qd0 = (reference[1] - reference[0]) / dt if samples > 1 else np.zeros(n)
     q, qd, qdd, tau = (np.full((samples, n), np.nan) for _ in range(4))
     q[0], qd[0] = start, qd0
+    transmission = np.ascontiguousarray(model.robot.transmission_matrix)
+    values = model.values(theta_base)
     stopped = run(
         model.chain,
-        model.values(theta_base),
-        np.ascontiguousarray(model.robot.transmission_matrix),
-        np.ascontiguousarray(np.linalg.inv(model.robot.transmission_matrix)),
+        values,
+        transmission,
+        np.ascontiguousarray(np.linalg.inv(transmission)),
         controller.error_taps,
         controller.position_taps,
         controller.output_taps,
         controller.saturation,
         controller.memory,
-        reference,
+        reference @ transmission.T,
         pushed,
         dt,
         np.broadcast_to(np.asarray(max_velocity, dtype=np.float64), (n,)).copy(),
@@ -141,27 +147,37 @@ def simulate(
     return Simulation(q, qd, qdd, tau, stopped)
 
 
-@compiled
-def friction(values: Values, v: Floats, force: Floats, slope: Floats, pair_slope: Floats) -> None:
-    """Friction ``force`` (n,) at velocities ``v``, its diagonal ``slope`` (n,) and that of each coupling."""
-    g = values.smoothing
-    for j in range(v.size):
-        x = g * v[j]
-        force[j] = values.off[j] + values.fv[j] * v[j] + values.fc[j] * TWO_OVER_PI * np.arctan(x)
-        slope[j] = values.fv[j] + values.fc[j] * TWO_OVER_PI * g / (1.0 + x * x)
+@leaf
+def friction(
+    values: Values, v: Floats, x: Floats, bend: Floats, steep: Floats, force: Floats, slope: Floats, pair_slope: Floats
+) -> None:
+    """Friction ``force`` (n,) at velocities ``v``, its diagonal ``slope`` (n,) and that of each coupling.
+
+    ``x``, ``bend`` and ``steep`` are scratch of the `padded` number of joints and couplings.
+    """
+    g, n = values.smoothing, v.size
+    for j in range(n):
+        x[j] = g * v[j]
     for m in range(values.coupling_joints.shape[0]):
-        i, j = values.coupling_joints[m]
-        x = g * (v[i] + v[j])
-        common = values.coupling[m, 2] * TWO_OVER_PI * np.arctan(x)
-        steep = values.coupling[m, 2] * TWO_OVER_PI * g / (1.0 + x * x)
+        x[n + m] = g * (v[values.coupling_joints[m, 0]] + v[values.coupling_joints[m, 1]])
+    arctangents(x, bend, steep)
+    for j in range(n):
+        coulomb = TWO_OVER_PI * values.fc[j]
+        force[j] = values.off[j] + values.fv[j] * v[j] + coulomb * bend[j]
+        slope[j] = values.fv[j] + coulomb * g * steep[j]
+    for m in range(values.coupling_joints.shape[0]):
+        i, j = values.coupling_joints[m, 0], values.coupling_joints[m, 1]
+        coulomb = TWO_OVER_PI * values.coupling[m, 2]
+        common = coulomb * bend[n + m]
+        pair = coulomb * g * steep[n + m]
         force[i] += values.coupling[m, 1] * v[j] + common
         force[j] += values.coupling[m, 1] * v[i] + common
-        slope[i] += steep
-        slope[j] += steep
-        pair_slope[m] = steep + values.coupling[m, 1]
+        slope[i] += pair
+        slope[j] += pair
+        pair_slope[m] = pair + values.coupling[m, 1]
 
 
-@compiled
+@leaf
 def divisions(values: Values, v: Floats, a: Floats, dt: float) -> int:
     """How many steps one sample needs: more while a joint with Coulomb friction passes standstill."""
     most = 1
@@ -197,110 +213,126 @@ def run(
     qdd: Floats,
     tau: Floats,
 ) -> int:
-    """Fill ``q, qd, qdd, tau`` (N, n) from their first sample on; returns where it stopped, or -1."""
+    """Fill ``q, qd, qdd, tau`` (N, n) from their first sample on; returns where it stopped, or -1.
+
+    ``reference`` (N, n) is that of the motors.
+    """
     samples, n = reference.shape
-    pairs = values.coupling_joints.shape[0]
-    work, mass, mass_before, factor = np.empty((n, 8)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    coupled = values.coupling_joints
+    pairs = coupled.shape[0]
+    work, factor, stiff = np.empty((n, 6)), np.empty((n, n)), np.empty((n, n))
+    mass, mass_before = np.empty((n, n)), np.empty((n, n))
+    angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
+    terms = padded(n + pairs)
+    x, bend, steep = np.zeros(terms), np.empty(terms), np.empty(terms)
     bias, bias_before, still = np.empty(n), np.empty(n), np.zeros(n)
-    load, v, k1, k2, middle = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    load, k1, k2, middle, rate = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    # State and torque live in arrays of their own: a view of a row costs more than the row.
+    p, v, held, drive = q[0].copy(), qd[0].copy(), np.empty(n), np.empty(n)
+    disturbed = disturbance.shape[0] > 0
     force, slope, pair_slope = np.empty(n), np.empty(n), np.empty(pairs)
     force_middle, slope_middle, pair_slope_middle = np.empty(n), np.empty(n), np.empty(pairs)
-    # Histories with the newest sample of step k at column memory - 1 + k.
-    error = np.empty((n, samples + memory))
-    position = np.empty((n, samples + memory))
-    output = np.empty((n, samples + memory))
+    # The newest sample stands in row ``now``; when the rows are used up, the last ones move to the front.
+    rows = memory + HISTORY
+    error, position, output = np.empty((rows, n)), np.empty((rows, n)), np.empty((rows, n))
+    now = memory - 2
     for k in range(samples):
         for j in range(n):
-            if not (np.isfinite(q[k, j]) and abs(qd[k, j]) <= max_velocity[j]):
+            if not (np.isfinite(p[j]) and abs(v[j]) <= max_velocity[j]):
                 return k
-        rigid_torque(chain, values, q[k], qd[k], still, work, bias)
-        fill_mass_matrix(chain, values, q[k], work, mass)
-        friction(values, qd[k], force, slope, pair_slope)
-        now = memory - 1 + k
+        turn(chain, p, angle, sine, cosine)
+        rigid_torque(chain, values, p, v, still, sine, cosine, work, bias)
+        fill_mass_matrix(chain, values, p, sine, cosine, mass)
+        friction(values, v, x, bend, steep, force, slope, pair_slope)
+        now += 1
+        if now == rows:
+            for m in range(memory - 1):
+                for i in range(n):
+                    error[m, i] = error[now - memory + 1 + m, i]
+                    position[m, i] = position[now - memory + 1 + m, i]
+                    output[m, i] = output[now - memory + 1 + m, i]
+            now = memory - 1
         for i in range(n):
-            e = p = 0.0
+            here = 0.0
             for j in range(n):
-                e += transmission[i, j] * (reference[k, j] - q[k, j])
-                p += transmission[i, j] * q[k, j]
-            error[i, now], position[i, now] = e, p
+                here += transmission[i, j] * p[j]
+            error[now, i], position[now, i] = reference[k, i] - here, here
         if k == 0:
             for i in range(n):
-                held = speed = 0.0
+                bias_before[i] = bias[i]
+                for j in range(i + 1):
+                    mass_before[i, j] = mass[i, j]
+                balance = speed = 0.0
                 for j in range(n):
-                    held += inverse_transmission[j, i] * (bias[j] + force[j])
-                    speed += transmission[i, j] * qd[0, j]
+                    balance += inverse_transmission[j, i] * (bias[j] + force[j])
+                    speed += transmission[i, j] * v[j]
                 for back in range(1, memory):
-                    error[i, now - back] = error[i, now]
-                    position[i, now - back] = position[i, now] - back * dt * speed
-                    output[i, now - back] = held
-            mass_before[:] = mass
-            bias_before[:] = bias
+                    error[now - back, i] = error[now, i]
+                    position[now - back, i] = position[now, i] - back * dt * speed
+                    output[now - back, i] = balance
         for i in range(n):
             nu = 0.0
             for m in range(error_taps.shape[1]):
-                nu += error_taps[i, m] * error[i, now - m]
+                nu += error_taps[i, m] * error[now - m, i]
             for m in range(position_taps.shape[1]):
-                nu += position_taps[i, m] * position[i, now - m]
+                nu += position_taps[i, m] * position[now - m, i]
             for m in range(output_taps.shape[1]):
-                nu += output_taps[i, m] * output[i, now - 1 - m]
-            output[i, now] = min(max(nu, -saturation[i]), saturation[i])
-        before = tau[max(k - 1, 0)]
+                nu += output_taps[i, m] * output[now - 1 - m, i]
+            nu = min(max(nu, -saturation[i]), saturation[i])
+            output[now, i] = nu
+            drive[i] = nu + disturbance[k, i] if disturbed else nu
         for j in range(n):
             torque = 0.0
             for i in range(n):
-                torque += transmission[i, j] * output[i, now]
-                if disturbance.shape[0] > 0:
-                    torque += transmission[i, j] * disturbance[k, i]
-            tau[k, j] = torque
-            qdd[k, j] = 0.5 * (before[j] + torque) - bias[j] - force[j]
-        for i in range(n):
-            for j in range(i + 1):
-                factor[i, j] = mass[i, j]
-        if not cholesky(factor, n):
+                torque += transmission[i, j] * drive[i]
+            before = held[j] if k > 0 else torque
+            held[j] = tau[k, j] = torque
+            rate[j] = 0.5 * (before + torque) - bias[j] - force[j]
+        if not cholesky(mass, factor, n):
             return k
-        solve_factored(factor, n, qdd[k])
+        solve_factored(factor, n, rate)
+        for i in range(n):
+            qdd[k, i] = rate[i]
         if k + 1 == samples:
             break
         for i in range(n):
-            load[i] = tau[k, i] - (1.5 * bias[i] - 0.5 * bias_before[i])
-            v[i] = qd[k, i]
-            q[k + 1, i] = q[k, i]
+            load[i] = held[i] - (1.5 * bias[i] - 0.5 * bias_before[i])
             for j in range(i + 1):
-                here = mass[i, j]
-                mass[i, j] = 1.5 * here - 0.5 * mass_before[i, j]
-                mass_before[i, j] = here
+                at_sample = mass[i, j]
+                mass[i, j] = 1.5 * at_sample - 0.5 * mass_before[i, j]
+                mass_before[i, j] = at_sample
             bias_before[i] = bias[i]
-        steps = divisions(values, qd[k], qdd[k], dt)
+        steps = divisions(values, v, rate, dt)
         h = dt / steps
         for step in range(steps):
             if step > 0:
-                friction(values, v, force, slope, pair_slope)
+                friction(values, v, x, bend, steep, force, slope, pair_slope)
             for i in range(n):
-                for j in range(i + 1):
-                    factor[i, j] = mass[i, j]
-                factor[i, i] += GAMMA * h * slope[i]
+                for j in range(i):
+                    stiff[i, j] = mass[i, j]
+                stiff[i, i] = mass[i, i] + GAMMA * h * slope[i]
                 k1[i] = load[i] - force[i]
             for m in range(pairs):
-                i, j = values.coupling_joints[m]
-                factor[max(i, j), min(i, j)] += GAMMA * h * pair_slope[m]
-            if not cholesky(factor, n):
+                i, j = coupled[m, 0], coupled[m, 1]
+                stiff[max(i, j), min(i, j)] += GAMMA * h * pair_slope[m]
+            if not cholesky(stiff, factor, n):
                 return k + 1
             solve_factored(factor, n, k1)
             for i in range(n):
                 middle[i] = v[i] + 0.5 * h * k1[i]
-            friction(values, middle, force_middle, slope_middle, pair_slope_middle)
+            friction(values, middle, x, bend, steep, force_middle, slope_middle, pair_slope_middle)
             # M k1 = load - force - gamma h F k1 spares the product with the mass matrix.
             for i in range(n):
                 k2[i] = force[i] - force_middle[i] + GAMMA * h * slope[i] * k1[i]
             for m in range(pairs):
-                i, j = values.coupling_joints[m]
+                i, j = coupled[m, 0], coupled[m, 1]
                 k2[i] += GAMMA * h * pair_slope[m] * k1[j]
                 k2[j] += GAMMA * h * pair_slope[m] * k1[i]
             solve_factored(factor, n, k2)
             for i in range(n):
                 new = v[i] + h * (k1[i] + k2[i])
-                q[k + 1, i] += 0.5 * h * (v[i] + new)
+                p[i] += 0.5 * h * (v[i] + new)
                 v[i] = new
         for i in range(n):
-            qd[k + 1, i] = v[i]
+            q[k + 1, i], qd[k + 1, i] = p[i], v[i]
     return -1
