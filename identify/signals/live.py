@@ -1,0 +1,242 @@
+"""Velocities while the arm moves: a causal Kalman filter on the positions as they arrive.
+
+The model is that of the smoother (thesis section 5.1.2) in its kinematic form: the highest derivative is driven by
+white noise, the state holds position and derivatives at the sampling instant itself, so nothing has to be moved by
+half a sample. With the unit of time one sample and that of variance the measurement's, only the noise-variance ratio
+is left, and its meaning is that of :mod:`identify.signals.irwsm`: the same spectrum, ``NVR / w^(2 order)``.
+"""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from configs import DataError
+
+PRIOR = 1e10
+"""Variance of the unknown derivatives at the first sample, in units of the measurement's variance."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LiveDerivatives:
+    """Filtered positions and derivatives of a batch, shape (M, n) each; NaN until a joint's first measurement."""
+
+    q: Array
+    qd: Array
+    qdd: Array
+
+
+@dataclass(frozen=True)
+class LiveState:
+    """Where the filter stands after the last sample; all of shape (n,).
+
+    Parameters
+    ----------
+    q, qd, qdd
+        Position, velocity and acceleration at the last sample, SI; ``qdd`` is NaN for a filter of order 2, all are
+        NaN before the first measurement.
+    q_std, qd_std, qdd_std
+        Their standard deviations, from the innovations seen so far (5.16); NaN before there are enough.
+    measured
+        Number of measurements that entered.
+    """
+
+    q: Array
+    qd: Array
+    qdd: Array
+    q_std: Array
+    qd_std: Array
+    qdd_std: Array
+    measured: NDArray[np.int64]
+
+
+class VelocityFilter:
+    """Causal velocities and accelerations of n joints, sample by sample or batch by batch.
+
+    Parameters
+    ----------
+    n
+        Number of joints.
+    dt
+        Sampling period, s.
+    nvr
+        Noise-variance ratio, one for all joints or one per joint: the same number as for the smoother of this
+        order, for instance ``automatic_nvr(q[:, j], order)`` of an earlier recording.
+    order
+        2: position and velocity; 3: acceleration as well, and no lag while it is constant.
+
+    Notes
+    -----
+    ``F``, ``H``, ``Q`` and ``R`` are the matrices of the model in filterpy's notation, in samples.
+
+    Raises
+    ------
+    DataError
+        If ``dt`` or a ratio is not positive, or ``order`` neither 2 nor 3.
+    """
+
+    def __init__(self, n: int, dt: float, nvr: ArrayLike, order: int = 3) -> None:
+        ratios = np.asarray(nvr, dtype=np.float64)
+        if order not in (2, 3):
+            raise DataError(f"order of the velocity filter: expected 2 or 3, got {order}")
+        if not dt > 0:
+            raise DataError(f"sampling period: expected a positive number of seconds, got {dt}")
+        if ratios.ndim > 1 or ratios.size not in (1, n) or not (ratios > 0).all():
+            raise DataError(f"nvr: expected one positive number or {n}, got {nvr!r}")
+        self.n, self.dt, self.order = n, dt, order
+        self.nvr: Array = np.broadcast_to(ratios, (n,)).copy()
+        self.reset()
+
+    @property
+    def F(self) -> Array:  # noqa: N802
+        """Transition over one sample, (order, order)."""
+        return np.array([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])[: self.order, : self.order]
+
+    @property
+    def H(self) -> Array:  # noqa: N802
+        """Measurement, (1, order)."""
+        return np.eye(self.order)[:1]
+
+    @property
+    def Q(self) -> Array:  # noqa: N802
+        """Covariance that one sample of white noise adds, (n, order, order), relative to the measurement's."""
+        return self.nvr[:, None, None] * _driven(self.order)
+
+    @property
+    def R(self) -> Array:  # noqa: N802
+        """Covariance of the measurement, (1, 1): the unit."""
+        return np.eye(1)
+
+    def reset(self) -> None:
+        """Forget everything: the next measurement is the first."""
+        self._x = np.full((self.n, self.order), np.nan)
+        self._p = np.zeros((self.n, self.order, self.order))
+        self._squares = np.zeros(self.n)
+        self._measured = np.zeros(self.n, dtype=np.int64)
+
+    def handle(self, samples: ArrayLike) -> LiveDerivatives:
+        """Take positions in and give their filtered values and derivatives.
+
+        Parameters
+        ----------
+        samples
+            One sample (n,) or a batch (M, n), rad or m, in the order of time; NaN where a joint's measurement is
+            missing, which then is predicted.
+
+        Raises
+        ------
+        DataError
+            If the shape does not fit the joints, or a position is infinite.
+        """
+        y = np.atleast_2d(np.asarray(samples, dtype=np.float64))
+        if y.ndim != 2 or y.shape[1] != self.n:
+            raise DataError(f"positions of shape {y.shape} for a velocity filter of {self.n} joints")
+        if np.isinf(y).any():
+            k, j = np.argwhere(np.isinf(y))[0]
+            raise DataError(f"position of joint {j + 1} is infinite at sample {k} of the batch")
+        out = np.full((3, *y.shape), np.nan)
+        if y.size:
+            _filter(
+                np.ascontiguousarray(y), self.nvr, _driven(self.order), self._x, self._p,
+                self._squares, self._measured, out,
+            )  # fmt: skip
+        return LiveDerivatives(out[0], out[1] / self.dt, out[2] / self.dt**2)
+
+    def result(self) -> LiveState:
+        """State after the last sample, with standard deviations."""
+        known = self._measured > self.order
+        variance = np.full(self.n, np.nan)
+        variance[known] = self._squares[known] / (self._measured[known] - self.order)
+        state, std = np.full((3, self.n), np.nan), np.full((3, self.n), np.nan)
+        for i in range(self.order):
+            state[i] = self._x[:, i] / self.dt**i
+            std[i] = np.sqrt(variance * self._p[:, i, i]) / self.dt**i
+        return LiveState(state[0], state[1], state[2], std[0], std[1], std[2], self._measured.copy())
+
+
+def _driven(order: int) -> Array:
+    """Covariance that unit white noise on the highest derivative adds over one sample, (order, order)."""
+    if order == 2:
+        return np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
+    return np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])
+
+
+@numba.njit(cache=True)
+def _filter(y, nvr, driven, x, p, squares, measured, out):  # type: ignore[no-untyped-def]
+    """Predict and update every joint at every sample; ``x`` (n, order), ``p`` (n, order, order) in place."""
+    order = driven.shape[0]
+    half = np.empty((order, order))
+    gain = np.empty(order)
+    for j in range(y.shape[1]):
+        for k in range(y.shape[0]):
+            value = y[k, j]
+            if measured[j] == 0:
+                if np.isnan(value):
+                    continue
+                # The first measurement: what it says of the position, and nothing of the rest.
+                x[j] = 0.0
+                x[j, 0] = value
+                for a in range(order):
+                    for b in range(order):
+                        p[j, a, b] = 0.0
+                    p[j, a, a] = 1.0 if a == 0 else PRIOR
+                measured[j] = 1
+            else:
+                _predict(x[j], p[j], nvr[j], driven, half)
+                if not np.isnan(value):
+                    innovation = value - x[j, 0]
+                    variance = p[j, 0, 0] + 1.0
+                    measured[j] += 1
+                    if measured[j] > order:
+                        squares[j] += innovation * innovation / variance
+                    _update(x[j], p[j], innovation, variance, gain)
+            for a in range(order):
+                out[a, k, j] = x[j, a]
+
+
+@numba.njit(cache=True)
+def _predict(x, p, nvr, driven, half):  # type: ignore[no-untyped-def]
+    """``x = F x``, ``P = F P F' + nvr driven`` for the transition of one sample."""
+    order = x.size
+    if order == 3:
+        x[0] += x[1] + 0.5 * x[2]
+        x[1] += x[2]
+    else:
+        x[0] += x[1]
+    for b in range(order):
+        if order == 3:
+            half[0, b] = p[0, b] + p[1, b] + 0.5 * p[2, b]
+            half[1, b] = p[1, b] + p[2, b]
+            half[2, b] = p[2, b]
+        else:
+            half[0, b] = p[0, b] + p[1, b]
+            half[1, b] = p[1, b]
+    for a in range(order):
+        if order == 3:
+            p[a, 0] = half[a, 0] + half[a, 1] + 0.5 * half[a, 2]
+            p[a, 1] = half[a, 1] + half[a, 2]
+            p[a, 2] = half[a, 2]
+        else:
+            p[a, 0] = half[a, 0] + half[a, 1]
+            p[a, 1] = half[a, 1]
+        for b in range(order):
+            p[a, b] += nvr * driven[a, b]
+
+
+@numba.njit(cache=True)
+def _update(x, p, innovation, variance, gain):  # type: ignore[no-untyped-def]
+    """Measurement update in Joseph's form, which keeps the covariance symmetric and positive."""
+    order = x.size
+    for a in range(order):
+        gain[a] = p[a, 0] / variance
+        x[a] += gain[a] * innovation
+    first = p[0, 0]
+    row = p[0].copy()
+    for a in range(order):
+        for b in range(a, order):
+            value = p[a, b] - gain[a] * row[b] - gain[b] * row[a] + gain[a] * gain[b] * (first + 1.0)
+            p[a, b] = value
+            p[b, a] = value
