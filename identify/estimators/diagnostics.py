@@ -15,6 +15,7 @@ from scipy import linalg, signal, stats
 
 from identify.estimators.noise import ArModel, lagged_sums
 from identify.estimators.regression import (
+    MAX_AR_ORDER,
     Block,
     Estimate,
     instrumental_variable,
@@ -35,9 +36,6 @@ WEAK_F = 23.1
 
 LAGS = 20
 """Lags of the whiteness test beyond the order of the noise model."""
-
-MAX_ORDER = 60
-"""Highest order of the noise models fitted here."""
 
 SAME = 1e-8
 """Share of the IV variance under which the two estimators of the endogeneity test are one and the same."""
@@ -183,7 +181,7 @@ def diagnose_estimate(
     instruments: Sequence[Array] | None = None,
     weights: Sequence[ArModel] | None = None,
     essential: NDArray[np.bool_] | None = None,
-    max_order: int = MAX_ORDER,
+    max_order: int = MAX_AR_ORDER,
 ) -> Diagnostics:
     """Test an estimate.
 
