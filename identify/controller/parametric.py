@@ -1,0 +1,302 @@
+"""Parametric controllers, "C" (thesis section 5.2.2): structure from held-out data, gains by refined IV."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import DataError
+from identify.controller.crc import HELD_OUT, IdentifiedController, JointResponse
+from identify.controller.law import UNITS, Array, Stretch, Structure, gains, simulate_law, taps
+from identify.controller.riv import LawFit, fit_law, refined_iv
+from identify.model.controller import DiscreteController
+
+WORTH = 1e-5
+"""Share of the torque's variance that an addition to the law has to explain on held-out data (0.3 % in amplitude),"""
+
+WORTH_OF_REST = 0.5
+"""or share of what the law did not explain before."""
+
+SIGNIFICANT = 3.0
+"""Standard errors by which the held-out error has to fall for a change of the law to be believed."""
+
+BLOCKS = 30
+"""Stretches of held-out data over which that standard error is taken."""
+
+MOST_TAPS = 3
+"""Most backward differences that the velocity of a drive is averaged over."""
+
+MOST_DELAY = 2
+"""Most whole samples tried between position and controller output."""
+
+COARSE = 15
+"""Refined IV iterations at most while structures are compared."""
+
+SATURATED = 0.999
+"""Share of the saturation from which a sample is left out."""
+
+SHORTEST = 200
+"""Samples between two saturated stretches that can still be used."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """A physical gain, its standard deviation, and their unit."""
+
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class ControlLaw(JointResponse):
+    """The identified law of one drive; ``prewhitening_order`` is the order of its AR noise model.
+
+    Parameters
+    ----------
+    output_taps
+        From past torque to torque, (m,).
+    structure
+        What the law contains.
+    gains
+        Those of :func:`identify.controller.law.gains`.
+    saturated
+        Samples that were left out.
+    iterations, converged
+        Of the refined instrumental variables.
+    """
+
+    output_taps: Array
+    structure: Structure
+    gains: dict[str, Gain]
+    saturated: int
+    iterations: int
+    converged: bool
+
+
+def identify_parametric(
+    q_motor: Sequence[Array],
+    reference_motor: Sequence[Array],
+    torque_motor: Sequence[Array],
+    dt: float,
+    *,
+    structure: Structure | Sequence[Structure] | None = None,
+    saturation: Array | None = None,
+    gain: Array | None = None,
+    added_motor: Sequence[Array] | None = None,
+) -> IdentifiedController:
+    """Identify the control law of every drive by refined instrumental variables (thesis 3.2, 5.2.2).
+
+    Where the structure is not given it grows: from a cascade or a PD on the error by whichever change explains the
+    held-out torque best, as long as that is worth the trouble and not chance.
+
+    Parameters
+    ----------
+    q_motor, reference_motor, torque_motor
+        Measured position, reference and torque at the motor shafts, one (N, n) array per experiment.
+    dt
+        Sampling period, s.
+    structure
+        For all drives or for each; ``None``: chosen by the data.
+    saturation
+        Largest motor torque (n,); samples that reach it are left out. ``None``: none.
+    gain
+        Motor torque per unit of the drive's signal (n,), for the units of the gains; ``None``: one.
+    added_motor
+        Known torques inside ``torque_motor`` that are not the controller's, such as test pulses; their share in the
+        record is estimated, too. ``None``: none.
+
+    Returns
+    -------
+    IdentifiedController
+        Its responses are :class:`ControlLaw`.
+
+    Raises
+    ------
+    DataError
+        If a motor never deviates from its reference, is always saturated, or its law is not determined by the data.
+    """
+    n = q_motor[0].shape[1]
+    given = [structure] * n if structure is None or isinstance(structure, Structure) else list(structure)
+    limits = np.full(n, np.inf) if saturation is None else np.asarray(saturation, dtype=np.float64)
+    units = np.broadcast_to(np.asarray(1.0 if gain is None else gain, dtype=np.float64), (n,))
+    if len(given) != n or limits.shape != (n,):
+        raise DataError(f"controller: {len(given)} structures and {limits.size} saturations for {n} motors")
+    added = [np.zeros_like(t) for t in torque_motor] if added_motor is None else added_motor
+    signals = list(zip(q_motor, reference_motor, torque_motor, added, strict=True))
+    laws = []
+    for j in range(n):
+        experiments = [Stretch(*(x[:, j] for x in four)) for four in signals]
+        try:
+            laws.append(_identify_drive(experiments, dt, given[j], float(limits[j]), float(units[j])))
+        except DataError as error:
+            raise DataError(f"controller of motor {j + 1}: {error}") from error
+    controller = DiscreteController(
+        error_taps=_stack([law.error_taps for law in laws]),
+        position_taps=_stack([law.position_taps for law in laws]),
+        output_taps=_stack([law.output_taps for law in laws]),
+        saturation=limits,
+        dt=dt,
+    )
+    return IdentifiedController(controller, tuple(laws))
+
+
+def _identify_drive(
+    experiments: Sequence[Stretch], dt: float, structure: Structure | None, limit: float, unit: float
+) -> ControlLaw:
+    stretches = _unsaturated(experiments, limit)
+    chosen = structure or _choose(stretches, dt)
+    fit = fit_law(stretches, chosen, dt)
+    error_taps, position_taps, output_taps = taps(chosen, fit.theta, dt)
+    return ControlLaw(
+        error_taps=error_taps,
+        position_taps=position_taps,
+        prewhitening_order=fit.noise.order,
+        fit_pct=_held_out_fit(stretches, chosen, dt),
+        output_taps=output_taps,
+        structure=chosen,
+        gains=_gains_with_deviations(chosen, fit, dt, unit),
+        saturated=sum(int(np.sum(_saturated(e, limit))) for e in experiments),
+        iterations=fit.iterations,
+        converged=fit.converged,
+    )
+
+
+def _saturated(experiment: Stretch, limit: float) -> NDArray[np.bool_]:
+    return np.abs(experiment.nu - experiment.added) >= SATURATED * limit
+
+
+def _unsaturated(experiments: Sequence[Stretch], limit: float) -> list[Stretch]:
+    """Cut the experiments at saturated samples, which the law does not explain."""
+    stretches = []
+    for experiment in experiments:
+        free = np.concatenate([[False], ~_saturated(experiment, limit), [False]])
+        edges = np.flatnonzero(np.diff(free))
+        stretches += [
+            experiment.part(slice(i, k)) for i, k in zip(edges[::2], edges[1::2], strict=True) if k - i >= SHORTEST
+        ]
+    if not stretches:
+        raise DataError(f"no {SHORTEST} samples in a row are below its saturation ({limit:g} N m or N)")
+    if not any(np.ptp(s.r - s.q) > 0 for s in stretches):
+        raise DataError("position and reference never differ")
+    if not any(np.ptp(s.nu) > 0 for s in stretches):
+        raise DataError("its torque never changes")
+    return stretches
+
+
+def _choose(stretches: Sequence[Stretch], dt: float) -> Structure:
+    """Grow the structure on held-out data, then take away again what has become superfluous."""
+    first, last = _split(stretches)
+    power = float(np.mean(np.concatenate([s.nu for s in last]) ** 2))
+    added = any(np.ptp(s.added) > 0 for s in stretches)
+    judged: dict[Structure, Array] = {}
+
+    def judge(s: Structure) -> Array:
+        if s not in judged:
+            judged[s] = _held_out_errors(first, last, s, dt)
+        return judged[s]
+
+    best = min((Structure(added=added), Structure(velocity="error", added=added)), key=lambda s: judge(s).mean())
+    while better := [s for s in _additions(best) if _worth_it(judge(best), judge(s), power, s.size > best.size)]:
+        best = min(better, key=lambda s: judge(s).mean())
+    while as_good := [s for s in _reductions(best) if not _worth_it(judge(s), judge(best), power, larger=True)]:
+        best = min(as_good, key=lambda s: judge(s).mean())
+    return best
+
+
+def _additions(s: Structure) -> Iterator[Structure]:
+    """Structures with one thing more, or with one thing moved, than this one."""
+    if s.velocity != "both":
+        yield replace(s, velocity="both")
+        yield replace(s, velocity="error" if s.velocity == "position" else "position")
+    if s.velocity_taps < MOST_TAPS:
+        yield replace(s, velocity_taps=s.velocity_taps + 1)
+    if s.filtered is None:
+        yield replace(s, filtered="velocity")
+        if s.velocity != "error":  # where the two are one
+            yield replace(s, filtered="command")
+    if not s.integral:
+        yield replace(s, integral=True)
+    if not s.acceleration:
+        yield replace(s, acceleration=True)
+    yield from (replace(s, delay=delay) for delay in range(MOST_DELAY + 1) if delay != s.delay)
+
+
+def _reductions(s: Structure) -> Iterator[Structure]:
+    """Structures with one thing less than this one."""
+    if s.velocity == "both":
+        yield replace(s, velocity="position")
+        yield replace(s, velocity="error")
+    if s.velocity_taps > 1:
+        yield replace(s, velocity_taps=s.velocity_taps - 1)
+    if s.filtered is not None:
+        yield replace(s, filtered=None)
+    if s.integral:
+        yield replace(s, integral=False)
+    if s.acceleration:
+        yield replace(s, acceleration=False)
+
+
+def _worth_it(before: Array, after: Array, power: float, larger: bool) -> bool:
+    """Whether the held-out error falls by more than it scatters and, for a larger law, by enough."""
+    if not np.isfinite(after).all():
+        return False
+    if not np.isfinite(before).all():
+        return True
+    gain = before - after
+    chance = float(np.std(gain, ddof=1)) / np.sqrt(gain.size)
+    enough = min(WORTH * power, WORTH_OF_REST * float(before.mean())) if larger else 0.0
+    return bool(gain.mean() > enough and gain.mean() > SIGNIFICANT * chance)
+
+
+def _split(stretches: Sequence[Stretch]) -> tuple[list[Stretch], list[Stretch]]:
+    """The first part of every stretch and its held-out rest."""
+    cuts = [int(s.nu.size * (1 - HELD_OUT)) for s in stretches]
+    first = [s.part(slice(0, cut)) for s, cut in zip(stretches, cuts, strict=True)]
+    last = [s.part(slice(cut, None)) for s, cut in zip(stretches, cuts, strict=True)]
+    return first, last
+
+
+def _held_out_errors(first: Sequence[Stretch], last: Sequence[Stretch], structure: Structure, dt: float) -> Array:
+    """Mean squared simulation error on each stretch of held-out data, (BLOCKS,), with the law fitted to the rest.
+
+    Infinite where the data do not determine the structure.
+    """
+    try:
+        fit = refined_iv(first, structure, dt, noise_model=False, iterations=COARSE)
+    except DataError:
+        return np.full(BLOCKS, np.inf)
+    # Every structure is judged on the same samples.
+    begin = max(structure.lead, Structure(velocity_taps=MOST_TAPS, delay=MOST_DELAY).lead)
+    errors = [s.nu[begin:] - simulate_law(s, structure, fit.theta, dt)[begin - structure.lead :] for s in last]
+    return np.array([block.mean() for block in np.array_split(np.concatenate(errors) ** 2, BLOCKS)])
+
+
+def _held_out_fit(stretches: Sequence[Stretch], structure: Structure, dt: float) -> float:
+    """Share of the held-out torque's variance that the law explains, percent."""
+    first, last = _split(stretches)
+    miss = float(np.mean(_held_out_errors(first, last, structure, dt)))
+    power = float(np.var(np.concatenate([s.nu for s in last])))
+    return 100 * (1 - miss / power) if power > 0 and np.isfinite(miss) else 0.0
+
+
+def _gains_with_deviations(structure: Structure, fit: LawFit, dt: float, unit: float) -> dict[str, Gain]:
+    """Standard deviations to first order from the covariance of the fit."""
+    nominal = gains(structure, fit.theta, dt, unit)
+    slopes = np.zeros((len(nominal), structure.size))
+    for k, step in enumerate(1e-3 * np.sqrt(np.diag(fit.covariance))):
+        move = np.zeros(structure.size)
+        move[k] = step
+        ahead, behind = (gains(structure, fit.theta + sign * move, dt, unit) for sign in (1, -1))
+        slopes[:, k] = [(ahead[name] - behind[name]) / (2 * step) for name in nominal]
+    std = np.sqrt(np.einsum("ij,jk,ik->i", slopes, fit.covariance, slopes))
+    return {name: Gain(nominal[name], float(std[i]), UNITS[name]) for i, name in enumerate(nominal)}
+
+
+def _stack(rows: Sequence[Array]) -> Array:
+    """Rows of different lengths as (n, longest), filled up with zeros."""
+    stacked = np.zeros((len(rows), max(row.size for row in rows)))
+    for j, row in enumerate(rows):
+        stacked[j, : row.size] = row
+    return stacked

@@ -1,0 +1,223 @@
+"""Refined instrumental variables for the control law of a drive (thesis section 3.2).
+
+The thesis notes (5.2.2) that a controller's inputs are what it is given, without noise of their own, and that all
+noise of its recorded output is measured on top. So the inputs are their own instruments, and only the past output,
+which a filter in the law brings in, needs one: the output of the law itself, simulated with the last estimate (3.10).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import signal
+
+from configs import DataError
+from identify.controller.law import Array, Stretch, Structure, columns, integral_slopes, low_pass, simulate_law
+from identify.estimators.noise import WHITE, ArModel, fit_ar
+
+ITERATIONS = 40
+"""Iterations at most."""
+
+TOLERANCE = 1e-3
+"""Change of every parameter in its standard deviations, or a thousandth of this relatively, that ends them."""
+
+NOISE_ORDER = 20
+"""Highest order of the AR noise model."""
+
+FASTEST, SLOWEST = -0.9, 0.995
+"""Poles of the filter that are allowed; an estimate outside is moved back (the thesis reflects it)."""
+
+SETTLED = 1e-6
+"""Share of a filter's initial error that may be left where its rows begin to count."""
+
+LARGEST_CONDITION = 1e13
+"""Condition number of the scaled equations from which the data do not determine the law."""
+
+MISFIT = 1.5
+"""Growth of the squared simulation error by which a noise model gives away that it models what the law lacks."""
+
+
+@dataclass(frozen=True)
+class LawFit:
+    """Parameters (size,) of a structure, covariance (size, size), noise model, and how the iterations ended."""
+
+    theta: Array
+    covariance: Array
+    noise: ArModel
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Regressor, instruments (N, k) and target (N,) of a stretch, and what the last estimate leaves (N,)."""
+
+    x: Array
+    z: Array
+    y: Array
+    error: Array
+
+
+def fit_law(stretches: Sequence[Stretch], structure: Structure, dt: float) -> LawFit:
+    """Refined IV, unless its noise model hides what the law lacks: then the simplified method, which simulates best.
+
+    Raises
+    ------
+    DataError
+        If the motion does not determine a law of this structure.
+    """
+    refined = refined_iv(stretches, structure, dt)
+    simplified = refined_iv(stretches, structure, dt, noise_model=False)
+    miss, least = (_miss(stretches, structure, fit.theta, dt) for fit in (refined, simplified))
+    return refined if miss <= MISFIT * least else simplified
+
+
+def refined_iv(
+    stretches: Sequence[Stretch],
+    structure: Structure,
+    dt: float,
+    *,
+    noise_model: bool = True,
+    iterations: int = ITERATIONS,
+) -> LawFit:
+    """Iterate over parameters and noise model (3.2.2, steps 1 to 5).
+
+    With the filter's pole ``a'`` of the last iteration and ``w`` the part of the torque that is filtered,
+    ``nu + a' w_f(k-1) = U0 k + U1_f b + a w_f(k-1)``, index f for ``1 / (1 - a' z^-1)``: linear in ``k``, ``b`` and
+    ``a``, with measured ``w`` in the regressor and simulated ``w`` among the instruments.
+
+    Parameters
+    ----------
+    noise_model
+        Whether an AR model of the noise filters everything; without, this is the simplified method (SRIV), and the
+        covariance is the sandwich of the autocorrelation that its errors have.
+
+    Raises
+    ------
+    DataError
+        If the motion does not determine a law of this structure.
+    """
+    size, noise, converged = structure.size, WHITE, False
+    theta = _integral_start(stretches, structure, dt) if structure.integral else np.zeros(size)
+    for count in range(1, iterations + 1):
+        rows = [_rows(s, i, len(stretches), structure, theta, dt, count == 1) for i, s in enumerate(stretches)]
+        if count > 1:
+            errors = [r.error for r in rows]
+            power = max(float(np.mean(np.concatenate(errors) ** 2)), 1e-300)
+            noise = fit_ar(errors, NOISE_ORDER) if noise_model else replace(WHITE, variance=power)
+        solution, covariance = _instrumental(rows, noise, structure)
+        before, theta = theta, solution[:size]
+        if structure.filtered:
+            theta[-1] = np.clip(theta[-1], FASTEST, SLOWEST)
+        std = np.sqrt(np.diag(covariance)[:size])
+        if count > 2 and (np.abs(theta - before) <= TOLERANCE * np.maximum(std, 1e-3 * np.abs(theta))).all():
+            converged = True
+            break
+    if not noise_model:
+        covariance = _sandwich(rows)
+    return LawFit(theta, covariance[:size, :size], noise, count, converged)
+
+
+def _integral_start(stretches: Sequence[Stretch], structure: Structure, dt: float) -> Array:
+    """Parameters (size,) by least squares with the integrals of error and velocity free of each other, no filter.
+
+    The law is not linear in its gains where it integrates, and has other minima.
+    """
+    plain = replace(structure, integral=False, filtered=None)
+    rows, targets = [], []
+    for number, s in enumerate(stretches):
+        # The integral of the velocity is the position, the reference less the error.
+        integrals = [dt * np.cumsum(s.r - s.q), *((s.r,) if structure.velocity != "error" else ())]
+        late = slice(structure.lead - structure.delay, s.q.size - structure.delay)
+        own = np.zeros((s.q.size - structure.lead, len(stretches)))
+        own[:, number] = 1.0
+        rows.append(np.column_stack([columns(s, plain, np.zeros(plain.size), dt), *(x[late] for x in integrals), own]))
+        targets.append(s.nu[structure.lead :])
+    x = np.concatenate(rows)
+    scale = np.maximum(np.abs(x).max(axis=0), 1e-300)
+    found = np.linalg.lstsq(x / scale, np.concatenate(targets), rcond=None)[0] / scale
+    theta, rest = found[: plain.size], found[plain.size : -len(stretches)]
+    kv, e = sum(theta[plain.names.index(f"v{i}")] for i in range(structure.velocity_taps)), plain.names.index("e")
+    if structure.velocity == "position":
+        integral = -rest[1]
+        theta[e] -= integral
+    else:
+        # kv kp + ki is seen at the error and ki kp at its integral.
+        kp = (theta[e] + np.sqrt(max(theta[e] ** 2 - 4 * kv * rest[0], 0.0))) / (2 * kv)
+        integral = rest[0] / kp
+        theta[e] = kv * kp
+    start: Array = np.insert(theta, structure.names.index("integral"), integral)
+    return np.append(start, 0.0) if structure.filtered else start
+
+
+def _rows(
+    stretch: Stretch, number: int, stretches: int, structure: Structure, theta: Array, dt: float, first: bool
+) -> _Rows:
+    m, split, pole = len(structure.names), structure.unfiltered, structure.pole(theta)
+    u, y = columns(stretch, structure, theta, dt), stretch.nu[structure.lead :]
+    x = np.concatenate([u[:, :split], low_pass(u[:, split:], pole)], axis=1)
+    z = x.copy()
+    error = y - x @ theta[:m]
+    if structure.filtered:
+        measured = _past(low_pass(y - u[:, :split] @ theta[:split], pole))
+        simulated = measured if first else _past(low_pass(low_pass(u[:, split:] @ theta[split:m], pole), pole))
+        x, z = np.column_stack([x, measured]), np.column_stack([z, simulated])
+        y = y + pole * measured
+    if structure.integral:
+        slopes = integral_slopes(stretch, structure, theta, dt)
+        x[:, :m], z[:, :m] = x[:, :m] + slopes, z[:, :m] + slopes
+        own = np.zeros((y.size, stretches))
+        own[:, number] = 1.0
+        x, z = np.column_stack([x, own]), np.column_stack([z, own])
+        error = error - error.mean()
+    settled = _settling(pole, y.size)
+    return _Rows(x[settled:], z[settled:], y[settled:], error[settled:])
+
+
+def _instrumental(rows: Sequence[_Rows], noise: ArModel, structure: Structure) -> tuple[Array, Array]:
+    """``(Z' X)^-1 Z' y`` and ``(Z' Z)^-1`` of the whitened rows (3.10, 3.11)."""
+    used = [r for r in rows if r.y.size > 2 * noise.order]
+    if not used:
+        raise DataError(f"too few samples for a law of this structure ({structure})")
+    k = used[0].x.shape[1]
+    zx, zz, zy = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k)
+    for r in used:
+        x, z, y = noise.whiten(r.x), noise.whiten(r.z), noise.whiten(r.y)
+        zx, zz, zy = zx + z.T @ x, zz + z.T @ z, zy + z.T @ y
+    scale = np.sqrt(np.maximum(np.diag(zz), 1e-300))
+    weights = np.outer(scale, scale)
+    zx, zz = zx / weights, zz / weights
+    if max(np.linalg.cond(zz), np.linalg.cond(zx)) > LARGEST_CONDITION:
+        raise DataError(f"the motion does not determine a law of this structure ({structure})")
+    solution: Array = np.linalg.solve(zx, zy / scale) / scale
+    covariance: Array = np.linalg.inv(zz) / weights
+    return solution, covariance
+
+
+def _sandwich(rows: Sequence[_Rows]) -> Array:
+    """``(Z' X)^-1 Z' S Z (X' Z)^-1``, S the autocovariance of the errors as an AR process."""
+    noise = fit_ar([r.error for r in rows], NOISE_ORDER)
+    poles = np.concatenate([[1.0], noise.coefficients])
+    k = rows[0].x.shape[1]
+    zx, middle = np.zeros((k, k)), np.zeros((k, k))
+    for r in rows:
+        coloured = signal.lfilter([np.sqrt(noise.variance)], poles, r.z[::-1], axis=0)
+        zx, middle = zx + r.z.T @ r.x, middle + coloured.T @ coloured
+    bread = np.linalg.inv(zx)
+    covariance: Array = bread @ middle @ bread.T
+    return covariance
+
+
+def _miss(stretches: Sequence[Stretch], structure: Structure, theta: Array, dt: float) -> float:
+    return sum(float(np.sum((s.nu[structure.lead :] - simulate_law(s, structure, theta, dt)) ** 2)) for s in stretches)
+
+
+def _past(x: Array) -> Array:
+    return np.concatenate([x[:1], x[:-1]])
+
+
+def _settling(pole: float, samples: int) -> int:
+    """Rows until the initial state of the filter is forgotten, at most a quarter of them."""
+    if abs(pole) < 1e-3:
+        return 1
+    return min(1 + int(np.log(SETTLED) / np.log(abs(pole))), samples // 4)
