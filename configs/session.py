@@ -76,9 +76,11 @@ class ZenohOptions(Frozen):
 class IdentificationOptions(Frozen):
     """What the worker runs on an experiment; the same names as the options of ``armident identify``."""
 
-    method: Literal["idim-piv", "idim-iv", "idim-ls"] = "idim-piv"
+    method: Literal["idim-piv", "idim-iv", "idim-ls", "didim", "clie", "cloe", "sep-pem"] = "idim-piv"
     derivatives: Literal["irwsm", "irwsm2", "bandpass"] = "irwsm"
-    controller: Literal["crc", "known"] = "crc"
+    controller: Literal["crc", "parametric", "known"] = "crc"
+    noise_model: Literal["black-box", "grey-box"] = "black-box"
+    physical: bool = False
 
 
 class SessionConfig(Frozen):

@@ -17,14 +17,29 @@ Robot = Annotated[
 def identify(
     recording: Annotated[Path, typer.Argument(help="Recording to identify from (.mcap).")],
     config: Robot = None,
-    method: Annotated[str, typer.Option(help="idim-piv, idim-iv or idim-ls.")] = "idim-piv",
+    method: Annotated[str, typer.Option(help="idim-piv, idim-iv, idim-ls, didim, clie, cloe or sep-pem.")] = "idim-piv",
     derivatives: Annotated[
         str | None, typer.Option(help="irwsm, irwsm2 or bandpass. [default: irwsm, or the published filters]")
     ] = None,
-    controller: Annotated[str, typer.Option(help="crc (identified) or known (configured).")] = "crc",
-    decimation: Annotated[
-        int | None, typer.Option(min=1, help="Keep one sample of so many. [default: from the data]")
+    nvr: Annotated[
+        str | None,
+        typer.Option(help="Noise-variance ratio, or automatic, cross-validation, likelihood, tracking-error."),
     ] = None,
+    controller: Annotated[
+        str, typer.Option(help="crc (impulse response), parametric (cascade or PID) or known (configured).")
+    ] = "crc",
+    noise_model: Annotated[str, typer.Option(help="Of idim-piv: black-box or grey-box.")] = "black-box",
+    max_ar_order: Annotated[int, typer.Option(min=0, help="Highest order of the noise models.")] = 60,
+    bandwidth: Annotated[
+        float | None, typer.Option(help="Closed-loop bandwidth, Hz. [default: configured, or from the data]")
+    ] = None,
+    decimation: Annotated[
+        int | None, typer.Option(min=1, help="Keep one sample of so many. [default: from the bandwidth]")
+    ] = None,
+    weighted: Annotated[bool, typer.Option(help="Weigh each joint by its noise in idim-ls.")] = True,
+    physical: Annotated[
+        bool, typer.Option("--physical", help="Find the nearest physically consistent arm, too.")
+    ] = False,
     out: OutDirectory = None,
     json: Json = False,
 ) -> None:
@@ -34,7 +49,19 @@ def identify(
     """
     from identify.service import identify_command
 
-    identify_command(recording, config, method, derivatives, controller, decimation, out, as_json=json)
+    chosen = {
+        "method": method,
+        "derivatives": derivatives,
+        "nvr": nvr,
+        "controller": controller,
+        "noise_model": noise_model,
+        "max_ar_order": max_ar_order,
+        "bandwidth_hz": bandwidth,
+        "decimation": decimation,
+        "weighted": weighted,
+        "physical": physical,
+    }
+    identify_command(recording, config, chosen, out, as_json=json)
 
 
 def worker(
@@ -93,3 +120,23 @@ def trajectory(
     from identify.service import trajectory_command
 
     trajectory_command(config, out, duration, seed)
+
+
+def reproduce(
+    tables: Annotated[
+        str | None, typer.Option(help="Tables wanted, as in 5.2,6.7. [default: all from 4.1 to 6.8]")
+    ] = None,
+    measured: Annotated[
+        Path | None, typer.Option(help="Folder with the public recording of a real TX40. [default: virtual arm alone]")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder for recordings and results.")] = Path("reproduction"),
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer runs; the same tables.")] = False,
+    json: Json = False,
+) -> None:
+    """Print the thesis's tables beside ours, and whether its claims hold.
+
+    Example: armident reproduce --tables 5.2,6.7
+    """
+    from identify.reproduction.command import reproduce_command
+
+    reproduce_command(tables, measured, out, quick, as_json=json)

@@ -1,14 +1,16 @@
 """The closed loop that the auxiliary model simulates: which controller, which reference, which first parameters."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from configs import ConfigError, DataError, RobotConfig
-from identify.controller.crc import IdentifiedController, identify_crc
+from identify.controller.crc import JointResponse, identify_crc
 from identify.controller.nominal import known_controller, nominal_controller, saturation
+from identify.controller.parametric import ControlLaw, identify_parametric
 from identify.estimators.auxiliary import AuxiliaryModel
 from identify.experiment import Experiment
 from identify.model.arm import ArmModel
@@ -49,7 +51,14 @@ def closed_loop(
     ):
         for origin, start in starts:
             auxiliary = AuxiliaryModel(
-                model, controller, references, [(s.q[0], s.qd[0]) for s in signals], dt, decimation, fastest
+                model,
+                controller,
+                references,
+                [(s.q[0], s.qd[0]) for s in signals],
+                dt,
+                decimation,
+                fastest,
+                anchor=start,
             )
             runs = auxiliary.simulate(start)
             if runs is None:
@@ -91,15 +100,7 @@ def _controllers(
         if options.controller == "known":
             yield known_controller(robot, dt), references, {"kind": "known"}
         else:
-            ratios = robot.transmission_matrix
-            found = identify_crc(
-                [e.q @ ratios.T for e in experiments],
-                [r @ ratios.T for r in references],
-                [e.tau @ np.linalg.inv(ratios) for e in experiments],
-                dt,
-                saturation=saturation(robot),
-            )
-            yield found.controller, references, {"kind": "crc"} | _describe(found, robot)
+            yield _identified(robot, experiments, references, options, dt)
         reason = "the identified controller does not move the simulated arm like the real one: a stiff stand-in is used"
     stand_in = nominal_controller(
         model, ls, np.concatenate([s.q[:: max(1, s.q.shape[0] // 200)] for s in signals]), dt, bandwidth
@@ -107,19 +108,43 @@ def _controllers(
     yield stand_in, surrogate, {"kind": "nominal", "reason": reason, "error_taps": stand_in.error_taps.tolist()}
 
 
-def _describe(found: IdentifiedController, robot: RobotConfig) -> dict[str, Any]:
-    return {
-        "joints": [
-            {
-                "joint": joint.name,
-                "error_taps": r.error_taps.tolist(),
-                "position_taps": r.position_taps.tolist(),
-                "prewhitening_order": r.prewhitening_order,
-                "fit_pct": r.fit_pct,
-            }
-            for joint, r in zip(robot.joints, found.responses, strict=True)
-        ]
+def _identified(
+    robot: RobotConfig, experiments: Sequence[Experiment], references: Sequence[Array], options: Options, dt: float
+) -> tuple[DiscreteController, Sequence[Array], dict[str, Any]]:
+    """Every motor's controller from position, reference and torque at its shaft."""
+    ratios = robot.transmission_matrix
+    to_motor = np.linalg.inv(ratios)
+    q, wanted = [e.q @ ratios.T for e in experiments], [r @ ratios.T for r in references]
+    tau = [e.tau @ to_motor for e in experiments]
+    if options.controller == "crc":
+        found = identify_crc(q, wanted, tau, dt, saturation=saturation(robot))
+    else:
+        gain = np.array([joint.drive.gain for joint in robot.joints])
+        found = identify_parametric(q, wanted, tau, dt, saturation=saturation(robot), gain=gain)
+    described = [
+        {"joint": joint.name} | _description(response)
+        for joint, response in zip(robot.joints, found.responses, strict=True)
+    ]
+    return found.controller, references, {"kind": options.controller, "joints": described}
+
+
+def _description(response: JointResponse) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "error_taps": response.error_taps.tolist(),
+        "position_taps": response.position_taps.tolist(),
+        "prewhitening_order": response.prewhitening_order,
+        "fit_pct": response.fit_pct,
     }
+    if isinstance(response, ControlLaw):
+        found |= {
+            "output_taps": response.output_taps.tolist(),
+            "structure": asdict(response.structure),
+            "gains": {name: asdict(gain) for name, gain in response.gains.items()},
+            "saturated_samples": response.saturated,
+            "iterations": response.iterations,
+            "converged": response.converged,
+        }
+    return found
 
 
 def initial_parameters(model: ArmModel) -> Array:

@@ -88,6 +88,8 @@ class IdentificationDocument(Document):
     versions: dict[str, str]
     warnings: list[str]
     comparison: Comparison | None = None
+    diagnostics: dict[str, Any] | None = None
+    physical: dict[str, Any] | None = None
 
 
 class Alternative(Document):
@@ -211,6 +213,8 @@ def identification_document(
         versions=versions(),
         warnings=[*notes, *result.warnings],
         comparison=comparison,
+        diagnostics=result.diagnostics.document(),
+        physical=None if result.physical is None else result.physical.document(),
     )
 
 

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs import RobotConfig
-from identify.estimators.essential import essential_parameters
+from identify.estimators.diagnostics import Diagnostics
 from identify.estimators.noise import whiteness
 from identify.estimators.regression import Block, Estimate, residuals
 from identify.model.arm import ArmModel
+from identify.model.consistent import ConsistentParameters
 from identify.options import Options
 
 Array = NDArray[np.float64]
@@ -34,6 +35,10 @@ class Identification:
     ----------
     names, units, theta, std, covariance, essential
         Base parameters (b,), their covariance (b, b), and which of them the data need.
+    diagnostics
+        Tests of the estimate.
+    physical
+        The nearest physically consistent arm, where it was asked for.
     relative_error_pct, relative_error_pct_by_joint
         ``|y - X theta| / |y|`` on the torques decimated to twice the bandwidth, overall and (n,).
     whiteness, residual_autocorrelation, autocorrelation_bound
@@ -51,6 +56,8 @@ class Identification:
     covariance: Array
     std: Array
     essential: NDArray[np.bool_]
+    diagnostics: Diagnostics
+    physical: ConsistentParameters | None
     relative_error_pct: float
     relative_error_pct_by_joint: Array
     iterations: int
@@ -75,6 +82,9 @@ def make_result(
     options: Options,
     model: ArmModel,
     estimate: Estimate,
+    essential: NDArray[np.bool_],
+    diagnostics: Diagnostics,
+    physical: ConsistentParameters | None,
     blocks: Sequence[Block],
     ls: Estimate,
     ls_blocks: Sequence[Block],
@@ -86,7 +96,6 @@ def make_result(
     joints = [joint.name for joint in model.robot.joints]
     overall, by_joint = relative_errors(ls_blocks, estimate.theta)
     tests = [whiteness(series) for series in estimate.residuals]
-    used = sum(r.size for series in estimate.residuals for r in series)
     return Identification(
         method=options.method,
         names=model.base.names,
@@ -94,7 +103,9 @@ def make_result(
         theta=estimate.theta,
         covariance=estimate.covariance,
         std=estimate.std,
-        essential=essential_parameters(estimate.theta, estimate.covariance, used),
+        essential=essential,
+        diagnostics=diagnostics,
+        physical=physical,
         relative_error_pct=overall,
         relative_error_pct_by_joint=by_joint,
         iterations=estimate.iterations,

@@ -2,29 +2,25 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from configs import DataError, RobotConfig
 from identify.closed_loop import closed_loop
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.idim_iv import idim_iv
+from identify.estimators.diagnostics import diagnose_estimate
+from identify.estimators.essential import essential_parameters
 from identify.estimators.idim_ls import idim_ls
-from identify.estimators.idim_piv import idim_piv
-from identify.estimators.regression import Block, Estimate
 from identify.experiment import Experiment
+from identify.methods import PREFILTERED, Problem, decimation_of, solve
 from identify.model.arm import ArmModel
+from identify.model.consistent import nearest_consistent
 from identify.options import Options
-from identify.preparation import LS_CUTOFF, PIV_CUTOFF, equations, published_equations
-from identify.result import Array, Identification, make_result
+from identify.preparation import equations, published_equations
+from identify.result import Identification, make_result
 from identify.signals.bandwidth import motion_bandwidth
-from identify.signals.decimate import Decimation, design
-from identify.signals.differentiate import differentiate
-
-CONTRADICTION = 5.0
-"""Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before it is disbelieved."""
+from identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
 
 Progress = Callable[[str, float], None]
 
@@ -70,47 +66,64 @@ def identify_experiment(
     bandwidth = options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
 
     clock.enter("derivatives", 0.05)
-    method = options.derivatives or "irwsm"
-    signals = [differentiate(e.q, dt, method, options.nvr, bandwidth) for e in experiments]
+    signals = _derivatives(experiments, robot, options, dt, bandwidth)
 
     clock.enter("idim-ls", 0.2)
-    factor = options.decimation if options.method != "idim-piv" else None
-    ls_decimation = design(dt, _cutoff(dt, LS_CUTOFF * bandwidth, factor), factor)
+    # A factor given by hand is that of the method; a method with a noise model keeps its own for the comparison.
+    plain = decimation_of("idim-ls", dt, bandwidth, None if options.method in PREFILTERED else options.decimation)
     if options.derivatives is None and options.decimation is None and robot.preprocessing is not None:
         ls_blocks = published_equations(model, experiments, robot.preprocessing)
     else:
-        ls_blocks = equations(model, experiments, signals, ls_decimation)
-    ls = idim_ls(ls_blocks, model.base.names)
+        ls_blocks = equations(model, experiments, signals, plain)
+    ls = idim_ls(ls_blocks, model.base.names, weighted=options.weighted)
 
     controller: dict[str, Any] = {"kind": "none"}
     if options.method == "idim-ls":
-        estimate, blocks = ls, ls_blocks
+        estimate, blocks, solution = ls, ls_blocks, None
     else:
         clock.enter("controller", 0.35)
-        if options.method == "idim-piv":
-            decimation = design(dt, _cutoff(dt, PIV_CUTOFF * bandwidth, options.decimation), options.decimation)
-        else:
-            decimation = ls_decimation
-        blocks = equations(model, experiments, signals, decimation)
+        decimation = decimation_of(options.method, dt, bandwidth, options.decimation)
         auxiliary, start, controller = closed_loop(
             model, experiments, signals, options, ls.theta, decimation, bandwidth, warnings
         )
         clock.enter(options.method, 0.5)
-        if options.method == "idim-iv":
-            estimate = idim_iv(blocks, auxiliary, start)
-        else:
-            plain_blocks = equations(model, experiments, signals, ls_decimation)
-            estimate, blocks = _prefiltered(
-                blocks, auxiliary, plain_blocks, ls_decimation, start, options, model.base.names, warnings
-            )
-        warnings += estimate.warnings
+        solution = solve(Problem(experiments, signals, auxiliary, start, plain, options))
+        estimate, blocks = solution.estimate, solution.problem.blocks
+        warnings += [*solution.warnings, *estimate.warnings]
         if not estimate.converged:
             warnings.append(f"{options.method} did not converge: {estimate.stop_reason}")
 
-    clock.enter("statistics", 0.9)
-    result = make_result(options, model, estimate, blocks, ls, ls_blocks, controller, warnings, clock.spent)
+    clock.enter("statistics", 0.85)
+    used = sum(r.size for series in estimate.residuals for r in series)
+    essential = essential_parameters(estimate.theta, estimate.covariance, used)
+    if solution is None:
+        joints = [joint.name for joint in robot.joints]
+        diagnostics = diagnose_estimate(model.base.names, joints, blocks, estimate, essential=essential)
+    else:
+        diagnostics = solution.diagnostics(essential)
+    physical = None
+    if options.physical:
+        clock.enter("physical", 0.95)
+        physical = nearest_consistent(model, estimate.theta, estimate.covariance)
+        if not physical.compatible:
+            warnings.append(physical.verdict)
     clock.done()
-    return result
+    return make_result(
+        options, model, estimate, essential, diagnostics, physical, blocks, ls, ls_blocks, controller, warnings,
+        clock.spent,
+    )  # fmt: skip
+
+
+def _derivatives(
+    experiments: Sequence[Experiment], robot: RobotConfig, options: Options, dt: float, bandwidth: float
+) -> list[Derivatives]:
+    resolution = encoder_resolution(robot) if options.nvr == "tracking-error" else None
+    return [
+        differentiate(
+            e.q, dt, options.derivatives or "irwsm", options.nvr, bandwidth, q_ref=e.q_ref, resolution=resolution
+        )
+        for e in experiments
+    ]
 
 
 @dataclass
@@ -155,39 +168,3 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> None:
                 raise DataError(f"experiment {number}: {name} of {robot.joints[j].name} is not finite at sample {k}")
         if e.dt != experiments[0].dt:
             raise DataError("the experiments have different sampling rates")
-
-
-def _cutoff(dt: float, wanted: float, factor: int | None) -> float:
-    """Cut-off (Hz) of a decimation: as wanted, or what a factor given by hand leaves."""
-    return wanted if factor is None else 0.5 / (dt * factor)
-
-
-def _prefiltered(
-    blocks: list[Block],
-    auxiliary: AuxiliaryModel,
-    plain_blocks: list[Block],
-    plain_decimation: Decimation,
-    start: Array,
-    options: Options,
-    names: Sequence[str],
-    warnings: list[str],
-) -> tuple[Estimate, list[Block]]:
-    """IDIM-PIV, unless the prefilter contradicts IDIM-IV.
-
-    A noise model may move the estimate within its uncertainty only. Where it moves it further, the residual
-    is not noise but what the model lacks, and its inverse filter amplifies that (thesis section 6.2.3); then, as in
-    SEP-PEM, the dynamic model is estimated without it and it only enters the covariance (6.2.1).
-    """
-    plain_auxiliary = replace(auxiliary, decimation=plain_decimation, warnings=[])
-    plain = idim_iv(plain_blocks, plain_auxiliary, start, serial_order=options.max_ar_order)
-    estimate = idim_piv(blocks, auxiliary, plain.theta, max_order=options.max_ar_order)
-    shift = np.abs(estimate.theta - plain.theta) / plain.std
-    worst = int(np.argmax(shift))
-    if shift[worst] <= CONTRADICTION:
-        return estimate, blocks
-    warnings.append(
-        f"the prefilter of idim-piv moves {names[worst]} by {shift[worst]:.0f} standard deviations from "
-        "idim-iv: the residuals are model error, not noise; the parameters are those of idim-iv, the noise model only "
-        "enters their standard deviations"
-    )
-    return plain, plain_blocks

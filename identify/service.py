@@ -1,7 +1,7 @@
 """What the commands and the worker do with a recording: identify it, diagnose it, write the results."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from identify.document import (
 )
 from identify.experiment import Experiment
 from identify.from_recording import experiments_from_recording
-from identify.options import Options
+from identify.options import Options, parse_nvr
 from identify.result import Identification
 from identify.run import identify_experiment
 
@@ -85,26 +85,12 @@ def write_identification(outcome: Outcome, out: Path) -> tuple[Path, Path]:
 
 
 def identify_command(
-    path: Path,
-    config: Path | None,
-    method: str,
-    derivatives: str | None,
-    controller: str,
-    decimation: int | None,
-    out: Path | None,
-    *,
-    as_json: bool,
+    path: Path, config: Path | None, chosen: Mapping[str, Any], out: Path | None, *, as_json: bool
 ) -> None:
-    """Carry out ``armident identify``."""
+    """Carry out ``armident identify``; ``chosen`` are the fields of `Options` as the user wrote them."""
     from identify.terminal import identification_table, progress, warn
 
-    chosen: dict[str, Any] = {
-        "method": method,
-        "derivatives": derivatives,
-        "controller": controller,
-        "decimation": decimation,
-    }
-    options = Options(**chosen)
+    options = Options(**{**chosen, "nvr": parse_nvr(chosen.get("nvr"))})
     robot = None if config is None else load_robot(config)
     recording = read_recording(path)
     with progress(f"identify {path.name}") as report:

@@ -1,0 +1,176 @@
+"""The methods by name: which equations each of them solves, and the estimator that does it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.estimators.auxiliary import AuxiliaryModel
+from identify.estimators.clie import clie
+from identify.estimators.cloe import cloe
+from identify.estimators.diagnostics import Diagnostics, diagnose_estimate
+from identify.estimators.didim import didim
+from identify.estimators.idim_iv import idim_iv
+from identify.estimators.idim_piv import idim_piv
+from identify.estimators.regression import Block, Estimate, joint_variances
+from identify.estimators.sep_pem import sep_pem
+from identify.experiment import Experiment
+from identify.options import Method, Options
+from identify.preparation import LS_CUTOFF, PIV_CUTOFF, equations
+from identify.signals.decimate import Decimation, design
+from identify.signals.differentiate import Derivatives
+
+CONTRADICTION = 5.0
+"""Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before it is disbelieved."""
+
+PREFILTERED: tuple[Method, ...] = ("idim-piv", "sep-pem")
+"""Methods with a noise model: their equations are decimated only roughly (thesis section 7.2)."""
+
+MEASURED: tuple[Method, ...] = ("idim-ls", "idim-iv", "idim-piv")
+"""Methods whose regressor is the measured one."""
+
+Array = NDArray[np.float64]
+
+
+def decimation_of(method: Method, dt: float, bandwidth_hz: float, factor: int | None) -> Decimation:
+    """Low-pass and decimation for a method; ``factor``: as chosen by hand, ``None``: from the bandwidth."""
+    share = PIV_CUTOFF if method in PREFILTERED else LS_CUTOFF
+    cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)
+    return design(dt, cutoff, factor)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What every method is given: experiments with derivatives, the closed loop, and where to start.
+
+    Parameters
+    ----------
+    auxiliary
+        The simulated closed loop with the decimation of the method.
+    start
+        First theta, shape (b,).
+    plain
+        Decimation of the methods without a noise model.
+    """
+
+    experiments: Sequence[Experiment]
+    signals: Sequence[Derivatives]
+    auxiliary: AuxiliaryModel
+    start: Array
+    plain: Decimation
+    options: Options
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """Equations at measured signals, decimated as the method wants them."""
+        return equations(self.auxiliary.model, self.experiments, self.signals, self.auxiliary.decimation)
+
+    @cached_property
+    def plain_problem(self) -> "Problem":
+        """The same with the decimation of the methods without a noise model."""
+        return replace(self, auxiliary=replace(self.auxiliary.fresh(), decimation=self.plain))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """An estimate, the problem it belongs to, and what is to be said about it.
+
+    ``prefiltered``: the noise models of the estimate have weighed its rows, not only entered its covariance.
+    """
+
+    estimate: Estimate
+    problem: Problem
+    prefiltered: bool = False
+    warnings: tuple[str, ...] = ()
+
+    def diagnostics(self, essential: NDArray[np.bool_]) -> Diagnostics:
+        """Tests of the estimate on the equations it solves."""
+        problem, estimate = self.problem, self.estimate
+        instruments = problem.auxiliary.fresh().instruments(estimate.theta)
+        blocks, method = problem.blocks, problem.options.method
+        if method not in MEASURED:
+            blocks = [replace(b, x=z) for b, z in zip(blocks, instruments, strict=True)]
+        weights = None if self.prefiltered else joint_variances(blocks, estimate.theta)
+        return diagnose_estimate(
+            problem.auxiliary.model.base.names,
+            [joint.name for joint in problem.auxiliary.model.robot.joints],
+            blocks,
+            estimate,
+            instruments=instruments if method in MEASURED else None,
+            weights=weights,
+            essential=essential,
+        )
+
+
+def solve(problem: Problem) -> Solution:
+    """Run the method that the options name.
+
+    Raises
+    ------
+    DataError
+        If no auxiliary closed loop runs.
+    """
+    return _SOLVERS[problem.options.method](problem)
+
+
+def _idim_piv(problem: Problem) -> Solution:
+    """IDIM-PIV, unless the prefilter contradicts IDIM-IV.
+
+    A noise model may move the estimate within its uncertainty only. Where it moves it further, the residual
+    is not noise but what the model lacks, and its inverse filter amplifies that (thesis section 6.2.3); then, as in
+    SEP-PEM, the dynamic model is estimated without it and it only enters the covariance (6.2.1).
+    """
+    options, plain = problem.options, problem.plain_problem
+    without = idim_iv(plain.blocks, plain.auxiliary, problem.start, serial_order=options.max_ar_order)
+    estimate = idim_piv(
+        problem.blocks,
+        problem.auxiliary,
+        without.theta,
+        max_order=options.max_ar_order,
+        grey_box=options.noise_model == "grey-box",
+    )
+    shift = np.abs(estimate.theta - without.theta) / without.std
+    worst = int(np.argmax(shift))
+    if shift[worst] <= CONTRADICTION:
+        # A grey box weighs motor positions, not joint torques.
+        return Solution(estimate, problem, prefiltered=options.noise_model == "black-box")
+    warning = (
+        f"the prefilter of idim-piv moves {problem.auxiliary.model.base.names[worst]} by {shift[worst]:.0f} standard "
+        "deviations from idim-iv: the residuals are model error, not noise; the parameters are those of idim-iv, the "
+        "noise model only enters their standard deviations"
+    )
+    return Solution(without, plain, warnings=(warning,))
+
+
+def _idim_iv(problem: Problem) -> Solution:
+    return Solution(idim_iv(problem.blocks, problem.auxiliary, problem.start), problem)
+
+
+def _didim(problem: Problem) -> Solution:
+    return Solution(didim(problem.blocks, problem.auxiliary, problem.start), problem)
+
+
+def _clie(problem: Problem) -> Solution:
+    return Solution(clie(problem.blocks, problem.auxiliary, problem.start), problem)
+
+
+def _cloe(problem: Problem) -> Solution:
+    positions = [problem.auxiliary.decimation(e.q) for e in problem.experiments]
+    return Solution(cloe(problem.blocks, positions, problem.auxiliary, problem.start), problem)
+
+
+def _sep_pem(problem: Problem) -> Solution:
+    order = problem.options.max_ar_order
+    return Solution(sep_pem(problem.blocks, problem.auxiliary, problem.start, max_order=order), problem)
+
+
+_SOLVERS: dict[Method, Callable[[Problem], Solution]] = {
+    "idim-piv": _idim_piv,
+    "idim-iv": _idim_iv,
+    "didim": _didim,
+    "clie": _clie,
+    "cloe": _cloe,
+    "sep-pem": _sep_pem,
+}
