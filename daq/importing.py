@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs import ConfigError, DataError, RobotConfig
+from daq.polled import on_clock
 from daq.recording import Field, Recording, Stream
 from daq.recording.model import Quantity, Side
 
@@ -23,11 +24,19 @@ NAMES: Mapping[str, tuple[str, ...]] = {
 }
 """By what names each quantity is known; ``q`` also stands for columns ``q1..qn``."""
 
+ABSENT = "-"
+"""The name that leaves out what a file holds of a quantity."""
+
 EFFORTS: tuple[Quantity, ...] = ("torque", "current", "voltage")
 _UNEVEN = 0.01
 """Largest deviation of a sampling step from the median step, relative."""
 _FAR_OUT, _TOO_STRONG = 3.0, 10.0
 """Positions and torques beyond these multiples of the joint's limits are taken as a wrong unit."""
+
+_STILL = 1e-3
+"""A joint that uses less than this share of its position range says nothing about its demand."""
+_UNFOLLOWED = 0.5
+"""Share of the power of a joint's motion that its demand may leave unexplained before it counts as another quantity."""
 
 Table = dict[str, NDArray[np.float64]]
 
@@ -54,6 +63,7 @@ def import_recording(
     motor_side: bool = False,
     rate_hz: float | None = None,
     names: Mapping[str, str] | None = None,
+    polled: bool = False,
 ) -> Recording:
     """Read measured motion and effort as a recording, checked before anything is written.
 
@@ -65,25 +75,32 @@ def import_recording(
         The robot that was measured.
     effort
         A second CSV with one effort column per joint; ``path`` then has one position column per joint, and
-        headers of both are free or absent.
+        headers of both are free or absent. A file of a single column has the joints one after the other, sample by
+        sample.
     motor_side
         Positions and torques are those of the motors; currents and voltages always are.
     rate_hz
         Sampling rate where the file has no time column, or where its times are known to be worse than the clock.
     names
-        Names of this file by quantity (``time, position, torque, current, voltage, demand``).
+        Names of this file by quantity (``time, position, torque, current, voltage, demand``); ``-`` leaves one out.
+    polled
+        The rows were read from a controller of ``rate_hz`` without waiting for its samples, so that some are repeated
+        and some missed: they are put back on its clock (`daq.polled`).
 
     Raises
     ------
     ConfigError
         If a file or option is wrong.
     DataError
-        If the content is: missing columns, wrong number of axes, NaN, uneven time, or values far outside the limits.
+        If the content is: missing columns, wrong number of axes, NaN, uneven time, values far outside the limits, or
+        a demand that no joint followed.
     """
     names = dict(names or {})
     unknown = sorted(names.keys() - NAMES.keys())
     if unknown:
         raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
+    if polled and rate_hz is None:
+        raise ConfigError("--polled: say the rate of the controller's clock with --rate")
     source = _pair(path, effort, robot) if effort is not None else _load(path)
     rate = rate_hz if rate_hz is not None else _rate(source, names)
     side: Side = "motor" if motor_side else "joint"
@@ -103,12 +120,19 @@ def import_recording(
             f"{path}: expected columns q1..q{robot.n} and tau1..tau{robot.n} (or current, voltage); found {have}"
         )
     _check_units(path, robot, fields, raw)
-    count = len(raw["position"])
-    sync = np.arange(count, dtype=np.int64)
-    t_ns = np.round(sync * (1e9 / rate)).astype(np.int64)
     facts = {"source": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     if effort is not None:
         facts |= {"effort": effort.name, "effort_sha256": hashlib.sha256(effort.read_bytes()).hexdigest()}
+    if polled:
+        try:
+            even = on_clock(raw)
+        except DataError as error:
+            raise DataError(f"{path}: {error}") from error
+        raw = dict(even.values)
+        facts |= {"polled.repeated": str(even.repeated), "polled.interpolated": str(even.interpolated)}
+    count = len(raw["position"])
+    sync = np.arange(count, dtype=np.int64)
+    t_ns = np.round(sync * (1e9 / rate)).astype(np.int64)
     stream = Stream("samples", 1, sync, t_ns, fields, raw)
     counters = {"samples.expected": count, "samples.rows": count, "samples.in_gaps": 0}
     return Recording(None, robot, None, rate, {"samples": stream}, counters=counters, metadata=facts)
@@ -165,9 +189,11 @@ def _pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
         if not file.is_file():
             raise ConfigError(f"{file}: no such file")
         _, values, first_line = _csv(file)
+        _check_finite(Source(file, {}, first_line), values, [f"{j + 1}" for j in range(values.shape[1])])
+        if values.shape[1] == 1 and values.shape[0] % robot.n == 0:
+            values = values.reshape(-1, robot.n)
         if values.shape[1] != robot.n:
             raise DataError(f"{file}: {values.shape[1]} columns, but {robot.name} has {robot.n} joints")
-        _check_finite(Source(file, {}, first_line), values, [f"{j + 1}" for j in range(robot.n)])
         columns |= {f"{base}{j + 1}": values[:, j] for j in range(robot.n)}
     rows = {len(v) for v in columns.values()}
     if len(rows) != 1:
@@ -223,7 +249,9 @@ def _bad_line(path: Path, delimiter: str | None, columns: int, skip: int) -> str
 
 
 def _pick(source: Source, quantity: str, n: int, names: Mapping[str, str]) -> NDArray[np.float64] | None:
-    """The (N, n) values of a quantity, or ``None`` if the file has none."""
+    """The (N, n) values of a quantity, or ``None`` if the file has none or it is to be left out."""
+    if names.get(quantity) == ABSENT:
+        return None
     for base in (names[quantity],) if quantity in names else NAMES[quantity]:
         whole = source.table.get(base)
         labels = [f"{base}{j + 1}" for j in range(n)]
@@ -308,3 +336,18 @@ def _check_units(path: Path, robot: RobotConfig, fields: Mapping[str, Field], ra
                 raise DataError(
                     f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
                 )
+    if "demand" in raw:
+        _check_demand(path, robot, raw["demand"], raw["position"])
+
+
+def _check_demand(path: Path, robot: RobotConfig, demand: NDArray[np.float64], position: NDArray[np.float64]) -> None:
+    """Refuse a demand that moves otherwise than the joints: another unit, or not what the controller was given."""
+    motion = np.sum((position - position.mean(axis=0)) ** 2, axis=0)
+    missed = np.sum((demand - demand.mean(axis=0) - position + position.mean(axis=0)) ** 2, axis=0)
+    for k in np.flatnonzero(missed > _UNFOLLOWED * motion):
+        joint, moved, wanted = robot.joints[k], np.ptp(position[:, k]), np.ptp(demand[:, k])
+        if moved > _STILL * np.ptp(joint.limits.position):
+            raise DataError(
+                f"{path}: {joint.name} did not follow its demand, which spans {wanted:.4g} where the position spans "
+                f"{moved:.4g}: expected the same unit; --map demand={ABSENT} leaves it out"
+            )

@@ -137,6 +137,70 @@ def test_the_measured_tx40_is_a_pair_of_files(shared_data: Path, tmp_path: Path)
     assert read_recording(tmp_path / "tx40.mcap").sha256 == recording.sha256
 
 
+PANDA = load_robot("panda.yaml")
+
+
+def moving_panda(rate_hz: float = 1000.0, seconds: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and torques (N, 7) of a motion that rests in the beginning."""
+    t = np.arange(0.0, seconds, 1 / rate_hz)[:, None]
+    share = np.clip(t - 0.2, 0.0, 1.0)
+    phase = np.arange(7.0)
+    return 0.5 * share**2 * (3 - 2 * share) * np.sin(3 * t + phase) + [0, 0, 0, -1.5, 0, 1.5, 0], 5.0 * np.cos(
+        2 * t + phase
+    )
+
+
+def test_rows_read_without_waiting_are_put_back_on_the_clock_of_the_controller(tmp_path: Path) -> None:
+    q, tau = moving_panda()
+    rng = np.random.default_rng(5)
+    # What a program sees that asks too early or too late: one row in 15 again, one in 12 missed, a stall of 8.
+    asked = np.sort(np.append(np.arange(len(q)), rng.integers(0, len(q), len(q) // 15)))
+    missed = rng.random(len(asked)) < 1 / 12
+    missed[2000:2008] = True
+    missed[[0, -1]] = False
+    rows = asked[~missed]
+    for name, values in (("q", q), ("tau", tau)):
+        np.savetxt(tmp_path / f"{name}.txt", values[rows].ravel(), fmt="%.6g")
+    recording = import_recording(tmp_path / "q.txt", PANDA, effort=tmp_path / "tau.txt", rate_hz=1000.0, polled=True)
+    samples = recording.samples.raw
+    # The rest at the beginning tells no time: it may be off by what was missed or repeated in 0.2 s.
+    lag = len(samples["position"]) - len(q)
+    assert abs(lag) < 30
+    late, size = slice(1000, 3900), slice(1000 + lag, 3900 + lag)
+    # 1e-5: six digits were written.
+    assert np.abs(samples["position"][size] - q[late]).max() < 2e-5
+    assert np.abs(samples["torque"][size] - tau[late]).max() < 1e-3
+    assert int(recording.metadata["polled.repeated"]) + int(recording.metadata["polled.interpolated"]) > 300
+
+
+def test_rows_of_no_clock_are_refused(tmp_path: Path) -> None:
+    q, tau = moving_panda()
+    t = np.sort(np.random.default_rng(1).uniform(0.0, 4.0, len(q)))
+    for name, values in (("q", q), ("tau", tau)):
+        even = np.arange(len(q)) / 1000.0
+        np.savetxt(tmp_path / f"{name}.txt", np.stack([np.interp(t, even, v) for v in values.T], axis=1))
+    with pytest.raises(DataError, match=r"q\.txt: \d+ % of the rows are not a whole number of samples"):
+        import_recording(tmp_path / "q.txt", PANDA, effort=tmp_path / "tau.txt", rate_hz=1000.0, polled=True)
+    with pytest.raises(ConfigError, match="--polled: say the rate"):
+        import_recording(tmp_path / "q.txt", PANDA, effort=tmp_path / "tau.txt", polled=True)
+    for name in ("q", "tau"):
+        np.savetxt(tmp_path / f"{name}.txt", np.zeros((100, 7)))
+    with pytest.raises(DataError, match=r"only 1 of 100 rows differ"):
+        import_recording(tmp_path / "q.txt", PANDA, effort=tmp_path / "tau.txt", rate_hz=1000.0, polled=True)
+
+
+def test_a_demand_in_another_unit_is_refused_and_can_be_left_out(tmp_path: Path) -> None:
+    q, tau = moving_panda()
+    path = tmp_path / "a.npz"
+    np.savez(path, positions=q, torques=tau, target_positions=np.deg2rad(q))
+    with pytest.raises(DataError, match=r"joint_1 did not follow its demand, .*--map demand=- leaves it out"):
+        import_recording(path, PANDA, rate_hz=1000.0)
+    recording = import_recording(path, PANDA, rate_hz=1000.0, names={"demand": "-"})
+    assert set(recording.samples.fields) == {"position", "torque"}
+    np.savez(path, positions=q, torques=tau, target_positions=q + 0.01)
+    assert "demand" in import_recording(path, PANDA, rate_hz=1000.0).samples.fields
+
+
 def test_a_recording_without_samples_is_not_exported(tmp_path: Path) -> None:
     recording = import_recording(write_csv(tmp_path / "a.csv", table()), TX40)
     samples = recording.samples
