@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from configs import DataError, RobotConfig
 from identify.closed_loop import closed_loop
@@ -54,10 +55,16 @@ def identify_experiment(
     DataError
         If the data cannot support the request: too short, not finite, motion that leaves parameters undetermined.
     """
-    options = options or Options()
     experiments = [experiments] if isinstance(experiments, Experiment) else list(experiments)
     _check(experiments, robot)
-    clock = _Clock(progress or (lambda stage, share: None))
+    # The matrices are tall and narrow: threads gain little, wait for each other on a busy machine, and round otherwise.
+    with threadpool_limits(1):
+        return _identify(experiments, robot, options or Options(), _Clock(progress or (lambda stage, share: None)))
+
+
+def _identify(
+    experiments: Sequence[Experiment], robot: RobotConfig, options: Options, clock: "_Clock"
+) -> Identification:
     warnings: list[str] = []
 
     clock.enter("model", 0.0)
