@@ -8,15 +8,25 @@ from scipy import signal
 
 from configs import DataError
 
-POWER_SHARE = 0.99
+POWER_SHARE = 0.95
 """Share of the power of the velocity that lies below the bandwidth of the motion."""
 
-MARGIN = 2.0
+MARGIN = 5.0
 """From the bandwidth of the motion to the closed-loop bandwidth that the filters are chosen for."""
+
+SIGNIFICANT = 10.0
+"""Power of a frequency in noise floors from which on it counts as motion; white noise exceeds it once in 20000."""
+
+PERIODS = 50.0
+"""Fewest periods of the bandwidth in the shortest experiment: 200 samples after the decimation of IDIM-LS."""
 
 
 def motion_bandwidth(q: Sequence[NDArray[np.float64]], dt: float) -> float:
     """Bandwidth (Hz) to choose filters by: a margin above where nearly all power of every joint's velocity lies.
+
+    Noise of the encoder is told from motion by the floor of the position's spectrum in the upper half of the
+    frequencies. Motion so slow that its filters would leave too few equations is given the bandwidth that leaves
+    enough.
 
     Parameters
     ----------
@@ -30,15 +40,29 @@ def motion_bandwidth(q: Sequence[NDArray[np.float64]], dt: float) -> float:
     DataError
         If nothing moves.
     """
-    highest = 0.0
-    for positions in q:
-        velocity = np.diff(positions, axis=0) / dt
-        frequency, power = signal.periodogram(velocity, 1 / dt, window="hann", axis=0)
-        below = frequency <= 0.1 / dt
-        cumulative = np.cumsum(power[below], axis=0)
-        for j in np.flatnonzero(cumulative[-1] > 0):
-            reached = np.searchsorted(cumulative[:, j], POWER_SHARE * cumulative[-1, j])
-            highest = max(highest, float(frequency[reached]))
+    highest = max((_velocity_bandwidth(positions, dt) for positions in q), default=0.0)
     if highest == 0:
         raise DataError("nothing moves in this recording")
-    return MARGIN * highest
+    shortest = min(positions.shape[0] for positions in q) * dt
+    return float(min(max(MARGIN * highest, PERIODS / shortest), MARGIN * _highest(dt)))
+
+
+def _highest(dt: float) -> float:
+    """Highest frequency (Hz) at which motion is looked for."""
+    return 0.04 / dt
+
+
+def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
+    """Frequency (Hz) below which ``POWER_SHARE`` of the velocity's power lies, of the fastest joint; 0: none moves."""
+    frequency, power = signal.periodogram(np.diff(q, axis=0) / dt, 1 / dt, window="hann", axis=0)
+    frequency, power = frequency[1:], power[1:]
+    position = power / (2 - 2 * np.cos(2 * np.pi * frequency * dt))[:, None]
+    # The power of white noise at one frequency is exponentially distributed: its median is log 2 of its mean.
+    floor = np.median(position[frequency >= 0.25 / dt], axis=0) / np.log(2)
+    moving = (position > SIGNIFICANT * floor) & (frequency <= _highest(dt))[:, None]
+    cumulative = np.cumsum(np.where(moving, power, 0.0), axis=0)
+    highest = 0.0
+    for j in np.flatnonzero(cumulative[-1] > 0):
+        reached = np.searchsorted(cumulative[:, j], POWER_SHARE * cumulative[-1, j])
+        highest = max(highest, float(frequency[reached]))
+    return highest
