@@ -1,0 +1,1 @@
+"""The thesis's tables, computed anew beside its figures."""

@@ -1,0 +1,84 @@
+"""What a table function is given, and the shapes that most tables have."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from identify.reproduction.emps_derivatives import Row, table_5_2
+from identify.reproduction.laboratory import Case, Laboratory, Method, Run
+from identify.reproduction.reference import reference_tables
+from identify.reproduction.tables import Cell, Column, Source, Table
+
+SIMULATIONS, SIMULATIONS_QUICK = 30, 3
+"""Noise realisations of table 5.2: the mean of 30 is known to 2 %, that of 3 to 6 %."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The two arms.
+
+    Parameters
+    ----------
+    virtual
+        The virtual TX40.
+    measured
+        The measured one, without reference and controller; ``None``: not at hand.
+    simulations
+        Noise realisations of the simulated EMPS.
+    """
+
+    virtual: Laboratory
+    measured: Laboratory | None = None
+    simulations: int = SIMULATIONS
+
+    def emps_derivatives(self) -> list[Row]:
+        """Errors of the derivatives on the simulated EMPS, by method."""
+        return self.virtual.once(("EMPS", self.simulations), lambda: table_5_2(self.simulations))
+
+    def arms(self, method: Method) -> list[tuple[Source, Laboratory]]:
+        """The arms whose recordings let a method run."""
+        arms: list[tuple[Source, Laboratory]] = [("virtual", self.virtual)]
+        if self.measured is not None and method == "idim-ls":
+            arms.append(("measured", self.measured))
+        return arms
+
+
+TableFunction = Callable[[Bench], Table]
+
+
+def estimates(
+    bench: Bench, number: str, columns: Sequence[tuple[str, Method, Case]], notes: Sequence[str] = ()
+) -> Table:
+    """A table of estimates: the thesis's columns, ours by method and case, and the virtual arm's own parameters."""
+    printed = reference_tables()[number]
+    ours = [
+        lab.column(name, lab.run(method, case), source)
+        for name, method, case in columns
+        for source, lab in bench.arms(method)
+    ]
+    return Table(number, printed.title, printed.labels, (*printed.printed(), *ours, bench.virtual.own()), tuple(notes))
+
+
+def figures(
+    number: str,
+    values: Mapping[str, Sequence[float | None]],
+    notes: Sequence[str] = (),
+    *,
+    names: Sequence[str] | None = None,
+    measured: Mapping[str, Sequence[float | None]] | None = None,
+) -> Table:
+    """A table of figures by row label, one per column of the thesis (or of ``names``)."""
+    printed = reference_tables()[number]
+    columns = list(printed.printed())
+    sources: list[tuple[Source, Mapping[str, Sequence[float | None]]]] = [("virtual", values)]
+    if measured is not None:
+        sources.append(("measured", measured))
+    for source, rows in sources:
+        for k, name in enumerate(names or printed.columns):
+            columns.append(Column(source, name, {label: Cell(row[k]) for label, row in rows.items()}))
+    labels = (*printed.labels, *(label for label in values if label not in printed.labels))
+    return Table(number, printed.title, labels, tuple(columns), tuple(notes))
+
+
+def iterations(run: Run) -> float | None:
+    """Iterations of a run; ``None`` where it did not converge."""
+    return run.estimate.iterations if run.estimate.converged else None

@@ -1,0 +1,203 @@
+"""Chapter 5: derivatives without knowledge of the bandwidth, and an unknown controller."""
+
+from dataclasses import replace
+
+from identify.controller.crc import PREWHITENING_ORDER
+from identify.reproduction.bench import Bench, TableFunction, estimates, figures, iterations
+from identify.reproduction.laboratory import Case, Method
+from identify.reproduction.tables import Table
+
+GOOD = Case("bandpass")
+"""The bandwidth is known: 50 Hz and 20 Hz (5.3.1)."""
+POOR_LS = Case("bandpass", bandpass_hz=200.0, cutoff_hz=100.0)
+"""It is taken for twice what it is, and IDIM-LS gets careless filters (5.3.1)."""
+POOR_IV = Case("bandpass", bandpass_hz=180.0, cutoff_hz=150.0)
+"""It is taken for three times what it is, before IDIM-IV (5.3.2)."""
+NOTHING = Case("differences", cutoff_hz=None)
+"""No filter at all (5.3.2.1)."""
+BY_HAND = 1e-5
+"""The thesis's NVR where it is not estimated (5.3.1)."""
+
+ACTUAL = Case()
+IMPULSE_RESPONSES = Case(controller="crc")
+KNOWN_STRUCTURE = Case(controller="parametric")
+
+SERIAL = "standard deviations without a well-tuned parallel filter are too small: residuals are serially correlated"
+
+
+def table_5_1(bench: Bench) -> Table:
+    """Noise-variance ratios of the joints."""
+    Rows = dict[str, list[float | None]]
+    rows: Rows = {}
+    measured: Rows | None = None if bench.measured is None else {}
+    for model, derivatives in (("IRWSM 1", "irwsm"), ("IRWSM 2", "irwsm2")):
+        for label, nvr in (
+            ("likelihood", "likelihood"),
+            ("tracking error", "tracking-error"),
+            ("automatic", "automatic"),
+        ):
+            case = Case(derivatives=derivatives, nvr=nvr)  # type: ignore[arg-type]
+            for lab, into in ((bench.virtual, rows), (bench.measured, measured)):
+                if lab is not None and into is not None and not (lab is bench.measured and nvr == "tracking-error"):
+                    ratios = lab.derivatives(case).nvr
+                    assert ratios is not None
+                    into[f"{model}, {label}"] = ratios[:, 0].tolist()
+    return figures(
+        "5.1",
+        rows,
+        ["IRWSM 1: of the first pass", "the thesis's text leaves open which of its rows is which"],
+        measured=measured,
+    )
+
+
+def smoothed(case: Case) -> tuple[Case, Case]:
+    """The case with IRWSM 1 and with IRWSM 2 in place of its bandpass, their NVR by likelihood if not by hand."""
+    nvr = "likelihood" if case.nvr == "automatic" else case.nvr
+    return replace(case, derivatives="irwsm", nvr=nvr), replace(case, derivatives="irwsm2", nvr=nvr)
+
+
+def table_5_2(bench: Bench) -> Table:
+    """Errors of the derivatives on the simulated EMPS."""
+    found = {row.label: row.ours for row in bench.emps_derivatives()}
+    signals = {
+        signal: [found[name][k] for name in found] for k, signal in enumerate(("position", "velocity", "acceleration"))
+    }
+    return figures("5.2", signals, [f"mean of {bench.simulations} simulations (the thesis: 100)"], names=tuple(found))
+
+
+def table_5_5(bench: Bench) -> Table:
+    """IDIM-LS where the bandwidth is known."""
+    first, second = smoothed(GOOD)
+    columns: list[tuple[str, Method, Case]] = [
+        ("bandpass", "idim-ls", GOOD),
+        ("IRWSM 1", "idim-ls", first),
+        ("IRWSM 2", "idim-ls", second),
+    ]
+    return estimates(bench, "5.5", columns)
+
+
+def table_5_6(bench: Bench) -> Table:
+    """Relative errors of IDIM-LS."""
+    rows: dict[str, list[Case | None]] = {
+        "good knowledge": [GOOD, *smoothed(GOOD)],
+        "poor knowledge": [POOR_LS, *smoothed(POOR_LS)],
+        "poor knowledge, NVR 1e-5": [None, *smoothed(replace(POOR_LS, nvr=BY_HAND))],
+    }
+    found = {
+        source: {
+            label: [None if case is None else lab.run("idim-ls", case).error_pct for case in cases]
+            for label, cases in rows.items()
+        }
+        for source, lab in bench.arms("idim-ls")
+    }
+    return figures("5.6", found["virtual"], measured=found.get("measured"))
+
+
+def table_5_7(bench: Bench) -> Table:
+    """IDIM-LS where the bandwidth is poorly known."""
+    by_hand = replace(POOR_LS, nvr=BY_HAND)
+    columns: list[tuple[str, Method, Case]] = [
+        ("bandpass", "idim-ls", POOR_LS),
+        ("IRWSM 1", "idim-ls", smoothed(POOR_LS)[0]),
+        ("IRWSM 2", "idim-ls", smoothed(POOR_LS)[1]),
+        ("IRWSM 1, NVR 1e-5", "idim-ls", smoothed(by_hand)[0]),
+        ("IRWSM 2, NVR 1e-5", "idim-ls", smoothed(by_hand)[1]),
+        ("IRWSM 1, automatic", "idim-ls", replace(POOR_LS, derivatives="irwsm")),
+    ]
+    return estimates(bench, "5.7", columns, [SERIAL])
+
+
+def table_5_8(bench: Bench) -> Table:
+    """IDIM-IV where the bandwidth is poorly known."""
+    columns: list[tuple[str, Method, Case]] = [
+        ("IDIM-LS bandpass", "idim-ls", POOR_IV),
+        ("IDIM-IV bandpass", "idim-iv", POOR_IV),
+        ("IDIM-IV IRWSM 1", "idim-iv", smoothed(POOR_IV)[0]),
+        ("IDIM-IV IRWSM 2", "idim-iv", smoothed(POOR_IV)[1]),
+    ]
+    return estimates(bench, "5.8", columns, [SERIAL])
+
+
+def table_5_9(bench: Bench) -> Table:
+    """Iterations of IDIM-IV."""
+    rows = {"poor knowledge": POOR_IV, "no knowledge": NOTHING}
+    found = {
+        label: [iterations(bench.virtual.run("idim-iv", c)) for c in (case, *smoothed(case))]
+        for label, case in rows.items()
+    }
+    return figures("5.9", found, ["ours stop at a relative change of 1e-4; without filters, 'bandpass' is differences"])
+
+
+def table_5_10(bench: Bench) -> Table:
+    """Relative errors with poor and with no knowledge."""
+    rows = {"poor knowledge": POOR_IV, "no knowledge": NOTHING}
+    found: dict[str, list[float | None]] = {}
+    for label, case in rows.items():
+        runs = [bench.virtual.run("idim-iv", c) for c in (case, *smoothed(case))]
+        found[label] = [bench.virtual.run("idim-ls", case).error_pct, *(run.error_pct for run in runs)]
+    measured = None
+    if bench.measured is not None:
+        lab = bench.measured
+        measured = {label: [lab.run("idim-ls", case).error_pct, None, None, None] for label, case in rows.items()}
+    return figures("5.10", found, measured=measured)
+
+
+def table_5_11(bench: Bench) -> Table:
+    """No filters at all."""
+    columns: list[tuple[str, Method, Case]] = [
+        ("IDIM-LS differences", "idim-ls", NOTHING),
+        ("IDIM-IV IRWSM 1", "idim-iv", smoothed(NOTHING)[0]),
+        ("IDIM-IV IRWSM 2", "idim-iv", smoothed(NOTHING)[1]),
+    ]
+    return estimates(bench, "5.11", columns, [SERIAL])
+
+
+def table_5_12(bench: Bench) -> Table:
+    """Sizes of the correlation analysis."""
+    found = bench.virtual.identified(IMPULSE_RESPONSES).responses
+    rows = {
+        "length": [float(r.error_taps.size) for r in found],
+        "prewhitening order": [float(r.prewhitening_order) for r in found],
+        "explained torque, %": [r.fit_pct for r in found],
+    }
+    return figures("5.12", rows, [f"chosen by held-out data; at most {PREWHITENING_ORDER} for the prewhitening"])
+
+
+def table_5_13(bench: Bench) -> Table:
+    """The controller is unknown."""
+    columns: list[tuple[str, Method, Case]] = [
+        ("IDIM-LS", "idim-ls", ACTUAL),
+        ("IDIM-IV (CRC)", "idim-iv", IMPULSE_RESPONSES),
+        ("IDIM-IV (C)", "idim-iv", KNOWN_STRUCTURE),
+    ]
+    return estimates(bench, "5.13", columns)
+
+
+def table_5_14(bench: Bench) -> Table:
+    """Relative errors where the controller is unknown."""
+    lab = bench.virtual
+    least = lab.run("idim-ls", ACTUAL)
+    runs = [lab.run("idim-iv", case) for case in (IMPULSE_RESPONSES, KNOWN_STRUCTURE)]
+    return figures(
+        "5.14",
+        {
+            "error, %": [least.error_pct, *(run.error_pct for run in runs)],
+            "iterations": [None, *(iterations(run) for run in runs)],
+        },
+    )
+
+
+TABLES: dict[str, TableFunction] = {
+    "5.1": table_5_1,
+    "5.2": table_5_2,
+    "5.5": table_5_5,
+    "5.6": table_5_6,
+    "5.7": table_5_7,
+    "5.8": table_5_8,
+    "5.9": table_5_9,
+    "5.10": table_5_10,
+    "5.11": table_5_11,
+    "5.12": table_5_12,
+    "5.13": table_5_13,
+    "5.14": table_5_14,
+}

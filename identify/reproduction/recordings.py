@@ -1,0 +1,163 @@
+"""The recordings that the tables are computed from: of the virtual TX40, and of a measured one."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import ArmidentError, ConfigError, DataError, RobotConfig, config_path, load_robot, load_session
+from daq.recording import read_recording
+from identify.controller.nominal import saturation
+from identify.experiment import Experiment
+from identify.from_recording import experiments_from_recording
+from identify.model.controller import DiscreteController
+
+SESSION = "tx40_cell.yaml"
+COMMAND = (sys.executable, "-m", "daq.cli", "robot")
+
+MEASURED_POSITIONS, MEASURED_TORQUES = "pos_read_data.csv", "curr_data.csv"
+MEASURED_PERIOD = 2e-4
+MEASURED_END_S = 7.5
+"""The measured arm stands still from here on."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What was recorded of an arm, and what only a virtual one can tell.
+
+    Parameters
+    ----------
+    robot
+        As recorded.
+    experiment
+        Positions, torques, and the reference of the virtual arm.
+    truth
+        Standard and base parameters of the virtual arm by name, and gains of its drives; of a measured one nothing.
+    """
+
+    robot: RobotConfig
+    experiment: Experiment
+    truth: dict[str, float]
+
+    def coarsened(self, points: int) -> Self:
+        """The same with joint positions rounded to so many points per turn.
+
+        Rounded after recording, as data of an arm that is given can be: its drives have seen their own encoders.
+        """
+        step = 2 * np.pi / points
+        return replace(self, experiment=replace(self.experiment, q=np.round(self.experiment.q / step) * step))
+
+    def controller(self) -> DiscreteController:
+        """The drives' own controller: a velocity loop around a position loop, both on the tracking error (B.3).
+
+        ``nu = kv (kp eps + s)`` where ``s`` is the derivative of ``eps`` through a first-order low-pass.
+        """
+        n, dt = self.robot.n, self.experiment.dt
+        kp, kv = (np.array([self.truth[f"{gain}{j + 1}"] for j in range(n)]) for gain in ("kp", "kv"))
+        loop = kv * np.array([joint.drive.gain for joint in self.robot.joints])
+        keep = float(np.exp(-2 * np.pi * self.truth["velocity_filter_hz"] * dt))
+        return DiscreteController(
+            error_taps=np.stack([loop * (kp + (1 - keep) / dt), -loop * (keep * kp + (1 - keep) / dt)], axis=1),
+            position_taps=np.zeros((n, 1)),
+            output_taps=np.full((n, 1), keep),
+            saturation=saturation(self.robot),
+            dt=dt,
+        )
+
+
+def virtual_recording(folder: Path, seed: int = 0) -> Recorded:
+    """Record the virtual TX40 on its excitation trajectory, in a process of its own, or take it from ``folder``.
+
+    Parameters
+    ----------
+    folder
+        Keeps recordings under a digest of what they were made with.
+    seed
+        Of the noise, whose size is that of table 6.3.
+
+    Raises
+    ------
+    ConfigError
+        If the folder cannot be written.
+    ArmidentError
+        If the virtual arm fails.
+    """
+    arguments = ["--config", SESSION, "--seed", str(seed)]
+    name = _digest(arguments)
+    recording, truth = folder / f"{name}.mcap", folder / f"{name}.json"
+    if not (recording.is_file() and truth.is_file()):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from error
+        _record(arguments, recording, truth)
+    read = read_recording(recording)
+    (experiment,), _ = experiments_from_recording(read, read.robot)
+    return Recorded(read.robot, experiment, json.loads(truth.read_text(encoding="utf-8")))
+
+
+def _digest(arguments: list[str]) -> str:
+    """Of the arguments, the files they name, and the version of the program."""
+    session = load_session(SESSION)
+    digest = hashlib.sha256("\0".join([version("armident"), *arguments]).encode())
+    files = [config_path(SESSION), session.robot]
+    if session.setpoints is not None:
+        files.append(session.setpoints.trajectory)
+    for file in files:
+        digest.update(Path(file).read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _record(arguments: list[str], recording: Path, truth: Path) -> None:
+    scratch = recording.with_name(f"{recording.stem}.{os.getpid()}.mcap")
+    command = [*COMMAND, *arguments, "--to-file", str(scratch), "--truth", str(truth)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        said = done.stderr.strip().splitlines()
+        raise ArmidentError(f"the virtual arm did not record: {said[-1] if said else f'exit code {done.returncode}'}")
+    scratch.replace(recording)
+
+
+def measured_recording(folder: Path) -> Recorded:
+    """The measured TX40: motor positions and torques at 5 kHz, no reference.
+
+    Parameters
+    ----------
+    folder
+        Holds ``pos_read_data.csv`` (rad at the motors) and ``curr_data.csv`` (N m at the motors), or a folder ``tx40``
+        that does.
+
+    Raises
+    ------
+    DataError
+        If the files are missing, not numbers, or do not fit together.
+    """
+    folder = folder / "tx40" if (folder / "tx40").is_dir() else folder
+    robot = load_robot("tx40")
+    rows = round(MEASURED_END_S / MEASURED_PERIOD)
+    position, torque = (_columns(folder / name, robot.n)[:rows] for name in (MEASURED_POSITIONS, MEASURED_TORQUES))
+    if position.shape != torque.shape:
+        raise DataError(f"{folder}: {len(position)} rows of positions, {len(torque)} of torques")
+    ratios = robot.transmission_matrix
+    q = np.asarray(np.linalg.solve(ratios, position.T).T, dtype=np.float64)
+    return Recorded(robot, Experiment(q=q, tau=torque @ ratios, q_ref=None, dt=MEASURED_PERIOD), {})
+
+
+def _columns(file: Path, n: int) -> NDArray[np.float64]:
+    try:
+        values = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read: {error}") from error
+    except ValueError as error:
+        raise DataError(f"{file}: {error}") from error
+    if values.shape[1] != n or not np.isfinite(values).all():
+        raise DataError(f"{file}: expected {n} columns of finite numbers, found {values.shape[1]}")
+    return np.asarray(values, dtype=np.float64)
