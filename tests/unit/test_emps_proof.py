@@ -17,18 +17,25 @@ from scipy.io import loadmat
 
 from configs import RobotConfig, load_robot
 from configs.robot import Effect
+from identify.controller.crc import identify_crc
+from identify.controller.parametric import identify_parametric
 from identify.discrepancy.catalogue import effect_names, effect_regressor
+from identify.estimators.auxiliary import AuxiliaryModel
+from identify.estimators.didim import didim
+from identify.estimators.idim_iv import idim_iv
 from identify.estimators.idim_ls import idim_ls
 from identify.experiment import Experiment
 from identify.model.arm import ArmModel
 from identify.model.controller import DiscreteController
 from identify.model.simulation import Simulation, simulate
 from identify.options import Options
-from identify.preparation import published_equations
+from identify.preparation import equations, published_equations
 from identify.result import relative_errors
 from identify.run import identify_experiment
 from identify.signals.bandpass import butterworth, central_difference
 from identify.signals.classical import chebyshev_decimate
+from identify.signals.decimate import design
+from identify.signals.differentiate import differentiate
 
 Floats = NDArray[np.float64]
 
@@ -232,3 +239,36 @@ def test_idim_piv_on_both_recordings_together_stays_with_the_published_fit(plain
     # The rigid model with symmetric friction misses 4.1 % of the force of the one and 6.0 % of that of the other.
     np.testing.assert_allclose(found.theta[:3], PUBLISHED[:3], rtol=0.04)
     assert found.relative_error_pct < 6.0
+
+
+def test_a_controller_response_from_the_tracking_error_alone_is_enough_for_idim_iv_and_not_for_didim(
+    plain: Axis,
+) -> None:
+    # Thesis section 5.3.3. The drive is a cascade: no response from the tracking error alone is its law.
+    robot = load_robot("emps")
+    model = ArmModel.from_config(robot)
+    signals = differentiate(plain.q, DT, "irwsm", None, 20.0)
+    decimation = design(DT, 40.0)
+    blocks = equations(model, [plain.experiment], [signals], decimation)
+    signal_side = ([plain.q], [plain.q_ref], [plain.force], DT)
+    exact = identify_parametric(*signal_side)
+    short = identify_crc(*signal_side, length=3, velocity_loop=False)
+    assert short.responses[0].fit_pct < 95.0 < 99.99 < exact.responses[0].fit_pct
+    found = {}
+    for name, controller in (("exact", exact.controller), ("short", short.controller)):
+        for method in (idim_iv, didim):
+            auxiliary = AuxiliaryModel(
+                model,
+                controller,
+                [plain.q_ref],
+                [(signals.q[0], signals.qd[0])],
+                DT,
+                decimation,
+                3.0 * np.abs(signals.qd).max(axis=0),
+            )
+            found[name, method.__name__] = method(blocks, auxiliary, PUBLISHED.copy())
+    std = found["exact", "idim_iv"].std
+    viscous = {key: estimate.theta[1] for key, estimate in found.items()}
+    assert abs(viscous["short", "idim_iv"] - viscous["exact", "idim_iv"]) < std[1]
+    assert abs(viscous["exact", "didim"] - viscous["exact", "idim_iv"]) < 2 * std[1]
+    assert abs(viscous["short", "didim"] - viscous["exact", "didim"]) > 10 * std[1]
