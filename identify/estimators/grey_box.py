@@ -42,7 +42,7 @@ class InverseController:
     def of(cls, auxiliary: AuxiliaryModel, order: int) -> Self:
         """The inverse of the auxiliary model's controller at its decimated rate, ``D_j`` of at most this order."""
         gain = controller_gain(auxiliary.controller, auxiliary.decimation.factor)
-        inverse: NDArray[np.float64] = np.linalg.inv(auxiliary.model.robot.transmission_matrix)
+        inverse = np.asarray(np.linalg.inv(auxiliary.model.robot.transmission_matrix), dtype=np.float64)
         return cls(inverse, tuple(fit_spectrum(1.0 / row**2, order) for row in gain))
 
     def __call__(self, blocks: Sequence[Block]) -> list[Block]:

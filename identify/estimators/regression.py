@@ -21,6 +21,9 @@ ITERATIONS = 20
 TOLERANCE = 1e-4
 """Relative change of theta and of the residual norm that ends the iterations; far below one standard deviation."""
 
+EXACT = 1e-10
+"""Relative change of theta that ends the iterations whatever the residual does: data without noise leave rounding."""
+
 MAX_AR_ORDER = 60
 """Highest order of the noise models that is tried."""
 
@@ -325,6 +328,8 @@ def iterate(
         theta, norm = new, new_norm
         if norm < least:
             best, least = theta, norm
+        if change < EXACT:
+            return Iterations(theta, k, True, f"theta changed by {change:.1e} (relative), which is rounding")
         if change < tolerance and drift < tolerance:
             reason = f"theta changed by {change:.1e} and the residual norm by {drift:.1e} (relative)"
             return Iterations(theta, k, True, reason)

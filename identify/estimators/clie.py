@@ -1,0 +1,42 @@
+"""CLIE: closed-loop input error, measured against simulated torques (thesis section 4.1.1)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.estimators.auxiliary import AuxiliaryModel
+from identify.estimators.output_error import output_error
+from identify.estimators.regression import ITERATIONS, Block, Estimate
+
+
+def clie(
+    blocks: Sequence[Block],
+    auxiliary: AuxiliaryModel,
+    start: NDArray[np.float64],
+    iterations: int = ITERATIONS,
+) -> Estimate:
+    """Minimise the input error ``tau - tau_s`` (4.3, 4.4).
+
+    Parameters
+    ----------
+    blocks
+        Filtered and decimated equations; of them only the torques are used, and which equations to keep.
+    auxiliary
+        The simulated closed loop with the true controller; its torques pass the same filter.
+    start
+        First theta, shape (b,).
+    iterations
+        Most steps; each costs one simulation, and b more where the sensitivities are renewed.
+
+    Returns
+    -------
+    Estimate
+        Its covariance is that of the Jacobian under serially uncorrelated residuals.
+
+    Raises
+    ------
+    DataError
+        If the closed loop cannot be simulated with ``start``.
+    """
+    return output_error(lambda r: r.torque, [b.y for b in blocks], blocks, auxiliary.fresh(), start, iterations)

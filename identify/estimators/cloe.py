@@ -1,0 +1,50 @@
+"""CLOE: closed-loop output error, measured against simulated positions (thesis section 4.1.1)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import DataError
+from identify.estimators.auxiliary import AuxiliaryModel
+from identify.estimators.output_error import output_error
+from identify.estimators.regression import ITERATIONS, Block, Estimate
+
+
+def cloe(
+    blocks: Sequence[Block],
+    positions: Sequence[NDArray[np.float64]],
+    auxiliary: AuxiliaryModel,
+    start: NDArray[np.float64],
+    iterations: int = ITERATIONS,
+) -> Estimate:
+    """Minimise the output error ``q_m - q_s`` (4.1, 4.2).
+
+    Parameters
+    ----------
+    blocks
+        Filtered and decimated equations: which samples to keep, and torques that scale the perturbations.
+    positions
+        Measured joint positions after the same filter, one (M, n) array per experiment, rad or m.
+    auxiliary
+        The simulated closed loop with the true controller; its positions pass the same filter.
+    start
+        First theta, shape (b,).
+    iterations
+        Most steps; each costs one simulation, and b more where the sensitivities are renewed.
+
+    Returns
+    -------
+    Estimate
+        ``noise`` and ``residuals`` belong to the positions; the covariance is that of the Jacobian under
+        serially uncorrelated residuals.
+
+    Raises
+    ------
+    DataError
+        If the positions do not match the blocks, or the closed loop cannot be simulated with ``start``.
+    """
+    shapes, expected = [p.shape for p in positions], [b.y.shape for b in blocks]
+    if shapes != expected:
+        raise DataError(f"positions of shapes {shapes} do not belong to equations of shapes {expected}")
+    return output_error(lambda r: r.position, positions, blocks, auxiliary.fresh(), start, iterations)

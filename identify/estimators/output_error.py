@@ -1,0 +1,288 @@
+"""Output error methods on the simulated closed loop: the sensitivities and steps that CLIE and CLOE share (4.1.1)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from identify.estimators.auxiliary import AuxiliaryModel, Response
+from identify.estimators.didim import solve_didim
+from identify.estimators.noise import ArModel
+from identify.estimators.regression import (
+    TOLERANCE,
+    Block,
+    Estimate,
+    column_norms,
+    error_variances,
+    inverse_gram,
+    iterate,
+    weighted_rows,
+    whitened,
+)
+from identify.estimators.triangular import triangularize
+
+Array = NDArray[np.float64]
+Arrays = Sequence[Array]
+Signal = Callable[[Response], Arrays]
+
+DIFFERENCE = 0.01
+"""Finite-difference step in standard deviations that a parameter would have if all others were known.
+
+Forward differences are then right to 1e-4 of a column's norm (TX40), far below what an iteration needs.
+"""
+
+LEAST_TORQUE = 1e-3
+"""Torque error, as a share of a joint's torque, that standard deviations count with at least: noise-free data."""
+
+LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-12, 1e-3, 1e6
+"""Levenberg-Marquardt damping, of columns of norm one: none to speak of, after a Gauss-Newton step fails, the last."""
+
+AS_PREDICTED = 0.1
+"""Relative deviation of the error's decrease from its prediction within which the sensitivities are kept."""
+
+SMALL_SURPRISE = 1.0
+"""The same in squared standard deviations of one equation: a deviation too small to matter to any parameter."""
+
+NEAR = 3.0
+"""Standard deviations that theta may have moved since the sensitivities that its covariance is computed with."""
+
+
+def output_error(
+    signal: Signal,
+    measured: Arrays,
+    blocks: Sequence[Block],
+    auxiliary: AuxiliaryModel,
+    start: Array,
+    iterations: int,
+) -> Estimate:
+    """Minimise the weighted difference between measured and simulated signals (4.1 to 4.4).
+
+    A start as poor as CAD values is first brought near by pseudo-linear regression (4.22), one simulation per
+    iteration. Then Gauss-Newton steps with finite-difference sensitivities; Levenberg-Marquardt damping where one does
+    not lower the error or leads where the loop cannot be simulated. Weights 2.24 to 2.26 are those of the
+    last residuals.
+
+    Parameters
+    ----------
+    signal
+        Picks the compared signal of a response.
+    measured
+        The same signal measured, one (M, n) array per experiment.
+    blocks
+        Equations of the same samples: which of them to keep, and the torques.
+    auxiliary
+        The simulated closed loop, not yet used by another estimator.
+    start
+        First theta, shape (b,).
+    iterations
+        Most steps.
+
+    Raises
+    ------
+    DataError
+        If the closed loop cannot be simulated anywhere near ``start``.
+    """
+    search = _approach(signal, measured, blocks, auxiliary, start, iterations)
+    scale = search.variances()
+    keep = search.keep
+
+    def step(_: Array, _k: int) -> tuple[Array, float]:
+        search.step()
+        return search.theta, float(np.linalg.norm(weighted_rows(search.errors(), keep, scale)))
+
+    theta, done, converged, reason = iterate(step, search.theta, iterations)
+    if search.stuck:
+        converged, reason = False, "no step lowers the error although the sensitivities promise it"
+    noise = search.variances()
+    covariance = search.covariance(noise)
+    residuals = whitened(search.errors(), keep, noise)
+    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())
+
+
+def _approach(
+    signal: Signal,
+    measured: Arrays,
+    blocks: Sequence[Block],
+    auxiliary: AuxiliaryModel,
+    start: Array,
+    iterations: int,
+) -> "_Search":
+    """The better of the start and of what pseudo-linear regression makes of it."""
+    given = _Search(signal, measured, blocks, auxiliary, *auxiliary.reachable(start))
+    near, _ = solve_didim(blocks, auxiliary, given.theta, iterations)
+    found = _Search(signal, measured, blocks, auxiliary, *auxiliary.reachable(near.theta))
+    return min(given, found, key=_Search.log_likelihood_loss)
+
+
+def sensitivities(auxiliary: AuxiliaryModel, theta: Array, response: Response, steps: Array) -> list[Response]:
+    """Derivatives of the response with respect to each parameter, by forward differences: b simulations at once.
+
+    A perturbation that the loop does not survive is tried backwards, then smaller; one that it never survives leaves
+    zeros and a warning.
+
+    Parameters
+    ----------
+    theta, response
+        Where to differentiate, (b,), and what the loop does there.
+    steps
+        Perturbation of each parameter, shape (b,).
+    """
+    columns: list[Response | None] = [None] * theta.size
+    for factor in (1.0, -1.0, 0.1, -0.1):
+        missing = [i for i, column in enumerate(columns) if column is None]
+        perturbed = [theta + factor * steps[i] * np.eye(theta.size)[i] for i in missing]
+        for i, moved in zip(missing, auxiliary.respond_many(perturbed), strict=True):
+            if moved is not None:
+                columns[i] = _quotient(moved, response, factor * steps[i])
+    lost = [auxiliary.model.base.names[i] for i, column in enumerate(columns) if column is None]
+    if lost:
+        auxiliary.warnings.append(f"the closed loop does not survive the smallest change of {', '.join(lost)}")
+    return [_quotient(response, response, 1.0) if column is None else column for column in columns]
+
+
+def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequence[NDArray[np.bool_]]) -> Array:
+    """Finite-difference steps (b,) on the scale of each parameter's standard deviation.
+
+    Parameters
+    ----------
+    zeta
+        Filtered regressor at simulated signals, one (M, n, b) array per experiment.
+    torques, errors
+        Torques, and what of them is not explained, (M, n) each.
+    keep
+        Equations to use, (M, n).
+    """
+    noise = [
+        ArModel(np.empty(0), max(e.variance, LEAST_TORQUE**2 * y.variance), 0.0)
+        for e, y in zip(error_variances(errors, keep, 0), error_variances(torques, keep, 0), strict=True)
+    ]
+    return DIFFERENCE / column_norms(weighted_rows(zeta, keep, noise))
+
+
+def weighted_columns(columns: Sequence[Arrays], keep: Sequence[NDArray[np.bool_]], noise: Sequence[ArModel]) -> Array:
+    """Jacobian of 4.2 and 4.4 (rows, b): each column stacked joint by joint and weighted."""
+    return np.stack([weighted_rows(column, keep, noise) for column in columns], axis=1)
+
+
+def _quotient(moved: Response, response: Response, step: float) -> Response:
+    return Response(
+        tuple((a - b) / step for a, b in zip(moved.torque, response.torque, strict=True)),
+        tuple((a - b) / step for a, b in zip(moved.position, response.position, strict=True)),
+    )
+
+
+@dataclass
+class _Search:
+    """Where the minimisation stands: theta, its response, and the sensitivities last computed."""
+
+    signal: Signal
+    measured: Arrays
+    blocks: Sequence[Block]
+    auxiliary: AuxiliaryModel
+    theta: Array
+    response: Response
+    damping: float = 0.0
+    stuck: bool = False
+    _columns: list[Arrays] | None = None
+    _differentiated_at: Array | None = None
+
+    @property
+    def keep(self) -> list[NDArray[np.bool_]]:
+        return [block.keep for block in self.blocks]
+
+    def errors(self, response: Response | None = None) -> list[Array]:
+        simulated = self.signal(response or self.response)
+        return [m - s for m, s in zip(self.measured, simulated, strict=True)]
+
+    def variances(self) -> list[ArModel]:
+        return error_variances(self.errors(), self.keep, self.theta.size)
+
+    def log_likelihood_loss(self) -> float:
+        """``sum_j N_j log sigma_j^2``: joints of any unit and size compare."""
+        counts = np.sum([kept.sum(axis=0) for kept in self.keep], axis=0)
+        return float(counts @ np.log([ar.variance for ar in self.variances()]))
+
+    def step(self) -> None:
+        """One accepted step, with fresh sensitivities where the last ones no longer predict."""
+        noise = self.variances()
+        if self._columns is not None and self._accept(noise):
+            return
+        self._differentiate()
+        self.stuck = not self._accept(noise) and self._step_left(noise) > TOLERANCE
+
+    def covariance(self, noise: Sequence[ArModel]) -> Array:
+        """``(Psi' W Psi)^-1`` with the sensitivities at theta; infinite where a sensitivity is zero."""
+        b = self.theta.size
+        for _ in range(2):
+            covariance = np.diag(np.full(b, np.inf))
+            if self._columns is not None and self._differentiated_at is not None:
+                psi = weighted_columns(self._columns, self.keep, noise)
+                felt = np.flatnonzero(psi.any(axis=0))
+                covariance[np.ix_(felt, felt)] = inverse_gram(psi[:, felt])
+                moved = np.abs(self.theta - self._differentiated_at)
+                if (moved <= NEAR * np.sqrt(np.diag(covariance))).all():
+                    break
+            self._differentiate()
+        return covariance
+
+    def _differentiate(self) -> None:
+        torques = [b.y for b in self.blocks]
+        errors = [y - t for y, t in zip(torques, self.response.torque, strict=True)]
+        steps = difference_steps(self.auxiliary.instruments(self.theta), torques, errors, self.keep)
+        responses = sensitivities(self.auxiliary, self.theta, self.response, steps)
+        self._columns = [self.signal(column) for column in responses]
+        self._differentiated_at = self.theta
+
+    def _factors(self, noise: Sequence[ArModel]) -> tuple[Array, Array, Array]:
+        """Triangular factor of the normalised Jacobian, projected residuals, and the columns' norms."""
+        assert self._columns is not None
+        psi = weighted_columns(self._columns, self.keep, noise)
+        norms = column_norms(psi)
+        top = triangularize(psi / norms, weighted_rows(self.errors(), self.keep, noise), columns=norms.size)
+        return top[:, :-1], top[:, -1], norms
+
+    def _step_left(self, noise: Sequence[ArModel]) -> float:
+        """Relative change of theta that the sensitivities still ask for."""
+        factor, projected, norms = self._factors(noise)
+        delta = _damped(factor, projected, LEAST_DAMPING)
+        return np.inf if delta is None else float(np.linalg.norm(delta / norms) / np.linalg.norm(self.theta))
+
+    def _cost(self, errors: Arrays, noise: Sequence[ArModel]) -> float:
+        rows = weighted_rows(errors, self.keep, noise)
+        return float(rows @ rows)
+
+    def _accept(self, noise: Sequence[ArModel]) -> bool:
+        """Go the first step, from Gauss-Newton's to the most damped, that lowers the error; false if none does."""
+        factor, projected, norms = self._factors(noise)
+        cost = self._cost(self.errors(), noise)
+        damping = self.damping
+        while damping <= MOST_DAMPING:
+            delta = _damped(factor, projected, damping)
+            response = None if delta is None else self.auxiliary.respond(self.theta + delta / norms)
+            if response is not None and delta is not None:
+                lower = cost - self._cost(self.errors(response), noise)
+                if lower > 0.0:
+                    self.theta, self.response = self.theta + delta / norms, response
+                    predicted = float(projected @ projected - np.sum((projected - factor @ delta) ** 2))
+                    surprise = abs(lower - predicted)
+                    if damping > 0.0 or surprise > max(AS_PREDICTED * predicted, SMALL_SURPRISE):
+                        self._columns = None
+                    self.damping = damping / 10.0 if damping > FIRST_DAMPING else 0.0
+                    return True
+            damping = max(10.0 * damping, FIRST_DAMPING)
+        return False
+
+
+def _damped(factor: Array, projected: Array, damping: float) -> Array | None:
+    """Minimise ``|projected - factor delta|^2 + damping |delta|^2``; ``None`` where that has no single solution."""
+    b = projected.size
+    if damping > 0.0:
+        rows = np.vstack([factor, np.sqrt(damping) * np.eye(b)])
+        top = triangularize(rows, np.append(projected, np.zeros(b)), columns=b)
+        factor, projected = top[:, :b], top[:, b]
+    if not np.diag(factor).all():
+        return None
+    delta: Array = linalg.solve_triangular(factor, projected)
+    return delta if np.isfinite(delta).all() else None
