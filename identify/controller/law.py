@@ -227,6 +227,7 @@ def taps(structure: Structure, theta: Array, dt: float) -> tuple[Array, Array, A
 UNITS = {
     "kp": "1/s",
     "kv": "drive unit per motor speed",
+    "stiffness": "drive unit per motor position",
     "error_delay": "samples",
     "velocity_delay": "samples",
     "ti": "s",
@@ -235,7 +236,7 @@ UNITS = {
     "corner": "Hz",
     "added": "1",
 }
-"""Of the gains; speeds and accelerations are in rad or m and s."""
+"""Of the gains; motor positions, speeds and accelerations are in rad or m and s."""
 
 
 def gains(structure: Structure, theta: Array, dt: float, unit: float) -> dict[str, float]:
@@ -253,9 +254,10 @@ def gains(structure: Structure, theta: Array, dt: float, unit: float) -> dict[st
     Returns
     -------
     dict
-        ``kp``, ``kv``, ``error_delay`` and ``velocity_delay`` (mean age of what the torque answers to; a backward
-        difference is half a sample old), and, where the structure has them, ``ti`` (reset time), ``corner`` of the
-        filter, ``velocity_feedforward`` (share), ``acceleration_feedforward`` and ``added`` (share).
+        ``kp``, ``kv``, ``stiffness`` (their product), ``error_delay`` and ``velocity_delay`` (mean age of what the
+        torque answers to; a backward difference is half a sample old), and, where the structure has them, ``ti`` (reset
+        time), ``corner`` of the filter, ``velocity_feedforward`` (share), ``acceleration_feedforward`` and ``added``
+        (share).
     """
     value, pole = _levels(structure, theta), structure.pole(theta)
     lags = range(structure.velocity_taps)
@@ -264,6 +266,7 @@ def gains(structure: Structure, theta: Array, dt: float, unit: float) -> dict[st
     found = {
         "kp": value["e"] / kv,
         "kv": kv / unit,
+        "stiffness": value["e"] / unit,
         "error_delay": structure.delay + (late if structure.filtered == "command" else 0.0),
         "velocity_delay": structure.delay + 0.5 + sum(i * value[f"v{i}"] for i in lags) / kv + late,
     }

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from configs import DataError
 from identify.controller.crc import HELD_OUT, IdentifiedController, JointResponse
-from identify.controller.law import UNITS, Array, Stretch, Structure, gains, simulate_law, taps
+from identify.controller.law import UNITS, Array, Stretch, Structure, gains, loop_ratios, simulate_law, taps
 from identify.controller.riv import LawFit, fit_law, refined_iv
 from identify.model.controller import DiscreteController
 
@@ -283,6 +283,8 @@ def _held_out_fit(stretches: Sequence[Stretch], structure: Structure, dt: float)
 
 def _gains_with_deviations(structure: Structure, fit: LawFit, dt: float, unit: float) -> dict[str, Gain]:
     """Standard deviations to first order from the covariance of the fit."""
+    if loop_ratios(structure, fit.theta) == (0.0, 0.0):
+        raise DataError(f"its torque does not answer to the velocity ({structure})")
     nominal = gains(structure, fit.theta, dt, unit)
     slopes = np.zeros((len(nominal), structure.size))
     for k, step in enumerate(1e-3 * np.sqrt(np.diag(fit.covariance))):

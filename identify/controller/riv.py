@@ -187,7 +187,8 @@ def _instrumental(rows: Sequence[_Rows], noise: ArModel, structure: Structure) -
     scale = np.sqrt(np.maximum(np.diag(zz), 1e-300))
     weights = np.outer(scale, scale)
     zx, zz = zx / weights, zz / weights
-    if max(np.linalg.cond(zz), np.linalg.cond(zx)) > LARGEST_CONDITION:
+    finite = bool(np.isfinite(zx).all() and np.isfinite(zz).all())
+    if not finite or max(np.linalg.cond(zz), np.linalg.cond(zx)) > LARGEST_CONDITION:
         raise DataError(f"the motion does not determine a law of this structure ({structure})")
     solution: Array = np.linalg.solve(zx, zy / scale) / scale
     covariance: Array = np.linalg.inv(zz) / weights

@@ -105,6 +105,7 @@ def test_structure_and_gains_of_a_drive_are_found(drive: Drive, structure: Struc
     assert law.converged
     assert value(law, "kp") == pytest.approx(drive.kp, rel=2e-3)
     assert value(law, "kv") == pytest.approx(drive.kv, rel=2e-3)
+    assert value(law, "stiffness") == pytest.approx(drive.kp * drive.kv, rel=2e-3)
     age = drive.late + drive.velocity_samples / 2 + drive.pole / (1 - drive.pole)
     assert value(law, "velocity_delay") == pytest.approx(age, abs=0.02)
     if drive.ti is not None:
@@ -265,3 +266,12 @@ def test_recorded_gains_of_emps_come_out_under_pulses_and_so_does_their_size(sha
     as_recorded = emps_law(data, force - pulses)
     assert value(as_recorded, "kp") == pytest.approx(data["kp"].item(), rel=0.02)
     assert value(as_recorded, "kv") == pytest.approx(data["kv"].item(), rel=0.02)
+
+
+def test_a_drive_without_velocity_loop_is_seen_as_a_stiffness() -> None:
+    rng = np.random.default_rng(1)
+    t = np.arange(3000) * DT
+    r, q = np.sin(3 * t), np.sin(3 * t - 0.1)
+    law = identified(Stretch(q, r, 5.0 * (r - q) + 0.01 * rng.standard_normal(t.size), np.zeros(t.size)))
+    assert abs(value(law, "stiffness") - 5.0) < 3 * law.gains["stiffness"].std < 0.05
+    assert abs(value(law, "kv")) < 3 * law.gains["kv"].std

@@ -26,6 +26,9 @@ from virtual_robot.servo import CONTROL_PERIOD, VELOCITY_FILTER_HZ, gains
 
 Floats = NDArray[np.float64]
 
+TABLE_5_12 = (10, 20, 3, 13, 10, 20)
+"""Lengths of the impulse responses in the thesis."""
+
 
 def value(law: ControlLaw, name: str) -> float:
     return law.gains[name].value
@@ -99,6 +102,19 @@ def test_closed_loop_with_the_identified_controller_moves_like_the_virtual_arm()
     assert np.linalg.norm(noisy.qd - signals.qd) < 0.05 * np.linalg.norm(signals.qd)
 
 
+def test_sizes_of_table_5_12_explain_as_much_as_those_the_data_choose() -> None:
+    experiment = recorded(1.0)
+    given = identify_crc(
+        *motor_side(experiment), experiment.dt, length=TABLE_5_12, velocity_loop=False, saturation=saturation(robot())
+    )
+    assert tuple(r.error_taps.size for r in given.responses) == TABLE_5_12
+    chosen = identify_crc(*motor_side(experiment), experiment.dt, saturation=saturation(robot()))
+    laws = identified_tx40(1.0).responses
+    for one, two, law in zip(given.responses, chosen.responses, laws, strict=True):
+        assert one.fit_pct == pytest.approx(two.fit_pct, abs=0.02)
+        assert one.fit_pct == pytest.approx(law.fit_pct, abs=0.02)
+
+
 def test_idim_iv_gives_the_same_with_parametric_and_correlated_controllers() -> None:
     # Tables 5.13 and 5.14: "C" and "CRC", here with the sizes of table 5.12, are equally good auxiliary models.
     experiment = recorded(1.0)
@@ -110,7 +126,7 @@ def test_idim_iv_gives_the_same_with_parametric_and_correlated_controllers() -> 
     crc = identify_crc(
         *motor_side(experiment),
         experiment.dt,
-        length=[10, 20, 3, 13, 10, 20],
+        length=TABLE_5_12,
         velocity_loop=False,
         saturation=saturation(robot()),
     )
