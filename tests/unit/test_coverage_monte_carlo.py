@@ -24,7 +24,7 @@ from tests.statistics.coverage import (
 
 LEVEL = 0.01
 """Probability of failing where the intervals are right, of each of the two tests on simulated recordings."""
-RUNS = 16
+RUNS = 12
 
 
 def drawn(understated: float, runs: int = 200, bias: float = 0.0) -> Runs:
