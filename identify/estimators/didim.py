@@ -13,12 +13,14 @@ from identify.estimators.regression import (
     Iterations,
     inverse_gram,
     iterate,
+    iv_covariance,
     joint_variances,
     least_squares,
     residual_norm,
     stacked,
     whitened_residuals,
 )
+from identify.estimators.sensitivity import torque_sensitivities
 
 
 def didim(
@@ -26,6 +28,8 @@ def didim(
     auxiliary: AuxiliaryModel,
     start: NDArray[np.float64],
     iterations: int = ITERATIONS,
+    *,
+    true_sensitivities: bool = False,
 ) -> Estimate:
     """Iterate least squares of the measured torque on the simulated regressor (2.36).
 
@@ -39,6 +43,14 @@ def didim(
         First theta of the auxiliary model, shape (b,).
     iterations
         Most iterations.
+    true_sensitivities
+        Covariance with the Jacobian of the simulated torque, for b more simulations.
+
+    Notes
+    -----
+    2.36 solves ``Z' W (y - tau_s) = 0``, so the estimate scatters by ``(Z' W Psi)^-1 Z' W Z (Psi' W Z)^-1`` with the
+    Jacobian ``Psi`` of ``tau_s``. 2.37 takes Z for ``Psi`` (4.22) and is too small where the loop follows its
+    reference loosely.
 
     Raises
     ------
@@ -48,7 +60,11 @@ def didim(
     auxiliary = auxiliary.fresh()
     (theta, done, converged, reason), simulated = solve_didim(blocks, auxiliary, start, iterations)
     noise = joint_variances(simulated, theta)
-    covariance = inverse_gram(stacked(simulated, noise)[0])  # 2.37
+    z, _y = stacked(simulated, noise)
+    if true_sensitivities:
+        covariance = iv_covariance(z, torque_sensitivities(auxiliary, theta, blocks, noise))
+    else:
+        covariance = inverse_gram(z)  # 2.37
     residuals = whitened_residuals(simulated, theta, noise)
     return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())
 

@@ -21,20 +21,10 @@ from identify.estimators.regression import (
     weighted_rows,
     whitened,
 )
+from identify.estimators.sensitivity import Array, Arrays, difference_steps, sensitivities, weighted_columns
 from identify.estimators.triangular import triangularize
 
-Array = NDArray[np.float64]
-Arrays = Sequence[Array]
 Signal = Callable[[Response], Arrays]
-
-DIFFERENCE = 0.01
-"""Finite-difference step in standard deviations that a parameter would have if all others were known.
-
-Forward differences are then right to 1e-4 of a column's norm (TX40), far below what an iteration needs.
-"""
-
-LEAST_TORQUE = 1e-3
-"""Torque error, as a share of a joint's torque, that standard deviations count with at least: noise-free data."""
 
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-12, 1e-3, 1e6
 """Levenberg-Marquardt damping, of columns of norm one: none to speak of, after a Gauss-Newton step fails, the last."""
@@ -114,63 +104,6 @@ def _approach(
     near, _ = solve_didim(blocks, auxiliary, given.theta, iterations)
     found = _Search(signal, measured, blocks, auxiliary, *auxiliary.reachable(near.theta))
     return min(given, found, key=_Search.log_likelihood_loss)
-
-
-def sensitivities(auxiliary: AuxiliaryModel, theta: Array, response: Response, steps: Array) -> list[Response]:
-    """Derivatives of the response with respect to each parameter, by forward differences: b simulations at once.
-
-    A perturbation that the loop does not survive is tried backwards, then smaller; one that it never survives leaves
-    zeros and a warning.
-
-    Parameters
-    ----------
-    theta, response
-        Where to differentiate, (b,), and what the loop does there.
-    steps
-        Perturbation of each parameter, shape (b,).
-    """
-    columns: list[Response | None] = [None] * theta.size
-    for factor in (1.0, -1.0, 0.1, -0.1):
-        missing = [i for i, column in enumerate(columns) if column is None]
-        perturbed = [theta + factor * steps[i] * np.eye(theta.size)[i] for i in missing]
-        for i, moved in zip(missing, auxiliary.respond_many(perturbed), strict=True):
-            if moved is not None:
-                columns[i] = _quotient(moved, response, factor * steps[i])
-    lost = [auxiliary.model.base.names[i] for i, column in enumerate(columns) if column is None]
-    if lost:
-        auxiliary.warnings.append(f"the closed loop does not survive the smallest change of {', '.join(lost)}")
-    return [_quotient(response, response, 1.0) if column is None else column for column in columns]
-
-
-def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequence[NDArray[np.bool_]]) -> Array:
-    """Finite-difference steps (b,) on the scale of each parameter's standard deviation.
-
-    Parameters
-    ----------
-    zeta
-        Filtered regressor at simulated signals, one (M, n, b) array per experiment.
-    torques, errors
-        Torques, and what of them is not explained, (M, n) each.
-    keep
-        Equations to use, (M, n).
-    """
-    noise = [
-        ArModel(np.empty(0), max(e.variance, LEAST_TORQUE**2 * y.variance), 0.0)
-        for e, y in zip(error_variances(errors, keep, 0), error_variances(torques, keep, 0), strict=True)
-    ]
-    return DIFFERENCE / column_norms(weighted_rows(zeta, keep, noise))
-
-
-def weighted_columns(columns: Sequence[Arrays], keep: Sequence[NDArray[np.bool_]], noise: Sequence[ArModel]) -> Array:
-    """Jacobian of 4.2 and 4.4 (rows, b): each column stacked joint by joint and weighted."""
-    return np.stack([weighted_rows(column, keep, noise) for column in columns], axis=1)
-
-
-def _quotient(moved: Response, response: Response, step: float) -> Response:
-    return Response(
-        tuple((a - b) / step for a, b in zip(moved.torque, response.torque, strict=True)),
-        tuple((a - b) / step for a, b in zip(moved.position, response.position, strict=True)),
-    )
 
 
 @dataclass
