@@ -24,8 +24,8 @@ from configs import DataError
 LOG10_NVR_RANGE = {2: (-12.0, 4.0), 3: (-14.0, 4.0)}
 """Where the ratio is searched; below, third-order factors lose definiteness (about 1e-16)."""
 
-SETTLED = 1e-14
-"""Relative change below which the pivots of a Toeplitz band count as constant."""
+SETTLED = 40.0
+"""Time constants, ``NVR^(-1 / (2 order))`` samples, after which the factors of the band are constant to rounding."""
 
 _STENCIL = {2: np.array([1.0, -2.0, 1.0]), 3: np.array([-1.0, 3.0, -3.0, 1.0])}
 
@@ -82,7 +82,7 @@ def negative_log_likelihood(y: NDArray[np.float64], order: int, nvr: float) -> f
     Equals ``(N - order) log(s2) + sum log nu(k)`` of a Kalman filter started from a diffuse state.
     """
     w = np.diff(_checked(y, order), n=order)
-    return float(_profile(w, _band(order, nvr)))
+    return float(_profile(w, _band(order, nvr), _transient(order, nvr)))
 
 
 def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
@@ -108,7 +108,7 @@ def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> 
     w = _scaled_differences(y, order)
     if w is None:
         return 1.0
-    return _search(lambda nvr: float(_profile(w, _band(order, nvr))), order, tolerance)
+    return _search(lambda nvr: float(_profile(w, _band(order, nvr), _transient(order, nvr))), order, tolerance)
 
 
 def cross_validation(y: NDArray[np.float64], order: int, nvr: float) -> float:
@@ -156,7 +156,7 @@ def kept_share(order: int, nvr: float) -> float:
 
 
 def _score(w: NDArray[np.float64], order: int, nvr: float) -> float:
-    squares = float(_residual_sum(w, _band(order, nvr), _STENCIL[order]))
+    squares = float(_residual_sum(w, _band(order, nvr), _STENCIL[order], _transient(order, nvr)))
     return float(np.log(squares) - 2 * np.log(1 - kept_share(order, nvr)))
 
 
@@ -206,6 +206,11 @@ def _band(order: int, nvr: float) -> NDArray[np.float64]:
     return band
 
 
+def _transient(order: int, nvr: float) -> int:
+    """Samples after which the factors of the Toeplitz band no longer change: they converge as ``exp(-k / tau)``."""
+    return int(SETTLED * nvr ** (-0.5 / order)) + 10
+
+
 @numba.njit(cache=True)
 def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
     """Row i of ``V = L diag(d) L'``: fills ``low[i % p]`` (distance 1..p) and returns d_i; rings of length p."""
@@ -221,16 +226,14 @@ def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _profile(w, band):  # type: ignore[no-untyped-def]
+def _profile(w, band, transient):  # type: ignore[no-untyped-def]
     """``m log(w' V^-1 w) + log|V|`` in one forward sweep; the factors of a Toeplitz band become constant."""
     m, p = w.size, band.size - 1
     d, low, z = np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.zeros(p + 1)
-    quadratic, logdet, pivot, steady, i = 0.0, 0.0, 1.0, 0, 0
-    while i < m and steady <= p:
-        before = pivot
+    quadratic, logdet, pivot, i = 0.0, 0.0, 1.0, 0
+    while i < min(m, transient):
         pivot = _row(band, d, low, i, p)
         d[i % (p + 1)] = pivot
-        steady = steady + 1 if abs(pivot - before) <= SETTLED * pivot else 0
         value = w[i]
         for k in range(1, min(p, i) + 1):
             value -= low[i % (p + 1), k] * z[(i - k) % (p + 1)]
@@ -282,26 +285,21 @@ def _correction(w, band, stencil):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _residual_sum(w, band, stencil):  # type: ignore[no-untyped-def]
+def _residual_sum(w, band, stencil, transient):  # type: ignore[no-untyped-def]
     """``|D' V^-1 w|^2``; as in :func:`_profile` the factors of a Toeplitz band become constant."""
     m, p = w.size, band.size - 1
     d, low, z = np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.empty(m)
-    # Rows of the factor until they are constant; row `last` stands for all that follow.
+    # Row `last` of the factor stands for all that follow.
     pivots, rows = np.empty(m), np.zeros((m, p + 1))
-    pivot, steady, last = 1.0, 0, -1
-    while last + 1 < m and steady <= p:
-        i = last + 1
-        before = pivot
-        pivot = _row(band, d, low, i, p)
-        d[i % (p + 1)] = pivot
-        steady = steady + 1 if abs(pivot - before) <= SETTLED * pivot else 0
-        pivots[i] = pivot
+    last = min(m, transient) - 1
+    for i in range(last + 1):
+        pivots[i] = _row(band, d, low, i, p)
+        d[i % (p + 1)] = pivots[i]
         value = w[i]
         for k in range(1, min(p, i) + 1):
             rows[i, k] = low[i % (p + 1), k]
             value -= rows[i, k] * z[i - k]
         z[i] = value
-        last = i
     l1, l2 = rows[last, 1], rows[last, 2]
     l3 = rows[last, 3] if p == 3 else 0.0
     if last + 1 < m:

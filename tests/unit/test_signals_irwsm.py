@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from configs import DataError
 from identify.signals.irwsm import (
+    automatic_nvr,
     cross_validated_nvr,
     cross_validation,
     irwsm,
@@ -88,6 +89,23 @@ def test_cross_validation_score_equals_the_dense_definition(order: int, nvr: flo
     # The trace is that of a series without ends, which add about as many degrees of freedom as the order.
     assert cross_validation(y, order, nvr) == pytest.approx(score, abs=4 * order / y.size)
     assert kept_share(order, nvr) == pytest.approx(np.trace(smoother) / y.size, abs=order / y.size)
+
+
+@pytest.mark.parametrize(("order", "nvr"), [(2, 1e-6), (2, 1.0), (3, 1e-8), (3, 1.0)])
+def test_score_of_a_series_longer_than_the_transient_equals_that_of_its_smoother(order: int, nvr: float) -> None:
+    # Beyond the transient the factors are taken as constant; the smoother itself computes every row.
+    y = noisy_sine(20000)
+    squares = np.sum((y - irwsm(y, order, nvr).level) ** 2)
+    score = np.log(squares) - 2 * np.log(1 - kept_share(order, nvr))
+    assert cross_validation(y, order, nvr) == pytest.approx(score, abs=1e-6)
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_automatic_ratio_is_the_smoother_of_two(order: int) -> None:
+    y = noisy_sine(5000)
+    validated, likeliest = cross_validated_nvr(y, order), optimal_nvr(y, 3)
+    assert automatic_nvr(y, order) == min(validated, likeliest ** (order / 3))
+    assert automatic_nvr(np.full(1000, 1.25), order) == 1.0
 
 
 @pytest.mark.parametrize("order", [2, 3])
