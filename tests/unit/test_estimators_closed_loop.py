@@ -20,15 +20,16 @@ from identify.estimators.sensitivity import sensitivity
 from identify.estimators.sep_pem import sep_pem
 from tests.unit.two_joint_arm import Recorded, masked, model, recorded, start
 
-METHODS: dict[str, Callable[[Recorded], Estimate]] = {
-    "idim-ls": lambda data: idim_ls(data.blocks, model().base.names),
-    "idim-iv": lambda data: idim_iv(data.blocks, data.loop, start()),
-    "idim-piv": lambda data: idim_piv(data.blocks, data.loop, start()),
-    "grey-box idim-piv": lambda data: idim_piv(data.blocks, data.loop, start(), grey_box=True),
-    "didim": lambda data: didim(data.blocks, data.loop, start()),
-    "sep-pem": lambda data: sep_pem(data.blocks, data.loop, start()),
-    "clie": lambda data: clie(data.blocks, data.loop, start()),
-    "cloe": lambda data: cloe(data.blocks, data.positions, data.loop, start()),
+Start = NDArray[np.float64]
+METHODS: dict[str, Callable[[Recorded, Start], Estimate]] = {
+    "idim-ls": lambda data, _: idim_ls(data.blocks, model().base.names),
+    "idim-iv": lambda data, start: idim_iv(data.blocks, data.loop, start),
+    "idim-piv": lambda data, start: idim_piv(data.blocks, data.loop, start),
+    "grey-box idim-piv": lambda data, start: idim_piv(data.blocks, data.loop, start, grey_box=True),
+    "didim": lambda data, start: didim(data.blocks, data.loop, start),
+    "sep-pem": lambda data, start: sep_pem(data.blocks, data.loop, start),
+    "clie": lambda data, start: clie(data.blocks, data.loop, start),
+    "cloe": lambda data, start: cloe(data.blocks, data.positions, data.loop, start),
 }
 ITERATIVE = [name for name in METHODS if name != "idim-ls"]
 UNFILTERED = ["idim-ls", "idim-iv", "didim", "clie", "cloe"]
@@ -37,7 +38,7 @@ UNFILTERED = ["idim-ls", "idim-iv", "didim", "clie", "cloe"]
 @pytest.mark.parametrize("method", METHODS)
 def test_without_noise_the_truth_comes_back_from_a_start_without_friction_or_gravity(method: str) -> None:
     data = recorded()
-    found = METHODS[method](data)
+    found = METHODS[method](data, start())
     assert found.converged
     # Iterations end at a relative change of 1e-4, and the steps before it are superlinear.
     np.testing.assert_allclose(found.theta, data.truth, atol=1e-6)
@@ -51,15 +52,17 @@ def test_equations_that_are_left_out_do_not_count(method: str) -> None:
     spoilt_positions = data.positions[0].copy()
     spoilt_positions[~data.blocks[0].keep] += 1.0
     data = replace(data, blocks=[replace(data.blocks[0], y=spoilt)], positions=[spoilt_positions])
-    np.testing.assert_allclose(METHODS[method](data).theta, data.truth, atol=1e-6)
+    np.testing.assert_allclose(METHODS[method](data, start()).theta, data.truth, atol=1e-6)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_two_experiments_without_noise_give_the_truth(method: str) -> None:
     a, b = recorded(), recorded(seconds=4.0)
-    loop = replace(a.loop, references=[*a.loop.references, *b.loop.references], initial=a.loop.initial + b.loop.initial)
+    loop = replace(
+        a.loop, references=[*a.loop.references, *b.loop.references], initial=[*a.loop.initial, *b.loop.initial]
+    )
     both = Recorded(a.blocks + b.blocks, a.positions + b.positions, loop, a.truth)
-    np.testing.assert_allclose(METHODS[method](both).theta, a.truth, atol=1e-6)
+    np.testing.assert_allclose(METHODS[method](both, start()).theta, a.truth, atol=1e-6)
 
 
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "clie"])
@@ -69,7 +72,7 @@ def test_standard_deviations_are_those_of_the_scatter(method: str) -> None:
     for seed in range(12):
         data = recorded(seconds=3.0, seed=seed, torque_noise=0.5, cutoff_hz=None)
         thinned = thin(data, 10)
-        found = METHODS[method](thinned)
+        found = METHODS[method](thinned, start())
         deviations.append((found.theta - data.truth) / found.std)
     # 156 deviations, some correlated: their mean square is 1 within about 0.15.
     assert 0.75 < np.sqrt(np.mean(np.square(deviations))) < 1.25
@@ -193,20 +196,10 @@ def test_position_is_far_less_sensitive_than_torque() -> None:
 @pytest.mark.parametrize("method", ITERATIVE)
 def test_a_start_that_cannot_be_simulated_is_refused_or_led_back_to_the_anchor(method: str) -> None:
     data = recorded(torque_noise=1.0)
-    impossible = replace(data, loop=replace(data.loop, anchor=None))
     negative = -np.abs(start())
-    run = {
-        "idim-iv": lambda d: idim_iv(d.blocks, d.loop, negative),
-        "idim-piv": lambda d: idim_piv(d.blocks, d.loop, negative),
-        "grey-box idim-piv": lambda d: idim_piv(d.blocks, d.loop, negative, grey_box=True),
-        "didim": lambda d: didim(d.blocks, d.loop, negative),
-        "sep-pem": lambda d: sep_pem(d.blocks, d.loop, negative),
-        "clie": lambda d: clie(d.blocks, d.loop, negative),
-        "cloe": lambda d: cloe(d.blocks, d.positions, d.loop, negative),
-    }[method]
     with pytest.raises(DataError, match="cannot be simulated"):
-        run(impossible)
-    found = run(replace(data, loop=replace(data.loop, anchor=start())))
+        METHODS[method](data, negative)
+    found = METHODS[method](replace(data, loop=replace(data.loop, anchor=start())), negative)
     assert any("not physical" in warning for warning in found.warnings)
     assert (np.abs(found.theta - data.truth) < 5 * found.std + 1e-9).all()
 
@@ -230,7 +223,7 @@ def test_hopeless_noise_ends_with_numbers_and_without_an_exception(method: str) 
     y: NDArray[np.float64] = block.y + 500.0 * rng.standard_normal(block.y.shape)
     x = block.x * (1 + rng.standard_normal(block.x.shape))
     positions = [data.positions[0] + rng.standard_normal(data.positions[0].shape)]
-    found = METHODS[method](replace(data, blocks=[replace(block, y=y, x=x)], positions=positions))
+    found = METHODS[method](replace(data, blocks=[replace(block, y=y, x=x)], positions=positions), start())
     assert np.isfinite(found.theta).all()
     assert (found.std > 0).all()
-    assert found.warnings or found.converged or found.stop_reason
+    assert found.converged or found.stop_reason.startswith(("stopped after", "the equations of", "no step"))

@@ -98,7 +98,8 @@ def recorded(
     decimation = design(DT, CUTOFF_HZ if cutoff_hz is None else cutoff_hz, 1 if cutoff_hz is None else None)
     y = decimation(aligned_torque(tau))
     x = filtered_regressor(arm, Derivatives(run.q, run.qd, run.qdd, None), decimation)
-    blocks = [Block(y, x, np.ones(y.shape, dtype=np.bool_), decimation.instants(t.size) * DT)]
+    instants = np.asarray(decimation.instants(t.size) * DT, dtype=np.float64)
+    blocks = [Block(y, x, np.ones(y.shape, dtype=np.bool_), instants)]
     loop = AuxiliaryModel(
         arm, controller, [q_ref], [(run.q[0], run.qd[0])], DT, decimation, 3 * np.abs(run.qd).max(axis=0)
     )
