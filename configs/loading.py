@@ -161,7 +161,8 @@ def _first_problem(error: ValidationError, kind: type[BaseModel], data: dict[str
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     if first["type"] == "extra_forbidden":
         missing = [str(p["loc"][-1]) for p in problems if p["type"] == "missing"]
-        near = difflib.get_close_matches(str(first["loc"][-1]), missing + sorted(_keys(kind)), n=1)
+        offered = _keys(kind) | (_keys(UrdfGeometry) if kind is RobotConfig else set())
+        near = difflib.get_close_matches(str(first["loc"][-1]), missing + sorted(offered), n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         return f"{key}: unknown key{hint}{more}"
     value = first.get("input")

@@ -93,7 +93,7 @@ def in_our_frames(bodies: list[Any], theirs_in_ours: Floats) -> Floats:
     return np.array([body.toDynamicParameters()[np.argsort(TO_OURS)] for body in placed])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(chains)
 def test_a_urdf_has_the_dynamics_that_pinocchio_reads_from_it(
     tmp_path_factory: pytest.TempPathFactory, chain: tuple[int, int, bool]
@@ -153,7 +153,7 @@ def test_rules_and_qr_find_the_same_base_parameters(right_angles: bool, seed: in
 
 
 @pytest.mark.parametrize("right_angles", [True, False])
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 7))
 def test_rules_and_qr_find_the_same_base_parameters_of_a_urdf(
     tmp_path_factory: pytest.TempPathFactory, right_angles: bool, seed: int, n: int

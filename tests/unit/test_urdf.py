@@ -283,6 +283,13 @@ def test_a_mistake_in_the_configuration_is_named_with_its_key(tmp_path: Path, ke
     assert "\n" not in str(caught.value)
 
 
+def test_a_misspelt_urdf_key_is_recognised(tmp_path: Path) -> None:
+    file = configuration(tmp_path, 2)
+    file.write_text(file.read_text().replace("urdf:", "urdff:"))
+    with pytest.raises(ConfigError, match=r"urdff: unknown key; did you mean 'urdf'\?"):
+        load_robot(file)
+
+
 def test_a_missing_urdf_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"arm\.yaml: urdf\.file: no such file arm\.urdf"):
         load_robot(configuration(tmp_path, 2))
