@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from identify.reproduction.emps_derivatives import Row, table_5_2
 from identify.reproduction.laboratory import Case, Laboratory, Method, Run
+from identify.reproduction.recordings import Recorded
 from identify.reproduction.reference import reference_tables
 from identify.reproduction.tables import Cell, Column, Source, Table
 
@@ -22,12 +23,15 @@ class Bench:
         The virtual TX40.
     measured
         The measured one, without reference and controller; ``None``: not at hand.
+    emps
+        The measured EMPS; ``None``: not at hand.
     simulations
         Noise realisations of the simulated EMPS.
     """
 
     virtual: Laboratory
     measured: Laboratory | None = None
+    emps: Recorded | None = None
     simulations: int = SIMULATIONS
 
     def emps_derivatives(self) -> list[Row]:

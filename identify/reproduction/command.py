@@ -10,7 +10,7 @@ from identify.reproduction.bench import SIMULATIONS, SIMULATIONS_QUICK, Bench, T
 from identify.reproduction.claims import Claim, judged
 from identify.reproduction.laboratory import Laboratory
 from identify.reproduction.printing import document, markdown, print_tables
-from identify.reproduction.recordings import measured_recording, virtual_recording
+from identify.reproduction.recordings import measured_emps, measured_recording, virtual_recording
 from identify.reproduction.tables import Table
 from identify.terminal import Report, progress
 
@@ -34,7 +34,8 @@ def reproduce_command(
     tables
         Numbers with commas between them; ``None``: all, with ``quick`` all but the slow ones.
     measured
-        Folder of the measured TX40; its columns stand beside those of the virtual one where it can have any.
+        Folder with the measured TX40, whose columns stand beside those of the virtual one where it can have any, and
+        perhaps the measured EMPS, for claim 5; see ``measured_recording`` and ``measured_emps``.
     out
         Folder for ``reproduce.json``, ``reproduce.md`` and the recordings; ``None``: ``reproduction``.
     quick
@@ -91,8 +92,12 @@ def make_bench(folder: Path, measured: Path | None = None, *, quick: bool = Fals
     if measured is not None:
         recorded = measured_recording(measured)
         real = Laboratory(lambda: recorded)
-    virtual = Laboratory(lambda: virtual_recording(folder / "recordings"))
-    return Bench(virtual, real, SIMULATIONS_QUICK if quick else SIMULATIONS)
+    return Bench(
+        virtual=Laboratory(lambda: virtual_recording(folder / "recordings")),
+        measured=real,
+        emps=None if measured is None else measured_emps(measured),
+        simulations=SIMULATIONS_QUICK if quick else SIMULATIONS,
+    )
 
 
 def reproduce(

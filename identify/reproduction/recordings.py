@@ -12,6 +12,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.io import loadmat
 
 from configs import ArmidentError, ConfigError, DataError, RobotConfig, config_path, load_robot, load_session
 from daq.recording import read_recording
@@ -27,6 +28,7 @@ MEASURED_POSITIONS, MEASURED_TORQUES = "pos_read_data.csv", "curr_data.csv"
 MEASURED_PERIOD = 2e-4
 MEASURED_END_S = 7.5
 """The measured arm stands still from here on."""
+EMPS_FILE, EMPS_PERIOD = "DATA_EMPS.mat", 1e-3
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,29 @@ def measured_recording(folder: Path) -> Recorded:
     ratios = robot.transmission_matrix
     q = np.asarray(np.linalg.solve(ratios, position.T).T, dtype=np.float64)
     return Recorded(robot, Experiment(q=q, tau=torque @ ratios, q_ref=None, dt=MEASURED_PERIOD), {})
+
+
+def measured_emps(folder: Path) -> Recorded | None:
+    """The measured EMPS, an axis with reference, or ``None`` where ``folder/emps/DATA_EMPS.mat`` is absent.
+
+    Raises
+    ------
+    DataError
+        If the file is not what was published.
+    """
+    file = folder / "emps" / EMPS_FILE
+    if not file.is_file():
+        return None
+    robot = load_robot("emps")
+    try:
+        found = loadmat(file, variable_names=("qm", "qg", "vir"))
+        q, reference, voltage = (
+            np.asarray(found[name], dtype=np.float64).reshape(-1, 1) for name in ("qm", "qg", "vir")
+        )
+    except (KeyError, ValueError, TypeError, NotImplementedError) as error:
+        raise DataError(f"{file}: cannot be read: {error}") from error
+    torque = robot.joints[0].drive.gain * voltage
+    return Recorded(robot, Experiment(q=q, tau=torque, q_ref=reference, dt=EMPS_PERIOD), {})
 
 
 def _columns(file: Path, n: int) -> NDArray[np.float64]:

@@ -19,9 +19,10 @@ from identify.reproduction import claims, recordings
 from identify.reproduction.bench import Bench
 from identify.reproduction.chapter4 import GOOD, UNDECIMATED, WRONG, relative
 from identify.reproduction.command import SLOW, TABLES, chosen_tables, make_bench, reproduce, reproduce_command
+from identify.reproduction.emps_controller import controllers_on_emps
 from identify.reproduction.laboratory import Case, Laboratory, Run, between
 from identify.reproduction.printing import document, markdown
-from identify.reproduction.recordings import measured_recording, virtual_recording
+from identify.reproduction.recordings import measured_emps, measured_recording, virtual_recording
 from identify.reproduction.reference import REFERENCE, essential_names, reference_tables
 from identify.reproduction.tables import Cell, Column, Table
 from virtual_robot.offline import simulate_recording, with_encoder_counts
@@ -311,3 +312,24 @@ def test_measured_files_that_cannot_be_used_are_named(tmp_path: Path) -> None:
         (tmp_path / name).write_text("a,b\n1,2\n")
     with pytest.raises(DataError, match="expected 6 columns of finite numbers, found 2"):
         measured_recording(tmp_path)
+
+
+def test_on_measured_emps_an_impulse_response_serves_idim_iv_and_not_didim(shared_data: Path) -> None:
+    recorded = measured_emps(shared_data)
+    if recorded is None:
+        pytest.skip("no emps folder in the measured data")
+    # Thesis section 5.3.3: the drive feeds back the velocity, so no response from the tracking error is its law.
+    found = controllers_on_emps(recorded)
+    assert found.fit_pct < 99
+    (law, response), (direct, shifted) = found.idim_iv, found.didim
+    assert claims.apart(response.theta, law) < 0.5
+    assert claims.apart(shifted.theta, direct) > 2
+    assert claims.apart(direct.theta, law) < 1
+
+
+def test_emps_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    assert measured_emps(tmp_path) is None
+    (tmp_path / "emps").mkdir()
+    (tmp_path / "emps" / recordings.EMPS_FILE).write_text("not what MATLAB writes")
+    with pytest.raises(DataError, match=r"DATA_EMPS\.mat: cannot be read"):
+        measured_emps(tmp_path)

@@ -1,0 +1,61 @@
+"""Section 5.3.3 on a measured axis whose drive feeds back the velocity: what an impulse response is good for there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from identify.closed_loop import RUNAWAY
+from identify.controller.crc import identify_crc
+from identify.controller.parametric import identify_parametric
+from identify.estimators.auxiliary import AuxiliaryModel
+from identify.estimators.didim import didim
+from identify.estimators.idim_iv import idim_iv
+from identify.estimators.idim_ls import idim_ls
+from identify.estimators.regression import Estimate
+from identify.model.arm import ArmModel
+from identify.preparation import LS_CUTOFF, equations
+from identify.reproduction.recordings import Recorded
+from identify.signals.decimate import design
+from identify.signals.differentiate import differentiate
+
+MODE_HZ = 20.0
+"""Highest mode of the closed loop (5.1.4)."""
+
+
+@dataclass(frozen=True)
+class Controllers:
+    """Estimates with the identified law (``C``) and with the impulse response from the tracking error (``CRC``).
+
+    ``fit_pct`` says how much of the torque the impulse response explains on held-out data, percent.
+    """
+
+    idim_iv: tuple[Estimate, Estimate]
+    didim: tuple[Estimate, Estimate]
+    fit_pct: float
+
+
+def controllers_on_emps(recorded: Recorded) -> Controllers:
+    """IDIM-IV and DIDIM on the measured EMPS with both identified controllers (5.2.2, 5.2.3)."""
+    experiment = recorded.experiment
+    assert experiment.q_ref is not None
+    model, dt = ArmModel.from_config(recorded.robot), experiment.dt
+    signals = differentiate(experiment.q, dt)
+    decimation = design(dt, LS_CUTOFF * MODE_HZ)
+    blocks = equations(model, [experiment], [signals], decimation)
+    start = idim_ls(blocks, model.base.names).theta
+    law = identify_parametric([experiment.q], [experiment.q_ref], [experiment.tau], dt)
+    response = identify_crc([experiment.q], [experiment.q_ref], [experiment.tau], dt, velocity_loop=False)
+    loops = [
+        AuxiliaryModel(
+            model=model,
+            controller=found.controller,
+            references=[experiment.q_ref],
+            initial=[(signals.q[0], signals.qd[0])],
+            dt=dt,
+            decimation=decimation,
+            max_velocity=RUNAWAY * np.abs(signals.qd).max(axis=0),
+        )
+        for found in (law, response)
+    ]
+    instrumental, direct = ([method(blocks, loop, start) for loop in loops] for method in (idim_iv, didim))
+    return Controllers((instrumental[0], instrumental[1]), (direct[0], direct[1]), response.responses[0].fit_pct)
