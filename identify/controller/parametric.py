@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,10 @@ WORTH = 1e-5
 """Share of the torque's variance that an addition to the law has to explain on held-out data (0.3 % in amplitude),"""
 
 WORTH_OF_REST = 0.5
-"""or share of what the law did not explain before."""
+"""or share of what the law did not explain before,"""
+
+EXACT = 1e-9
+"""but never less than this share of the torque's variance, where numbers end."""
 
 SIGNIFICANT = 3.0
 """Standard errors by which the held-out error has to fall for a change of the law to be believed."""
@@ -208,13 +212,15 @@ def _choose(stretches: Sequence[Stretch], dt: float) -> Structure:
 def _additions(s: Structure) -> Iterator[Structure]:
     """Structures with one thing more, or with one thing moved, than this one."""
     if s.velocity != "both":
-        yield replace(s, velocity="both")
-        yield replace(s, velocity="error" if s.velocity == "position" else "position")
+        # With the reference's velocity fed forward, a filtered command is a filtered velocity.
+        filtered: Literal["velocity"] | None = "velocity" if s.filtered else None
+        yield replace(s, velocity="both", filtered=filtered)
+        yield replace(s, velocity="error" if s.velocity == "position" else "position", filtered=filtered)
     if s.velocity_taps < MOST_TAPS:
         yield replace(s, velocity_taps=s.velocity_taps + 1)
     if s.filtered is None:
         yield replace(s, filtered="velocity")
-        if s.velocity != "error":  # where the two are one
+        if s.velocity == "position":
             yield replace(s, filtered="command")
     if not s.integral:
         yield replace(s, integral=True)
@@ -246,7 +252,7 @@ def _worth_it(before: Array, after: Array, power: float, larger: bool) -> bool:
         return True
     gain = before - after
     chance = float(np.std(gain, ddof=1)) / np.sqrt(gain.size)
-    enough = min(WORTH * power, WORTH_OF_REST * float(before.mean())) if larger else 0.0
+    enough = max(min(WORTH * power, WORTH_OF_REST * float(before.mean())), EXACT * power) if larger else 0.0
     return bool(gain.mean() > enough and gain.mean() > SIGNIFICANT * chance)
 
 
