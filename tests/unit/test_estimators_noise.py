@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from identify.estimators.noise import ArModel, fit_ar, lagged_sums, whiteness
+from identify.estimators.noise import ArModel, fit_ar, fit_spectrum, lagged_sums, whiteness
 
 COEFFICIENTS = np.array([-1.5, 0.7])
 
@@ -61,3 +61,20 @@ def test_a_residual_of_zeros_gives_a_model_and_no_nan() -> None:
     assert model.order == 0
     assert model.variance > 0
     assert whiteness([np.zeros(100)]).fraction_outside == 0.0
+
+
+def test_an_ar_spectrum_gives_its_own_model() -> None:
+    z = np.exp(-1j * np.pi * np.linspace(0, 1, 4097))
+    power = 0.09 / np.abs(1 + COEFFICIENTS[0] * z + COEFFICIENTS[1] * z**2) ** 2
+    model = fit_spectrum(power, 2)
+    np.testing.assert_allclose(model.coefficients, COEFFICIENTS, atol=1e-9)
+    assert abs(model.variance - 0.09) < 1e-9
+
+
+def test_model_of_any_spectrum_is_stable_in_both_directions_of_use() -> None:
+    # A gain whose inverse, as it stands, would not be stable: a zero outside the unit circle.
+    z = np.exp(-1j * np.pi * np.linspace(0, 1, 4097))
+    model = fit_spectrum(1 / np.abs(1 - 1.25 * z) ** 2, 5)
+    roots = np.roots(np.append(1.0, model.coefficients))
+    assert (np.abs(roots) < 1).all()
+    np.testing.assert_allclose(model.coefficients[0], -0.8, atol=1e-6)
