@@ -170,7 +170,7 @@ def measured_emps(folder: Path) -> Recorded | None:
         q, reference, voltage = (
             np.asarray(found[name], dtype=np.float64).reshape(-1, 1) for name in ("qm", "qg", "vir")
         )
-    except (KeyError, ValueError, TypeError, NotImplementedError) as error:
+    except (OSError, LookupError, ValueError, TypeError, NotImplementedError) as error:
         raise DataError(f"{file}: cannot be read: {error}") from error
     torque = robot.joints[0].drive.gain * voltage
     return Recorded(robot, Experiment(q=q, tau=torque, q_ref=reference, dt=EMPS_PERIOD), {})
