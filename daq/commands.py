@@ -34,7 +34,12 @@ def import_(
     rate: Annotated[
         float | None, typer.Option("--rate", help="Sampling rate, Hz; default: column t.", min=0.001)
     ] = None,
-    names: Annotated[str, typer.Option("--map", help="Names in the file: position=qm,voltage=vir,...")] = "",
+    names: Annotated[
+        str, typer.Option("--map", help="Names in the file: position=qm,voltage=vir,...; demand=- leaves it out.")
+    ] = "",
+    polled: Annotated[
+        bool, typer.Option("--polled", help="Rows were read without waiting: put them on the clock of --rate.")
+    ] = False,
 ) -> None:
     """Make a recording of measurements that other tools wrote.
 
@@ -58,6 +63,7 @@ def import_(
         motor_side=motor_side,
         rate_hz=rate,
         names={key: value for key, _, value in pairs},
+        polled=polled,
     )
     write_recording(recording, out)
     samples = recording.samples

@@ -12,7 +12,9 @@ from identify.controller.crc import JointResponse, identify_crc
 from identify.controller.nominal import known_controller, nominal_controller, saturation
 from identify.controller.parametric import ControlLaw, identify_parametric
 from identify.estimators.auxiliary import AuxiliaryModel
+from identify.estimators.followed import FollowedMotion
 from identify.experiment import Experiment
+from identify.methods import MEASURED
 from identify.model.arm import ArmModel
 from identify.model.controller import DiscreteController
 from identify.options import Options
@@ -76,7 +78,11 @@ def closed_loop(
         if closest is not None and closest[0] < RELEVANT:
             break
     if closest is None:
-        raise DataError("no closed loop could be simulated: it diverges with every controller and start tried")
+        if options.method not in MEASURED or options.noise_model == "grey-box":
+            raise DataError("no closed loop could be simulated: it diverges with every controller and start tried")
+        reason = "no closed loop could be simulated with this estimate: instruments from the smoothed motion itself"
+        warnings.append(reason)
+        return FollowedMotion.of(model, surrogate, dt, decimation), ls, {"kind": "followed", "reason": reason}
     _, auxiliary, start, found = closest
     if found["kind"] == "nominal":
         warnings.append(found["reason"])
@@ -102,9 +108,12 @@ def _controllers(
         else:
             yield _identified(robot, experiments, references, options, dt)
         reason = "the identified controller does not move the simulated arm like the real one: a stiff stand-in is used"
-    stand_in = nominal_controller(
-        model, ls, np.concatenate([s.q[:: max(1, s.q.shape[0] // 200)] for s in signals]), dt, bandwidth
-    )
+    postures = np.concatenate([s.q[:: max(1, s.q.shape[0] // 200)] for s in signals])
+    try:
+        stand_in = nominal_controller(model, ls, postures, dt, bandwidth)
+    except DataError:
+        # Inertias that are not positive: no gain can be chosen by them.
+        return
     yield stand_in, surrogate, {"kind": "nominal", "reason": reason, "error_taps": stand_in.error_taps.tolist()}
 
 

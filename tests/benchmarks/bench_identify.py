@@ -1,13 +1,14 @@
-"""`identify` of a six-axis recording of about 7.5 s at 5 kHz: wall time and peak memory, in a process of its own."""
+"""`identify` of a six-axis recording of about 7.5 s at 5 kHz: wall time and peak memory of every method."""
 
 import json
 import subprocess
 import sys
 
+from identify.options import METHODS
 from tests.benchmarks.harness import Row
 
 MEASURE = """
-import json, resource, time
+import json, resource, sys, time
 from configs import config_path, load_robot, load_trajectory
 from identify.from_recording import experiments_from_recording
 from identify.options import Options
@@ -18,11 +19,12 @@ robot = load_robot("tx40")
 trajectory = load_trajectory(str(config_path("tx40.yaml").parent / "trajectories" / "tx40_excitation.yaml"))
 experiments, _ = experiments_from_recording(simulate_recording(robot, trajectory, seed=1), robot)
 figures = {"samples": sum(e.q.shape[0] for e in experiments)}
-for method in ("idim-ls", "idim-iv", "idim-piv"):
+for method in sys.argv[1:]:
+    options = Options(method=method, controller="parametric" if method in ("clie", "cloe") else "crc")
     best = float("inf")
     for _ in range(2):
         start = time.perf_counter()
-        result = identify_experiment(experiments, robot, Options(method=method))
+        result = identify_experiment(experiments, robot, options)
         best = min(best, time.perf_counter() - start)
     figures[method] = best
     figures[method + " iterations"] = result.iterations
@@ -32,8 +34,8 @@ print(json.dumps(figures))
 
 
 def run() -> list[Row]:
-    """Warm wall time of the three methods and peak memory of the whole process."""
-    done = subprocess.run([sys.executable, "-c", MEASURE], capture_output=True, text=True, check=True)
+    """Warm wall time of every method, from positions to the finished result, and peak memory of the whole process."""
+    done = subprocess.run([sys.executable, "-c", MEASURE, *METHODS], capture_output=True, text=True, check=True)
     figures = json.loads(done.stdout.splitlines()[-1])
     rows = [
         Row(
@@ -44,6 +46,6 @@ def run() -> list[Row]:
             "s",
             f"{figures['samples']} samples x 6 axes at 5 kHz, {figures[method + ' iterations']} iterations, warm",
         )
-        for method in ("idim-ls", "idim-iv", "idim-piv")
+        for method in METHODS
     ]
     return [*rows, Row("identify, peak memory", figures["memory"], None, None, "MB", "whole process, plant included")]
