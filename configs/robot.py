@@ -112,11 +112,13 @@ class Friction(Frozen):
 class Controller(Frozen):
     """A known cascade ``nu = kv (kp (q_r - q) - qd)`` per motor, in units of the drive's signal.
 
-    ``kp`` in 1/s; ``kv`` in units of ``signal`` per (rad/s or m/s).
+    ``kp`` in 1/s; ``kv`` in units of ``signal`` per (rad/s or m/s). The velocity is the mean over the last
+    ``velocity_samples`` sampling periods.
     """
 
     kp: tuple[Positive, ...]
     kv: tuple[float, ...]
+    velocity_samples: Annotated[int, Field(ge=1)] = 1
 
 
 class Preprocessing(Frozen):

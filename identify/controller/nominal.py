@@ -32,8 +32,14 @@ def known_controller(robot: RobotConfig, dt: float) -> DiscreteController:
     if robot.controller is None:
         raise ConfigError(f"controller known: the configuration of {robot.name} has no controller (kp, kv)")
     gain = np.array([joint.drive.gain for joint in robot.joints])
+    known = robot.controller
     return DiscreteController.cascade(
-        np.array(robot.controller.kp), np.array(robot.controller.kv), gain, dt, saturation=saturation(robot)
+        np.array(known.kp),
+        np.array(known.kv),
+        gain,
+        dt,
+        saturation=saturation(robot),
+        velocity_samples=known.velocity_samples,
     )
 
 

@@ -34,7 +34,7 @@ print(json.dumps([time.perf_counter() - start, resource.getrusage(resource.RUSAG
 
 
 def run() -> list[Row]:
-    """IDIM-IV; beside each figure stands ten times the one before: a ratio of 1 or more is growth no faster than linear."""
+    """IDIM-IV; beside each figure stands ten times the one before: a ratio of 1 or more is linear growth at most."""
     rows: list[Row] = []
     before: tuple[float, float] | None = None
     for seconds in SECONDS:
