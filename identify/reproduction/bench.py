@@ -9,8 +9,8 @@ from identify.reproduction.recordings import Recorded
 from identify.reproduction.reference import reference_tables
 from identify.reproduction.tables import Cell, Column, Source, Table
 
-SIMULATIONS, SIMULATIONS_QUICK = 30, 3
-"""Noise realisations of table 5.2: the mean of 30 is known to 2 %, that of 3 to 6 %."""
+SIMULATIONS, SIMULATIONS_QUICK = 100, 3
+"""Noise realisations of table 5.2, the thesis's number and what is enough for two digits."""
 
 
 @dataclass(frozen=True)

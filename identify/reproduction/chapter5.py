@@ -62,7 +62,12 @@ def table_5_2(bench: Bench) -> Table:
     signals = {
         signal: [found[name][k] for name in found] for k, signal in enumerate(("position", "velocity", "acceleration"))
     }
-    return figures("5.2", signals, [f"mean of {bench.simulations} simulations (the thesis: 100)"], names=tuple(found))
+    return figures(
+        "5.2",
+        signals,
+        [f"mean of {bench.simulations} noise realisations (the thesis: 100), at 5 kHz"],
+        names=tuple(found),
+    )
 
 
 def table_5_5(bench: Bench) -> Table:

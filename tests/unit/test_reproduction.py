@@ -4,6 +4,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from identify.reproduction.printing import document, markdown
 from identify.reproduction.recordings import measured_emps, measured_recording, virtual_recording
 from identify.reproduction.reference import REFERENCE, essential_names, reference_tables
 from identify.reproduction.tables import Cell, Column, Table
+from virtual_robot.cli import robot as robot_command
 from virtual_robot.offline import simulate_recording, with_encoder_counts
 from virtual_robot.run import record_robot
 
@@ -82,6 +84,19 @@ def test_recording_to_a_file_is_the_simulation_of_the_sessions_set_points(tmp_pa
     assert truth["kp6"] > truth["kp1"] > 0
     with pytest.raises(ConfigError, match="there is such a file already"):
         record_robot(Path("tx40_cell.yaml"), out)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"encoder_counts": 3600}, "--trajectory and --encoder-counts belong to --to-file"),
+        ({"to_file": Path("new.mcap"), "duration": 3.0}, "--replay and --duration have no meaning"),
+        ({"to_file": Path("new.mcap"), "replay": Path("old.mcap")}, "--replay and --duration have no meaning"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        robot_command(**options)
 
 
 def test_virtual_arm_is_recorded_once_for_the_same_arguments(
