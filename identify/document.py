@@ -67,7 +67,11 @@ class Comparison(Document):
 
 
 class IdentificationDocument(Document):
-    """``identification.json``: what was identified, from what, how, and how well."""
+    """``identification.json``: what was identified, from what, how, and how well.
+
+    ``torque_delay_samples`` has, per joint, by how many samples the torque runs ahead of the position (0.5 if the drive
+    reports the torque it holds), and the standard deviation.
+    """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
     robot: str
@@ -90,6 +94,7 @@ class IdentificationDocument(Document):
     comparison: Comparison | None = None
     diagnostics: dict[str, Any] | None = None
     physical: dict[str, Any] | None = None
+    torque_delay_samples: dict[str, list[float]] | None = None
 
 
 class Alternative(Document):
@@ -215,6 +220,12 @@ def identification_document(
         comparison=comparison,
         diagnostics=result.diagnostics.document(),
         physical=None if result.physical is None else result.physical.document(),
+        torque_delay_samples=None
+        if result.delay is None
+        else {
+            name: [float(samples), float(std)]
+            for name, samples, std in zip(joints, result.delay.samples, result.delay.std, strict=True)
+        },
     )
 
 

@@ -20,6 +20,7 @@ from identify.experiment import Experiment
 from identify.options import Method, Options
 from identify.preparation import LS_CUTOFF, PIV_CUTOFF, equations
 from identify.signals.decimate import Decimation, design
+from identify.signals.delay import TorqueDelay, torque_delay
 from identify.signals.differentiate import Derivatives
 
 CONTRADICTION = 5.0
@@ -78,11 +79,13 @@ class Solution:
     """An estimate, the problem it belongs to, and what is to be said about it.
 
     ``prefiltered``: the noise models of the estimate have weighed its rows, not only entered its covariance.
+    ``noise_of``: the quantity that noise models and residuals of the estimate belong to.
     """
 
     estimate: Estimate
     problem: Problem
     prefiltered: bool = False
+    noise_of: str = "joint torque"
     warnings: tuple[str, ...] = ()
 
     def diagnostics(self, essential: NDArray[np.bool_]) -> Diagnostics:
@@ -102,6 +105,15 @@ class Solution:
             weights=weights,
             essential=essential,
         )
+
+    def delay(self) -> TorqueDelay | None:
+        """Delay of the recorded torques, with the motion simulated along the recorded reference as instruments."""
+        problem = self.problem
+        runs = problem.auxiliary.simulate(self.estimate.theta)
+        if runs is None:
+            return None
+        motions = [Derivatives(run.q, run.qd, run.qdd, None) for run in runs]
+        return torque_delay(problem.auxiliary.model, problem.experiments, problem.signals, problem.plain, motions)
 
 
 def solve(problem: Problem) -> Solution:
@@ -134,8 +146,9 @@ def _idim_piv(problem: Problem) -> Solution:
     shift = np.abs(estimate.theta - without.theta) / without.std
     worst = int(np.argmax(shift))
     if shift[worst] <= CONTRADICTION:
-        # A grey box weighs motor positions, not joint torques.
-        return Solution(estimate, problem, prefiltered=options.noise_model == "black-box")
+        if options.noise_model == "grey-box":
+            return Solution(estimate, problem, noise_of="motor position")
+        return Solution(estimate, problem, prefiltered=True)
     warning = (
         f"the prefilter of idim-piv moves {problem.auxiliary.model.base.names[worst]} by {shift[worst]:.0f} standard "
         "deviations from idim-iv: the residuals are model error, not noise; the parameters are those of idim-iv, the "
@@ -158,7 +171,8 @@ def _clie(problem: Problem) -> Solution:
 
 def _cloe(problem: Problem) -> Solution:
     positions = [problem.auxiliary.decimation(e.q) for e in problem.experiments]
-    return Solution(cloe(problem.blocks, positions, problem.auxiliary, problem.start), problem)
+    estimate = cloe(problem.blocks, positions, problem.auxiliary, problem.start)
+    return Solution(estimate, problem, noise_of="joint position")
 
 
 def _sep_pem(problem: Problem) -> Solution:

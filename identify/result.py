@@ -14,6 +14,7 @@ from identify.estimators.regression import Block, Estimate, residuals
 from identify.model.arm import ArmModel
 from identify.model.consistent import ConsistentParameters
 from identify.options import Options
+from identify.signals.delay import TorqueDelay
 
 Array = NDArray[np.float64]
 
@@ -39,6 +40,8 @@ class Identification:
         Tests of the estimate.
     physical
         The nearest physically consistent arm, where it was asked for.
+    delay
+        Of the recorded torques against the positions, where a reference trajectory was recorded.
     relative_error_pct, relative_error_pct_by_joint
         ``|y - X theta| / |y|`` on the torques decimated to twice the bandwidth, overall and (n,).
     whiteness, residual_autocorrelation, autocorrelation_bound
@@ -58,6 +61,7 @@ class Identification:
     essential: NDArray[np.bool_]
     diagnostics: Diagnostics
     physical: ConsistentParameters | None
+    delay: TorqueDelay | None
     relative_error_pct: float
     relative_error_pct_by_joint: Array
     iterations: int
@@ -85,10 +89,12 @@ def make_result(
     essential: NDArray[np.bool_],
     diagnostics: Diagnostics,
     physical: ConsistentParameters | None,
+    delay: TorqueDelay | None,
     blocks: Sequence[Block],
     ls: Estimate,
     ls_blocks: Sequence[Block],
     controller: dict[str, Any],
+    noise_of: str,
     warnings: Sequence[str],
     timing_s: dict[str, float],
 ) -> Identification:
@@ -106,6 +112,7 @@ def make_result(
         essential=essential,
         diagnostics=diagnostics,
         physical=physical,
+        delay=delay,
         relative_error_pct=overall,
         relative_error_pct_by_joint=by_joint,
         iterations=estimate.iterations,
@@ -115,6 +122,7 @@ def make_result(
             JointWhiteness(name, test.lags, test.fraction_outside) for name, test in zip(joints, tests, strict=True)
         ),
         noise_model={
+            "of": noise_of,
             "rate_hz": float(1 / (blocks[0].t[1] - blocks[0].t[0])),
             "joints": [
                 {"joint": name, "order": ar.order, "variance": ar.variance, "coefficients": ar.coefficients.tolist()}

@@ -17,11 +17,15 @@ from identify.experiment import Experiment
 from identify.methods import PREFILTERED, Problem, decimation_of, solve
 from identify.model.arm import ArmModel
 from identify.model.consistent import nearest_consistent
-from identify.options import Options
+from identify.options import CONTROLLERS, Options
 from identify.preparation import equations, published_equations
 from identify.result import Identification, make_result
 from identify.signals.bandwidth import motion_bandwidth
+from identify.signals.delay import HELD, TorqueDelay
 from identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
+
+TOLERATED_DELAY = 1.0
+"""Samples by which torque and position may be apart without a warning."""
 
 Progress = Callable[[str, float], None]
 
@@ -58,7 +62,7 @@ def identify_experiment(
     experiments = [experiments] if isinstance(experiments, Experiment) else list(experiments)
     _check(experiments, robot)
     # The matrices are tall and narrow: threads gain little, wait for each other on a busy machine, and round otherwise.
-    with threadpool_limits(1):
+    with threadpool_limits(1):  # type: ignore[no-untyped-call]
         return _identify(experiments, robot, options or Options(), _Clock(progress or (lambda stage, share: None)))
 
 
@@ -101,6 +105,7 @@ def _identify(
             warnings.append(f"{options.method} did not converge: {estimate.stop_reason}")
 
     clock.enter("statistics", 0.85)
+    delay: TorqueDelay | None = None
     used = sum(r.size for series in estimate.residuals for r in series)
     essential = essential_parameters(estimate.theta, estimate.covariance, used)
     if solution is None:
@@ -108,6 +113,9 @@ def _identify(
         diagnostics = diagnose_estimate(model.base.names, joints, blocks, estimate, essential=essential)
     else:
         diagnostics = solution.diagnostics(essential)
+        if controller["kind"] in CONTROLLERS:
+            delay = solution.delay()
+            warnings += _late(delay, robot)
     physical = None
     if options.physical:
         clock.enter("physical", 0.95)
@@ -116,9 +124,21 @@ def _identify(
             warnings.append(physical.verdict)
     clock.done()
     return make_result(
-        options, model, estimate, essential, diagnostics, physical, blocks, ls, ls_blocks, controller, warnings,
-        clock.spent,
+        options, model, estimate, essential, diagnostics, physical, delay, blocks, ls, ls_blocks, controller,
+        "joint torque" if solution is None else solution.noise_of, warnings, clock.spent,
     )  # fmt: skip
+
+
+def _late(delay: TorqueDelay | None, robot: RobotConfig) -> list[str]:
+    """A warning for every joint whose torque is recorded more than a sample off the position it belongs to."""
+    if delay is None:
+        return []
+    off = delay.contradicts() & (np.abs(delay.samples - HELD) > TOLERATED_DELAY)
+    return [
+        f"{joint.name}: the torque belongs to the position {samples:.1f} +- {std:.1f} samples later, expected is {HELD}"
+        for joint, samples, std, wrong in zip(robot.joints, delay.samples, delay.std, off, strict=True)
+        if wrong
+    ]
 
 
 def _derivatives(
