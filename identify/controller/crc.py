@@ -122,20 +122,16 @@ def _identify_joint(
     best: tuple[float, JointResponse] | None = None
     for velocity in structures:
         inputs = [error, motion] if velocity else [error]
-        plain = [_lagged(NO_FILTER, [u[k] for u in inputs], nu[k], longest) for k in range(len(nu))]
-        judge = _split(plain)[1]
-        power = sum(float(np.sum((b - b.mean()) ** 2)) for _, b in judge)
+        plain = _correlations(NO_FILTER, inputs, nu, longest)
+        power = sum(float(np.sum((b - b.mean()) ** 2)) for b in _held_out(nu, longest))
         for ar in (NO_FILTER, fit_ar(error, PREWHITENING_ORDER)):
-            pieces = plain
-            if ar.order:
-                pieces = [_lagged(ar, [u[k] for u in inputs], nu[k], longest) for k in range(len(nu))]
-            part, whole = _correlations(_split(pieces)[0]), _correlations(pieces)
+            fitted, judge = _correlations(ar, inputs, nu, longest) if ar.order else plain
             for m in lengths:
                 chosen = np.concatenate([np.arange(m) + i * longest for i in range(len(inputs))])
-                taps = _solve(part, chosen)
-                miss = sum(float(np.sum((b - a[:, chosen] @ taps) ** 2)) for a, b in judge)
+                taps = _solve(fitted, chosen)
+                miss = plain[1].miss(taps, chosen)
                 if best is None or miss < best[0] * (1 - GAIN_WORTH_A_TAP):
-                    taps = _solve(whole, chosen)
+                    taps = _solve(fitted + judge, chosen)
                     response = JointResponse(
                         error_taps=taps[:m],
                         position_taps=np.diff(taps[m:], prepend=0.0, append=0.0) if velocity else np.empty(0),
@@ -147,44 +143,73 @@ def _identify_joint(
     return best[1]
 
 
-def _lagged(
-    ar: ArModel, inputs: list[NDArray[np.float64]], output: NDArray[np.float64], length: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Prewhitened inputs at lags 0..length-1, shape (N', inputs * length), and output (N',)."""
-    columns = []
-    for u in inputs:
-        white = ar.whiten(u)
-        columns += [white[length - 1 - lag : white.size - lag] for lag in range(length)]
-    return np.stack(columns, axis=1), ar.whiten(output)[length - 1 :]
+@dataclass(frozen=True)
+class _Correlations:
+    """``R_eps,eps`` (m, m) and ``R_nu,eps`` (m,) of 5.31 and 5.32, and the power of the output, all as sums."""
+
+    auto: NDArray[np.float64]
+    cross: NDArray[np.float64]
+    power: float
+
+    def __add__(self, other: "_Correlations") -> "_Correlations":
+        return _Correlations(self.auto + other.auto, self.cross + other.cross, self.power + other.power)
+
+    def miss(self, taps: NDArray[np.float64], chosen: NDArray[np.int64]) -> float:
+        """Sum of the squared errors of a response."""
+        explained = 2 * taps @ self.cross[chosen] - taps @ self.auto[np.ix_(chosen, chosen)] @ taps
+        return max(self.power - float(explained), 0.0)
 
 
-_Pieces = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
+def _held_out(output: Sequence[NDArray[np.float64]], length: int) -> list[NDArray[np.float64]]:
+    """The last part of every experiment, which only judges."""
+    return [b[length - 1 + _cut(b.size - length + 1) :] for b in output]
 
 
-def _split(pieces: _Pieces) -> tuple[_Pieces, _Pieces]:
-    """The first part of every experiment and its last, held-out part."""
-    cut = [int(b.size * (1 - HELD_OUT)) for _, b in pieces]
-    return (
-        [(a[:c], b[:c]) for (a, b), c in zip(pieces, cut, strict=True)],
-        [(a[c:], b[c:]) for (a, b), c in zip(pieces, cut, strict=True)],
-    )
+def _cut(rows: int) -> int:
+    return int(rows * (1 - HELD_OUT))
 
 
-def _correlations(pieces: _Pieces) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``R_eps,eps`` and ``R_nu,eps`` of 5.31 and 5.32 over all experiments."""
-    columns = pieces[0][0].shape[1]
-    auto, cross = np.zeros((columns, columns)), np.zeros(columns)
-    for a, b in pieces:
-        auto += a.T @ a
-        cross += a.T @ b
-    return auto, cross
+def _correlations(
+    ar: ArModel, inputs: Sequence[Sequence[NDArray[np.float64]]], output: Sequence[NDArray[np.float64]], length: int
+) -> tuple[_Correlations, _Correlations]:
+    """Correlations of the prewhitened inputs at lags 0..length-1, of the fitted and of the held-out part."""
+    parts: tuple[list[_Correlations], list[_Correlations]] = [], []
+    for k, raw in enumerate(output):
+        white = [ar.whiten(u[k]) for u in inputs]
+        b = ar.whiten(raw)
+        cut = length - 1 + _cut(b.size - length + 1)
+        for into, first, last in ((parts[0], length - 1, cut), (parts[1], cut, b.size)):
+            into.append(_sums(white, b, length, first, last))
+    return sum(parts[0][1:], parts[0][0]), sum(parts[1][1:], parts[1][0])
 
 
-def _solve(
-    correlations: tuple[NDArray[np.float64], NDArray[np.float64]], chosen: NDArray[np.int64]
+def _sums(
+    inputs: Sequence[NDArray[np.float64]], b: NDArray[np.float64], length: int, first: int, last: int
+) -> _Correlations:
+    """Correlations over the samples ``first .. last - 1``; no matrix of lagged inputs is ever formed."""
+    auto = np.block([[_lag_products(u, v, length, first, last) for v in inputs] for u in inputs])
+    cross = np.array([u[first - lag : last - lag] @ b[first:last] for u in inputs for lag in range(length)])
+    return _Correlations(auto, cross, float(b[first:last] @ b[first:last]))
+
+
+def _lag_products(
+    u: NDArray[np.float64], v: NDArray[np.float64], length: int, first: int, last: int
 ) -> NDArray[np.float64]:
+    """``sum_k u(k - i) v(k - j)`` for lags i, j, shape (length, length): one edge, and steps along the diagonals."""
+    out = np.empty((length, length))
+    for lag in range(length):
+        out[0, lag] = u[first:last] @ v[first - lag : last - lag]
+        out[lag, 0] = u[first - lag : last - lag] @ v[first:last]
+    for i in range(1, length):
+        begins = u[first - i] * v[first - length + 1 : first][::-1]
+        ends = u[last - i] * v[last - length + 1 : last][::-1]
+        out[i, 1:] = out[i - 1, :-1] + begins - ends
+    return out
+
+
+def _solve(correlations: _Correlations, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
     """Solve the correlation equations; directions that the input does not contain get no response."""
-    gram, right = correlations[0][np.ix_(chosen, chosen)], correlations[1][chosen]
+    gram, right = correlations.auto[np.ix_(chosen, chosen)], correlations.cross[chosen]
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = linalg.eigh(gram / np.outer(scale, scale))
     used = values > 1e-11 * values[-1]
