@@ -1,6 +1,8 @@
 """The stacked regression ``y = X theta + e`` of all joints and experiments, and how it is solved."""
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -90,19 +92,23 @@ class Estimate:
 def filtered_regressor(
     model: ArmModel, signals: Derivatives, decimation: Decimation, *, sharp_sign: bool = False
 ) -> NDArray[np.float64]:
-    """Base regressor after the parallel filter, shape (M, n, b), chunk by chunk so that memory stays small."""
-    samples = signals.q.shape[0]
-    count = decimation.count(samples)
+    """Base regressor after the parallel filter, shape (M, n, b).
+
+    Chunk by chunk, so that memory stays small, and on all processors: neither kernel holds the interpreter lock.
+    """
+    count = decimation.count(signals.q.shape[0])
     rows = max(1, _CHUNK_ROWS // decimation.factor)
-    parts = []
-    for first in range(0, count, rows):
+    if count == 0:
+        decimation(signals.q)
+
+    def chunk(first: int) -> NDArray[np.float64]:
         last = min(first + rows, count)
         span = slice(first * decimation.factor, (last - 1) * decimation.factor + decimation.taps.size)
         phi = model.base_regressor(signals.q[span], signals.qd[span], signals.qdd[span], sharp_sign=sharp_sign)
-        parts.append(decimation(phi))
-    if not parts:
-        decimation(signals.q)
-    return np.concatenate(parts)
+        return decimation(phi)
+
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        return np.concatenate(list(pool.map(chunk, range(0, count, rows))))
 
 
 def weighted_rows(

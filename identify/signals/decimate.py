@@ -75,7 +75,7 @@ def design(dt: float, cutoff_hz: float, factor: int | None = None) -> Decimation
     return Decimation(factor, np.asarray(taps, dtype=np.float64))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _convolve(x, taps, factor, count):  # type: ignore[no-untyped-def]
     out = np.zeros((count, x.shape[1]))
     for m in range(count):
