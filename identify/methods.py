@@ -18,7 +18,7 @@ from identify.estimators.regression import Block, Estimate, joint_variances
 from identify.estimators.sep_pem import sep_pem
 from identify.experiment import Experiment
 from identify.options import Method, Options
-from identify.preparation import LS_CUTOFF, PIV_CUTOFF, equations
+from identify.preparation import LS_CUTOFF, PIV_CUTOFF, decimated_rows, equations, sufficient
 from identify.signals.decimate import Decimation, design
 from identify.signals.delay import TorqueDelay, torque_delay
 from identify.signals.differentiate import Derivatives
@@ -35,11 +35,52 @@ MEASURED: tuple[Method, ...] = ("idim-ls", "idim-iv", "idim-piv")
 Array = NDArray[np.float64]
 
 
-def decimation_of(method: Method, dt: float, bandwidth_hz: float, factor: int | None) -> Decimation:
-    """Low-pass and decimation for a method; ``factor``: as chosen by hand, ``None``: from the bandwidth."""
+def decimation_of(
+    method: Method,
+    dt: float,
+    bandwidth_hz: float,
+    factor: int | None,
+    *,
+    samples: Sequence[int] = (),
+    rows: int = 0,
+    warnings: list[str] | None = None,
+) -> Decimation:
+    """Low-pass and decimation for a method, never so strong that too few equations are left.
+
+    Parameters
+    ----------
+    method
+        Methods with a noise model decimate only roughly.
+    dt
+        Sampling period, s.
+    bandwidth_hz
+        Closed-loop bandwidth.
+    factor
+        As chosen by hand, which stands however few equations it leaves; ``None``: from the bandwidth.
+    samples
+        Length of every experiment.
+    rows
+        Fewest instants to leave of all experiments together, see `least_rows`.
+    warnings
+        Gets a line if the cut-off was raised to leave as many, or if there are fewer.
+    """
     share = PIV_CUTOFF if method in PREFILTERED else LS_CUTOFF
     cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)
-    return design(dt, cutoff, factor)
+    wanted = design(dt, cutoff, factor)
+    chosen = wanted if factor is not None else sufficient(wanted, dt, samples, rows)
+    left, heard = decimated_rows(chosen, samples), [] if warnings is None else warnings
+    if left < rows:
+        heard.append(
+            f"the decimation by {chosen.factor} leaves {left} equations per joint, fewer than {rows}: the estimate "
+            "and its standard deviations are uncertain; record longer"
+            + (" or decimate less" if chosen.factor > 1 else "")
+        )
+    elif chosen is not wanted:
+        heard.append(
+            f"a cut-off of {cutoff:.3g} Hz leaves {decimated_rows(wanted, samples)} equations per joint, fewer than "
+            f"{rows}: raised to {0.5 / (dt * chosen.factor):.3g} Hz, which leaves {left}"
+        )
+    return chosen
 
 
 @dataclass(frozen=True)

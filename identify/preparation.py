@@ -1,5 +1,6 @@
 """From experiments to filtered equations: derivatives, alignment of the torque, parallel filter, decimation."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +12,7 @@ from identify.experiment import Experiment
 from identify.model.arm import ArmModel
 from identify.signals.bandpass import butterworth, central_difference
 from identify.signals.classical import chebyshev_decimate, kept_samples
-from identify.signals.decimate import Decimation
+from identify.signals.decimate import Decimation, design
 from identify.signals.differentiate import Derivatives
 
 LS_CUTOFF = 2.0
@@ -19,6 +20,55 @@ LS_CUTOFF = 2.0
 
 PIV_CUTOFF = 5.0
 """Cut-off of the rough decimation before IDIM-PIV, in closed-loop bandwidths (thesis section 7.2)."""
+
+EQUATIONS_PER_PARAMETER = 10.0
+"""Fewest equations, of all joints and experiments together, per base parameter: what they leave to tell the noise from
+the parameters with."""
+
+
+def least_rows(model: ArmModel) -> int:
+    """Fewest decimated instants of all experiments together: each gives one equation per joint.
+
+    ``EQUATIONS_PER_PARAMETER b / n``, rounded up, for b base parameters and n joints.
+    """
+    return math.ceil(EQUATIONS_PER_PARAMETER * model.base.b / model.n)
+
+
+def decimated_rows(decimation: Decimation, samples: Sequence[int]) -> int:
+    """Instants that a decimation leaves of experiments of so many samples."""
+    return sum(decimation.count(count) for count in samples)
+
+
+def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: int) -> Decimation:
+    """The decimation or, where it leaves too few instants, the strongest one that leaves enough.
+
+    Motion slower than the cut-off fits through any wider one: raising it costs nothing but noise that the estimator
+    averages, while too few equations determine neither parameters nor noise.
+
+    Parameters
+    ----------
+    decimation
+        As the bandwidth asks for.
+    dt
+        Sampling period, s.
+    samples
+        Length of every experiment.
+    rows
+        Fewest instants of all experiments together, see :func:`least_rows`. Where not even all samples are as many,
+        all samples stay.
+    """
+    if decimated_rows(decimation, samples) >= rows:
+        return decimation
+    low, high = 1, decimation.factor
+    found = design(dt, 0.5 / dt, 1)
+    while high - low > 1:
+        factor = (low + high) // 2
+        tried = design(dt, 0.5 / (dt * factor), factor)
+        if decimated_rows(tried, samples) >= rows:
+            low, found = factor, tried
+        else:
+            high = factor
+    return found
 
 
 def aligned_torque(tau: NDArray[np.float64]) -> NDArray[np.float64]:
