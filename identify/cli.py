@@ -34,7 +34,10 @@ def identify(
         float | None, typer.Option(help="Closed-loop bandwidth, Hz. [default: configured, or from the data]")
     ] = None,
     decimation: Annotated[
-        int | None, typer.Option(min=1, help="Keep one sample of so many. [default: from the bandwidth]")
+        str | None,
+        typer.Option(
+            help="Keep one sample of so many, or noise: as many as it remembers. [default: from the bandwidth]"
+        ),
     ] = None,
     weighted: Annotated[bool, typer.Option(help="Weigh each joint by its noise in idim-ls.")] = True,
     physical: Annotated[
@@ -123,17 +126,13 @@ def trajectory(
 
 
 def reproduce(
-    tables: Annotated[
-        str | None, typer.Option(help="Tables wanted, as in 5.2,6.7. [default: all from 4.1 to 6.8]")
-    ] = None,
-    measured: Annotated[
-        Path | None, typer.Option(help="Folder with the public recording of a real TX40. [default: virtual arm alone]")
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", help="Folder for recordings and results.")] = Path("reproduction"),
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer runs; the same tables.")] = False,
+    tables: Annotated[str | None, typer.Option(help="Tables by number, as 5.2,6.7. [default: all]")] = None,
+    measured: Annotated[Path | None, typer.Option(help="Folder of the measured TX40 and EMPS.")] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the results and recordings.")] = Path("reproduction"),
+    quick: Annotated[bool, typer.Option("--quick", help="Without tables 4.1 to 4.3, fewer simulations.")] = False,
     json: Json = False,
 ) -> None:
-    """Print the thesis's tables beside ours, and whether its claims hold.
+    """Compute the thesis's tables beside its figures, and say which of its claims hold.
 
     Example: armident reproduce --tables 5.2,6.7
     """

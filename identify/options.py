@@ -32,7 +32,7 @@ class Options:
         ``crc`` identifies it by correlation analysis, ``parametric`` as a cascade or PID by refined instrumental
         variables, ``known`` takes the gains of the configuration.
     decimation
-        Keep one sample of so many; ``None``: from the bandwidth.
+        Keep one sample of so many; ``noise``: of as many as the noise remembers (6.2.3); ``None``: from the bandwidth.
     nvr
         Noise-variance ratio of the smoother, or the rule to find it: ``automatic``, ``cross-validation``,
         ``likelihood``, ``tracking-error``; ``None``: ``automatic``.
@@ -51,7 +51,7 @@ class Options:
     method: Method = "idim-piv"
     derivatives: DerivativesName | None = None
     controller: ControllerName = "crc"
-    decimation: int | None = None
+    decimation: int | Literal["noise"] | None = None
     nvr: float | NvrRule | None = None
     bandwidth_hz: float | None = None
     noise_model: NoiseModelName = "black-box"
@@ -69,8 +69,8 @@ class Options:
         ):
             if value not in offered:
                 raise ConfigError(f"{name}: {value!r} is not one of {', '.join(str(o) for o in offered if o)}")
-        if self.decimation is not None and self.decimation < 1:
-            raise ConfigError(f"decimation: expected a number of samples, got {self.decimation}")
+        if self.decimation not in (None, "noise") and not (isinstance(self.decimation, int) and self.decimation >= 1):
+            raise ConfigError(f"decimation: expected a number of samples or noise, got {self.decimation}")
         if self.max_ar_order < 0:
             raise ConfigError(f"max_ar_order: expected 0 or more, got {self.max_ar_order}")
         if self.bandwidth_hz is not None and not self.bandwidth_hz > 0:
@@ -88,5 +88,15 @@ def parse_nvr(text: str | None) -> float | NvrRule | None:
         return None
     try:
         return float(text)
+    except ValueError:
+        return text  # type: ignore[return-value]
+
+
+def parse_decimation(text: str | None) -> int | Literal["noise"] | None:
+    """A decimation as a user writes it: a number, or ``noise`` (which `Options` checks)."""
+    if text is None:
+        return None
+    try:
+        return int(text)
     except ValueError:
         return text  # type: ignore[return-value]

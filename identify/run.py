@@ -18,11 +18,12 @@ from identify.methods import PREFILTERED, Problem, decimation_of, solve
 from identify.model.arm import ArmModel
 from identify.model.consistent import nearest_consistent
 from identify.options import CONTROLLERS, Options
-from identify.preparation import equations, published_equations
-from identify.result import Identification, make_result
+from identify.preparation import aligned_torque, equations, published_equations
+from identify.result import Array, Identification, make_result
 from identify.signals.bandwidth import motion_bandwidth
 from identify.signals.delay import HELD, TorqueDelay
 from identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
+from identify.signals.noise_decimation import decimation_from_noise
 
 TOLERATED_DELAY = 1.0
 """Samples by which torque and position may be apart without a warning."""
@@ -81,19 +82,26 @@ def _identify(
 
     clock.enter("idim-ls", 0.2)
     # A factor given by hand is that of the method; a method with a noise model keeps its own for the comparison.
-    plain = decimation_of("idim-ls", dt, bandwidth, None if options.method in PREFILTERED else options.decimation)
+    factor = options.decimation if isinstance(options.decimation, int) else None
+    plain = decimation_of("idim-ls", dt, bandwidth, None if options.method in PREFILTERED else factor)
     if options.derivatives is None and options.decimation is None and robot.preprocessing is not None:
         ls_blocks = published_equations(model, experiments, robot.preprocessing)
     else:
         ls_blocks = equations(model, experiments, signals, plain)
     ls = idim_ls(ls_blocks, model.base.names, weighted=options.weighted)
+    if options.decimation == "noise":
+        factor = _memory_of_noise(model, experiments, signals, ls.theta, warnings)
+        if options.method not in PREFILTERED:
+            plain = decimation_of("idim-ls", dt, bandwidth, factor)
+            ls_blocks = equations(model, experiments, signals, plain)
+            ls = idim_ls(ls_blocks, model.base.names, weighted=options.weighted)
 
     controller: dict[str, Any] = {"kind": "none"}
     if options.method == "idim-ls":
         estimate, blocks, solution = ls, ls_blocks, None
     else:
         clock.enter("controller", 0.35)
-        decimation = decimation_of(options.method, dt, bandwidth, options.decimation)
+        decimation = decimation_of(options.method, dt, bandwidth, factor)
         auxiliary, start, controller = closed_loop(
             model, experiments, signals, options, ls.theta, decimation, bandwidth, warnings
         )
@@ -127,6 +135,24 @@ def _identify(
         options, model, estimate, essential, diagnostics, physical, delay, blocks, ls, ls_blocks, controller,
         "joint torque" if solution is None else solution.noise_of, warnings, clock.spent,
     )  # fmt: skip
+
+
+def _memory_of_noise(
+    model: ArmModel,
+    experiments: Sequence[Experiment],
+    signals: Sequence[Derivatives],
+    theta: Array,
+    warnings: list[str],
+) -> int:
+    """The decimation after which the noise that IDIM-LS leaves at the full rate is hardly correlated."""
+    left = [
+        aligned_torque(e.tau) - model.inverse_dynamics(theta, s.q, s.qd, s.qdd)
+        for e, s in zip(experiments, signals, strict=True)
+    ]
+    found = decimation_from_noise(left)
+    if found.bounded:
+        warnings.append(f"the noise may remember more than the {found.factor} samples that the decimation was set to")
+    return found.factor
 
 
 def _late(delay: TorqueDelay | None, robot: RobotConfig) -> list[str]:

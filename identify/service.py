@@ -20,7 +20,7 @@ from identify.document import (
 )
 from identify.experiment import Experiment
 from identify.from_recording import experiments_from_recording
-from identify.options import Options, parse_nvr
+from identify.options import Options, parse_decimation, parse_nvr
 from identify.result import Identification
 from identify.run import identify_experiment
 
@@ -90,7 +90,8 @@ def identify_command(
     """Carry out ``armident identify``; ``chosen`` are the fields of `Options` as the user wrote them."""
     from identify.terminal import identification_table, progress, warn
 
-    options = Options(**{**chosen, "nvr": parse_nvr(chosen.get("nvr"))})
+    as_written = {"nvr": parse_nvr(chosen.get("nvr")), "decimation": parse_decimation(chosen.get("decimation"))}
+    options = Options(**{**chosen, **as_written})
     robot = None if config is None else load_robot(config)
     recording = read_recording(path)
     with progress(f"identify {path.name}") as report:

@@ -11,7 +11,7 @@ from daq.recording import Recording
 from identify.document import to_json
 from identify.methods import MEASURED
 from identify.model.arm import ArmModel
-from identify.options import METHODS, Method, Options, parse_nvr
+from identify.options import METHODS, Method, Options, parse_decimation, parse_nvr
 from identify.report.identification import identification_report
 from identify.service import Outcome, identify_recording
 from virtual_robot.inertias import plant_parameters
@@ -93,6 +93,15 @@ def test_the_grey_box_agrees_with_the_black_box() -> None:
     assert (np.abs(grey.theta - black.theta)[black.essential] < 3 * black.std[black.essential]).all()
 
 
+def test_decimation_from_the_noise_gives_the_same_arm() -> None:
+    """The thesis kept one sample of 125 by hand (section 6.2.3)."""
+    usual = identified(options("idim-iv")).result
+    chosen = identified(Options(method="idim-iv", decimation="noise")).result
+    rate = chosen.noise_model["rate_hz"]
+    assert 5000 / 250 <= rate <= 5000 / 40
+    assert (np.abs(chosen.theta - usual.theta)[usual.essential] < 3 * chosen.std[usual.essential]).all()
+
+
 def test_unweighted_least_squares_is_another_estimate_of_the_same() -> None:
     weighted, plain = (identified(Options(method="idim-ls", weighted=w)).result for w in (True, False))
     assert not np.array_equal(weighted.theta, plain.theta)
@@ -109,7 +118,8 @@ def test_unweighted_least_squares_is_another_estimate_of_the_same() -> None:
         ({"nvr": parse_nvr("-1e-5")}, "nvr: expected a ratio above 0, got -1e-05"),
         ({"bandwidth_hz": 0.0}, "bandwidth_hz: expected a frequency above 0, got 0.0"),
         ({"max_ar_order": -1}, "max_ar_order: expected 0 or more, got -1"),
-        ({"decimation": 0}, "decimation: expected a number of samples, got 0"),
+        ({"decimation": 0}, "decimation: expected a number of samples or noise, got 0"),
+        ({"decimation": parse_decimation("some")}, "decimation: expected a number of samples or noise, got some"),
     ],
 )
 def test_what_is_not_offered_is_refused_by_name(wrong: dict[str, object], message: str) -> None:
