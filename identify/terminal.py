@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from numba.core import event
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -17,10 +18,35 @@ SHOW_AFTER_S = 2.0
 Report = Callable[[str, float], None]
 
 
+class _Compilation(event.Listener):
+    """Says once that kernels are being compiled: the first run on a machine waits for that, and for nothing else."""
+
+    def __init__(self, what: str) -> None:
+        self._what, self._said = what, False
+
+    def on_start(self, event: event.Event) -> None:
+        """A kernel that no cache holds is about to be compiled."""
+        if not self._said:
+            self._said = True
+            print(f"{self._what}: compiling for this machine, once: later runs find it cached", file=sys.stderr)
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing is said of the end."""
+
+
 @contextmanager
 def progress(what: str) -> Iterator[Report]:
-    """Report stages after two seconds: a bar where stderr is a terminal, otherwise one plain line per stage."""
+    """Report stages after two seconds: a bar where stderr is a terminal, otherwise one plain line per stage.
+
+    The first run on a machine also says that it waits for the compiler.
+    """
     begin = time.monotonic()
+    with event.install_listener("numba:compile", _Compilation(what)), _stages(what, begin) as report:
+        yield report
+
+
+@contextmanager
+def _stages(what: str, begin: float) -> Iterator[Report]:
     if not sys.stderr.isatty():
         yield _plain_lines(what, begin)
         return
