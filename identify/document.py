@@ -40,7 +40,10 @@ class RecordingReference(Document):
 
 
 class Parameter(Document):
-    """One estimated parameter, SI; ``relative_std_pct`` is null where the value is zero."""
+    """One estimated parameter, SI; ``relative_std_pct`` is null where the value is zero.
+
+    ``formula`` is the parameter in standard ones, where several act as one: ``my5 - mz6``.
+    """
 
     name: str
     value: float
@@ -48,6 +51,7 @@ class Parameter(Document):
     relative_std_pct: float | None
     unit: str
     essential: bool
+    formula: str | None = None
 
 
 class Whiteness(Document):
@@ -180,7 +184,7 @@ def identification_document(
     joints = [joint.name for joint in robot.joints]
     essential = np.asarray(result.essential, dtype=bool)
     parameters = [
-        parameter(name, value, std, unit, bool(keep))
+        parameter(name, value, std, unit, bool(keep), result.formulas.get(name))
         for name, value, std, unit, keep in zip(
             result.names, result.theta, result.std, result.units, essential, strict=True
         )
@@ -229,13 +233,19 @@ def identification_document(
     )
 
 
-def parameter(name: str, value: float, std: float, unit: str, essential: bool) -> Parameter:
+def parameter(name: str, value: float, std: float, unit: str, essential: bool, formula: str | None = None) -> Parameter:
     """One parameter with its relative standard deviation in percent."""
     relative = 100.0 * float(std) / abs(float(value)) if value != 0.0 else None
     if relative is not None and not math.isfinite(relative):
         relative = None
     return Parameter(
-        name=name, value=float(value), std=float(std), relative_std_pct=relative, unit=unit, essential=essential
+        name=name,
+        value=float(value),
+        std=float(std),
+        relative_std_pct=relative,
+        unit=unit,
+        essential=essential,
+        formula=formula,
     )
 
 

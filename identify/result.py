@@ -34,8 +34,9 @@ class Identification:
 
     Parameters
     ----------
-    names, units, theta, std, covariance, essential
-        Base parameters (b,), their covariance (b, b), and which of them the data need.
+    names, units, formulas, theta, std, covariance, essential
+        Base parameters (b,), the formulas of those that stand for several, their covariance (b, b), and which of them
+        the data need.
     diagnostics
         Tests of the estimate.
     physical
@@ -55,6 +56,7 @@ class Identification:
     method: str
     names: tuple[str, ...]
     units: tuple[str, ...]
+    formulas: dict[str, str]
     theta: Array
     covariance: Array
     std: Array
@@ -105,6 +107,7 @@ def make_result(
     return Identification(
         method=options.method,
         names=model.base.names,
+        formulas={name: formula for name, formula in model.base.formulas.items() if formula != name},
         units=tuple(unit(name, model.robot) for name in model.base.names),
         theta=estimate.theta,
         covariance=estimate.covariance,
