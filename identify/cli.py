@@ -115,14 +115,19 @@ def trajectory(
     out: Annotated[Path, typer.Option("--out", help="Trajectory file to write (.yaml).")],
     duration: Annotated[float, typer.Option(min=1.0, help="Length, s.")] = 7.5,
     seed: Annotated[int, typer.Option(help="Start of the random search.")] = 0,
+    known: Annotated[
+        Path | None,
+        typer.Option(help="An identification.json of the robot: torques stay within limits, precision is predicted."),
+    ] = None,
+    evaluations: Annotated[int, typer.Option(min=1, help="Candidates to try.")] = 2000,
 ) -> None:
     """Design an exciting trajectory inside the limits of a robot.
 
-    Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --duration 8
+    Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
     from identify.service import trajectory_command
 
-    trajectory_command(config, out, duration, seed)
+    trajectory_command(config, out, duration, seed, known, evaluations)
 
 
 def reproduce(

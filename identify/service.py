@@ -153,18 +153,34 @@ def diagnose_command(
     return 0 if document.verdict == "no_gap" else FOUND
 
 
-def trajectory_command(config: Path, out: Path, duration: float, seed: int) -> None:
+def trajectory_command(
+    config: Path, out: Path, duration: float, seed: int, known: Path | None, evaluations: int
+) -> None:
     """Carry out ``armident trajectory``."""
     from identify.excitation import design_trajectory
-    from identify.terminal import progress
+    from identify.prior import prior_from
+    from identify.terminal import design_table, progress
 
     robot = load_robot(config)
-    with progress("trajectory") as report:
-        design = design_trajectory(robot, duration, seed, progress=lambda share: report("searching", share))
     if out.suffix not in {".yaml", ".yml"}:
         raise ConfigError(f"--out {out}: expected a file name that ends in .yaml")
+    prior = None
+    if known is not None:
+        prior = prior_from(load_document(known, IdentificationDocument), robot, str(known))
+    with progress("trajectory") as report:
+        design = design_trajectory(
+            robot,
+            duration,
+            seed,
+            noise=None if prior is None else prior.noise,
+            evaluations=evaluations,
+            theta=None if prior is None else prior.theta,
+            progress=lambda share: report("searching", share),
+        )
     text = yaml.safe_dump(design.trajectory.model_dump(mode="json", by_alias=True), sort_keys=False)
     write_atomically(out, text)
+    if prior is not None and design.std is not None:
+        design_table(robot, prior.theta, design.std)
     print(f"{out}: {design.trajectory.duration:.2f} s, condition number {design.condition:.0f}")
 
 

@@ -5,12 +5,16 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import numpy as np
 from numba.core import event
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from configs import RobotConfig
 from identify.document import DiagnosisDocument, IdentificationDocument
+from identify.model.arm import ArmModel
 
 SHOW_AFTER_S = 2.0
 """Work that takes no longer needs no progress."""
@@ -70,6 +74,17 @@ def warn(lines: list[str]) -> None:
     """One line each on stderr."""
     for line in lines:
         print(f"armident: warning: {line}", file=sys.stderr)
+
+
+def design_table(robot: RobotConfig, theta: NDArray[np.float64], std: NDArray[np.float64]) -> None:
+    """What a designed trajectory will tell: base parameters (b,) and their predicted standard deviations."""
+    table = Table(title=f"{robot.name}: predicted precision, base parameters", title_justify="left")
+    for column in ("parameter", "value", "std", "std %"):
+        table.add_column(column, justify="left" if column == "parameter" else "right")
+    for name, value, deviation in zip(ArmModel.from_config(robot).base.names, theta, std, strict=True):
+        relative = "" if value == 0 else f"{100 * deviation / abs(value):.1f}"
+        table.add_row(name, f"{value:.4f}", f"{deviation:.4f}", relative)
+    Console().print(table)
 
 
 def identification_table(document: IdentificationDocument) -> None:
