@@ -1,7 +1,7 @@
 """Autoregressive noise models, whitening and whiteness (thesis section 6.1.3)."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,24 @@ class ArModel:
         flat = np.ascontiguousarray(x, dtype=np.float64).reshape(x.shape[0], -1)
         out: NDArray[np.float64] = _convolve(flat, self.coefficients) / np.sqrt(self.variance)
         return out.reshape((out.shape[0], *x.shape[1:]))
+
+    def widened(self, samples: int) -> "ArModel":
+        """The same filter, its variance times ``((N + l) / (N - l))^2``: for weights and covariances of an estimate.
+
+        Two errors of relative size ``2 l / N`` make the information ``X' Omega^-1 X`` of the model too large.
+        The filter was fitted to the very residuals that it whitens: on others of the same process its error has the
+        variance ``(N + l) / (N - l)`` times as large (Akaike, Fitting autoregressive models for prediction, 1969). And
+        an estimate weighted by it scatters more than one weighted by the process itself, by the relative variance of an
+        AR spectrum, ``2 l / N`` on the average of the frequencies (Berk, Consistent autoregressive spectral estimates,
+        1974), less what the parameters do not feel of it.
+
+        Parameters
+        ----------
+        samples
+            N, length of the residuals from which the model comes, of all experiments together; more than the order.
+        """
+        factor = ((samples + self.order) / (samples - self.order)) ** 2
+        return replace(self, variance=factor * self.variance)
 
 
 WHITE = ArModel(np.empty(0), 1.0, 0.0)

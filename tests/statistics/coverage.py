@@ -250,6 +250,7 @@ def distances(runs: Runs, names: Sequence[str] = ESSENTIAL) -> Floats:
 def table(runs: Runs, rows: Sequence[Coverage]) -> str:
     """The coverage of every parameter and of all of them together, as text."""
     chi2, degrees = distances(runs), len(rows)
+    rms = float(np.sqrt(np.mean(runs.deviations[:, runs.columns([row.name for row in rows])] ** 2)))
     lines = [
         f"{'parameter':<10} {'truth':>9} {'covered':>9} {'%':>6} {'95 % bounds':>14} {'bias/std':>9} {'scatter':>8}"
     ]
@@ -266,6 +267,7 @@ def table(runs: Runs, rows: Sequence[Coverage]) -> str:
         f"handed over to idim-iv {int(runs.stepped_back.sum())}",
         f"intervals of +-{SIGMAS:g} std promise {100 * NOMINAL:.2f} %; mean {100 * shares.mean():.2f} %, "
         f"least {100 * shares.min():.1f} %, most {100 * shares.max():.1f} %",
+        f"root mean square of the errors in standard deviations: {rms:.3f}",
         f"within {100 * WANTED[0]:.0f} to {100 * WANTED[1]:.0f} %: "
         f"{int(sum(row.verdict == 'ok' for row in rows))} of {degrees}",
         f"joint: mean squared distance of the truth {chi2.mean():.2f} of {degrees} degrees of freedom "

@@ -1,10 +1,12 @@
 """AR models: found, applied, and tested for what they leave."""
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scipy import signal
 
 from identify.estimators.noise import ArModel, fit_ar, fit_spectrum, lagged_sums, whiteness
+from identify.estimators.regression import Block, inverse_gram, least_squares, noise_models, stacked
 
 COEFFICIENTS = np.array([-1.5, 0.7])
 
@@ -54,6 +56,48 @@ def test_what_the_parameters_absorbed_is_given_back() -> None:
     x = coloured(4000)
     r = lagged_sums(x[:, None], 10)
     assert fit_ar([x], 10, absorbed=r).variance > 1.9 * fit_ar([x], 10).variance
+
+
+def test_widening_is_two_of_akaikes_factors_and_leaves_filter_and_white_noise_alone() -> None:
+    model = ArModel(COEFFICIENTS, 4.0, 1.0)
+    wide = model.widened(100)
+    assert wide.variance == pytest.approx(4.0 * (102 / 98) ** 2)
+    np.testing.assert_array_equal(wide.coefficients, COEFFICIENTS)
+    assert ArModel(np.empty(0), 4.0, 1.0).widened(100).variance == 4.0
+
+
+def test_errors_of_parameters_are_as_large_as_said_although_the_noise_model_is_an_estimate() -> None:
+    # Noise of long memory and parameters of the low frequencies, as a robot has them after rough decimation.
+    coefficients = np.array([-0.80, 0.28, -0.24, 0.14, -0.16, 0.18, -0.10, 0.08, -0.18])
+    samples, parameters, runs = 700, 10, 300
+    rng = np.random.default_rng(0)
+    said, known, plain = np.empty(runs), np.empty(runs), np.empty(runs)
+    for run in range(runs):
+        white = rng.standard_normal((samples + 500, 1 + parameters))
+        noise = signal.lfilter([1.0], np.append(1.0, coefficients), white[:, :1], axis=0)[500:]
+        x = signal.lfilter([1.0], [1.0, -0.9], white[:, 1:], axis=0)[500:]
+        block = Block(noise, x[:, None, :], np.ones((samples, 1), np.bool_), np.arange(samples, dtype=np.float64))
+        known[run] = squared_distance(*weighted([block], [ArModel(coefficients, 1.0, 0.0)]))
+        models = [ArModel(np.empty(0), float(np.var(noise)), 0.0)]
+        for _ in range(5):
+            theta, covariance = weighted([block], models)
+            models = noise_models([block], theta, covariance, 30)
+        said[run] = squared_distance(*weighted([block], models))
+        order = models[0].order
+        plain[run] = said[run] * ((samples + order) / (samples - order)) ** 2
+    # Over seeds 0 to 4 the difference to the known noise model is 0.006 +- 0.007; unwidened it is 0.064.
+    assert abs(np.mean(said - known)) < 0.035
+    assert np.mean(plain - known) > 0.035
+
+
+def weighted(blocks: list[Block], models: list[ArModel]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x, y = stacked(blocks, models)
+    return least_squares(x, y), inverse_gram(x)
+
+
+def squared_distance(theta: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
+    """Of an estimate from its truth 0, as a share of what its covariance makes expect."""
+    return float(theta @ np.linalg.solve(covariance, theta)) / theta.size
 
 
 def test_a_residual_of_zeros_gives_a_model_and_no_nan() -> None:
