@@ -15,11 +15,15 @@ from identify.model.arm import ArmModel
 from identify.model.controller import DiscreteController
 from identify.model.physical import damp_to_physical
 from identify.model.simulation import Simulation, simulate
+from identify.signals.bandpass import butterworth
 from identify.signals.decimate import Decimation
 from identify.signals.differentiate import Derivatives
 
 HALVINGS = 8
 """Step halvings towards the last estimate that could be simulated."""
+
+WIDER = 2.0
+"""Decimated Nyquist frequency in bands of the instruments from which on they are filtered; less is left by rounding."""
 
 POSTURES = 100
 """Postures of the references at which the mass matrix of an iterate that diverged is examined."""
@@ -59,6 +63,10 @@ class AuxiliaryModel:
         Joint speeds (n,) beyond which a simulation counts as diverged.
     anchor
         A theta that is known to simulate, to move towards while there is no last one.
+    band_hz
+        Instruments vary no faster than this, whatever the decimation lets through. Beyond the motion's band the
+        measured regressor, smoothed, lacks what reference and simulated loop still hold, such as the steps in
+        which set points arrive, and a prefilter that amplifies high frequencies would count that as information.
     """
 
     model: ArmModel
@@ -70,7 +78,13 @@ class AuxiliaryModel:
     max_velocity: NDArray[np.float64]
     warnings: list[str] = field(default_factory=list)
     anchor: NDArray[np.float64] | None = None
+    band_hz: float = np.inf
     _last: NDArray[np.float64] | None = None
+
+    @property
+    def limits_band(self) -> bool:
+        """Whether the decimation lets through so much more than ``band_hz`` that instruments are filtered."""
+        return 0.5 / (self.dt * self.decimation.factor) >= WIDER * self.band_hz
 
     def fresh(self) -> Self:
         """The same loop without memory of estimates and warnings: what an estimator starts with."""
@@ -129,7 +143,7 @@ class AuxiliaryModel:
             If neither theta nor any point between it and the last good estimate can be simulated.
         """
         _, runs = self._nearest(theta)
-        return [filtered_regressor(self.model, Derivatives(r.q, r.qd, r.qdd, None), self.decimation) for r in runs]
+        return [filtered_regressor(self.model, self._in_band(run), self.decimation) for run in runs]
 
     def equations(self, blocks: Sequence[Block], theta: NDArray[np.float64]) -> list[Block]:
         """The equations with the simulated regressor in place of the measured one (2.32).
@@ -152,6 +166,13 @@ class AuxiliaryModel:
         near, runs = self._nearest(theta)
         return near, self._filtered(runs)
 
+    def _in_band(self, run: Simulation) -> Derivatives:
+        """Simulated signals, without what is faster than ``band_hz`` where the decimation leaves that in."""
+        if not self.limits_band:
+            return Derivatives(run.q, run.qd, run.qdd, None)
+        q, qd, qdd = (butterworth(s, self.dt, self.band_hz) for s in (run.q, run.qd, run.qdd))
+        return Derivatives(q, qd, qdd, None)
+
     def _filtered(self, runs: Sequence[Simulation]) -> Response:
         return Response(
             tuple(self.decimation(_at_samples(run.tau)) for run in runs),
@@ -169,14 +190,14 @@ class AuxiliaryModel:
             raise DataError("the auxiliary closed loop cannot be simulated: it diverges with the first estimate")
         damped = damp_to_physical(self.model, theta, previous, self._postures())
         reason = damped.reason or "its simulation diverged"
-        for halving in range(HALVINGS + 1):
-            target = previous + (damped.theta - previous) * 0.5**halving
+        for share in (*(0.5**halving for halving in range(HALVINGS + 1)), 0.0):
+            target = previous + (damped.theta - previous) * share
             runs = self.simulate(target)
             if runs is not None:
                 self._last = target
-                share = 100 * damped.step * 0.5**halving
                 self.warnings.append(
-                    f"an iterate was not physical: {reason}; simulated a point {share:.1f} % of the way to it"
+                    f"an iterate was not physical: {reason}; "
+                    f"simulated a point {100 * damped.step * share:.1f} % of the way to it"
                 )
                 return target, runs
         raise DataError("the auxiliary closed loop cannot be simulated: it diverges between all estimates tried")

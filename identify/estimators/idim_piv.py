@@ -7,19 +7,17 @@ from numpy.typing import NDArray
 
 from identify.estimators.auxiliary import AuxiliaryModel
 from identify.estimators.grey_box import InverseController
+from identify.estimators.iv_products import IvProducts, iv_products
 from identify.estimators.noise import ArModel
 from identify.estimators.regression import (
     ITERATIONS,
     MAX_AR_ORDER,
     Block,
     Estimate,
-    instrumental_variable,
     iterate,
-    iv_covariance,
     joint_variances,
     noise_models,
     residual_norm,
-    stacked,
     whitened_residuals,
 )
 
@@ -74,17 +72,19 @@ def idim_piv(
     scale = joint_variances(measured, start)
     noise: list[ArModel] = scale  # step 1: H = 1, lambda from the start
 
+    def solved(at: NDArray[np.float64]) -> IvProducts:
+        instruments = [block.x for block in seen(auxiliary.equations(blocks, at))]
+        return iv_products(instruments, measured, noise)  # 6.30
+
     def step(previous: NDArray[np.float64], k: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise
-        z, _y = stacked(seen(auxiliary.equations(blocks, previous)), noise)  # step 2a
-        x, y = stacked(measured, noise)
-        estimate = instrumental_variable(z, x, y)  # step 2b, 6.30
+        products = solved(previous)  # steps 2a and 2b
+        estimate = products.theta
         if k <= NOISE_UPDATES:
-            noise = noise_models(measured, estimate, iv_covariance(z, x), max_order)  # step 2c
+            noise = noise_models(measured, estimate, products.covariance, max_order)  # step 2c
         return estimate, residual_norm(measured, estimate, scale)
 
     theta, done, converged, reason = iterate(step, start, iterations)
-    z, _y = stacked(seen(auxiliary.equations(blocks, theta)), noise)
-    covariance = iv_covariance(z, stacked(measured, noise)[0])
+    covariance = solved(theta).covariance
     residuals = whitened_residuals(measured, theta, noise)
     return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())

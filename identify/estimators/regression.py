@@ -101,14 +101,18 @@ def filtered_regressor(
     if count == 0:
         decimation(signals.q)
 
-    def chunk(first: int) -> NDArray[np.float64]:
+    filtered = np.empty((count, model.n, model.base.b))
+
+    def fill(first: int) -> None:
         last = min(first + rows, count)
         span = slice(first * decimation.factor, (last - 1) * decimation.factor + decimation.taps.size)
         phi = model.base_regressor(signals.q[span], signals.qd[span], signals.qdd[span], sharp_sign=sharp_sign)
-        return decimation(phi)
+        filtered[first:last] = decimation(phi)
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        return np.concatenate(list(pool.map(chunk, range(0, count, rows))))
+        for _ in pool.map(fill, range(0, count, rows)):
+            pass
+    return filtered
 
 
 def weighted_rows(
@@ -173,13 +177,15 @@ def noise_models(
     """
     errors = residuals(blocks, theta)
     factor = _square_root(covariance)
-    models = []
-    for j in range(blocks[0].y.shape[1]):
+
+    def of_joint(j: int) -> ArModel:
         series = [e[:, j] for e in errors]
         longest = min(max_order, min(s.size for s in series) - 1)
         absorbed = sum((lagged_sums(b.x[:, j] @ factor, longest) for b in blocks), np.zeros(longest + 1))
-        models.append(fit_ar(series, longest, absorbed).widened(sum(s.size for s in series)))
-    return models
+        return fit_ar(series, longest, absorbed).widened(sum(s.size for s in series))
+
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        return list(pool.map(of_joint, range(blocks[0].y.shape[1])))
 
 
 def _square_root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
