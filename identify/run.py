@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from identify.methods import PREFILTERED, Problem, decimation_of, solve
 from identify.model.arm import ArmModel
 from identify.model.consistent import nearest_consistent
 from identify.options import CONTROLLERS, Options
-from identify.preparation import aligned_torque, equations, published_equations
+from identify.preparation import aligned_torque, equations, least_rows, published_equations
 from identify.result import Array, Identification, make_result
 from identify.signals.bandwidth import motion_bandwidth
 from identify.signals.delay import HELD, TorqueDelay
@@ -81,9 +82,11 @@ def _identify(
     signals = _derivatives(experiments, robot, options, dt, bandwidth)
 
     clock.enter("idim-ls", 0.2)
+    lengths = [e.q.shape[0] for e in experiments]
+    decimate = partial(decimation_of, samples=lengths, rows=least_rows(model), warnings=warnings)
     # A factor given by hand is that of the method; a method with a noise model keeps its own for the comparison.
     factor = options.decimation if isinstance(options.decimation, int) else None
-    plain = decimation_of("idim-ls", dt, bandwidth, None if options.method in PREFILTERED else factor)
+    plain = decimate("idim-ls", dt, bandwidth, None if options.method in PREFILTERED else factor)
     if options.derivatives is None and options.decimation is None and robot.preprocessing is not None:
         ls_blocks = published_equations(model, experiments, robot.preprocessing)
     else:
@@ -92,7 +95,7 @@ def _identify(
     if options.decimation == "noise":
         factor = _memory_of_noise(model, experiments, signals, ls.theta, warnings)
         if options.method not in PREFILTERED:
-            plain = decimation_of("idim-ls", dt, bandwidth, factor)
+            plain = decimate("idim-ls", dt, bandwidth, factor)
             ls_blocks = equations(model, experiments, signals, plain)
             ls = idim_ls(ls_blocks, model.base.names, weighted=options.weighted)
 
@@ -101,7 +104,7 @@ def _identify(
         estimate, blocks, solution = ls, ls_blocks, None
     else:
         clock.enter("controller", 0.35)
-        decimation = decimation_of(options.method, dt, bandwidth, factor)
+        decimation = decimate(options.method, dt, bandwidth, factor)
         auxiliary, start, controller = closed_loop(
             model, experiments, signals, options, ls.theta, decimation, bandwidth, warnings
         )
