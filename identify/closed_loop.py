@@ -61,6 +61,8 @@ def closed_loop(
                 decimation,
                 fastest,
                 anchor=start,
+                # Methods without a measured regressor have the torque's band in both their sides.
+                band_hz=PIV_CUTOFF * bandwidth if options.method in MEASURED else np.inf,
             )
             runs = auxiliary.simulate(start)
             if runs is None:

@@ -114,6 +114,17 @@ class Problem:
         """The same with the decimation of the methods without a noise model."""
         return replace(self, auxiliary=replace(self.auxiliary.fresh(), decimation=self.plain))
 
+    @cached_property
+    def in_band(self) -> "Problem":
+        """The same, decimated to the band of the instruments where the equations have a wider one.
+
+        At the recorded rate nearly all rows lie beyond the band in which anything is told.
+        """
+        auxiliary = self.auxiliary
+        if not auxiliary.limits_band:
+            return self
+        return replace(self, auxiliary=replace(auxiliary.fresh(), decimation=design(auxiliary.dt, auxiliary.band_hz)))
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -130,13 +141,14 @@ class Solution:
     warnings: tuple[str, ...] = ()
 
     def diagnostics(self, essential: NDArray[np.bool_]) -> Diagnostics:
-        """Tests of the estimate on the equations it solves."""
-        problem, estimate = self.problem, self.estimate
+        """Tests of the estimate on the equations it solves, thinned out to the band of its instruments."""
+        problem, estimate = self.problem.in_band, self.estimate
         instruments = problem.auxiliary.fresh().instruments(estimate.theta)
         blocks, method = problem.blocks, problem.options.method
         if method not in MEASURED:
             blocks = [replace(b, x=z) for b, z in zip(blocks, instruments, strict=True)]
-        weights = None if self.prefiltered else joint_variances(blocks, estimate.theta)
+        as_weighed = self.prefiltered and problem is self.problem
+        weights = None if as_weighed else joint_variances(blocks, estimate.theta)
         return diagnose_estimate(
             problem.auxiliary.model.base.names,
             [joint.name for joint in problem.auxiliary.model.robot.joints],

@@ -22,6 +22,7 @@ from identify.methods import decimation_of
 from identify.model.arm import ArmModel
 from identify.options import Options
 from identify.preparation import PIV_CUTOFF, equations
+from identify.run import identify_experiment
 from identify.signals.decimate import design
 from identify.signals.differentiate import Derivatives, differentiate
 from virtual_robot.inertias import plant_parameters
@@ -125,3 +126,13 @@ def test_no_chosen_decimation_is_wider_than_twice_the_band(cutoff_hz: float) -> 
     factor = design(0.0002, cutoff_hz).factor
 
     assert 0.5 / (0.0002 * factor) < 2.0 * cutoff_hz
+
+
+@pytest.mark.slow
+def test_identification_at_the_recorded_rate_converges_without_a_warning() -> None:
+    found = identify_experiment(recorded()[0], load_robot("tx40"), Options(method="idim-piv", decimation=1))
+
+    assert found.converged
+    assert not found.warnings
+    assert not found.diagnostics.weak_instruments
+    assert np.sqrt(np.mean(((found.theta - truth()) / found.std) ** 2)) < 1.5
