@@ -79,6 +79,7 @@ class IdentificationOptions(Frozen):
     method: Literal["idim-piv", "idim-iv", "idim-ls", "didim", "clie", "cloe", "sep-pem"] = "idim-piv"
     derivatives: Literal["irwsm", "irwsm2", "bandpass"] = "irwsm"
     controller: Literal["crc", "parametric", "known"] = "crc"
+    nvr: Positive | Literal["automatic", "cross-validation", "likelihood", "tracking-error"] = "automatic"
     noise_model: Literal["black-box", "grey-box"] = "black-box"
     physical: bool = False
 
