@@ -117,7 +117,7 @@ def simulate(
     start = reference[0] if q0 is None else np.asarray(q0, dtype=np.float64)
     if qd0 is None:
         qd0 = (reference[1] - reference[0]) / dt if samples > 1 else np.zeros(n)
-    q, qd, qdd, tau = (np.full((samples, n), np.nan) for _ in range(4))
+    q, qd, qdd, tau = (np.empty((samples, n)) for _ in range(4))
     q[0], qd[0] = start, qd0
     transmission = np.ascontiguousarray(model.robot.transmission_matrix)
     values = model.values(theta_base)
