@@ -108,6 +108,7 @@ class Assembler:
         if first_counter is not None:
             self._books.state[COUNTER] = (first_counter - 1) % overflow
             self._books.state[ORIGIN] = first_counter
+        self._dropped = False
         self._open: dict[tuple[str, str | None, str], tuple[int, int]] = {}
         self._totals = dict.fromkeys(
             [f"{s.name}.{what}" for s in streams for what in ("expected", "rows", "in_gaps", "discarded")], 0
@@ -146,7 +147,11 @@ class Assembler:
             Whether the kernel dropped frames between the last call and the end of these.
         """
         columns = _columns(frames)
+        self._dropped |= dropped
         longest = self._longest if sent is None else min(self._longest, sent - self.last_sync)
+        if sent is not None and not self._dropped:
+            # Our own SYNCs reach us unless the kernel drops them: time that passed is a producer held up, no loss.
+            longest = 0
         syncs = _count_sync(*columns, *self._timing, longest, self._books)
         if dropped:
             self._books.hole[:] = self._books.head + syncs + 1

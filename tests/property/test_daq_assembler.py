@@ -234,6 +234,17 @@ def test_a_jump_of_the_clock_is_no_gap() -> None:
         assert assembler.counters["samples.rows"] == COUNT
 
 
+def test_a_producer_that_was_held_up_has_lost_nothing() -> None:
+    """As long as a turn of its counter, while answers are late and more SYNCs have been sent than were read."""
+    frames = bus(COUNT, Faults(late={k: 400 - k for k in range(100, 300)}))
+    frames["t_ns"][len(frames) // 2 :] += 245 * PERIOD_NS
+    assembler = Assembler(STREAMS, JOINTS, PERIOD_NS)
+    batch = assembler.push(frames, sent=5 * COUNT)
+    assert assembler.counters["sync_missing"] == 0
+    assert batch.gaps == ()
+    assert assembler.last_sync == COUNT - 1
+
+
 def test_a_foreign_sync_starts_at_its_own_counter() -> None:
     frames = bus(COUNT, Faults())
     later = frames[np.flatnonzero(frames["can_id"] == 0x80)[123] :]
