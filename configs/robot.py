@@ -86,10 +86,12 @@ class Effect(Frozen):
     """An effect of the discrepancy catalogue that is part of this robot's model, and its parameters.
 
     Shape parameters (a Stribeck velocity, a harmonic) stay as given; linear ones are estimated with the rest.
+    ``other`` is the second joint of an effect between two.
     """
 
     effect: Name
     joint: Name
+    other: Name | None = None
     parameters: dict[str, float] = Field(default_factory=dict)
 
 
@@ -178,8 +180,9 @@ class RobotConfig(Frozen):
                 if joint not in names:
                     raise ValueError(f"couplings: no joint named {joint!r}; joints are {', '.join(names)}")
         for effect in self.effects:
-            if effect.joint not in names:
-                raise ValueError(f"effects: no joint named {effect.joint!r}; joints are {', '.join(names)}")
+            for name in (effect.joint, effect.other):
+                if name is not None and name not in names:
+                    raise ValueError(f"effects: no joint named {name!r}; joints are {', '.join(names)}")
         threshold = self.friction.velocity_threshold
         if threshold is not None and len(threshold) != n:
             raise ValueError(f"friction.velocity_threshold: expected {n} numbers")

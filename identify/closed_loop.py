@@ -63,6 +63,7 @@ def closed_loop(
                 anchor=start,
                 # Methods without a measured regressor have the torque's band in both their sides.
                 band_hz=PIV_CUTOFF * bandwidth if options.method in MEASURED else np.inf,
+                starts=[e.start for e in experiments],
             )
             runs = auxiliary.simulate(start)
             if runs is None:

@@ -142,7 +142,7 @@ def assess(
     """
     period = 1e-3
     q, qd, qdd = _motion(trajectory, period)
-    x = model.base_regressor(q, qd, qdd)
+    x = model.base_regressor(q, qd, qdd, dt=period)
     keep = max(1, round(0.5 / (cutoff_hz * period)))
     sections = butter(4, 2.0 * cutoff_hz * period, output="sos")
     x = sosfiltfilt(sections, x, axis=0)[keep // 2 :: keep] / np.asarray(noise, dtype=np.float64)[:, None]
@@ -244,7 +244,7 @@ class _Search:
             torque = self.model.inverse_dynamics(self.theta, q, qd, qdd)
             if (np.abs(torque) > self.torque).any():
                 return np.inf
-        x = (self.model.base_regressor(q, qd, qdd) / self.sigma[:, None]).reshape(-1, self.model.base.b)
+        x = (self.model.base_regressor(q, qd, qdd, dt=1.0 / SEARCH_RATE) / self.sigma[:, None]).reshape(-1, self.model.base.b)
         eigenvalues = np.linalg.eigvalsh(x.T @ x)
         if not eigenvalues[0] > 0.0:
             return np.inf

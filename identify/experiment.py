@@ -21,9 +21,12 @@ class Experiment:
         Reference positions, shape (N, n), or ``None`` where none was recorded.
     dt
         Sampling period, s.
+    start
+        Time of the first sample since the recordings began, s: what friction that warms up depends on.
     """
 
     q: NDArray[np.float64]
     tau: NDArray[np.float64]
     q_ref: NDArray[np.float64] | None
     dt: float
+    start: float = 0.0

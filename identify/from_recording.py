@@ -79,7 +79,13 @@ def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tupl
                 f"{len(long_enough)} of them longer than {MIN_PIECE_S} s are used"
             )
         experiments += [
-            Experiment(q=q[piece], tau=tau[piece], q_ref=None if q_ref is None else q_ref[piece], dt=dt)
+            Experiment(
+                q=q[piece],
+                tau=tau[piece],
+                q_ref=None if q_ref is None else q_ref[piece],
+                dt=dt,
+                start=float(samples.sync[piece[0]] - samples.sync[0]) * dt,
+            )
             for piece in long_enough
         ]
     if not experiments:

@@ -165,7 +165,10 @@ class Solution:
         runs = problem.auxiliary.simulate(self.estimate.theta)
         if runs is None:
             return None
-        motions = [Derivatives(run.q, run.qd, run.qdd, None) for run in runs]
+        motions = [
+            Derivatives(run.q, run.qd, run.qdd, None, e.dt, e.start)
+            for run, e in zip(runs, problem.experiments, strict=True)
+        ]
         return torque_delay(problem.auxiliary.model, problem.experiments, problem.signals, problem.plain, motions)
 
 

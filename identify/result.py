@@ -108,7 +108,7 @@ def make_result(
         method=options.method,
         names=model.base.names,
         formulas={name: formula for name, formula in model.base.formulas.items() if formula != name},
-        units=tuple(unit(name, model.robot) for name in model.base.names),
+        units=units(model),
         theta=estimate.theta,
         covariance=estimate.covariance,
         std=estimate.std,
@@ -152,6 +152,12 @@ def relative_errors(blocks: Sequence[Block], theta: Array) -> tuple[float, Array
     miss = sum(np.sum(np.where(b.keep, e, 0.0) ** 2, axis=0) for e, b in zip(errors, blocks, strict=True))
     power = sum(np.sum(np.where(b.keep, b.y, 0.0) ** 2, axis=0) for b in blocks)
     return 100 * float(np.sqrt(np.sum(miss) / np.sum(power))), 100 * np.sqrt(miss / np.maximum(power, 1e-300))
+
+
+def units(model: ArmModel) -> tuple[str, ...]:
+    """SI units of the base parameters, those of the terms at the end, (b,)."""
+    rigid = [unit(name, model.robot) for name in model.base.names[: model.base.b - model.e]]
+    return (*rigid, *(one for term in model.terms for one in term.units))
 
 
 UNITS = {"ia": ("kg m^2", "kg"), "fv": ("N m s/rad", "N s/m"), "fc": ("N m", "N"), "of": ("N m", "N")}

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from configs import DataError, RobotConfig
+from identify.catalogue.wiring import rewired
 from identify.closed_loop import closed_loop
 from identify.estimators.diagnostics import diagnose_estimate
 from identify.estimators.essential import essential_parameters
@@ -28,6 +29,9 @@ from identify.signals.noise_decimation import decimation_from_noise
 
 TOLERATED_DELAY = 1.0
 """Samples by which torque and position may be apart without a warning."""
+
+ANCHORINGS = 2
+"""Estimates of the arm with its terms before those that depend on its torques are left as they are."""
 
 Progress = Callable[[str, float], None]
 
@@ -74,6 +78,7 @@ def _identify(
     warnings: list[str] = []
 
     clock.enter("model", 0.0)
+    experiments = rewired(experiments, robot)
     model = ArmModel.from_config(robot)
     dt = experiments[0].dt
     bandwidth = options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
@@ -83,6 +88,8 @@ def _identify(
 
     clock.enter("idim-ls", 0.2)
     lengths = [e.q.shape[0] for e in experiments]
+    if any(term.effect.predicts for term in model.terms):
+        model = _anchored(model, experiments, signals, bandwidth, lengths)
     decimate = partial(decimation_of, samples=lengths, rows=least_rows(model), warnings=warnings)
     # A factor given by hand is that of the method; a method with a noise model keeps its own for the comparison.
     factor = options.decimation if isinstance(options.decimation, int) else None
@@ -140,6 +147,25 @@ def _identify(
     )  # fmt: skip
 
 
+def _anchored(
+    model: ArmModel,
+    experiments: Sequence[Experiment],
+    signals: Sequence[Derivatives],
+    bandwidth: float,
+    lengths: Sequence[int],
+) -> ArmModel:
+    """The model whose terms predict torques by an estimate: first of the rigid arm, then with the terms in it."""
+    rigid = model.without_terms()
+    decimation = decimation_of(
+        "idim-ls", experiments[0].dt, bandwidth, None, samples=lengths, rows=least_rows(model)
+    )
+    theta = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names).theta
+    for _ in range(ANCHORINGS):
+        model = model.anchored(np.concatenate([theta[: rigid.base.b], np.zeros(model.e)]))
+        theta = idim_ls(equations(model, experiments, signals, decimation), model.base.names).theta
+    return model
+
+
 def _memory_of_noise(
     model: ArmModel,
     experiments: Sequence[Experiment],
@@ -149,7 +175,9 @@ def _memory_of_noise(
 ) -> int:
     """The decimation after which the noise that IDIM-LS leaves at the full rate is hardly correlated."""
     left = [
-        aligned_torque(e.tau) - model.inverse_dynamics(theta, s.q, s.qd, s.qdd)
+        aligned_torque(e.tau)
+        - model.inverse_dynamics(theta, s.q, s.qd, s.qdd)
+        - model.term_regressor(model.motion(s.q, s.qd, s.qdd, e.dt, e.start)) @ theta[theta.size - model.e :]
         for e, s in zip(experiments, signals, strict=True)
     ]
     found = decimation_from_noise(left)
@@ -175,8 +203,11 @@ def _derivatives(
 ) -> list[Derivatives]:
     resolution = encoder_resolution(robot) if options.nvr == "tracking-error" else None
     return [
-        differentiate(
-            e.q, dt, options.derivatives or "irwsm", options.nvr, bandwidth, q_ref=e.q_ref, resolution=resolution
+        replace(
+            differentiate(
+                e.q, dt, options.derivatives or "irwsm", options.nvr, bandwidth, q_ref=e.q_ref, resolution=resolution
+            ),
+            start=e.start,
         )
         for e in experiments
     ]

@@ -64,12 +64,6 @@ def identify_recording(
     """
     robot = robot or recording.robot
     experiments, notes = experiments_from_recording(recording, robot)
-    if robot.effects:
-        from identify.discrepancy.compensation import without_effects
-
-        experiments = without_effects(experiments, robot)
-        named = ", ".join(f"{e.effect} of {e.joint}" for e in robot.effects)
-        notes.append(f"effects taken out with the values of the configuration, not estimated again: {named}")
     result = identify_experiment(experiments, robot, options or Options(), progress)
     return Outcome(recording, robot, result, identification_document(result, recording, robot, notes))
 

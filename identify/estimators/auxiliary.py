@@ -14,7 +14,8 @@ from identify.estimators.regression import Block, filtered_regressor
 from identify.model.arm import ArmModel
 from identify.model.controller import DiscreteController
 from identify.model.physical import damp_to_physical
-from identify.model.simulation import Simulation, simulate
+from identify.model.relaxation import simulate_with_terms
+from identify.model.simulation import Simulation
 from identify.signals.bandpass import butterworth
 from identify.signals.decimate import Decimation
 from identify.signals.differentiate import Derivatives
@@ -67,6 +68,8 @@ class AuxiliaryModel:
         Instruments vary no faster than this, whatever the decimation lets through. Beyond the motion's band the
         measured regressor, smoothed, lacks what reference and simulated loop still hold, such as the steps in
         which set points arrive, and a prefilter that amplifies high frequencies would count that as information.
+    starts
+        Time of the first sample of every experiment since the recordings began, s; ``None``: zero.
     """
 
     model: ArmModel
@@ -79,6 +82,7 @@ class AuxiliaryModel:
     warnings: list[str] = field(default_factory=list)
     anchor: NDArray[np.float64] | None = None
     band_hz: float = np.inf
+    starts: Sequence[float] | None = None
     _last: NDArray[np.float64] | None = None
 
     @property
@@ -115,9 +119,17 @@ class AuxiliaryModel:
         if not np.isfinite(theta).all():
             return None
         runs = []
-        for q_ref, (q0, qd0) in zip(self.references, self.initial, strict=True):
-            run = simulate(
-                self.model, theta, self.controller, q_ref, self.dt, q0=q0, qd0=qd0, max_velocity=self.max_velocity
+        for k, (q_ref, (q0, qd0)) in enumerate(zip(self.references, self.initial, strict=True)):
+            run = simulate_with_terms(
+                self.model,
+                theta,
+                self.controller,
+                q_ref,
+                self.dt,
+                start=self._start(k),
+                q0=q0,
+                qd0=qd0,
+                max_velocity=self.max_velocity,
             )
             if run.diverged_at is not None:
                 return None
@@ -143,7 +155,10 @@ class AuxiliaryModel:
             If neither theta nor any point between it and the last good estimate can be simulated.
         """
         _, runs = self._nearest(theta)
-        return [filtered_regressor(self.model, self._in_band(run), self.decimation) for run in runs]
+        return [
+            filtered_regressor(self.model, self._in_band(run, self._start(k)), self.decimation)
+            for k, run in enumerate(runs)
+        ]
 
     def equations(self, blocks: Sequence[Block], theta: NDArray[np.float64]) -> list[Block]:
         """The equations with the simulated regressor in place of the measured one (2.32).
@@ -166,12 +181,15 @@ class AuxiliaryModel:
         near, runs = self._nearest(theta)
         return near, self._filtered(runs)
 
-    def _in_band(self, run: Simulation) -> Derivatives:
+    def _start(self, experiment: int) -> float:
+        return 0.0 if self.starts is None else self.starts[experiment]
+
+    def _in_band(self, run: Simulation, start: float) -> Derivatives:
         """Simulated signals, without what is faster than ``band_hz`` where the decimation leaves that in."""
         if not self.limits_band:
-            return Derivatives(run.q, run.qd, run.qdd, None)
+            return Derivatives(run.q, run.qd, run.qdd, None, self.dt, start)
         q, qd, qdd = (butterworth(s, self.dt, self.band_hz) for s in (run.q, run.qd, run.qdd))
-        return Derivatives(q, qd, qdd, None)
+        return Derivatives(q, qd, qdd, None, self.dt, start)
 
     def _filtered(self, runs: Sequence[Simulation]) -> Response:
         return Response(

@@ -41,5 +41,9 @@ class FollowedMotion(AuxiliaryModel):
         for q in self.references:
             qd = central_difference(q, self.dt)
             qdd = central_difference(qd, self.dt)
-            runs.append(Simulation(q, qd, qdd, self.model.inverse_dynamics(theta, q, qd, qdd), None))
+            tau = self.model.inverse_dynamics(theta, q, qd, qdd)
+            if self.model.terms:
+                motion = self.model.motion(q, qd, qdd, self.dt, self._start(len(runs)))
+                tau = tau + self.model.term_regressor(motion) @ theta[theta.size - self.model.e :]
+            runs.append(Simulation(q, qd, qdd, tau, None))
         return runs

@@ -94,20 +94,27 @@ def filtered_regressor(
 ) -> NDArray[np.float64]:
     """Base regressor after the parallel filter, shape (M, n, b).
 
-    Chunk by chunk, so that memory stays small, and on all processors: neither kernel holds the interpreter lock.
+    Chunk by chunk, so that memory stays small, and on all processors: neither kernel holds the interpreter lock. Terms
+    of the model, which may remember, see the motion in one piece.
     """
     count = decimation.count(signals.q.shape[0])
     rows = max(1, _CHUNK_ROWS // decimation.factor)
     if count == 0:
         decimation(signals.q)
 
+    rigid = model.base.b - model.e
     filtered = np.empty((count, model.n, model.base.b))
+    if model.terms:
+        if signals.dt is None:
+            raise ValueError("the terms of a model need the sampling period of the signals")
+        motion = model.motion(signals.q, signals.qd, signals.qdd, signals.dt, signals.start, sharp_sign=sharp_sign)
+        filtered[:, :, rigid:] = decimation(model.term_regressor(motion))
 
     def fill(first: int) -> None:
         last = min(first + rows, count)
         span = slice(first * decimation.factor, (last - 1) * decimation.factor + decimation.taps.size)
-        phi = model.base_regressor(signals.q[span], signals.qd[span], signals.qdd[span], sharp_sign=sharp_sign)
-        filtered[first:last] = decimation(phi)
+        phi = model.rigid_regressor(signals.q[span], signals.qd[span], signals.qdd[span], sharp_sign=sharp_sign)
+        filtered[first:last, :, :rigid] = decimation(phi)
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         for _ in pool.map(fill, range(0, count, rows)):

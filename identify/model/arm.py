@@ -1,14 +1,16 @@
 """The dynamic model of a serial arm: regressor, inverse and direct dynamics, base parameters."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from configs import ArmidentError, RobotConfig
-from identify.model.base_parameters import BaseParameters, base_parameters
-from identify.model.chain import Chain, Columns, Floats, Values, chain_of, columns_of, standard_names, values_of
+from identify.catalogue.motion import Motion
+from identify.catalogue.terms import Term, terms_of
+from identify.model.base_parameters import BaseParameters, base_parameters, with_terms
+from identify.model.chain import INERTIAL, Chain, Columns, Floats, Values, chain_of, columns_of, standard_names, values_of
 from identify.model.kernels import (
     fill_forward_dynamics,
     fill_inverse_dynamics,
@@ -23,6 +25,8 @@ class ArmModel:
 
     Everything is joint side and SI. Friction is ``fv qd + fc sign(qd) + off``; where ``sharp_sign`` is
     false the sign is ``(2/pi) atan(g qd)`` with the ``sign_smoothing`` g of the robot configuration.
+    The effects that the configuration names are further terms: their linear parameters stand after all others
+    in ``names`` and in ``base.names``. Rigid dynamics (mass matrix, recursion, simulation step) pass over them.
 
     Examples
     --------
@@ -40,6 +44,9 @@ class ArmModel:
     columns: Columns
     base_columns: Columns
     base: BaseParameters
+    terms: tuple[Term, ...] = ()
+    anchor: Floats | None = None
+    """Parameters by which terms that depend on the model's own torques predict them, (p,) or (b,)."""
 
     @classmethod
     def from_config(cls, robot: RobotConfig) -> Self:
@@ -49,7 +56,9 @@ class ArmModel:
         columns = columns_of(robot, names)
         base = base_parameters(robot, chain, columns, names)
         base_columns = columns_of(robot, tuple(names[k] for k in base.independent))
-        return cls(robot, names, chain, columns, base_columns, base)
+        terms = terms_of(robot)
+        further = tuple(name for term in terms for name in term.names)
+        return cls(robot, names + further, chain, columns, base_columns, with_terms(base, further), terms)
 
     @property
     def n(self) -> int:
@@ -61,8 +70,51 @@ class ArmModel:
         """``g`` of the smoothed sign, s/rad or s/m."""
         return self.robot.friction.sign_smoothing
 
+    @property
+    def e(self) -> int:
+        """Number of linear parameters of the effects: the last ones of ``names`` and of ``base.names``."""
+        return sum(len(term.names) for term in self.terms)
+
+    @property
+    def of_links(self) -> NDArray[np.bool_]:
+        """Which standard parameters belong to links: not friction, offset, rotor or effect, (p,)."""
+        rigid = self.names[: len(self.names) - self.e]
+        links = [name.rstrip("0123456789") in INERTIAL for name in rigid]
+        return np.array(links + [False] * self.e, dtype=np.bool_)
+
+    def anchored(self, theta: ArrayLike) -> Self:
+        """The same model, its terms predicting torques by ``theta``, (p,) or (b,)."""
+        return replace(self, anchor=np.asarray(theta, dtype=np.float64))
+
+    def without_terms(self) -> Self:
+        """The rigid model alone."""
+        if not self.terms:
+            return self
+        rigid = len(self.names) - self.e
+        return replace(self, names=self.names[:rigid], base=self.base.without(self.e), terms=(), anchor=None)
+
+    def with_gravity(self, gravity: ArrayLike) -> Self:
+        """The same model under another gravity (3,), m/s^2."""
+        return replace(self, chain=self.chain._replace(gravity=np.asarray(gravity, dtype=np.float64)))
+
+    def smooth_sign(self, qd: Floats) -> Floats:
+        """``(2/pi) atan(g qd)`` (thesis appendix B.2)."""
+        smooth: Floats = 2 / np.pi * np.arctan(self.smoothing * qd)
+        return smooth
+
+    def motion(
+        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, dt: float, start: float = 0.0, *, sharp_sign: bool = False
+    ) -> Motion:
+        """A motion as the terms see it; every array (N, n), ``dt`` and ``start`` in s."""
+        return Motion(self, *self._motion(q, qd, qdd), dt, start, self.anchor, sharp=sharp_sign)
+
+    def term_regressor(self, motion: Motion) -> Floats:
+        """Columns of the terms, shape (N, n, e): torque per unit of their linear parameters."""
+        columns = [term.columns(motion) for term in self.terms]
+        return np.concatenate(columns, axis=2) if columns else np.zeros((motion.samples, self.n, 0))
+
     def regressor(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False) -> Floats:
-        """Regressor of the standard parameters.
+        """Regressor of the standard parameters without those of the terms.
 
         Parameters
         ----------
@@ -74,18 +126,48 @@ class ArmModel:
         Returns
         -------
         ndarray
-            Shape (N, n, p): row j of sample k times ``theta`` is the torque of joint j.
+            Shape (N, n, p - e): row j of sample k times ``theta`` is the torque of joint j.
         """
-        return self._regressor(self.columns, len(self.names), q, qd, qdd, sharp_sign)
+        return self._regressor(self.columns, len(self.names) - self.e, q, qd, qdd, sharp_sign)
 
-    def base_regressor(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False) -> Floats:
-        """Regressor of the base parameters, shape (N, n, b); see `regressor`."""
-        return self._regressor(self.base_columns, self.base.b, q, qd, qdd, sharp_sign)
+    def base_regressor(
+        self,
+        q: ArrayLike,
+        qd: ArrayLike,
+        qdd: ArrayLike,
+        *,
+        sharp_sign: bool = False,
+        dt: float | None = None,
+        start: float = 0.0,
+    ) -> Floats:
+        """Regressor of the base parameters, shape (N, n, b); see `regressor`.
+
+        Parameters
+        ----------
+        dt, start
+            Sampling period and time of the first sample, s; a model with terms needs the whole motion and these.
+
+        Raises
+        ------
+        ValueError
+            If the model has terms and ``dt`` is missing.
+        """
+        rigid = self.rigid_regressor(q, qd, qdd, sharp_sign=sharp_sign)
+        if not self.terms:
+            return rigid
+        if dt is None:
+            raise ValueError("the terms of a model need the sampling period")
+        further = self.term_regressor(self.motion(q, qd, qdd, dt, start, sharp_sign=sharp_sign))
+        return np.concatenate([rigid, further], axis=2)
+
+    def rigid_regressor(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False) -> Floats:
+        """Regressor of the base parameters without those of the terms, shape (N, n, b - e)."""
+        return self._regressor(self.base_columns, self.base.b - self.e, q, qd, qdd, sharp_sign)
 
     def inverse_dynamics(
         self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False
     ) -> Floats:
-        """Joint torques (N, n) along a motion, by the Newton-Euler recursion (A.22 to A.26).
+        """Joint torques (N, n) along a motion, by the Newton-Euler recursion (A.22 to A.26), without the terms.
 
         Parameters
         ----------

@@ -4,7 +4,7 @@ Found twice: in symbols by Khalil's rules, and numerically by the QR decompositi
 regressor. The numbers decide; the rules give the formulas.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -50,6 +50,35 @@ class BaseParameters:
     def b(self) -> int:
         """Number of base parameters."""
         return len(self.names)
+
+    def without(self, last: int) -> "BaseParameters":
+        """The same without the last parameters, which terms of the model have added."""
+        b, p = self.b - last, self.regroup.shape[1] - last
+        return replace(
+            self,
+            names=self.names[:b],
+            independent=self.independent[:b],
+            regroup=self.regroup[:b, :p],
+            formulas={name: self.formulas[name] for name in self.names[:b]},
+        )
+
+
+def with_terms(base: BaseParameters, names: tuple[str, ...]) -> BaseParameters:
+    """Base parameters with those of further terms at the end, which nothing is regrouped with."""
+    if not names:
+        return base
+    b, p = base.regroup.shape
+    e = len(names)
+    regroup = np.zeros((b + e, p + e))
+    regroup[:b, :p] = base.regroup
+    regroup[b:, p:] = np.eye(e)
+    return replace(
+        base,
+        names=base.names + names,
+        independent=np.concatenate([base.independent, np.arange(p, p + e)]),
+        regroup=regroup,
+        formulas=base.formulas | {name: name for name in names},
+    )
 
 
 def base_parameters(robot: RobotConfig, chain: Chain, columns: Columns, names: tuple[str, ...]) -> BaseParameters:

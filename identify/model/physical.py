@@ -53,7 +53,7 @@ def is_physical(model: ArmModel, theta_base: ArrayLike, q_samples: ArrayLike) ->
     if not np.isfinite(theta).all():
         return False, "parameters are not finite"
     names = _names(model, theta)
-    negative = [names[k] for k in _friction(names) if theta[k] < 0.0]
+    negative = [names[k] for k in _friction(names, model.e) if theta[k] < 0.0]
     bad, smallest = _mass_failures(model, theta, np.asarray(q_samples, dtype=np.float64))
     reasons = []
     if bad:
@@ -82,7 +82,7 @@ def damp_to_physical(model: ArmModel, theta: ArrayLike, theta_previous: ArrayLik
         return Damped(previous.copy(), 0.0, "parameters are not finite: kept the previous ones")
     postures = np.asarray(q_samples, dtype=np.float64)
     names = _names(model, wanted)
-    negative = [k for k in _friction(names) if wanted[k] < 0.0]
+    negative = [k for k in _friction(names, model.e) if wanted[k] < 0.0]
     reasons = []
     if negative:
         wanted = wanted.copy()
@@ -107,8 +107,9 @@ def _names(model: ArmModel, theta: Floats) -> tuple[str, ...]:
     return model.names if theta.size == len(model.names) else model.base.names
 
 
-def _friction(names: tuple[str, ...]) -> list[int]:
-    return [k for k, name in enumerate(names) if name.startswith(("fv", "fc"))]
+def _friction(names: tuple[str, ...], terms: int) -> list[int]:
+    """Places of viscous and Coulomb friction; the last parameters are those of the terms."""
+    return [k for k, name in enumerate(names[: len(names) - terms]) if name.startswith(("fv", "fc"))]
 
 
 def _mass_failures(model: ArmModel, theta: Floats, postures: Floats) -> tuple[int, float]:

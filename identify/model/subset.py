@@ -11,7 +11,8 @@ from identify.model.chain import columns_of
 def restricted_to(model: ArmModel, names: Collection[str]) -> ArmModel:
     """The same arm with the base parameters ``names`` only, the others being zero.
 
-    Regressor, dynamics and simulation then speak of these parameters alone, in the order of the full model.
+    Regressor, dynamics and simulation then speak of these parameters alone, in the order of the full model; terms of
+    the model are left out.
 
     Parameters
     ----------
@@ -23,6 +24,7 @@ def restricted_to(model: ArmModel, names: Collection[str]) -> ArmModel:
     ConfigError
         If the model has no base parameter of such a name.
     """
+    model = model.without_terms()
     base = model.base
     unknown = sorted(set(names) - set(base.names))
     if unknown:

@@ -153,8 +153,8 @@ def _rate(model: ArmModel, s: Derivatives, theta: Array) -> Array:
     """Change per sample of the torque that the model needs for the measured motion, (N, n), chunk by chunk."""
     torque = np.concatenate(
         [
-            model.base_regressor(s.q[k : k + _CHUNK_ROWS], s.qd[k : k + _CHUNK_ROWS], s.qdd[k : k + _CHUNK_ROWS])
-            @ theta
+            model.rigid_regressor(s.q[k : k + _CHUNK_ROWS], s.qd[k : k + _CHUNK_ROWS], s.qdd[k : k + _CHUNK_ROWS])
+            @ theta[: theta.size - model.e]
             for k in range(0, s.q.shape[0], _CHUNK_ROWS)
         ]
     )

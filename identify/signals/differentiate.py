@@ -27,12 +27,16 @@ class Derivatives:
     """Positions and their derivatives at the sampling instants, shape (N, n) each.
 
     ``nvr`` has shape (n, 2) for ``irwsm`` (first and second pass), (n, 1) for ``irwsm2``, ``None`` for ``bandpass``.
+    ``dt`` is the sampling period and ``start`` the time of the first sample since the recordings began, s: what terms
+    of a model may depend on.
     """
 
     q: NDArray[np.float64]
     qd: NDArray[np.float64]
     qdd: NDArray[np.float64]
     nvr: NDArray[np.float64] | None
+    dt: float | None = None
+    start: float = 0.0
 
 
 def differentiate(
@@ -88,7 +92,7 @@ def differentiate(
             raise DataError("derivatives bandpass: the closed-loop bandwidth is unknown; set bandwidth_hz or use irwsm")
         smooth = butterworth(q, dt, min(5 * bandwidth_hz, 0.45 / dt))
         qd = central_difference(smooth, dt)
-        return Derivatives(smooth, qd, central_difference(qd, dt), None)
+        return Derivatives(smooth, qd, central_difference(qd, dt), None, dt)
     rule, given = _ratios(q, derivatives, nvr, q_ref, resolution)
     if derivatives == "irwsm":
         columns = [_irwsm1(q[:, j], dt, rule, given[j]) for j in range(q.shape[1])]
@@ -99,6 +103,7 @@ def differentiate(
         qd=np.stack([c[1] for c in columns], axis=1),
         qdd=np.stack([c[2] for c in columns], axis=1),
         nvr=np.array([c[3] for c in columns]),
+        dt=dt,
     )
 
 

@@ -1,0 +1,130 @@
+"""Effects of drives and encoders: what they report is not what they do."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.catalogue.effect import Effect, Linear, Place, Shape
+from identify.catalogue.motion import Motion
+
+Array = NDArray[np.float64]
+
+
+def _gain(motion: Motion, place: Place) -> Array:
+    return motion.of_motor(place.joint, motion.motor_torque[:, place.joint])
+
+
+def _alone(motion: Motion, place: Place) -> str | None:
+    if motion.n == 1:
+        return "the parameters of a single axis grow and shrink with the gain of its only drive"
+    return None
+
+
+def _gain_numbers(motion: Motion, place: Place) -> Array:
+    if motion.n > 1 or motion.theta is None:
+        return np.zeros((motion.model.base.b, 0))
+    return motion.theta[: motion.model.base.b, None].copy()
+
+
+def _saturation(motion: Motion, place: Place) -> Array:
+    torque = motion.motor_torque[:, place.joint]
+    most = max(float(np.abs(torque).max()), 1e-12)
+    return motion.of_motor(place.joint, torque * (torque / most) ** 2)
+
+
+def _delay(motion: Motion, place: Place) -> Array:
+    return motion.of_motor(place.joint, -motion.rate(motion.motor_torque[:, place.joint]))
+
+
+def _bandwidth(motion: Motion, place: Place) -> Array:
+    return motion.of_motor(place.joint, motion.rate(motion.motor_torque[:, place.joint]))
+
+
+def _eccentricity(motion: Motion, place: Place, *, harmonic: float) -> Array:
+    """Measured positions are ``q + c cos(h q) + s sin(h q)``: the real ones move by as much less."""
+    j = place.joint
+    angle, w, a = harmonic * motion.q[:, j], harmonic * motion.qd[:, j], harmonic * motion.qdd[:, j]
+    c, s = np.cos(angle), np.sin(angle)
+    columns = []
+    for shift, rate, acceleration in ((c, -s * w, -s * a - c * w**2), (s, c * w, c * a - s * w**2)):
+        moves = [np.zeros_like(motion.q) for _ in range(3)]
+        for move, values in zip(moves, (shift, rate, acceleration), strict=True):
+            move[:, j] = -values
+        columns.append(motion.moved(*moves))
+    return np.stack(columns, axis=2)
+
+
+def rounds(motion: Motion, joint: int) -> Sequence[float]:
+    """Once and twice per turn of the joint and of its motor; of a prismatic axis wave numbers of its travel."""
+    if motion.model.robot.joints[joint].type == "prismatic":
+        resolution = np.pi / float(motion.span[joint])
+        return [float(resolution * k) for k in range(4, 81, 2)]
+    ratio = float(np.max(np.abs(motion.model.robot.transmission_matrix[joint])))
+    return sorted({1.0, 2.0, ratio, 2 * ratio})
+
+
+EFFECTS = (
+    Effect(
+        name="drive_gain_error",
+        title="a wrong torque constant",
+        says="a drive gives another torque per ampere than configured: a wrong data sheet, weak magnets, a changed drive",
+        reference="Gautier, Briot 2014, IEEE Trans. Automatic Control 59(10), Global identification of drive gains",
+        linear=(Linear("gain_error", ("", "")),),
+        columns=_gain,
+        visible=_alone,
+        predicts=True,
+        needs="several joints that carry the same link; for a single axis a baseline",
+        scope="motor",
+        excitation=("load", "accelerations"),
+    ),
+    Effect(
+        name="drive_gain_saturation",
+        title="a torque constant that falls with current",
+        says="the motor gives less torque per ampere at high current: its iron saturates",
+        reference="Leonhard 2001, Control of Electrical Drives, chapter 5",
+        linear=(Linear("gain_loss", ("", ""), sign=1),),
+        columns=_saturation,
+        predicts=True,
+        needs="small and large torques",
+        scope="motor",
+        excitation=("load", "accelerations"),
+    ),
+    Effect(
+        name="time_delay",
+        title="torques that are recorded late",
+        says="the reported torque belongs to a position that was reported earlier: a filter or a queue in the drive",
+        reference="Brunot 2017, section 2.3.1",
+        linear=(Linear("delay", ("s", "s"), sign=1),),
+        columns=_delay,
+        predicts=True,
+        needs="quick changes of the torque",
+        scope="motor",
+        excitation=("accelerations",),
+    ),
+    Effect(
+        name="actuator_bandwidth",
+        title="torque that lags behind the command",
+        says="the reported torque is a command that the motor follows late: a slow current loop",
+        reference="Leonhard 2001, Control of Electrical Drives, chapter 7",
+        linear=(Linear("lag", ("s", "s"), sign=1),),
+        columns=_bandwidth,
+        predicts=True,
+        needs="quick changes of the torque",
+        scope="motor",
+        excitation=("accelerations",),
+    ),
+    Effect(
+        name="encoder_eccentricity",
+        title="an encoder that runs out of true",
+        says="the measured position has an error that repeats with the turn: an encoder disc mounted off centre",
+        reference="Armstrong 1998, Mechanism and Machine Theory; de Silva 2007, Sensors and Actuators, chapter 5",
+        linear=(Linear("ecc", ("rad", "m")), Linear("ecs", ("rad", "m"))),
+        shapes=(Shape("harmonic", ("per rad of the joint", "rad/m"), rounds, continuous=False),),
+        columns=_eccentricity,
+        predicts=True,
+        needs="fast motion over a wide range",
+        together=True,
+        excitation=("speeds", "range"),
+    ),
+)

@@ -1,0 +1,128 @@
+"""What an entry of the catalogue is."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.catalogue.motion import Motion
+
+Array = NDArray[np.float64]
+
+Scope = Literal["joint", "motor", "pair", "arm"]
+"""Where an effect sits: in one joint, in one motor (which a coupled transmission joins to several joints), between two
+joints, or in the arm as a whole (its stanza then names the first joint, a payload the last one)."""
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A parameter that the torque is proportional to.
+
+    Parameters
+    ----------
+    name
+        In the robot configuration; in results the number of the joint is appended.
+    unit
+        Of a revolute joint; and of a prismatic one.
+    sign
+        +1 or -1 where physics knows it, 0 where both are possible.
+    """
+
+    name: str
+    unit: tuple[str, str]
+    sign: int = 0
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A parameter that the torque depends on in another way: found by search, then refined.
+
+    Parameters
+    ----------
+    name, unit
+        In the robot configuration; the unit of a revolute and of a prismatic joint.
+    grid
+        Values worth trying on a motion of a joint, increasing, in the unit of the parameter.
+    continuous
+        Whether values between those of the grid make sense; a harmonic is a whole number.
+    """
+
+    name: str
+    unit: tuple[str, str]
+    grid: Callable[[Motion, int], Sequence[float]]
+    continuous: bool = True
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect: the torque it adds to what the drives report is ``columns(motion, joint, **shapes) @ linear``.
+
+    Parameters
+    ----------
+    name
+        In ``diagnosis.json`` and in the ``effects`` of a robot configuration.
+    title, says
+        A name and an explanation in plain language, for a plant engineer.
+    reference
+        Where the form comes from.
+    linear
+        Linear parameters, one per column.
+    columns
+        ``(motion, place, **shapes)`` to an array (N, k) of the torques (N m or N) of joint ``place.joint``, or
+        (N, n, k) of all joints, per unit of the linear parameters.
+    needs
+        What a recording must contain for the effect to be visible, in words.
+    shapes
+        Nonlinear parameters.
+    scope
+        See `Scope`.
+    visible
+        Why the effect cannot show in a motion whatever its size, or ``None``; the motion is the model's own.
+    numbers
+        Change of the base parameters (b, k) per unit of the linear ones, where the effect is nothing but other numbers
+        in the same model: it shows against a baseline only, and ``columns`` follow from it.
+    together
+        Whether several of one effect on one joint are one finding (the harmonics of a periodic torque).
+    excitation
+        What a trajectory that is to show the effect must have plenty of; see `identify.excitation`.
+    rewires
+        Whether the effect is an exchange of signals instead of a torque: `identify.catalogue.wiring` undoes it in the
+        recording, and there are no columns.
+    predicts
+        Whether the columns depend on the torques that the model predicts, and so on its parameters.
+    """
+
+    name: str
+    title: str
+    says: str
+    reference: str
+    linear: tuple[Linear, ...]
+    columns: Callable[..., Array]
+    needs: str
+    shapes: tuple[Shape, ...] = ()
+    scope: Scope = "joint"
+    visible: Callable[[Motion, "Place"], str | None] | None = None
+    numbers: Callable[[Motion, "Place"], Array] | None = None
+    together: bool = False
+    excitation: tuple[str, ...] = field(default=("reversals", "speeds"))
+    rewires: bool = False
+    predicts: bool = False
+
+    def torque(self, motion: Motion, place: "Place", shapes: Mapping[str, float]) -> Array:
+        """Columns of all joints, shape (N, n, k)."""
+        columns = self.columns(motion, place, **shapes)
+        if columns.ndim == 3:
+            return columns
+        whole = np.zeros((motion.samples, motion.n, columns.shape[1]))
+        whole[:, place.joint] = columns
+        return whole
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where in an arm an effect sits; joints count from 0, ``other`` is the second one of a pair."""
+
+    joint: int
+    other: int | None = None

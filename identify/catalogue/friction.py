@@ -1,0 +1,206 @@
+"""Friction that is more than ``fv qd + fc sign(qd)``."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.catalogue.effect import Effect, Linear, Place, Shape
+from identify.catalogue.motion import Motion
+from identify.model.compiled import compiled
+
+Array = NDArray[np.float64]
+
+TORQUE = ("N m", "N")
+VISCOUS = ("N m s/rad", "N s/m")
+
+
+def speeds(motion: Motion, joint: int) -> Sequence[float]:
+    """Characteristic speeds from a hundredth of the joint's top speed to a third of it."""
+    top = float(motion.top_speed[joint])
+    return [float(v) for v in top * np.geomspace(0.01, 0.35, 8)]
+
+
+def _asymmetric_viscous(motion: Motion, place: Place) -> Array:
+    return (motion.qd * motion.sign)[:, place.joint, None]
+
+
+def _asymmetric_coulomb(motion: Motion, place: Place) -> Array:
+    return motion.sign[:, place.joint, None] ** 2
+
+
+def _stribeck(motion: Motion, place: Place, *, velocity: float) -> Array:
+    j = place.joint
+    return (np.exp(-((motion.qd[:, j] / velocity) ** 2)) * motion.sign[:, j])[:, None]
+
+
+def _nonlinear_viscous(motion: Motion, place: Place, *, exponent: float) -> Array:
+    j = place.joint
+    # Measured in the joint's own speeds, so that the parameter is a torque whatever the exponent.
+    share = np.abs(motion.qd[:, j]) / motion.model.robot.joints[j].limits.velocity
+    return (share**exponent * motion.sign[:, j])[:, None]
+
+
+def _load_dependent(motion: Motion, place: Place) -> Array:
+    j = place.joint
+    return (np.abs(motion.transmitted[:, j]) * motion.sign[:, j])[:, None]
+
+
+def _presliding(motion: Motion, place: Place, *, displacement: float) -> Array:
+    j = place.joint
+    return (motion.sign[:, j] - dahl(motion.q[:, j], displacement))[:, None]
+
+
+@compiled
+def dahl(q: Array, displacement: float) -> Array:
+    """Dahl's friction over its level along positions ``q`` (N,), exactly between samples.
+
+    ``dz/dq = (1 - z sign(qd)) / displacement``: after a reversal it approaches its level as an exponential of the way.
+    """
+    z = np.empty(q.size)
+    state = 0.0
+    z[0] = state
+    for k in range(1, q.size):
+        way = q[k] - q[k - 1]
+        side = 1.0 if way > 0 else -1.0
+        state = side + (state - side) * np.exp(-abs(way) / displacement)
+        z[k] = state
+    return z
+
+
+def _position_dependent(motion: Motion, place: Place, *, period: float) -> Array:
+    j = place.joint
+    angle, side = 2 * np.pi * motion.q[:, j] / period, motion.sign[:, j]
+    return np.stack([side * np.cos(angle), side * np.sin(angle)], axis=1)
+
+
+def turns(motion: Motion, joint: int) -> Sequence[float]:
+    """Periods in the joint's position: whole fractions of a turn, or of the travel of a prismatic axis."""
+    if motion.model.robot.joints[joint].type == "revolute":
+        return [2 * np.pi / k for k in (4, 3, 2, 1)]
+    low, high = motion.model.robot.joints[joint].limits.position
+    return [(high - low) / k for k in (4, 3, 2, 1)]
+
+
+def _drift(motion: Motion, place: Place) -> Array:
+    j = place.joint
+    progress = motion.t / max(motion.duration, motion.dt * motion.samples) - 0.5
+    return np.stack([motion.sign[:, j] * progress, motion.qd[:, j] * progress], axis=1)
+
+
+def _coupling(motion: Motion, place: Place) -> Array:
+    first, second = place.joint, place.other
+    assert second is not None
+    dry = np.sign if motion.sharp else motion.model.smooth_sign
+    columns = np.zeros((motion.samples, motion.n, 3))
+    for one, two in ((first, second), (second, first)):
+        columns[:, one, 0] = motion.qdd[:, two]
+        columns[:, one, 1] = motion.qd[:, two]
+        columns[:, one, 2] = dry(motion.qd[:, one] + motion.qd[:, two])
+    return columns
+
+
+EFFECTS = (
+    Effect(
+        name="asymmetric_viscous_friction",
+        title="viscous friction that differs between the directions",
+        says="friction grows with speed more in one direction than in the other: a worn or one-sidedly loaded gear",
+        reference="Janot, Gautier, Brunot 2019, Data set and reference models of EMPS",
+        linear=(Linear("fva", VISCOUS),),
+        columns=_asymmetric_viscous,
+        needs="both directions of motion at several speeds",
+    ),
+    Effect(
+        name="asymmetric_coulomb_friction",
+        title="dry friction that differs between the directions",
+        says="dry friction differs between the two directions of motion, beyond a constant offset",
+        reference="Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)",
+        linear=(Linear("fca", TORQUE),),
+        columns=_asymmetric_coulomb,
+        needs="both directions of motion, and standstill: while moving it looks like a constant offset",
+        excitation=("reversals", "standstill"),
+    ),
+    Effect(
+        name="stribeck_friction",
+        title="extra friction at low speed",
+        says="extra friction at low speed that fades as the joint speeds up: poor or squeezed-out lubricant",
+        reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
+        linear=(Linear("fst", TORQUE, sign=1),),
+        shapes=(Shape("velocity", ("rad/s", "m/s"), speeds),),
+        columns=_stribeck,
+        needs="slow motion in both directions",
+        excitation=("slow", "reversals"),
+    ),
+    Effect(
+        name="nonlinear_viscous_friction",
+        title="friction curved in speed",
+        says="friction does not grow in proportion to speed: the lubricant thins or churns",
+        reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
+        linear=(Linear("fvn", TORQUE),),
+        shapes=(Shape("exponent", ("", ""), lambda motion, joint: (0.3, 0.5, 0.7, 1.5, 2.0, 3.0)),),
+        columns=_nonlinear_viscous,
+        needs="slow and fast motion",
+        excitation=("speeds",),
+    ),
+    Effect(
+        name="load_dependent_friction",
+        title="friction in proportion to the load",
+        says="dry friction grows with the torque that the gear transmits",
+        reference="Hamon, Gautier, Garrec 2010, IROS, Dynamic identification with a dry friction model dependent on load",
+        linear=(Linear("fcl", ("", ""), sign=1),),
+        columns=_load_dependent,
+        predicts=True,
+        needs="motion in both directions under small and under large load",
+        excitation=("reversals", "load"),
+    ),
+    Effect(
+        name="presliding_friction",
+        title="dry friction that yields before it slides",
+        says="at a reversal dry friction builds up over a small way instead of at once: elastic contacts or seals",
+        reference="Dahl 1968, A solid friction model; Canudas de Wit et al. 1995, IEEE TAC 40(3)",
+        linear=(Linear("fcd", TORQUE, sign=-1),),
+        shapes=(
+            Shape(
+                "displacement",
+                ("rad", "m"),
+                lambda motion, joint: tuple(float(motion.span[joint]) * np.geomspace(0.002, 0.1, 8)),
+            ),
+        ),
+        columns=_presliding,
+        needs="many reversals",
+        excitation=("reversals", "slow"),
+    ),
+    Effect(
+        name="position_dependent_friction",
+        title="friction that varies with the joint's position",
+        says="dry friction differs from one position of the joint to another: a bent shaft, a tight spot, uneven wear",
+        reference="Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators",
+        linear=(Linear("fpc", TORQUE), Linear("fps", TORQUE)),
+        shapes=(Shape("period", ("rad", "m"), turns, continuous=False),),
+        columns=_position_dependent,
+        needs="a wide range of joint positions, passed in both directions",
+        together=True,
+        excitation=("range", "reversals"),
+    ),
+    Effect(
+        name="friction_drift",
+        title="friction that changes while it is recorded",
+        says="friction at the end of the recording is not what it was at its beginning: the gear warms up",
+        reference="Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators",
+        linear=(Linear("fcdr", TORQUE), Linear("fvdr", VISCOUS)),
+        columns=_drift,
+        needs="the same motion early and late in the recordings",
+        excitation=("repeats",),
+    ),
+    Effect(
+        name="coupling_friction",
+        title="friction and inertia shared by two joints",
+        says="two joints share a shaft or gear: what one does costs the other friction and inertia",
+        reference="Brunot 2017, equation B.1",
+        linear=(Linear("iac", ("kg m^2", "kg")), Linear("fvc", VISCOUS), Linear("fcc", TORQUE)),
+        columns=_coupling,
+        needs="motion of both joints, together and against each other",
+        scope="pair",
+        excitation=("independent",),
+    ),
+)

@@ -1,0 +1,156 @@
+"""A motion as the effects of the catalogue see it."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from identify.model.arm import ArmModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Positions, their derivatives, and what the model makes of them; SI, joint side.
+
+    Parameters
+    ----------
+    model
+        The arm; of it effects use geometry, transmission, limits and the smoothing of the sign.
+    q, qd, qdd
+        Shape (N, n) each.
+    dt
+        Sampling period, s.
+    start
+        Time of the first sample since the beginning of the first recording, s.
+    theta
+        Standard or base parameters by which torques are predicted, (p,) or (b,); ``None`` while there are none.
+    duration
+        Of all recordings together, s: what a slow change is measured in.
+    """
+
+    model: "ArmModel"
+    q: Array
+    qd: Array
+    qdd: Array
+    dt: float
+    start: float = 0.0
+    theta: Array | None = None
+    duration: float = 0.0
+    sharp: bool = False
+
+    @property
+    def samples(self) -> int:
+        """N."""
+        return int(self.q.shape[0])
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.model.n
+
+    @cached_property
+    def sign(self) -> Array:
+        """Sign of the velocity, smoothed as the model smooths it (thesis appendix B.2), (N, n)."""
+        if self.sharp:
+            return np.sign(self.qd)
+        smooth: Array = 2 / np.pi * np.arctan(self.model.smoothing * self.qd)
+        return smooth
+
+    @cached_property
+    def t(self) -> Array:
+        """Time since the beginning of the first recording, s, (N,)."""
+        return self.start + self.dt * np.arange(self.samples)
+
+    @cached_property
+    def motor(self) -> Array:
+        """Angles of the motors, rad (m where the axis is prismatic and direct), (N, n)."""
+        angles: Array = self.q @ self.model.robot.transmission_matrix.T
+        return angles
+
+    @cached_property
+    def top_speed(self) -> Array:
+        """Speed that each joint exceeds for one sample in a hundred, (n,)."""
+        top: Array = np.maximum(np.quantile(np.abs(self.qd), 0.99, axis=0), 1e-9)
+        return top
+
+    @cached_property
+    def span(self) -> Array:
+        """Distance between the outermost positions of each joint, (n,)."""
+        span: Array = np.maximum(np.ptp(self.q, axis=0), 1e-9)
+        return span
+
+    @cached_property
+    def torque(self) -> Array:
+        """Joint torques that the model predicts, friction included, (N, n).
+
+        Raises
+        ------
+        ValueError
+            If there are no parameters to predict with.
+        """
+        return self._predicted(self._theta)
+
+    @cached_property
+    def transmitted(self) -> Array:
+        """Torques that the gears hand on to the links: without friction, offsets and rotors, (N, n)."""
+        return self._predicted(self.links)
+
+    @cached_property
+    def standard(self) -> Array:
+        """Standard parameters that predict the same torques as ``theta``, (p,)."""
+        theta = self._theta
+        return theta if theta.size == len(self.model.names) else self.model.standard_from_base(theta)
+
+    @cached_property
+    def links(self) -> Array:
+        """Standard parameters of the links alone: no friction, offsets and rotors, (p,)."""
+        alone: Array = np.where(self.model.of_links, self.standard, 0.0)
+        return alone
+
+    @cached_property
+    def motor_torque(self) -> Array:
+        """Torques at the shafts of the motors that the model predicts, (N, n)."""
+        at_shafts: Array = self.torque @ np.linalg.inv(self.model.robot.transmission_matrix)
+        return at_shafts
+
+    def of_motor(self, motor: int, torque: Array) -> Array:
+        """What a torque (N,) at the shaft of a motor is at the joints, (N, n, 1)."""
+        joints: Array = (torque[:, None] * self.model.robot.transmission_matrix[motor])[:, :, None]
+        return joints
+
+    def moved(self, shift: Array, rate: Array, acceleration: Array, *, links: bool = False) -> Array:
+        """Change (N, n) of the predicted torque per unit of a change of the motion.
+
+        Parameters
+        ----------
+        shift, rate, acceleration
+            Changes of positions, velocities and accelerations, (N, n) each.
+        links
+            Of the links alone, without friction and rotors.
+        """
+        theta = self.links if links else self._theta
+        step = 1e-6 / max(float(np.abs(shift).max()), 1e-300)
+        moved = self.model.inverse_dynamics(
+            theta, self.q + step * shift, self.qd + step * rate, self.qdd + step * acceleration
+        )
+        change: Array = (moved - self._predicted(theta)) / step
+        return change
+
+    def rate(self, values: Array) -> Array:
+        """Time derivative along the first axis, central differences."""
+        slope: Array = np.gradient(values, self.dt, axis=0)
+        return slope
+
+    def _predicted(self, theta: Array) -> Array:
+        return self.model.inverse_dynamics(theta, self.q, self.qd, self.qdd, sharp_sign=self.sharp)
+
+    @property
+    def _theta(self) -> Array:
+        if self.theta is None:
+            raise ValueError("a motion without parameters predicts no torque")
+        return self.theta
