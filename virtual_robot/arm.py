@@ -1,6 +1,5 @@
-"""The virtual arm: six servo drives on the plant, one control period at a time."""
+"""The virtual arm: servo drives on the plant, one control period at a time."""
 
-import math
 from typing import Protocol
 
 import numpy as np
@@ -47,11 +46,13 @@ class Arm:
     q
         Posture at the start, shape (n,), rad or m.
     sync_period
-        Time between two SYNC, s: a multiple of the control period, 200 us.
+        Time between two SYNC, s: a multiple of the drives' control period; ``None``: one of them.
     seed, noise
-        Noise of the size of table 6.3, ``noise`` scales its amplitude.
+        Noise of the size measured (see ``virtual_robot.noise``), ``noise`` scales its amplitude.
     scenario
         Hidden effects.
+    velocity_feedback
+        Of the drives, see ``servo.design``.
 
     Raises
     ------
@@ -63,32 +64,32 @@ class Arm:
         self,
         robot: RobotConfig,
         q: ArrayLike,
-        sync_period: float = servo.CONTROL_PERIOD,
+        sync_period: float | None = None,
         seed: int = 0,
         noise: float = 1.0,
         scenario: Scenario | None = None,
+        velocity_feedback: bool | None = None,
     ) -> None:
-        n = robot.n
-        self._periods = round(sync_period / servo.CONTROL_PERIOD)
-        if self._periods < 1 or abs(self._periods * servo.CONTROL_PERIOD - sync_period) > 1e-9:
+        n, period = robot.n, servo.control_period(robot)
+        sync_period = period if sync_period is None else sync_period
+        self._periods = round(sync_period / period)
+        if self._periods < 1 or abs(self._periods * period - sync_period) > 1e-9:
             raise ConfigError(
-                f"SYNC period {sync_period * 1e6:.0f} us: the virtual drives need a multiple of "
-                f"{servo.CONTROL_PERIOD * 1e6:.0f} us"
+                f"SYNC period {sync_period * 1e6:.0f} us: the virtual drives need a multiple of {period * 1e6:.0f} us"
             )
         self.plant = Plant(robot, q, scenario)
-        self._noise = Noise(robot, servo.CONTROL_PERIOD, seed, noise)
+        self._noise = Noise(robot, period, seed, noise)
         self._ratio = robot.transmission_matrix
         drives = [joint.drive for joint in robot.joints]
         self._per_rad = counts_per_si(robot)
         self._torque = self._ratio.T * np.array([drive.gain for drive in drives])
         self._limit = np.array([drive.saturation or np.inf for drive in drives])
         self._permille = np.array([1000.0 / drive.rated for drive in drives])
-        self._kp, self._kv = servo.gains(robot, self.plant.mass_matrix())
-        self._smooth = 1.0 - math.exp(-2 * math.pi * servo.VELOCITY_FILTER_HZ * servo.CONTROL_PERIOD)
+        self._servo = servo.design(robot, self.plant.mass_matrix(), velocity_feedback)
         self._origin, self._target = np.zeros(n), np.zeros(n)
         self._age, self._steps = np.zeros(n, np.int64), np.ones(n, np.int64)
         self._held = np.ones(n, np.bool_)
-        self._error, self._error_rate, self._current = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._past, self._rate, self._current = np.zeros((n, self._servo.velocity_samples)), np.zeros(n), np.zeros(n)
         self._tau = np.zeros(n)
         self.position, self.current, self.demand = np.zeros(n, np.int32), np.zeros(n, np.int16), np.zeros(n, np.int32)
         self.plant.brake[:] = BRAKE
@@ -96,7 +97,7 @@ class Arm:
 
     def interpolation_time(self, joint: int, seconds: float) -> None:
         """How long drive ``joint`` takes from one target to the next (60C2h), s."""
-        self._steps[joint] = max(round(seconds / servo.CONTROL_PERIOD), 1)
+        self._steps[joint] = max(round(seconds / self._servo.period), 1)
 
     def enable(self, joint: int, enabled: bool) -> None:
         """Open or close the brake of ``joint``; its demand starts at the measured position."""
@@ -114,15 +115,17 @@ class Arm:
     def advance(self) -> None:
         """Move on by one SYNC period."""
         for _ in range(self._periods):
-            self.plant.advance(self._tau, servo.CONTROL_PERIOD)
+            self.plant.advance(self._tau, self._servo.period)
             self._control()
 
     def _control(self) -> None:
         measured, disturbance = self._noise.next()
+        drives = self._servo
         servo.control(
-            self.plant.q, self._ratio, self._per_rad, self._origin, self._target, self._age, self._steps, self._held,
-            self._kp, self._kv, self._smooth, self._limit, measured, self._permille,
-            self._error, self._error_rate, self._current, self.position, self.current, self.demand,
+            drives.period, drives.velocity_feedback, self.plant.q, self._ratio, self._per_rad,
+            self._origin, self._target, self._age, self._steps, self._held,
+            drives.kp, drives.kv, drives.smooth, self._limit, measured, self._permille,
+            self._past, self._rate, self._current, self.position, self.current, self.demand,
             self._torque, disturbance, self._tau,
         )  # fmt: skip
 

@@ -23,6 +23,15 @@ def robot(
     encoder_counts: Annotated[
         int | None, typer.Option(min=1, help="Counts per motor turn, with --to-file. [default: those of the robot]")
     ] = None,
+    velocity_feedback: Annotated[
+        bool | None,
+        typer.Option(
+            "--velocity-feedback/--velocity-error",
+            help="What the drives' velocity loop is fed with. [default: the error; the velocity where the robot's "
+            "configuration knows its controller]",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Put the virtual arm on a bus: six CiA 402 drives, or a measured recording behind them.
 
@@ -36,10 +45,12 @@ def robot(
     if to_file is not None:
         if replay is not None or duration is not None:
             raise ConfigError("--to-file simulates one trajectory: --replay and --duration have no meaning with it")
-        record_robot(config, to_file, scenario, seed, noise, trajectory, encoder_counts, truth)
+        record_robot(config, to_file, scenario, seed, noise, trajectory, encoder_counts, truth, velocity_feedback)
         return
     if scenario is not None and replay is not None:
         raise ConfigError("--scenario hides effects in the plant, --replay has no plant: give one of them")
+    if velocity_feedback is not None and replay is not None:
+        raise ConfigError("--velocity-feedback and --velocity-error choose drives, --replay has none")
     if truth is not None and replay is not None:
         raise ConfigError("--truth: a replayed recording does not know the parameters of its arm")
-    run_robot(config, scenario, replay, seed, noise, duration, truth)
+    run_robot(config, scenario, replay, seed, noise, duration, truth, velocity_feedback)

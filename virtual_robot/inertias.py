@@ -1,4 +1,4 @@
-"""Link parameters of the virtual TX40: physically consistent, and equal to table B.4 where it speaks.
+"""Link parameters of the virtual arms; those of the TX40 physically consistent, and equal to table B.4 where it speaks.
 
 Table B.4 gives fourteen essential base inertial values; the links need sixty standard ones. A semidefinite
 programme chooses them: every link's pseudo-inertia positive definite (Wensing, Kim, Slotine 2018), rotor
@@ -60,8 +60,12 @@ MASS_MARGIN = 0.02
 
 
 def base_parameters(standard: Mapping[str, float]) -> dict[str, float]:
-    """Compute the 40 base inertial parameters of the TX40 from its standard ones (tables B.2 and B.3)."""
-    return {name: sum(c * standard[k] for k, c in terms.items()) for name, terms in regrouping().items()}
+    """Compute the 40 base inertial parameters of the TX40 from its standard ones (tables B.2 and B.3).
+
+    An arm of fewer links has those whose standard parameters it has; a single axis has none that are regrouped.
+    """
+    groups = {name: terms for name, terms in regrouping().items() if terms.keys() <= standard.keys()}
+    return {name: sum(c * standard[k] for k, c in terms.items()) for name, terms in groups.items()}
 
 
 @cache

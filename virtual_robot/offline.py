@@ -1,12 +1,17 @@
 """A recording of the virtual arm without a bus: the same drives and plant, as fast as they compute."""
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig, Trajectory
+from configs import ConfigError, RobotConfig, Trajectory
 from configs.scenario import Scenario
 from daq.recording import Field, Mark, Recording, Stream
+from virtual_robot import servo
 from virtual_robot.arm import Arm, counts_per_si
+
+Effort = Literal["current", "voltage", "torque"]
 
 OPERATION_ENABLED = 0x1237
 """Statusword: operation enabled, remote, drive follows the command value (CiA 402)."""
@@ -20,10 +25,11 @@ def simulate_recording(
     seed: int,
     noise: float = 1.0,
     scenario: Scenario | None = None,
-    period: float = 200e-6,
+    period: float | None = None,
     setpoint_every: int = 5,
     settle: float = 0.3,
     start_ns: int = 0,
+    velocity_feedback: bool | None = None,
 ) -> Recording:
     """Simulate what ``armident capture`` would record of the virtual arm on a trajectory.
 
@@ -33,10 +39,10 @@ def simulate_recording(
         The arm; one that ``virtual_robot`` has link parameters for.
     trajectory
         Reference, joint side; the arm stands at its start when the recording begins.
-    seed, noise, scenario
+    seed, noise, scenario, velocity_feedback
         As for ``Arm``.
     period
-        SYNC period, s.
+        SYNC period, s; ``None``: the control period of the drives.
     setpoint_every
         Set points go out, and demands are recorded, on every so many SYNC.
     settle
@@ -47,7 +53,8 @@ def simulate_recording(
     Returns
     -------
     Recording
-        Streams ``samples`` (position, current, status) and ``demand``, and the marks of the experiment.
+        Streams ``samples`` (position, current or what else the drives report as effort, status) and ``demand``, and the
+        marks of the experiment.
 
     Raises
     ------
@@ -55,14 +62,14 @@ def simulate_recording(
         If the trajectory leaves the robot's limits, or there is no such virtual arm.
     """
     trajectory.check(robot)
-    every = setpoint_every
+    every, period = setpoint_every, servo.control_period(robot) if period is None else period
     scale = counts_per_si(robot)
     rows = np.rint(trajectory.sample(period * every) @ robot.transmission_matrix.T * scale).astype(np.int32)
     first = round(settle / period / every) * every + every - 1
     last = first + (len(rows) - 1) * every
     total = last + round(settle / period) + 1
 
-    arm = Arm(robot, trajectory.start, period, seed, noise, scenario)
+    arm = Arm(robot, trajectory.start, period, seed, noise, scenario, velocity_feedback)
     for joint in range(robot.n):
         arm.enable(joint, True)
         arm.interpolation_time(joint, period * every)
@@ -88,7 +95,7 @@ def simulate_recording(
     knots = np.arange(every - 1, total, every, dtype=np.int64)
     samples = Stream(
         "samples", 1, sync, times(sync), sample_fields(robot),
-        {"position": position, "current": current, "status": np.full((total, n), OPERATION_ENABLED, np.uint16)},
+        {"position": position, effort_of(robot): current, "status": np.full((total, n), OPERATION_ENABLED, np.uint16)},
     )  # fmt: skip
     demands = Stream("demand", every, knots, times(knots), demand_fields(robot), {"demand": demand})
     marks = (
@@ -107,19 +114,39 @@ def with_encoder_counts(robot: RobotConfig, counts: float) -> RobotConfig:
     return robot.model_copy(update={"joints": joints})
 
 
+def effort_of(robot: RobotConfig) -> Effort:
+    """What the robot's drives report as effort.
+
+    Raises
+    ------
+    ConfigError
+        If some report another effort than others.
+    """
+    efforts: list[Effort] = sorted({joint.drive.signal for joint in robot.joints})
+    if len(efforts) > 1:
+        raise ConfigError(f"robot {robot.name!r}: its drives report {' and '.join(efforts)}, a stream has room for one")
+    return efforts[0]
+
+
 def sample_fields(robot: RobotConfig) -> dict[str, Field]:
-    """Fields of the ``samples`` stream: motor positions, currents, statuswords."""
+    """Fields of the ``samples`` stream: motor positions, efforts, statuswords."""
     rated = tuple(joint.drive.rated / 1000.0 for joint in robot.joints)
+    effort, metres = effort_of(robot), _position_unit(robot) == "m"
+    unit = {"current": "A", "voltage": "V", "torque": "N" if metres else "N m"}[effort]
     return {
-        "position": Field("position", "position", "rad", "motor", _per_count(robot)),
-        "current": Field("current", "current", "A", "motor", rated),
+        "position": Field("position", "position", _position_unit(robot), "motor", _per_count(robot)),
+        effort: Field(effort, effort, unit, "motor", rated),
         "status": Field("status", "status", "", "motor", (1.0,) * robot.n),
     }
 
 
 def demand_fields(robot: RobotConfig) -> dict[str, Field]:
     """Field of the ``demand`` stream: motor positions wanted."""
-    return {"demand": Field("demand", "demand", "rad", "motor", _per_count(robot))}
+    return {"demand": Field("demand", "demand", _position_unit(robot), "motor", _per_count(robot))}
+
+
+def _position_unit(robot: RobotConfig) -> str:
+    return "rad" if all(joint.type == "revolute" for joint in robot.joints) else "m"
 
 
 def _per_count(robot: RobotConfig) -> tuple[float, ...]:

@@ -1,6 +1,7 @@
 """``armident robot``: the virtual arm, or a measured recording, on the bus of a session."""
 
 import json
+import math
 import signal
 import sys
 from pathlib import Path
@@ -28,11 +29,14 @@ def run_robot(
     noise: float = 1.0,
     duration: float | None = None,
     truth: Path | None = None,
+    velocity_feedback: bool | None = None,
 ) -> None:
     """Serve the drives of a session until SIGINT or SIGTERM, or for ``duration`` seconds.
 
     ``truth`` names a file for the arm's own parameters: standard ones, base ones where several act as one, and the
-    gains of the drives (``kp``, 1/s; ``kv``, A s/rad at the motor; ``velocity_filter_hz``).
+    drives' (``kp``, 1/s; ``kv``, units of their signal per rad/s or m/s at the motor; ``velocity_samples``;
+    ``velocity_filter_hz``, null without filter; ``velocity_feedback``, 0 or 1). ``velocity_feedback`` chooses the
+    latter, see ``servo.design``.
 
     Raises
     ------
@@ -49,10 +53,10 @@ def run_robot(
         motion = _replay(session, robot, replay)
     else:
         hidden = load_scenario(scenario) if scenario is not None else None
-        motion = Arm(robot, rest_posture(robot), session.sync_period, seed, noise, hidden)
+        motion = Arm(robot, rest_posture(robot), session.sync_period, seed, noise, hidden, velocity_feedback)
         _warm_up(robot, session)
         if truth is not None:
-            _write_truth(robot, rest_posture(robot), truth)
+            _write_truth(robot, rest_posture(robot), truth, velocity_feedback)
     stop = _Stop()
     with Server(session, robot, motion) as server:
         nodes = ", ".join(str(drive.node_id) for drive in server.drives)
@@ -70,6 +74,7 @@ def record_robot(
     trajectory: Path | None = None,
     encoder_counts: int | None = None,
     truth: Path | None = None,
+    velocity_feedback: bool | None = None,
 ) -> None:
     """Write a recording of one trajectory of the virtual arm to ``out``, without a bus.
 
@@ -81,7 +86,7 @@ def record_robot(
         File of the trajectory; ``None``: the session's.
     encoder_counts
         Counts per motor turn in place of the robot's; the drives see them too.
-    truth
+    truth, velocity_feedback
         As for ``run_robot``.
 
     Raises
@@ -102,22 +107,24 @@ def record_robot(
     recording = simulate_recording(
         robot, motion, seed, noise,
         None if scenario is None else load_scenario(scenario),
-        session.sync_period, setpoints.every, setpoints.settle_s,
+        session.sync_period, setpoints.every, setpoints.settle_s, velocity_feedback=velocity_feedback,
     )  # fmt: skip
     if truth is not None:
-        _write_truth(robot, motion.start, truth)
+        _write_truth(robot, motion.start, truth, velocity_feedback)
     write_recording(recording, out)
     print(f"{recording.samples.sync.size} samples of {robot.name} in {out}", file=sys.stderr)
 
 
-def _write_truth(robot: RobotConfig, q: ArrayLike, path: Path) -> None:
-    """Parameters of the plant, and gains of the drives tuned at posture ``q`` (n,)."""
+def _write_truth(robot: RobotConfig, q: ArrayLike, path: Path, velocity_feedback: bool | None) -> None:
+    """Parameters of the plant, and of the drives, tuned at posture ``q`` (n,)."""
     parameters = plant_parameters(robot)
-    kp, kv = servo.gains(robot, Plant(robot, q).mass_matrix())
-    drives = {"velocity_filter_hz": servo.VELOCITY_FILTER_HZ}
+    drives = servo.design(robot, Plant(robot, q).mass_matrix(), velocity_feedback)
+    values: dict[str, float | None] = {**parameters, **base_parameters(parameters)}
+    values["velocity_feedback"] = float(drives.velocity_feedback)
+    values["velocity_samples"] = float(drives.velocity_samples)
+    values["velocity_filter_hz"] = drives.filter_hz if math.isfinite(drives.filter_hz) else None
     for j in range(robot.n):
-        drives |= {f"kp{j + 1}": float(kp[j]), f"kv{j + 1}": float(kv[j])}
-    values = parameters | base_parameters(parameters) | drives
+        values |= {f"kp{j + 1}": float(drives.kp[j]), f"kv{j + 1}": float(drives.kv[j])}
     path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
 
 

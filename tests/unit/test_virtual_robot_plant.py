@@ -117,5 +117,5 @@ def test_friction_slows_by_the_coefficients_of_table_b4(tx40: RobotConfig) -> No
 
 
 def test_an_arm_nobody_knows_is_refused_by_name() -> None:
-    with pytest.raises(ConfigError, match=r"'emps'.*tx40"):
-        Plant(load_robot("emps.yaml"), [0.0])
+    with pytest.raises(ConfigError, match=r"'panda'.*emps, tx40"):
+        Plant(load_robot("panda.yaml"), np.zeros(7))
