@@ -27,9 +27,9 @@ def side_by_side(table: Table) -> list[Column]:
 
 
 def text_of(cell: Cell | None) -> str:
-    """A figure with four digits, its relative standard deviation behind it."""
+    """A figure with four digits, its relative standard deviation behind it; or words."""
     if cell is None or cell.value is None:
-        return ""
+        return cell.text if cell is not None else ""
     value = f"{cell.value:.4g}"
     return value if cell.std_pct is None else f"{value} ({cell.std_pct:.3g} %)"
 
@@ -119,6 +119,8 @@ def _column(column: Column, labels: Sequence[str]) -> dict[str, Any]:
     }
     if any(cell.std_pct is not None for cell in cells):
         content["std_pct"] = [_number(cell.std_pct) for cell in cells]
+    if any(cell.text for cell in cells):
+        content["texts"] = [cell.text for cell in cells]
     return content
 
 

@@ -17,12 +17,13 @@ REFERENCE = "B.4"
 
 
 class ReferenceTable(Frozen):
-    """One table: estimates (value and relative standard deviation in percent, column by column), or plain figures."""
+    """One table: estimates (value and relative standard deviation in percent, column by column), figures, or words."""
 
     title: str
     columns: tuple[str, ...]
     estimates: dict[str, tuple[float, ...]] = Field(default_factory=dict)
     figures: dict[str, tuple[float | None, ...]] = Field(default_factory=dict)
+    words: dict[str, tuple[str, ...]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _rows_fit(self) -> Self:
@@ -32,12 +33,15 @@ class ReferenceTable(Frozen):
         for label, figures in self.figures.items():
             if len(figures) != len(self.columns):
                 raise ValueError(f"{label}: expected {len(self.columns)} figures")
+        for label, words in self.words.items():
+            if len(words) != len(self.columns):
+                raise ValueError(f"{label}: expected words for {len(self.columns)} columns")
         return self
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of the rows."""
-        return (*self.estimates, *self.figures)
+        return (*self.estimates, *self.figures, *self.words)
 
     def printed(self) -> tuple[Column, ...]:
         """The columns as the thesis prints them."""
@@ -45,6 +49,7 @@ class ReferenceTable(Frozen):
         for k, name in enumerate(self.columns):
             cells = {label: Cell(row[2 * k], row[2 * k + 1]) for label, row in self.estimates.items()}
             cells |= {label: Cell(row[k]) for label, row in self.figures.items()}
+            cells |= {label: Cell(None, text=row[k]) for label, row in self.words.items()}
             columns.append(Column("thesis", name, cells))
         return tuple(columns)
 

@@ -10,10 +10,14 @@ Source = Literal["thesis", "virtual", "measured", "arm"]
 
 @dataclass(frozen=True)
 class Cell:
-    """A figure, and its relative standard deviation in percent where it is an estimate; ``None``: not there."""
+    """A figure, and its relative standard deviation in percent where it is an estimate; ``None``: not there.
+
+    ``text`` is what a table says in words in place of a figure.
+    """
 
     value: float | None
     std_pct: float | None = None
+    text: str = ""
 
 
 @dataclass(frozen=True)
