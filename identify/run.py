@@ -156,9 +156,7 @@ def _anchored(
 ) -> ArmModel:
     """The model whose terms predict torques by an estimate: first of the rigid arm, then with the terms in it."""
     rigid = model.without_terms()
-    decimation = decimation_of(
-        "idim-ls", experiments[0].dt, bandwidth, None, samples=lengths, rows=least_rows(model)
-    )
+    decimation = decimation_of("idim-ls", experiments[0].dt, bandwidth, None, samples=lengths, rows=least_rows(model))
     theta = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names).theta
     for _ in range(ANCHORINGS):
         model = model.anchored(np.concatenate([theta[: rigid.base.b], np.zeros(model.e)]))

@@ -85,7 +85,9 @@ EFFECTS = (
         says="the last link is heavier than in the baseline: a gripper or a workpiece is mounted",
         reference="Gaz, De Luca 2017, IROS, Payload estimation based on identified coefficients of robot dynamics",
         linear=tuple(
-            Linear(f"{kind}p", ("kg" if kind == "m" else "kg m" if len(kind) == 2 and kind[0] == "m" else "kg m^2",) * 2)
+            Linear(
+                f"{kind}p", ("kg" if kind == "m" else "kg m" if len(kind) == 2 and kind[0] == "m" else "kg m^2",) * 2
+            )
             for kind in INERTIAL
         ),
         columns=lambda motion, place: by_numbers(motion, _payload_numbers(motion, place)),

@@ -1,0 +1,151 @@
+"""Which effects could sit where, and the columns they would add."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import combinations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.catalogue.effect import Effect, Place
+from identify.catalogue.motion import Motion
+from identify.catalogue.registry import catalogue
+from identify.discrepancy.regression import whitened
+from identify.discrepancy.study import Stretch, Study
+from identify.estimators.noise import ArModel
+
+Array = NDArray[np.float64]
+Shapes = tuple[tuple[str, float], ...]
+Key = tuple[str, int, int | None, Shapes, str, str]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect at a place; the nonlinear parameters are those of the grid that are to be tried."""
+
+    effect: Effect
+    place: Place
+    grid: tuple[Shapes, ...]
+
+    @property
+    def key(self) -> tuple[str, int, int | None]:
+        """Name and place."""
+        return self.effect.name, self.place.joint, self.place.other
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Whitened columns of a candidate, (R, k) each: training rows and held-out rows, measured and simulated."""
+
+    x: Array
+    z: Array
+    held_x: Array
+    held_z: Array
+
+
+@dataclass
+class Workshop:
+    """Makes columns of candidates, and keeps what can be used again.
+
+    Parameters
+    ----------
+    study
+        The stretches.
+    theta
+        Parameters by which effects that depend on the model's torques predict them.
+    noise
+        AR models that whiten.
+    """
+
+    study: Study
+    theta: Array
+    noise: tuple[ArModel, ...]
+    kept: dict[Key, tuple[Array, ...]] = field(default_factory=dict)
+    _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
+
+    def with_fit(self, theta: Array, noise: tuple[ArModel, ...]) -> "Workshop":
+        """The same after a refit; columns that do not depend on theta stay."""
+        still = {key: value for key, value in self.kept.items() if not catalogue()[key[0]].predicts}
+        return Workshop(self.study, theta, noise, still)
+
+    def instruments(self, effect: Effect, place: Place, shapes: Shapes, *, keep: bool = True) -> Array:
+        """Whitened columns (R, k) at the simulated signals of the training data: what a search looks at."""
+        return whitened(self._decimated(effect, place, shapes, "train", "simulated", keep), self.noise)
+
+    def columns(self, effect: Effect, place: Place, shapes: Shapes) -> Columns:
+        """Whitened columns of an effect."""
+        parts = (
+            whitened(self._decimated(effect, place, shapes, part, kind, keep=True), self.noise)
+            for part in ("train", "held")
+            for kind in ("measured", "simulated")
+        )
+        return Columns(*parts)
+
+    def motion(self, stretch: Stretch, kind: str) -> Motion:
+        """A stretch as effects see it."""
+        key = (id(stretch), kind)
+        if key not in self._motions:
+            self._motions[key] = self.study.motion(getattr(stretch, kind), self.theta)
+        return self._motions[key]
+
+    def _decimated(
+        self, effect: Effect, place: Place, shapes: Shapes, part: str, kind: str, keep: bool
+    ) -> tuple[Array, ...]:
+        key = (effect.name, place.joint, place.other, shapes, part, kind)
+        if key in self.kept:
+            return self.kept[key]
+        made = tuple(self._band(effect, place, shapes, self.motion(s, kind)) for s in getattr(self.study, part))
+        if keep:
+            self.kept[key] = made
+        return made
+
+    def _band(self, effect: Effect, place: Place, shapes: Shapes, motion: Motion) -> Array:
+        """Columns in the band of the comparison; joints that the effect leaves alone are not filtered."""
+        columns = effect.columns(motion, place, **dict(shapes))
+        if columns.ndim == 3:
+            return self.study.decimation(columns)
+        own = self.study.decimation(columns)
+        whole = np.zeros((own.shape[0], motion.n, own.shape[1]))
+        whole[:, place.joint] = own
+        return whole
+
+
+def candidates(workshop: Workshop) -> Iterator[Candidate]:
+    """All effects of the catalogue at all places of the robot that it does not have there already.
+
+    Left out are effects that are nothing but other numbers, exchanges of signals, and those that say of themselves
+    that this motion cannot show them.
+    """
+    study = workshop.study
+    motion = workshop.motion(study.train[0], "measured")
+    names = study.joints
+    present = {
+        (e.effect, names.index(e.joint), None if e.other is None else names.index(e.other)) for e in study.robot.effects
+    }
+    coupled = {frozenset(names.index(j) for j in c.joints) for c in study.robot.couplings}
+    for effect in catalogue().values():
+        if effect.rewires or effect.numbers is not None:
+            continue
+        for place in places(effect, study.robot.n):
+            if effect.scope == "pair" and frozenset((place.joint, place.other)) in coupled:
+                continue
+            if (effect.name, place.joint, place.other) in present and not effect.together:
+                continue
+            if effect.visible is not None and effect.visible(motion, place) is not None:
+                continue
+            yield Candidate(effect, place, grid(effect, motion, place))
+
+
+def places(effect: Effect, n: int) -> list[Place]:
+    """Where an effect can sit in an arm of n joints."""
+    if effect.scope == "pair":
+        return [Place(i, j) for i, j in combinations(range(n), 2)]
+    if effect.scope == "arm":
+        return [Place(0)]
+    return [Place(j) for j in range(n)]
+
+
+def grid(effect: Effect, motion: Motion, place: Place) -> tuple[Shapes, ...]:
+    """All combinations of nonlinear parameters to try."""
+    axes = [[(shape.name, float(v)) for v in shape.grid(motion, place.joint)] for shape in effect.shapes]
+    return tuple(product(*axes))

@@ -1,0 +1,187 @@
+"""What a diagnosis works on: training and held-out stretches of motion, with their torques in one band."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import DataError, RobotConfig
+from identify.catalogue.motion import Motion
+from identify.catalogue.wiring import rewired
+from identify.closed_loop import closed_loop
+from identify.estimators.idim_ls import idim_ls
+from identify.experiment import Experiment
+from identify.methods import decimation_of
+from identify.model.arm import ArmModel
+from identify.options import Options
+from identify.preparation import aligned_torque, equations, least_rows
+from identify.signals.bandwidth import motion_bandwidth
+from identify.signals.decimate import Decimation, design
+from identify.signals.differentiate import Derivatives, differentiate
+
+Array = NDArray[np.float64]
+
+HELD_OUT_SHARE = 0.35
+"""Last part of every experiment kept for judging, where no other recording is given for it."""
+
+BAND = 5.0
+"""Frequency up to which model and data are compared, as a multiple of the closed-loop bandwidth."""
+
+WORKING_RATE = 20.0
+"""Rate at which effects are evaluated, over the frequency up to which model and data are compared."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One uninterrupted stretch of motion at the working rate, SI, joint side.
+
+    Parameters
+    ----------
+    measured
+        Smoothed positions and their derivatives.
+    simulated
+        The same motion without noise, of the simulated closed loop: instruments.
+    y
+        Torques (M, n) in the band of the comparison.
+    t
+        Their instants, s, (M,).
+    experiment
+        Number of the experiment that it is cut from.
+    """
+
+    measured: Derivatives
+    simulated: Derivatives
+    y: Array
+    t: Array
+    experiment: int
+
+
+@dataclass(frozen=True)
+class Study:
+    """Training and held-out stretches of one robot.
+
+    Parameters
+    ----------
+    robot
+        The robot as configured.
+    model
+        Its model.
+    decimation
+        From the working rate to the rate of the comparison.
+    dt
+        Of the working rate, s.
+    duration
+        Of all recordings, s.
+    loop
+        Which closed loop the instruments come from.
+    """
+
+    robot: RobotConfig
+    model: ArmModel
+    decimation: Decimation
+    dt: float
+    duration: float
+    train: tuple[Stretch, ...]
+    held: tuple[Stretch, ...]
+    loop: str
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def joints(self) -> list[str]:
+        """Names of the joints."""
+        return [joint.name for joint in self.robot.joints]
+
+    def motion(self, signals: Derivatives, theta: Array | None, model: ArmModel | None = None) -> Motion:
+        """Signals as effects see them."""
+        return Motion(
+            model or self.model, signals.q, signals.qd, signals.qdd, self.dt, signals.start, theta, self.duration
+        )
+
+
+def build_study(training: Sequence[Experiment], validation: Sequence[Experiment], robot: RobotConfig) -> Study:
+    """Differentiate, simulate, split and filter the experiments.
+
+    Parameters
+    ----------
+    training
+        Experiments to fit; without ``validation`` their last part is held out.
+    validation
+        Experiments to judge by, or none.
+
+    Raises
+    ------
+    DataError
+        If rates differ, or the motion is too short or does not determine the parameters of the model.
+    """
+    experiments = rewired([*training, *validation], robot)
+    dt = experiments[0].dt
+    if any(abs(e.dt - dt) > 1e-9 * dt for e in experiments):
+        raise DataError("the recordings have different sampling rates; diagnose them separately")
+    experiments = _continued(experiments)
+    model = ArmModel.from_config(robot)
+    bandwidth = robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
+    cutoff = min(BAND * bandwidth, 0.25 / dt)
+    factor = max(1, int(1.0 / (dt * WORKING_RATE * cutoff)))
+    first = design(dt, 0.4 / (dt * factor), factor) if factor > 1 else design(dt, 0.5 / dt, 1)
+    second = design(dt * factor, cutoff)
+    signals = [replace(differentiate(e.q, dt, bandwidth_hz=bandwidth), start=e.start) for e in experiments]
+    simulated, loop, warnings = _simulated(model, experiments, signals, bandwidth)
+    train: list[Stretch] = []
+    held: list[Stretch] = []
+    for k, (e, s, z) in enumerate(zip(experiments, signals, simulated, strict=True)):
+        torque = first(aligned_torque(e.tau))
+        kept = first.instants(e.tau.shape[0])
+        pieces = [(train if k < len(training) else held, slice(0, None))]
+        if not validation:
+            cut = int((1 - HELD_OUT_SHARE) * torque.shape[0])
+            pieces = [(train, slice(0, cut)), (held, slice(cut, None))]
+        for into, span in pieces:
+            rows = kept[span]
+            y = second(torque[span])
+            t = e.start + dt * (rows[0] + factor * second.instants(rows.size))
+            into.append(Stretch(_at(s, rows, dt, factor), _at(z, rows, dt, factor), y, t, k))
+    duration = max(e.start + dt * e.q.shape[0] for e in experiments)
+    return Study(robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, tuple(warnings))
+
+
+def _simulated(
+    model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], bandwidth: float
+) -> tuple[list[Derivatives], str, list[str]]:
+    """Motion of the simulated closed loop with the parameters of IDIM-LS, one per experiment."""
+    dt, warnings = experiments[0].dt, list[str]()
+    rigid = model.without_terms()
+    lengths = [e.q.shape[0] for e in experiments]
+    decimation = decimation_of("idim-ls", dt, bandwidth, None, samples=lengths, rows=least_rows(rigid))
+    ls = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names)
+    auxiliary, start, description = closed_loop(
+        rigid, experiments, signals, Options(method="idim-iv"), ls.theta, decimation, bandwidth, warnings
+    )
+    runs = auxiliary.simulate(start)
+    if runs is None:
+        raise DataError("the closed loop cannot be simulated with the model as it stands")
+    motions = [Derivatives(run.q, run.qd, run.qdd, None, dt, e.start) for run, e in zip(runs, experiments, strict=True)]
+    return motions, str(description["kind"]), warnings
+
+
+def _at(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: int) -> Derivatives:
+    """Signals at some of their samples."""
+    return Derivatives(
+        np.ascontiguousarray(signals.q[rows]),
+        np.ascontiguousarray(signals.qd[rows]),
+        np.ascontiguousarray(signals.qdd[rows]),
+        None,
+        dt * factor,
+        signals.start + dt * float(rows[0]),
+    )
+
+
+def _continued(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Experiments one after the other on one axis of time, where they all begin at zero."""
+    out: list[Experiment] = []
+    end = 0.0
+    for e in experiments:
+        start = e.start if e.start >= end else end
+        out.append(replace(e, start=start))
+        end = start + e.dt * e.q.shape[0]
+    return out

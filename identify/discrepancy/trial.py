@@ -1,0 +1,194 @@
+"""One candidate beside the model: fitted on the training data, judged by what it predicts on data it has not seen."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from identify.discrepancy.candidates import Candidate, Shapes, Workshop
+from identify.discrepancy.regression import Fit
+
+Array = NDArray[np.float64]
+
+NEWEY_WEST_LAGS = 20
+RANK_TOLERANCE = 1e-3
+"""Columns that the model nearly contains (relative norm left beside it) cannot be tested."""
+REFINEMENTS = 12
+"""Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """How a candidate did.
+
+    Parameters
+    ----------
+    candidate, shapes
+        What was tried.
+    values, std
+        Linear parameters fitted on the training data beside the model, and their standard deviations, (k,).
+    statistic
+        Score statistic on the training data, chi-square of k degrees of freedom without merit.
+    held_statistic
+        Standardised projection of the held-out residual on the change of prediction that the candidate asks for:
+        standard normal without merit, large with it.
+    gain
+        Drop of the sum of squares of the whitened held-out residuals by that change.
+    inflation
+        Variance of the whitened residuals along the change, over that of white noise; at least 1.
+    share
+        Share of the whitened held-out residuals' power of the joints concerned that the change takes away.
+    """
+
+    candidate: Candidate
+    shapes: Shapes
+    values: Array
+    std: Array
+    statistic: float
+    held_statistic: float
+    gain: float
+    inflation: float
+    share: float
+
+    @property
+    def p_train(self) -> float:
+        """That a candidate without merit fits the training residual so well, at the best of all shapes tried."""
+        p = float(stats.chi2.sf(self.statistic / self.inflation, self.values.size))
+        return min(1.0, p * max(len(self.candidate.grid), 1))
+
+    @property
+    def p_held(self) -> float:
+        """That a candidate without merit predicts the held-out residual so well."""
+        return float(stats.norm.sf(self.held_statistic))
+
+    @property
+    def score(self) -> float:
+        """Gain in log-likelihood over both parts, less what fitting alone gains on the training part."""
+        fitted = self.values.size + len(self.shapes)
+        return 0.5 * (self.statistic - fitted + self.gain) / self.inflation
+
+
+def best_trial(fit: Fit, candidate: Candidate, workshop: Workshop) -> Trial | None:
+    """The candidate at the shapes that fit the training data best.
+
+    Returns
+    -------
+    Trial or None
+        ``None`` if the model already contains the candidate, the motion does not excite it, or what fits best has a
+        sign that physics forbids.
+    """
+    best: tuple[float, Shapes] | None = None
+    for shapes in candidate.grid:
+        statistic = score_statistic(fit, workshop.instruments(candidate.effect, candidate.place, shapes))
+        if statistic is not None and (best is None or statistic > best[0]):
+            best = statistic, shapes
+    if best is None:
+        return None
+    return judge(fit, candidate, _refined(fit, candidate, workshop, best), workshop)
+
+
+def score_statistic(fit: Fit, instruments: Array) -> float | None:
+    """Power of the training residual along instruments (R, k) beside the model's own; ``None`` if nothing is left."""
+    basis = _beside(fit, instruments)
+    if basis is None:
+        return None
+    score = basis[0].T @ fit.residual
+    return float(score @ score)
+
+
+def judge(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) -> Trial | None:
+    """Fit a candidate by instrumental variables beside the model and judge it on the held-out data.
+
+    The judge is the projection of the held-out residual of the model without the candidate on the change of prediction
+    that the candidate asks for, at simulated signals: noise that the motion has followed has no part in it. Without
+    merit it has mean zero; its spread comes from the noise, from what serial correlation is left (Newey-West), and from
+    theta, estimated from the training data.
+    """
+    columns = workshop.columns(candidate.effect, candidate.place, shapes)
+    basis = _beside(fit, columns.z)
+    if basis is None:
+        return None
+    u, right, scale = basis
+    score = u.T @ fit.residual
+    # (D~' C) in the coordinates of u: how much of the instrument's direction the measured columns have.
+    gram = u.T @ (columns.x / scale) @ right
+    try:
+        inverse = np.linalg.inv(gram)
+    except np.linalg.LinAlgError:
+        return None
+    values = (right @ (inverse @ score)) / scale
+    std = np.sqrt(np.sum((right @ inverse) ** 2, axis=1)) / scale
+    if any(p.sign and value * p.sign <= 0 for p, value in zip(candidate.effect.linear, values, strict=True)):
+        return None
+    away = fit.absorbed(columns.x @ values[:, None])[:, 0]
+    change = columns.held_z @ values - fit.held.z @ away
+    before, after = fit.held_residual, fit.held_residual - change
+    size = float(change @ change)
+    if size == 0.0:
+        return None
+    inflation = max(1.0, _newey_west(change * after) / size)
+    variance = size * inflation + fit.spread(change)
+    gain = float(before @ before - after @ after)
+    concerned = np.abs(columns.held_z).any(axis=1)
+    share = gain / max(float(before[concerned] @ before[concerned]), 1e-300)
+    return Trial(
+        candidate,
+        shapes,
+        values,
+        std,
+        float(score @ score),
+        float(change @ before) / float(np.sqrt(variance)),
+        gain,
+        inflation,
+        share,
+    )
+
+
+def _beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
+    """Orthonormal directions (R, r) of instruments beside the model's, and how they map back."""
+    scale = np.linalg.norm(instruments, axis=0)
+    if np.any(scale == 0) or not np.isfinite(scale).all():
+        return None
+    beside = fit.beside(instruments / scale)
+    # Through the small Gram matrix: candidates have a few columns and many rows.
+    power, right = np.linalg.eigh(beside.T @ beside)
+    kept = power > RANK_TOLERANCE**2
+    if not kept.any():
+        return None
+    right = right[:, kept]
+    return (beside @ right) / np.sqrt(power[kept]), right, scale
+
+
+def _refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[float, Shapes]) -> Shapes:
+    """Shapes between those of the grid, one continuous parameter after the other, on a logarithmic scale."""
+    found = best
+    for k, shape in enumerate(candidate.effect.shapes):
+        values = sorted({grid[k][1] for grid in candidate.grid})
+        if not shape.continuous or len(values) < 2:
+            continue
+        at = int(np.argmin(np.abs(np.array(values) - found[1][k][1])))
+        low, high = values[max(at - 1, 0)], values[min(at + 1, len(values) - 1)]
+
+        def loss(logarithm: float, k: int = k) -> float:
+            shapes = (*found[1][:k], (found[1][k][0], float(np.exp(logarithm))), *found[1][k + 1 :])
+            statistic = score_statistic(
+                fit, workshop.instruments(candidate.effect, candidate.place, shapes, keep=False)
+            )
+            return 0.0 if statistic is None else -statistic
+
+        result = optimize.minimize_scalar(
+            loss, bounds=(np.log(low), np.log(high)), method="bounded", options={"maxiter": REFINEMENTS}
+        )
+        if -result.fun > found[0]:
+            found = -float(result.fun), (*found[1][:k], (shape.name, float(np.exp(result.x))), *found[1][k + 1 :])
+    return found[1]
+
+
+def _newey_west(products: Array) -> float:
+    """Variance of a sum of serially correlated terms of mean zero, with Bartlett weights."""
+    centred = products - products.mean()
+    total = float(centred @ centred)
+    for lag in range(1, min(NEWEY_WEST_LAGS, centred.size - 1) + 1):
+        total += 2 * (1 - lag / (NEWEY_WEST_LAGS + 1)) * float(centred[lag:] @ centred[:-lag])
+    return max(total, 0.0)
