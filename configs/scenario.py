@@ -9,10 +9,14 @@ from configs.robot import Name
 
 
 class HiddenEffect(Frozen):
-    """One effect on one joint; which parameters it takes is the virtual arm's business."""
+    """One effect on one joint; which parameters it takes is the virtual arm's business.
+
+    ``other`` is the second joint of an effect between two.
+    """
 
     effect: Name
     joint: Name
+    other: Name | None = None
     parameters: dict[Name, float] = Field(default_factory=dict)
 
 

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from configs import ConfigError, RobotConfig
 from configs.scenario import Scenario
 from virtual_robot import servo
+from virtual_robot.effects import hidden_effects
+from virtual_robot.effects.signals import Signals
 from virtual_robot.noise import Noise
 from virtual_robot.plant import BRAKE, Plant
 
@@ -78,6 +80,7 @@ class Arm:
                 f"SYNC period {sync_period * 1e6:.0f} us: the virtual drives need a multiple of {period * 1e6:.0f} us"
             )
         self.plant = Plant(robot, q, scenario)
+        self._signals = Signals(hidden_effects(scenario, robot), robot, period)
         self._noise = Noise(robot, period, seed, noise)
         self._ratio = robot.transmission_matrix
         drives = [joint.drive for joint in robot.joints]
@@ -85,13 +88,18 @@ class Arm:
         self._torque = self._ratio.T * np.array([drive.gain for drive in drives])
         self._limit = np.array([drive.saturation or np.inf for drive in drives])
         self._permille = np.array([1000.0 / drive.rated for drive in drives])
-        self._servo = servo.design(robot, self.plant.mass_matrix(), velocity_feedback)
+        # Drives are tuned for the arm that is known.
+        known = self.plant if scenario is None else Plant(robot, q)
+        self._servo = servo.design(robot, known.mass_matrix(), velocity_feedback)
         self._origin, self._target = np.zeros(n), np.zeros(n)
         self._age, self._steps = np.zeros(n, np.int64), np.ones(n, np.int64)
         self._held = np.ones(n, np.bool_)
         self._past, self._rate, self._current = np.zeros((n, self._servo.velocity_samples)), np.zeros(n), np.zeros(n)
         self._tau = np.zeros(n)
         self.position, self.current, self.demand = np.zeros(n, np.int32), np.zeros(n, np.int16), np.zeros(n, np.int32)
+        self._own = (self.position, self.current, self.demand)
+        if self._signals.swapped:
+            self._own = (self.position.copy(), self.current.copy(), self.demand.copy())
         self.plant.brake[:] = BRAKE
         self._control()
 
@@ -120,14 +128,27 @@ class Arm:
 
     def _control(self) -> None:
         measured, disturbance = self._noise.next()
-        drives = self._servo
+        drives, (position, current, demand) = self._servo, self._own
         servo.control(
-            drives.period, drives.velocity_feedback, self.plant.q, self._ratio, self._per_rad,
+            drives.period, drives.velocity_feedback, self._signals.measured(self.plant.q), self._ratio, self._per_rad,
             self._origin, self._target, self._age, self._steps, self._held,
             drives.kp, drives.kv, drives.smooth, self._limit, measured, self._permille,
-            self._past, self._rate, self._current, self.position, self.current, self.demand,
+            self._past, self._rate, self._current, position, current, demand,
             self._torque, disturbance, self._tau,
         )  # fmt: skip
+        if self._signals.acts:
+            self._distort(measured, disturbance)
+
+    def _distort(self, noise: NDArray[np.float64], disturbance: NDArray[np.float64]) -> None:
+        """Put hidden errors of amplifiers, wiring and names between drives, plant and bus."""
+        signals, (position, current, demand) = self._signals, self._own
+        self._tau[:] = signals.applied(self._current) + disturbance
+        permille = np.floor((signals.reported(self._current) + noise) * self._permille + 0.5)
+        current[:] = np.clip(permille, -32768, 32767)
+        if signals.swapped:
+            self.current[:] = np.clip(signals.torque_sign * current[signals.torque_from], -32768, 32767)
+            self.position[:] = signals.position_sign * position[signals.position_from]
+            self.demand[:] = signals.position_sign * demand[signals.position_from]
 
 
 def counts_per_si(robot: RobotConfig) -> NDArray[np.float64]:

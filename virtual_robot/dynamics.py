@@ -1,14 +1,22 @@
-"""Compiled integration of the arm over one control period: stiff friction inside, held torque outside."""
+"""Compiled integration of the arm over one control period: stiff friction inside, held torque outside.
+
+Coordinates ``y`` (N,): the joints as their motors see them (n,), then links behind a gear that gives, then masses
+that swing. Without such effects N = n, and motor and link are one.
+"""
 
 import math
 
 import numpy as np
 from numba import njit
 
-from virtual_robot.effects import effect_torque
+from virtual_robot.effects.bristles import bristle_rate
+from virtual_robot.effects.forces import CODES, effect_torque
+from virtual_robot.effects.gears import gear_torque
 
 SUBSTEPS = 6
 """Inner steps per control period of 200 us: 33 us against the 50 us time constant of joint 6 at standstill."""
+
+LOAD_CODE = CODES.index("load_dependent_friction")
 
 # ROS3: L-stable Rosenbrock method of order 3 (Sandu et al., Atmospheric Environment 31, 1997), two evaluations.
 GAMMA = 0.43586652150845899941601945119356
@@ -17,13 +25,15 @@ M2, M3 = 6.1697947043828245592553615689730, -0.42772256543218573326238373806514
 
 
 @njit(cache=True, error_model="numpy")
-def resist(q, qd, friction, smoothing, pairs, pair_friction, brake, ratio, code, joint, parameters, out, slope):  # type: ignore[no-untyped-def]
-    """Friction, couplings (eq. B.1), brakes and hidden effects: torque ``out`` (n,) and ``slope`` (n, n).
+def resist(q, qd, t, friction, smoothing, pairs, pair_friction, brake, ratio, table, load, out, slope):  # type: ignore[no-untyped-def]
+    """Friction, couplings (eq. B.1), brakes and hidden torques: torque ``out`` (N,) and ``slope`` (N, N).
 
-    ``friction`` (n, 3) holds fv, fc and the offset; ``pairs`` (C, 2) and ``pair_friction`` (C, 2) the couplings.
+    ``friction`` (n, 3) holds fv, fc and the offset; ``pairs`` (C, 2) and ``pair_friction`` (C, 2) the couplings;
+    ``table`` the hidden torques, ``load`` (n,) what the gears pass on.
     """
-    n = q.size
+    n = friction.shape[0]
     slope[:, :] = 0.0
+    out[n:] = 0.0
     for i in range(n):
         x = smoothing * qd[i]
         out[i] = (friction[i, 0] + brake[i]) * qd[i] + friction[i, 1] * 2.0 / math.pi * math.atan(x) + friction[i, 2]
@@ -39,17 +49,35 @@ def resist(q, qd, friction, smoothing, pairs, pair_friction, brake, ratio, code,
         slope[j, j] += dry_slope
         slope[i, j] += pair_friction[c, 0] + dry_slope
         slope[j, i] += pair_friction[c, 0] + dry_slope
-    for e in range(code.size):
-        j = joint[e]
+    for e in range(table.shape[0]):
+        code, j, other = int(table[e, 0]), int(table[e, 1]), int(table[e, 2])
         motor = 0.0
         for i in range(n):
             motor += ratio[j, i] * q[i]
-        torque, steep = effect_torque(
-            code[e], parameters[e], friction[j, 0], friction[j, 1], q[j], qd[j], motor, smoothing
-        )
+        beside = 0.0 if other < 0 else qd[other]
+        torque, steep = effect_torque(code, table[e, 3:], q[j], qd[j], motor, beside, load[j], t, smoothing)
         out[j] += torque
         # A falling characteristic stays out of the matrix, which must remain positive definite.
         slope[j, j] += max(steep, 0.0) if steep > 0.0 else max(steep, -0.9 * slope[j, j])
+
+
+@njit(cache=True, error_model="numpy")
+def give(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-def]
+    """Add the torques of the gears that give to ``out`` (N,), their slopes to ``slope`` and ``stiff`` (N, N)."""
+    for e in range(gears.shape[0]):
+        a, b = int(gears[e, 0]), int(gears[e, 1])
+        if b < 0:
+            torque, steep, damping = gear_torque(gears[e], q[a], qd[a])
+            out[a] += torque
+            slope[a, a] += damping
+            stiff[a, a] += steep
+            continue
+        torque, steep, damping = gear_torque(gears[e], q[a] - q[b], qd[a] - qd[b])
+        out[a] += torque
+        out[b] -= torque
+        for i, j, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
+            slope[i, j] += sign * damping
+            stiff[i, j] += sign * steep
 
 
 @njit(cache=True, error_model="numpy")
@@ -87,75 +115,124 @@ def _solve(a, x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def advance(  # type: ignore[no-untyped-def]
-    period,
-    q,
-    qd,
-    middle,
-    speed,
-    tau,
-    mass,
-    bias,
-    rotor,
-    friction,
-    smoothing,
-    pairs,
-    pair_friction,
-    brake,
-    ratio,
-    code,
-    joint,
-    parameters,
-):
-    """Move ``q``, ``qd`` on by ``period`` under the held torque ``tau`` (all (n,)), in place.
+    period, substeps, t, q, qd, z, middle, speed, tau, mass, bias, rotor, link,
+    friction, smoothing, pairs, pair_friction, brake, ratio, table, load, gears, bristles,
+):  # fmt: skip
+    """Move ``q``, ``qd`` (N,) and the bristles ``z`` (B,) on by ``period`` under the held torque ``tau`` (n,).
 
     ``mass`` (upper triangle) and ``bias`` are Pinocchio's mass matrix and nonlinear effects at the predicted
-    ``middle`` of the period; ``rotor`` (n, n) is added to the mass matrix. ``middle`` and ``speed`` get
-    the positions and velocities predicted for the middle of the next period.
+    ``middle`` of the period, of the coordinates ``link``; ``rotor`` (N, N) is added to the mass matrix. ``middle``
+    and ``speed`` (N,) get the positions and velocities predicted for the middle of the next period.
     """
-    n = q.size
-    full = np.empty((n, n))
-    for i in range(n):
-        for j in range(i, n):
-            full[i, j] = mass[i, j] + rotor[i, j]
-            full[j, i] = full[i, j]
-    force, slope, matrix = np.empty(n), np.empty((n, n)), np.empty((n, n))
-    k1, k2, k3, x1, x2, x3 = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    q2, qd2, mk = np.empty(n), np.empty(n), np.empty(n)
+    n, count, total = tau.size, bristles.shape[0], q.size
+    full = rotor.copy()
+    held = np.zeros(total)
+    held[:n] = tau
+    gravity = np.zeros(total)
+    for i in range(link.size):
+        a = link[i]
+        gravity[a] = bias[i]
+        full[a, a] += mass[i, i]
+        for j in range(i + 1, link.size):
+            b = link[j]
+            full[a, b] += mass[i, j]
+            full[b, a] += mass[i, j]
+    force, slope, matrix = np.empty(total), np.empty((total, total)), np.empty((total, total))
+    stiff = np.zeros((total, total))
+    k1, k2, k3, mk = np.empty(total), np.empty(total), np.empty(total), np.empty(total)
+    x1, x2, x3 = np.empty(total), np.empty(total), np.empty(total)
+    q2, qd2 = np.empty(total), np.empty(total)
+    z1, z2, z3, rate, inverse, cross = (
+        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    )  # fmt: skip
+    pull = np.empty(count)
+    loaded = False
+    for e in range(table.shape[0]):
+        loaded |= int(table[e, 0]) == LOAD_CODE
     before = qd.copy()
-    h = period / SUBSTEPS
+    last = qd.copy()
+    h = period / substeps
     hg = h * GAMMA
-    for _ in range(SUBSTEPS):
-        resist(q, qd, friction, smoothing, pairs, pair_friction, brake, ratio, code, joint, parameters, force, slope)
-        for i in range(n):
-            for j in range(n):
+    for step in range(substeps):
+        now = t + (step + 0.5) * h
+        resist(q, qd, now, friction, smoothing, pairs, pair_friction, brake, ratio, table, load, force, slope)
+        if gears.shape[0] > 0:
+            stiff[:, :] = 0.0
+            give(q, qd, gears, force, slope, stiff)
+        for i in range(total):
+            for j in range(total):
                 matrix[i, j] = full[i, j] / hg + slope[i, j]
-            k1[i] = tau[i] - bias[i] - force[i]
+            k1[i] = held[i] - gravity[i] - force[i]
+        if gears.shape[0] > 0:
+            for i in range(total):
+                for j in range(total):
+                    matrix[i, j] += hg * stiff[i, j]
+                    k1[i] -= hg * stiff[i, j] * qd[j]
+        for b in range(count):
+            # The bristle's own stage is solved for and put into that of its joint.
+            j = int(bristles[b, 0])
+            rate[b], own, cross[b] = bristle_rate(bristles[b], z[b], qd[j])
+            inverse[b] = 1.0 / (1.0 / hg - own)
+            pull[b] = (bristles[b, 5] + bristles[b, 6] * own) * inverse[b]
+            matrix[j, j] += max(bristles[b, 6] * cross[b] + pull[b] * cross[b], -0.5 * full[j, j] / hg)
+            k1[j] -= bristles[b, 5] * z[b] + bristles[b, 6] * rate[b] + pull[b] * rate[b]
         _factor(matrix)
         _solve(matrix, k1)
-        for i in range(n):
+        for i in range(total):
             x1[i] = hg * (qd[i] + k1[i])
             q2[i] = q[i] + x1[i]
             qd2[i] = qd[i] + k1[i]
-        resist(q2, qd2, friction, smoothing, pairs, pair_friction, brake, ratio, code, joint, parameters, force, slope)
-        for i in range(n):
+        resist(q2, qd2, now, friction, smoothing, pairs, pair_friction, brake, ratio, table, load, force, slope)
+        if gears.shape[0] > 0:
+            give(q2, qd2, gears, force, slope, slope)
+        for b in range(count):
+            j = int(bristles[b, 0])
+            z1[b] = inverse[b] * (rate[b] + cross[b] * k1[j])
+            rate[b] = bristle_rate(bristles[b], z[b] + z1[b], qd2[j])[0]
+            force[j] += bristles[b, 5] * (z[b] + z1[b]) + bristles[b, 6] * rate[b]
+        for i in range(total):
             s = 0.0
-            for j in range(n):
+            for j in range(total):
                 s += full[i, j] * k1[j]
             mk[i] = s / h
-            k2[i] = tau[i] - bias[i] - force[i] + C21 * mk[i]
+            k2[i] = held[i] - gravity[i] - force[i] + C21 * mk[i]
+        if gears.shape[0] > 0:
+            for i in range(total):
+                for j in range(total):
+                    k2[i] -= hg * stiff[i, j] * (qd2[j] + C21 * x1[j] / h)
+        for b in range(count):
+            k2[int(bristles[b, 0])] -= pull[b] * (rate[b] + C21 * z1[b] / h)
         _solve(matrix, k2)
-        for i in range(n):
+        for b in range(count):
+            z2[b] = inverse[b] * (rate[b] + C21 * z1[b] / h + cross[b] * k2[int(bristles[b, 0])])
+        for i in range(total):
             s = 0.0
-            for j in range(n):
+            for j in range(total):
                 s += full[i, j] * k2[j]
-            k3[i] = tau[i] - bias[i] - force[i] + C31 * mk[i] + C32 * s / h
-        _solve(matrix, k3)
-        for i in range(n):
+            k3[i] = held[i] - gravity[i] - force[i] + C31 * mk[i] + C32 * s / h
             x2[i] = hg * (qd2[i] + k2[i] + C21 * x1[i] / h)
+        if gears.shape[0] > 0:
+            for i in range(total):
+                for j in range(total):
+                    k3[i] -= hg * stiff[i, j] * (qd2[j] + (C31 * x1[j] + C32 * x2[j]) / h)
+        for b in range(count):
+            k3[int(bristles[b, 0])] -= pull[b] * (rate[b] + (C31 * z1[b] + C32 * z2[b]) / h)
+        _solve(matrix, k3)
+        for i in range(total):
             x3[i] = hg * (qd2[i] + k3[i] + (C31 * x1[i] + C32 * x2[i]) / h)
             q[i] += x1[i] + M2 * x2[i] + M3 * x3[i]
             qd[i] += k1[i] + M2 * k2[i] + M3 * k3[i]
-    for i in range(n):
+        for b in range(count):
+            z3[b] = inverse[b] * (rate[b] + (C31 * z1[b] + C32 * z2[b]) / h + cross[b] * k3[int(bristles[b, 0])])
+            z[b] += z1[b] + M2 * z2[b] + M3 * z3[b]
+        if loaded:
+            for i in range(n):
+                load[i] = bias[i]
+                for j in range(link.size):
+                    a = link[j]
+                    load[i] += mass[min(i, j), max(i, j)] * (qd[a] - last[a]) / h
+            last[:] = qd
+    for i in range(total):
         half = 0.5 * (qd[i] - before[i])
         speed[i] = qd[i] + half
         middle[i] = q[i] + 0.5 * period * (qd[i] + 0.5 * half)

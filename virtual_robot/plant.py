@@ -6,10 +6,14 @@ import numpy as np
 import pinocchio
 from numpy.typing import ArrayLike, NDArray
 
-from configs import RobotConfig
+from configs import ConfigError, RobotConfig
 from configs.scenario import Scenario
 from virtual_robot import dynamics
-from virtual_robot.effects import effect_table
+from virtual_robot.effects import Hidden, hidden_effects
+from virtual_robot.effects.bodies import add_rotors, change_bodies, hanging, hinge_damping, shaking
+from virtual_robot.effects.bristles import bristle_table, sliding_level
+from virtual_robot.effects.forces import force_table
+from virtual_robot.effects.gears import gear_rows, twist_under
 from virtual_robot.inertias import plant_parameters
 from virtual_robot.model import build_model
 
@@ -17,6 +21,9 @@ pin: Any = pinocchio
 
 BRAKE = 1e9
 """Viscous coefficient (N m s/rad) of a closed holding brake: it creeps less than an encoder count an hour."""
+
+FINE_STEP = 34e-6
+"""Longest inner step (s) with gears that give or bristles: a twentieth of the fastest contact's period."""
 
 
 class Plant:
@@ -34,59 +41,154 @@ class Plant:
         Initial position, shape (n,), rad or m; the arm stands still.
     scenario
         Hidden effects.
+
+    Attributes
+    ----------
+    q, qd
+        Position and velocity of the joints as their motors have them, shape (n,).
+    coordinates, velocities
+        The same, then links behind a gear that gives, then masses that swing, shape (N,).
+    bristles
+        Deflection of the bristles, rad, shape (B,).
     """
 
     def __init__(self, robot: RobotConfig, q: ArrayLike, scenario: Scenario | None = None) -> None:
         standard = plant_parameters(robot)
-        n = robot.n
+        hidden = hidden_effects(scenario, robot)
+        n, start = robot.n, np.array(q, dtype=np.float64)
         self.model = build_model(robot, standard)
+        change_bodies(self.model, hidden)
         self._data = self.model.createData()
-        self.q = np.array(q, dtype=np.float64)
-        self.qd = np.zeros(n)
-        self._middle, self._speed = self.q.copy(), np.zeros(n)
+        self._gravity, self._shaking = np.array(self.model.gravity.linear), shaking(hidden, np.array(robot.gravity))
+        swing = hanging(self.model, hidden, start)
+        links = _symmetric(pin.crba(self.model, self._data, np.concatenate([start, swing])))[:n, :n]
         names = [joint.name for joint in robot.joints]
-        self.rotor = np.diag([standard[f"ia{j + 1}"] for j in range(n)])
+        rotor = np.diag([standard[f"ia{j + 1}"] for j in range(n)])
         friction = np.array([[standard[f"{k}{j + 1}"] for k in ("fv", "fc", "off")] for j in range(n)])
         pairs = np.array([[names.index(j) for j in c.joints] for c in robot.couplings], np.int64).reshape(-1, 2)
         pair_friction = np.array([[standard[f"{k}{c.name}"] for k in ("fv", "fc")] for c in robot.couplings]).reshape(
             -1, 2
         )
         for c, (i, j) in zip(robot.couplings, pairs, strict=True):
-            self.rotor[i, j] = self.rotor[j, i] = standard[f"ia{c.name}"]
+            rotor[i, j] = rotor[j, i] = standard[f"ia{c.name}"]
+        add_rotors(rotor, hidden, links)
+        table = force_table(hidden, robot, friction)
+        bristles = bristle_table(hidden, robot, friction, np.diag(rotor) + np.diag(links))
+        gears, moved = gear_rows(hidden, robot, rotor, links)
+        for h in hidden:
+            if h.effect == "coupling_friction":
+                viscous = h.given("viscous", 0.3 * h["coulomb"])
+                friction[[h.joint, h.other], 0] += viscous
+                pairs = np.vstack([pairs, [[h.joint, h.other]]])
+                pair_friction = np.vstack([pair_friction, [[viscous, h["coulomb"]]]])
+        # A bristle stands in place of the joint's Coulomb friction.
+        friction[bristles[:, 0].astype(np.int64), 1] = 0.0
+
+        soft, behind = len(gears), gears[:, 0].astype(np.int64)
+        total = n + soft + swing.size
+        link = np.arange(n)
+        link[behind] = n + np.arange(soft)
+        self._link = np.concatenate([link, np.arange(n + soft, total)])
+        self.rotor: NDArray[np.float64] = np.zeros((total, total))
+        self.rotor[:n, :n] = rotor
+        self.rotor[behind, behind] += moved
+        self.rotor[link[behind], link[behind]] -= moved
+        hinges = [[n + soft + k, -1, 0.0, d, 0.0, 0.0] for k, d in enumerate(hinge_damping(hidden, self._gravity))]
+        gears = np.vstack([gears, np.array(hinges).reshape(-1, gears.shape[1])])
+
+        self.coordinates = np.concatenate([start, start[behind], swing])
+        bias = pin.nonLinearEffects(self.model, self._data, self.coordinates[self._link], np.zeros(self._link.size))
+        for e, j in enumerate(behind):
+            self.coordinates[n + e] -= twist_under(gears[e], float(bias[j]))
+        self.velocities = np.zeros(total)
+        self.q, self.qd = self.coordinates[:n], self.velocities[:n]
+        self.bristles = np.zeros(len(bristles))
+        self._time = 0.0
+        self._middle, self._speed = self.coordinates.copy(), np.zeros(total)
         self.brake = np.zeros(n)
-        effects = effect_table(scenario, robot)
+        self._load = bias[:n].copy()
+        self._rows = bristles
+        self._gears = gears
         self._resisting: tuple[Any, ...] = (
-            friction, robot.friction.sign_smoothing, pairs, pair_friction, self.brake, robot.transmission_matrix,
-            effects.code, effects.joint, effects.parameters,
+            friction, robot.friction.sign_smoothing, pairs, pair_friction, self.brake, robot.transmission_matrix, table,
+            self._load,
         )  # fmt: skip
+        self._rigid = total == n
+        self._check(robot, hidden)
+
+    def _check(self, robot: RobotConfig, hidden: tuple[Hidden, ...]) -> None:
+        if hidden and np.linalg.eigvalsh(self._inertia(self.coordinates)).min() <= 0.0:
+            raise ConfigError(f"{hidden[0].where}: robot {robot.name!r} is left without inertia by its hidden effects")
 
     def mass_matrix(self) -> NDArray[np.float64]:
-        """Joint-side mass matrix (n, n) at the present position, rotors included."""
-        upper = np.triu(pin.crba(self.model, self._data, self.q))
-        mass: NDArray[np.float64] = upper + np.triu(upper, 1).T + self.rotor
+        """Joint-side mass matrix (n, n) at the present position, rotors included, gears taken as rigid."""
+        n = self.q.size
+        position = self.coordinates[self._link]
+        position[:n] = self.q
+        folded = self.rotor[:n, :n].copy()
+        for j in range(n):
+            if self._link[j] != j:
+                folded[j, j] += self.rotor[self._link[j], self._link[j]]
+        mass: NDArray[np.float64] = _symmetric(pin.crba(self.model, self._data, position))[:n, :n] + folded
         return mass
 
-    def resistance(self, q: NDArray[np.float64], qd: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Friction, brakes and hidden effects (n,): the torque that resists the motion."""
-        out, slope = np.empty(q.size), np.empty((q.size, q.size))
-        arguments = (q, qd, *self._resisting, out, slope)
+    def resistance(self, q: NDArray[np.float64], qd: NDArray[np.float64], t: float = 0.0) -> NDArray[np.float64]:
+        """Friction, brakes and hidden torques (n,) that resist the motion of the motors; bristles slide steadily."""
+        n = q.size
+        out, slope = np.empty(n), np.empty((n, n))
+        arguments = (q, qd, t, *self._resisting, out, slope)
         dynamics.resist(*arguments)
+        for row in self._rows:
+            j = int(row[0])
+            out[j] += np.sign(qd[j]) * sliding_level(row, qd[j])[0]
         return out
 
     def acceleration(
-        self, q: NDArray[np.float64], qd: NDArray[np.float64], tau: NDArray[np.float64]
+        self, q: NDArray[np.float64], qd: NDArray[np.float64], tau: NDArray[np.float64], t: float = 0.0
     ) -> NDArray[np.float64]:
-        """Direct dynamics (n,) at any state: what ``advance`` integrates, without its approximations."""
-        upper = np.triu(pin.crba(self.model, self._data, q))
-        mass = upper + np.triu(upper, 1).T + self.rotor
-        bias = pin.nonLinearEffects(self.model, self._data, q, qd)
-        out: NDArray[np.float64] = np.linalg.solve(mass, tau - bias - self.resistance(q, qd))
-        return out
+        """Direct dynamics (N,) of ``coordinates`` at any state: what ``advance`` integrates, without approximations.
+
+        Bristles slide steadily.
+        """
+        n, total = self.q.size, self.coordinates.size
+        force, slope = np.zeros(total), np.zeros((total, total))
+        force[:n] = self.resistance(q[:n], qd[:n], t) - tau
+        dynamics.give(q, qd, self._gears, force, slope, slope)
+        self._shake(t)
+        force[self._link] += pin.nonLinearEffects(self.model, self._data, q[self._link], qd[self._link])
+        return np.asarray(np.linalg.solve(self._inertia(q), -force), np.float64)
 
     def advance(self, tau: NDArray[np.float64], period: float) -> None:
         """Hold the joint torques ``tau`` (n,) for ``period`` seconds."""
-        mass = pin.crba(self.model, self._data, self._middle)
-        bias = pin.nonLinearEffects(self.model, self._data, self._middle, self._speed)
-        dynamics.advance(
-            period, self.q, self.qd, self._middle, self._speed, tau, mass, bias, self.rotor, *self._resisting
-        )
+        self._shake(self._time + 0.5 * period)
+        middle, speed = self._middle, self._speed
+        steps = dynamics.SUBSTEPS
+        if not self._rigid:
+            middle, speed = middle[self._link], speed[self._link]
+        if self._gears.size or self._rows.size:
+            steps = max(steps, int(np.ceil(period / FINE_STEP)))
+        mass = pin.crba(self.model, self._data, middle)
+        bias = pin.nonLinearEffects(self.model, self._data, middle, speed)
+        arguments = (
+            period, steps, self._time, self.coordinates, self.velocities, self.bristles, self._middle, self._speed, tau,
+            mass, bias, self.rotor, self._link, *self._resisting, self._gears, self._rows,
+        )  # fmt: skip
+        dynamics.advance(*arguments)
+        self._time += period
+
+    def _inertia(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        mass = self.rotor.copy()
+        rows, columns = np.ix_(self._link, self._link)
+        mass[rows, columns] += _symmetric(pin.crba(self.model, self._data, q[self._link]))
+        return mass
+
+    def _shake(self, t: float) -> None:
+        """Put the acceleration of the base at ``t`` into gravity."""
+        if len(self._shaking):
+            rows = self._shaking
+            self.model.gravity.linear = self._gravity - np.sin(rows[:, 3] * t) @ rows[:, :3]
+
+
+def _symmetric(upper: NDArray[np.float64]) -> NDArray[np.float64]:
+    out: NDArray[np.float64] = np.triu(upper) + np.triu(upper, 1).T
+    return out

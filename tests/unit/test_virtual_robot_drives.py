@@ -8,12 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot
-from configs.scenario import HiddenEffect, Scenario
 from configs.trajectory import Move
 from daq.recording import Recording
 from drivers.objects import Control, DriveState, drive_state
 from virtual_robot.arm import Arm, counts_per_si
-from virtual_robot.effects import EFFECTS, effect_torque
 from virtual_robot.inertias import rest_posture
 from virtual_robot.machine import next_state, statusword
 from virtual_robot.noise import DECIMATED_VARIANCE, RESIDUAL_VARIANCE, Noise
@@ -130,73 +128,6 @@ def test_noise_has_the_size_of_table_6_3(tx40: RobotConfig) -> None:
     # 40 s hold 1600 independent values below 20 Hz: 3.5 % standard deviation of a variance.
     np.testing.assert_allclose(total.var(axis=0), RESIDUAL_VARIANCE, rtol=0.15)
     np.testing.assert_allclose(below, DECIMATED_VARIANCE, rtol=0.15)
-
-
-EXAMPLES: dict[str, dict[str, float]] = {
-    "asymmetric_viscous_friction": {"ratio": 0.2},
-    "asymmetric_coulomb_friction": {"ratio": 0.2},
-    "stribeck_friction": {"extra": 2.0, "velocity": 0.1},
-    "joint_spring": {"stiffness": 5.0},
-    "cogging_torque": {"amplitude": 0.5, "harmonic": 2.0},
-    "friction_scale": {"factor": 1.3},
-}
-
-
-def with_effect(robot: RobotConfig, effect: str, joint: str, parameters: dict[str, float]) -> Plant:
-    hidden = HiddenEffect(effect=effect, joint=joint, parameters=parameters)
-    scenario = Scenario(schema="armident/scenario/1", effects=(hidden,))
-    return Plant(robot, np.zeros(robot.n), scenario)
-
-
-@pytest.mark.parametrize("effect", sorted(EFFECTS))
-@pytest.mark.parametrize("joint", ["joint_1", "joint_6"])
-def test_an_effect_acts_on_its_joint_alone(tx40: RobotConfig, effect: str, joint: str) -> None:
-    plant, healthy = with_effect(tx40, effect, joint, EXAMPLES[effect]), Plant(tx40, np.zeros(6))
-    q, qd = np.full(6, 0.7), np.full(6, 0.1)
-    extra = plant.resistance(q, qd) - healthy.resistance(q, qd)
-    assert np.flatnonzero(np.abs(extra) > 1e-3).tolist() == [int(joint[-1]) - 1]
-    assert np.abs(np.delete(extra, int(joint[-1]) - 1)).max() < 1e-12
-
-
-@pytest.mark.parametrize("effect", sorted(EFFECTS))
-def test_the_slope_of_an_effect_is_the_derivative_of_its_torque(effect: str) -> None:
-    code, step = list(EFFECTS).index(effect), 1e-6
-    row = np.zeros(4)
-    for k, (name, default) in enumerate(EFFECTS[effect].parameters.items()):
-        row[k] = EXAMPLES[effect].get(name, default or 0.0)
-    # None of them exactly at standstill, where asymmetric friction has a kink.
-    for qd in (-1.3, -0.05, -0.004, 0.003, 0.08, 1.1):
-        up, slope = effect_torque(code, row, 5.0, 8.0, 0.4, qd, 0.3, 150.0)
-        above = effect_torque(code, row, 5.0, 8.0, 0.4, qd + step, 0.3, 150.0)[0]
-        below = effect_torque(code, row, 5.0, 8.0, 0.4, qd - step, 0.3, 150.0)[0]
-        assert np.isfinite(up)
-        assert slope == pytest.approx((above - below) / (2 * step), rel=1e-4, abs=1e-5)
-
-
-def test_asymmetric_friction_is_a_fifth_up_forwards_and_a_fifth_down_backwards(tx40: RobotConfig) -> None:
-    plant = with_effect(tx40, "asymmetric_viscous_friction", "joint_2", {"ratio": 0.2})
-    healthy = Plant(tx40, np.zeros(6))
-    for speed in (1.0, -1.0):
-        qd = np.array([0.0, speed, 0.0, 0.0, 0.0, 0.0])
-        extra = plant.resistance(np.zeros(6), qd) - healthy.resistance(np.zeros(6), qd)
-        assert extra[1] == pytest.approx(0.2 * 5.50)
-
-
-@pytest.mark.parametrize(
-    ("effect", "joint", "parameters", "message"),
-    [
-        ("worn_gear", "joint_1", {}, r"effects\[0\]\.effect: 'worn_gear'"),
-        ("joint_spring", "joint_9", {"stiffness": 1.0}, r"effects\[0\]\.joint: 'joint_9'"),
-        ("joint_spring", "joint_1", {}, "needs stiffness"),
-        ("joint_spring", "joint_1", {"stiffness": 1.0, "damping": 1.0}, "parameters.damping: unknown"),
-        ("stribeck_friction", "joint_1", {"extra": 1.0, "velocity": 0.0}, "velocity: expected a number above 0"),
-    ],
-)
-def test_a_mistake_in_a_scenario_is_named(
-    tx40: RobotConfig, effect: str, joint: str, parameters: dict[str, float], message: str
-) -> None:
-    with pytest.raises(ConfigError, match=message):
-        with_effect(tx40, effect, joint, parameters)
 
 
 @pytest.mark.parametrize("name", ["tx40_worn_joint2.yaml", "tx40_cable_and_cogging.yaml"])

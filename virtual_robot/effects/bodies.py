@@ -1,0 +1,109 @@
+"""Hidden changes of the rigid bodies: what is mounted on the arm, and what the arm is mounted on."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio
+from numpy.typing import NDArray
+
+from configs import ConfigError
+from virtual_robot.effects.hidden import Hidden
+
+pin: Any = pinocchio
+
+
+def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:
+    """Mount payloads and vessels on a Pinocchio model, and tilt it; in place.
+
+    A swinging mass is a further joint, after those of the arm.
+    """
+    for h in hidden:
+        if h.effect == "payload":
+            placement = pin.SE3(np.eye(3), np.array([h["x"], h["y"], h["z"]]))
+            model.appendBodyToJoint(h.joint + 1, _ball(h["mass"], h["radius"]), placement)
+        elif h.effect == "gravity_direction":
+            model.gravity.linear = tilted(np.array(model.gravity.linear), h["tilt"], h["azimuth"])
+        elif h.effect == "slosh_payload":
+            hinge = pin.SE3(np.eye(3), np.array([0.0, 0.0, h["z"]]))
+            name = f"slosh_{h.joint + 1}"
+            number = model.addJoint(h.joint + 1, pin.JointModelRX(), hinge, name)
+            bob = pin.SE3(np.eye(3), np.array([0.0, 0.0, -h["length"]]))
+            model.appendBodyToJoint(number, _ball(h["mass"], 0.1 * h["length"]), bob)
+
+
+def hanging(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles at which the swinging masses rest with the arm at ``q`` (n,): rad, in Pinocchio's order."""
+    data = model.createData()
+    swinging = [h for h in hidden if h.effect == "slosh_payload"]
+    zero = np.concatenate([q, np.zeros(len(swinging))])
+    pin.forwardKinematics(model, data, zero)
+    out = []
+    for k in range(len(swinging)):
+        down = data.oMi[q.size + 1 + k].rotation.T @ model.gravity.linear
+        out.append(math.atan2(down[1], -down[2]))
+    return np.array(out)
+
+
+def hinge_damping(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Viscous coefficients (N m s/rad) of the swinging masses' hinges."""
+    out = []
+    for h in hidden:
+        if h.effect == "slosh_payload":
+            own = math.sqrt(max(float(np.linalg.norm(gravity)), 1.0) / h["length"])
+            out.append(h["damping"] * 2.0 * h["mass"] * h["length"] ** 2 * own)
+    return np.array(out)
+
+
+def add_rotors(rotor: NDArray[np.float64], hidden: Sequence[Hidden], links: NDArray[np.float64]) -> None:
+    """Add hidden rotor inertias to ``rotor`` (n, n), in place.
+
+    ``links`` is the mass matrix (n, n) of the links at the start.
+
+    Raises
+    ------
+    ConfigError
+        If an inertia taken away, or one between joints, leaves a mass matrix that is not positive definite.
+    """
+    for h in hidden:
+        if h.effect == "rotor_inertia":
+            one, two = (h.joint, h.joint) if h.other < 0 else (h.joint, h.other)
+            rotor[one, two] += h["inertia"]
+            if one != two:
+                rotor[two, one] += h["inertia"]
+            if np.linalg.eigvalsh(links + rotor).min() <= 0.0:
+                raise ConfigError(f"{h.where}.parameters.inertia: {h['inertia']:g} leaves a joint without inertia")
+
+
+def tilted(gravity: NDArray[np.float64], tilt: float, azimuth: float) -> NDArray[np.float64]:
+    """Gravity (3,) after the base was turned by ``tilt`` about a horizontal axis, ``azimuth`` from its x axis."""
+    one, two = _horizontal(gravity)
+    axis = math.cos(azimuth) * one + math.sin(azimuth) * two
+    out: NDArray[np.float64] = pin.exp3(tilt * axis) @ gravity
+    return out
+
+
+def shaking(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Amplitude vector (m/s^2) and angular frequency of every vibration of the base, shape (V, 4)."""
+    one, two = _horizontal(gravity)
+    rows = []
+    for h in hidden:
+        if h.effect == "base_vibration":
+            direction = math.cos(h["azimuth"]) * two + math.sin(h["azimuth"]) * one
+            rows.append([*(h["amplitude"] * direction), 2 * math.pi * h["frequency"]])
+    return np.array(rows, np.float64).reshape(-1, 4)
+
+
+def _horizontal(gravity: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two axes across gravity: the base's x axis made level, and the one across both."""
+    size = float(np.linalg.norm(gravity))
+    down = gravity / size if size > 0.0 else np.array([0.0, 0.0, -1.0])
+    start = np.array([1.0, 0.0, 0.0]) if abs(down[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    one = start - (start @ down) * down
+    one /= np.linalg.norm(one)
+    return one, np.cross(one, down)
+
+
+def _ball(mass: float, radius: float) -> Any:
+    return pin.Inertia(mass, np.zeros(3), mass * radius**2 * np.eye(3))

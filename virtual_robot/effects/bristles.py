@@ -1,0 +1,67 @@
+"""LuGre bristles in place of Coulomb friction: a state per joint (Canudas de Wit, Olsson, Astrom, Lischinsky 1995)."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from configs import ConfigError, RobotConfig
+from virtual_robot.effects.hidden import Hidden
+
+COLUMNS = 7
+"""Joint, Coulomb friction, extra at rest, Stribeck velocity, exponent, stiffness, damping."""
+
+
+@njit(cache=True, error_model="numpy")
+def sliding_level(row, qd):  # type: ignore[no-untyped-def]
+    """Friction (N m) when sliding at ``qd``, without its sign, and its slope over ``abs(qd)``."""
+    speed = abs(qd)
+    ratio = (speed / row[3]) ** row[4]
+    bump = row[2] * math.exp(-ratio)
+    return row[1] + bump, -bump * row[4] * ratio / max(speed, 1e-12)
+
+
+@njit(cache=True, error_model="numpy")
+def bristle_rate(row, z, qd):  # type: ignore[no-untyped-def]
+    """Rate of a bristle's deflection ``z``, ``qd - abs(qd) z stiffness / g(qd)``, and its slopes over z and qd."""
+    level, fall = sliding_level(row, qd)
+    pull = row[5] / level
+    side = math.copysign(1.0, qd)
+    return qd - abs(qd) * z * pull, -abs(qd) * pull, 1.0 - side * z * pull * (1.0 - abs(qd) * fall / level)
+
+
+def bristle_table(
+    hidden: Sequence[Hidden], robot: RobotConfig, friction: NDArray[np.float64], inertia: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rows of the joints with a bristle, shape (B, COLUMNS); Stribeck and presliding of one joint share it.
+
+    Parameters
+    ----------
+    friction
+        fv, fc and offset of the healthy arm, shape (n, 3).
+    inertia
+        What each joint's motor moves at the start (n,): it says what critical damping is.
+
+    Raises
+    ------
+    ConfigError
+        If a joint has no Coulomb friction that the bristle could stand for.
+    """
+    rows: list[NDArray[np.float64]] = []
+    mine = [h for h in hidden if h.place == "bristle"]
+    for j in sorted({h.joint for h in mine}):
+        speed, coulomb = robot.joints[j].limits.velocity, float(friction[j, 1])
+        extra, velocity, exponent, deflection, damping = 0.0, 0.02 * speed, 2.0, 4e-6 * speed, 0.0
+        # Sorted by name: the deflection of presliding comes first and yields to one given for Stribeck friction.
+        for h in sorted((h for h in mine if h.joint == j), key=lambda h: h.effect):
+            if coulomb <= 0.0:
+                raise ConfigError(f"{h.where}: {robot.joints[j].name} has no Coulomb friction to make a bristle of")
+            deflection, damping = h.given("deflection", deflection), max(damping, h["damping"])
+            if h.effect == "stribeck_friction":
+                extra, velocity, exponent = h["extra"], h.given("velocity", velocity), h["exponent"]
+        stiffness = coulomb / deflection
+        critical = 2.0 * math.sqrt(stiffness * inertia[j])
+        rows.append(np.array([j, coulomb, extra, velocity, exponent, stiffness, damping * critical]))
+    return np.array(rows).reshape(-1, COLUMNS)

@@ -1,0 +1,89 @@
+"""Gears that give: motor and link are two masses with a spring, and perhaps a gap, between them."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from configs import ConfigError, RobotConfig
+from virtual_robot.effects.hidden import Hidden
+
+COLUMNS = 6
+"""Coordinate of the motor, coordinate of the link (-1: the ground), stiffness, damping, gap, its rounding."""
+CONTACT_HZ = 100.0
+"""Frequency of motor against link in the contact of a gap, unless the scenario gives its stiffness."""
+MOTOR_SHARE = 0.3
+"""Share of the motor in a joint's inertia where the robot's parameters do not tell them apart."""
+ROUNDING = 0.02
+"""Rounding of the contact's kink, of the gap."""
+
+
+@njit(cache=True, error_model="numpy")
+def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
+    """Torque between motor and link (N m) at a ``twist`` (rad) and its rate, and its slopes over both."""
+    if row[4] == 0.0:
+        return row[2] * twist + row[3] * rate, row[2], row[3]
+    up, down = twist - 0.5 * row[4], -twist - 0.5 * row[4]
+    root_up, root_down = math.sqrt(up * up + row[5] * row[5]), math.sqrt(down * down + row[5] * row[5])
+    contact = 0.5 * (1.0 + up / root_up) + 0.5 * (1.0 + down / root_down)
+    press = 0.5 * (up + root_up) - 0.5 * (down + root_down)
+    return row[2] * press + row[3] * contact * rate, row[2] * contact, row[3] * contact
+
+
+def twist_under(row: NDArray[np.float64], torque: float) -> float:
+    """Twist (rad) at which a gear at rest carries ``torque`` (N m)."""
+    end = torque / float(row[2]) + math.copysign(float(row[4]), torque)
+    low, high = min(0.0, end), max(0.0, end)
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        if float(gear_torque(row, middle, 0.0)[0]) < torque:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+def gear_rows(
+    hidden: Sequence[Hidden], robot: RobotConfig, rotor: NDArray[np.float64], mass: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rows of the joints whose gear gives (E, COLUMNS), and what of the links' inertia is the motor's (E,).
+
+    The link of row e gets coordinate n + e.
+
+    Parameters
+    ----------
+    rotor
+        Rotor inertias (n, n), joint side.
+    mass
+        Mass matrix (n, n) of the links alone at the start.
+
+    Raises
+    ------
+    ConfigError
+        If the motor would have more inertia than motor and link together.
+    """
+    rows, moved = [], []
+    mine = [h for h in hidden if h.place == "gear"]
+    for e, j in enumerate(sorted({h.joint for h in mine})):
+        entries = {h.effect: h for h in mine if h.joint == j}
+        first = next(iter(entries.values()))
+        own, total = float(rotor[j, j]), float(rotor[j, j] + mass[j, j])
+        motor = first.given("motor_inertia", own if own > 0.0 else MOTOR_SHARE * total)
+        if motor >= total:
+            raise ConfigError(
+                f"{first.where}.parameters.motor_inertia: expected less than the {total:.4g} of "
+                f"{robot.joints[j].name} in all, found {motor:g}"
+            )
+        reduced = motor * (total - motor) / total
+        elastic, gap = entries.get("joint_elasticity"), entries.get("backlash")
+        if elastic is not None:
+            stiffness = elastic["stiffness"]
+        else:
+            stiffness = first.given("stiffness", reduced * (2.0 * math.pi * CONTACT_HZ) ** 2)
+        damping = first["damping"] * 2.0 * math.sqrt(stiffness * reduced)
+        play = 0.0 if gap is None else gap["gap"]
+        rows.append([j, robot.n + e, stiffness, damping, play, ROUNDING * play])
+        moved.append(motor - own)
+    return np.array(rows, np.float64).reshape(-1, COLUMNS), np.array(moved)
