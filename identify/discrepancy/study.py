@@ -44,6 +44,8 @@ class Stretch:
         The same motion without noise, of the simulated closed loop: instruments.
     y
         Torques (M, n) in the band of the comparison.
+    torque
+        The same at the working rate, with all they hold beyond that band, (N, n).
     t
         Their instants, s, (M,).
     experiment
@@ -53,6 +55,7 @@ class Stretch:
     measured: Derivatives
     simulated: Derivatives
     y: Array
+    torque: Array
     t: Array
     experiment: int
 
@@ -140,7 +143,7 @@ def build_study(training: Sequence[Experiment], validation: Sequence[Experiment]
             rows = kept[span]
             y = second(torque[span])
             t = e.start + dt * (rows[0] + factor * second.instants(rows.size))
-            into.append(Stretch(_at(s, rows, dt, factor), _at(z, rows, dt, factor), y, t, k))
+            into.append(Stretch(_at(s, rows, dt, factor), _at(z, rows, dt, factor), y, torque[span], t, k))
     duration = max(e.start + dt * e.q.shape[0] for e in experiments)
     return Study(robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, tuple(warnings))
 
