@@ -1,0 +1,241 @@
+"""Where model and data disagree: what the residual of each joint depends on, and with which shape."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from identify.catalogue.effect import Place
+from identify.discrepancy.candidates import Candidate, Workshop
+from identify.discrepancy.hints import hint_of, unit_of
+from identify.discrepancy.lines import lowest_frequency, residuals, strongest_line
+from identify.discrepancy.maps import Kind, Map, maps
+from identify.discrepancy.regression import Fit, Rows
+from identify.discrepancy.smoothing import smoothed
+from identify.discrepancy.trial import Trial, _beside, judge, score_statistic
+
+Array = NDArray[np.float64]
+
+HELD_OUT_LEVEL = 0.05
+"""The held-out data alone must speak for a dependence at this level."""
+
+SCREEN = 0.05
+"""Maps that do not even fit the training residual at this level are not judged on the held-out data."""
+
+MATERIAL = 0.02
+"""Share of a joint's held-out residual power that an unexplained dependence must have to be reported."""
+
+MOST = 2
+"""Most unexplained dependences of one joint."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A shape with its uncertainty.
+
+    Parameters
+    ----------
+    x
+        Values of the variable, (G,).
+    value
+        Torque that the model lacks there, N m or N, (G,).
+    band
+        Two standard deviations, (G,).
+    """
+
+    x: Array
+    value: Array
+    band: Array
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A dependence of one joint's residual on one variable.
+
+    Parameters
+    ----------
+    joint
+        Its name.
+    kind, other
+        What the residual varies with; the joint or motor that the variable belongs to, if it is another one.
+    unit
+        Of the variable.
+    share
+        Share of the power of the joint's held-out residual, as whitened, that the dependence predicts as fitted on the
+        training data; of a frequency its share of the residual at the working rate.
+    p_value
+        That a joint without the dependence shows it so clearly, of this one test.
+    curve
+        Its shape; of a frequency the spectrum around it.
+    """
+
+    joint: str
+    kind: Kind
+    other: str | None
+    unit: str
+    share: float
+    p_value: float
+    curve: Curve
+
+    @property
+    def varies_with(self) -> str:
+        """The variable in words."""
+        if self.other is None:
+            return self.kind
+        if self.kind == "motor angle":
+            return f"motor angle of {self.other}"
+        return f"{self.kind.removesuffix(' of another joint')} of {self.other}"
+
+    @property
+    def hint(self) -> str:
+        """What to look for, for whoever stands at the machine."""
+        at = self.curve.x[int(np.argmax(np.abs(self.curve.value)))]
+        return hint_of(self.kind, self.joint, self.other, f"{at:.3g} {self.unit}")
+
+
+def where(fit: Fit, workshop: Workshop, alpha: float = 0.01) -> list[Disagreement]:
+    """All variables on which a residual depends, those first that explain most of it on unseen data.
+
+    Every variable is one anonymous effect with a free shape, and passes the same judge as the effects of the
+    catalogue. Lines in the spectrum are judged against the spectrum around them.
+
+    Parameters
+    ----------
+    fit
+        Of the model as it stands.
+    workshop
+        Of the same fit.
+    alpha
+        Chance that a plant whose model is right shows any disagreement, over all variables and joints.
+    """
+    own = _bench(workshop)
+    level = alpha / _tests(fit, own)
+    best: dict[tuple[int, Kind, int | None], _Found] = {}
+    for f in sorted(_significant(fit, own, level), key=lambda f: -f.trial.share):
+        best.setdefault((f.map.joint, f.map.kind, f.map.other), f)
+    found = [f.disagreement(fit, own) for f in best.values()]
+    return sorted([*found, *_lines(fit, level)], key=lambda d: -d.share)
+
+
+def unexplained(fit: Fit, workshop: Workshop, alpha: float = 0.01) -> list[Disagreement]:
+    """What is left and matters, at most `MOST` dependences of each joint, each beside the ones before it.
+
+    A variable that merely goes along with a stronger one (speed with torque, say) is not named again.
+    """
+    study, own = fit.study, _bench(workshop)
+    level = alpha / _tests(fit, own)
+    significant, lines = _significant(fit, own, level), _lines(fit, level)
+    found: list[Disagreement] = []
+    for j, joint in enumerate(study.joints):
+        here: list[Disagreement] = [line for line in lines if line.joint == joint and line.share >= MATERIAL]
+        rivals = [f for f in significant if f.map.joint == j and f.trial.share >= MATERIAL]
+        beside = fit
+        while rivals and len(here) < MOST:
+            best = max(rivals, key=lambda f: f.trial.share)
+            here.append(best.disagreement(beside, own))
+            beside = _with(beside, best, own)
+            again = [_judged(beside, f.map, own) for f in rivals if f is not best]
+            rivals = [f for f in again if f is not None and f.passes(level) and f.trial.share >= MATERIAL]
+        found += here
+    return sorted(found, key=lambda d: -d.share)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A map and how it did."""
+
+    map: Map
+    trial: Trial
+
+    def passes(self, level: float) -> bool:
+        return self.trial.p_value < level and self.trial.p_held < HELD_OUT_LEVEL and self.trial.gain > 0
+
+    def disagreement(self, fit: Fit, workshop: Workshop) -> Disagreement:
+        study, m = fit.study, self.map
+        other = None if m.other is None else study.joints[m.other]
+        x = np.linspace(m.low, m.high, 121)
+        side = np.sign(x) if m.kind == "velocity" else np.ones_like(x)
+        basis = m.shape(x, side)
+        columns = workshop.columns(m.effect(), Place(m.joint), ())
+        # The kink that dry friction makes at standstill is no roughness.
+        pieces = [basis[x <= 0], basis[x >= 0]] if m.kind == "velocity" else [basis]
+        value, band = smoothed(fit, columns, basis, pieces)
+        return Disagreement(
+            study.joints[m.joint],
+            m.kind,
+            other,
+            unit_of(m.kind, study.robot.joints[m.joint if m.other is None else m.other].type),
+            self.trial.share,
+            self.trial.p_value,
+            Curve(x, value, band),
+        )
+
+
+def _bench(workshop: Workshop) -> Workshop:
+    """The same motions, with room for columns that belong to no effect of the catalogue."""
+    return replace(workshop, kept={})
+
+
+def _maps(fit: Fit, workshop: Workshop) -> list[Map]:
+    return list(maps(fit.study, [workshop.motion(s, "simulated") for s in fit.study.train]))
+
+
+def _tests(fit: Fit, workshop: Workshop) -> int:
+    """How many tests share the error rate: every map, and the spectrum of every joint."""
+    return len(_maps(fit, workshop)) + fit.study.robot.n
+
+
+def _significant(fit: Fit, workshop: Workshop, level: float) -> list[_Found]:
+    judged = (_judged(fit, m, workshop) for m in _maps(fit, workshop))
+    return [f for f in judged if f is not None and f.passes(level)]
+
+
+def _judged(fit: Fit, m: Map, workshop: Workshop) -> _Found | None:
+    effect, place = m.effect(), Place(m.joint)
+    instruments = workshop.instruments(effect, place, (), keep=False)
+    seen = np.abs(instruments).max(axis=0) > 0
+    if not seen.all():
+        return None
+    statistic = score_statistic(fit, instruments)
+    if statistic is None or stats.chi2.sf(statistic, len(effect.linear)) > SCREEN:
+        return None
+    trial = judge(fit, Candidate(effect, place, ((),)), (), workshop)
+    return None if trial is None else _Found(m, trial)
+
+
+def _with(fit: Fit, found: _Found, workshop: Workshop) -> Fit:
+    """The fit with a map among the parameters of the model, without what the model contained of it before."""
+    columns = workshop.columns(found.map.effect(), Place(found.map.joint), ())
+    basis = _beside(fit, columns.z)
+    assert basis is not None
+    _, right, scale = basis
+    through = right / scale[:, None]
+    train = Rows(
+        np.column_stack([fit.train.x, columns.x @ through]),
+        np.column_stack([fit.train.z, columns.z @ through]),
+        fit.train.y,
+    )
+    held = Rows(
+        np.column_stack([fit.held.x, columns.held_x @ through]),
+        np.column_stack([fit.held.z, columns.held_z @ through]),
+        fit.held.y,
+    )
+    values = np.linalg.lstsq(through, found.trial.values, rcond=None)[0]
+    theta = np.concatenate([fit.theta - found.trial.away, values])
+    return replace(fit, theta=theta, train=train, held=held)
+
+
+def _lines(fit: Fit, level: float) -> list[Disagreement]:
+    """The strongest line of each joint, where there is one."""
+    study = fit.study
+    train = residuals(study, study.train, fit.theta)
+    held = residuals(study, study.held, fit.theta)
+    found: list[Disagreement] = []
+    for j, joint in enumerate(study.joints):
+        line = strongest_line([e[:, j] for e in train], [e[:, j] for e in held], study.dt, lowest_frequency(study))
+        if line is None or not line.p_value < level or not line.p_held < HELD_OUT_LEVEL:
+            continue
+        curve = Curve(line.f, line.amplitude, line.noise)
+        found.append(Disagreement(joint, "frequency", None, "Hz", line.share, line.p_value, curve))
+    return found
