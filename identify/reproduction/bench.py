@@ -15,12 +15,14 @@ SIMULATIONS, SIMULATIONS_QUICK = 100, 3
 
 @dataclass(frozen=True)
 class Bench:
-    """The two arms.
+    """The arms.
 
     Parameters
     ----------
     virtual
-        The virtual TX40.
+        The virtual TX40, whose drives act on the tracking error alone.
+    feedback
+        The same arm with drives that feed back the velocity.
     measured
         The measured one, without reference and controller; ``None``: not at hand.
     emps
@@ -30,6 +32,7 @@ class Bench:
     """
 
     virtual: Laboratory
+    feedback: Laboratory
     measured: Laboratory | None = None
     emps: Recorded | None = None
     simulations: int = SIMULATIONS

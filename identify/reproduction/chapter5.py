@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
+from configs import DataError
 from identify.controller.crc import PREWHITENING_ORDER
 from identify.reproduction.bench import Bench, TableFunction, estimates, figures, iterations
 from identify.reproduction.laboratory import Case, Method
-from identify.reproduction.tables import Table
+from identify.reproduction.tables import Column, Table
 from identify.reproduction.two_stages import First, Second, TwoStages, two_stages
 
 GOOD = Case("bandpass")
@@ -20,9 +21,17 @@ BY_HAND = 1e-5
 """The thesis's NVR where it is not estimated (5.3.1)."""
 
 ACTUAL = Case()
-IMPULSE_RESPONSES = Case(controller="crc")
+IMPULSE_RESPONSES = Case(controller="cra", start="idim-ls")
+"""The thesis's, from the tracking error (5.3.3). From rotor inertias alone the loop can diverge with them."""
+OWN_RESPONSES = Case(controller="crc", start="idim-ls")
+"""Ours, which have a response from the velocity as well where held-out data ask for it."""
 KNOWN_STRUCTURE = Case(controller="parametric")
 
+FEEDBACK = ", velocity feedback"
+CONTROLLERS = (
+    "CRC: from the tracking error alone, with the lengths of table 5.12, IDIM-IV from the estimate of IDIM-LS; "
+    "velocity feedback: the same arm with drives of that kind"
+)
 IN_NUMBERS = ("distance, std", "closed loop, %", "gains, %", "simulations", "time, s")
 DISTANCE = (
     "distance from the virtual arm's own parameters in standard deviations of IDIM-IV with the actual controller, "
@@ -215,13 +224,20 @@ def table_5_11(bench: Bench) -> Table:
 
 def table_5_12(bench: Bench) -> Table:
     """Sizes of the correlation analysis."""
-    found = bench.virtual.identified(IMPULSE_RESPONSES).responses
-    rows = {
+    found = bench.virtual.identified(OWN_RESPONSES).responses
+    rows: dict[str, list[float]] = {
         "length": [float(r.error_taps.size) for r in found],
         "prewhitening order": [float(r.prewhitening_order) for r in found],
-        "explained torque, %": [r.fit_pct for r in found],
     }
-    return figures("5.12", rows, [f"chosen by held-out data; at most {PREWHITENING_ORDER} for the prewhitening"])
+    for drives, lab in (("", bench.virtual), (FEEDBACK, bench.feedback)):
+        for sizes, case in (("", OWN_RESPONSES), (", tracking error alone, the thesis's lengths", IMPULSE_RESPONSES)):
+            responses = lab.identified(case).responses
+            rows[f"explained torque, %{drives}{sizes}"] = [r.fit_pct for r in responses]
+    notes = [
+        f"chosen by held-out data; at most {PREWHITENING_ORDER} for the prewhitening",
+        "explained: of the variance of held-out torque",
+    ]
+    return figures("5.12", rows, notes)
 
 
 def table_5_13(bench: Bench) -> Table:
@@ -231,21 +247,27 @@ def table_5_13(bench: Bench) -> Table:
         ("IDIM-IV (CRC)", "idim-iv", IMPULSE_RESPONSES),
         ("IDIM-IV (C)", "idim-iv", KNOWN_STRUCTURE),
     ]
-    return estimates(bench, "5.13", columns)
+    table = estimates(bench, "5.13", columns, [CONTROLLERS])
+    columns.append(("DIDIM (CRC)", "didim", IMPULSE_RESPONSES))
+    lab, extra = bench.feedback, []
+    for name, method, case in columns:
+        try:
+            extra.append(lab.column(f"{name}{FEEDBACK}", lab.run(method, case)))
+        except DataError:
+            extra.append(Column("virtual", f"{name}{FEEDBACK}", {}))
+    *others, own = table.columns
+    return replace(table, columns=(*others, *extra, own))
 
 
 def table_5_14(bench: Bench) -> Table:
     """Relative errors where the controller is unknown."""
-    lab = bench.virtual
-    least = lab.run("idim-ls", ACTUAL)
-    runs = [lab.run("idim-iv", case) for case in (IMPULSE_RESPONSES, KNOWN_STRUCTURE)]
-    return figures(
-        "5.14",
-        {
-            "error, %": [least.error_pct, *(run.error_pct for run in runs)],
-            "iterations": [None, *(iterations(run) for run in runs)],
-        },
-    )
+    rows: dict[str, list[float | None]] = {}
+    for drives, lab in (("", bench.virtual), (FEEDBACK, bench.feedback)):
+        least = lab.run("idim-ls", ACTUAL)
+        runs = [lab.run("idim-iv", case) for case in (IMPULSE_RESPONSES, KNOWN_STRUCTURE)]
+        rows[f"error, %{drives}"] = [least.error_pct, *(run.error_pct for run in runs)]
+        rows[f"iterations{drives}"] = [None, *(iterations(run) for run in runs)]
+    return figures("5.14", rows, [CONTROLLERS])
 
 
 def _in_numbers(found: TwoStages | None) -> list[float | None]:

@@ -94,6 +94,7 @@ def make_bench(folder: Path, measured: Path | None = None, *, quick: bool = Fals
         real = Laboratory(lambda: recorded)
     return Bench(
         virtual=Laboratory(lambda: virtual_recording(folder / "recordings")),
+        feedback=Laboratory(lambda: virtual_recording(folder / "recordings", velocity_feedback=True)),
         measured=real,
         emps=None if measured is None else measured_emps(measured),
         simulations=SIMULATIONS_QUICK if quick else SIMULATIONS,

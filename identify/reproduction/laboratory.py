@@ -43,6 +43,8 @@ PIV_CUTOFF_HZ = 50.0
 """Rough decimation before IDIM-PIV (section 7.2)."""
 WHITENING_ORDER = 250
 """Highest AR order tried without decimation; the thesis finds 141 on average (6.3.1)."""
+RESPONSE_LENGTHS = (10, 20, 3, 13, 10, 20)
+"""Of the thesis's impulse responses, samples (table 5.12)."""
 SLOWEST = 1e-3
 """Joint speed (rad/s) that never counts as run away."""
 
@@ -69,10 +71,14 @@ class Case:
     gear_ratio
         Gear ratios of the simulator over the right ones.
     controller
-        Of the simulator: the arm's own, or one identified, as impulse responses or of known structure.
+        Of the simulator: the arm's own, or one identified, of known structure (``parametric``) or as impulse responses:
+        ``crc`` with structure and lengths by held-out data, ``cra`` as the thesis's are, from the tracking error alone
+        and with the lengths of table 5.12.
     midway
         Without decimation only: the equations hold midway between the samples, where the torque as recorded belongs,
         so that its noise stays white. Otherwise they hold at the samples, with the mean of two torques.
+    start
+        Of the iterations: the rotor inertias and nothing else (4.1.4), or the estimate of IDIM-LS.
     """
 
     derivatives: Literal["bandpass", "differences", "irwsm", "irwsm2"] = "irwsm"
@@ -81,8 +87,9 @@ class Case:
     cutoff_hz: float | None = GOOD_CUTOFF_HZ
     encoder_points: int | None = None
     gear_ratio: float = 1.0
-    controller: Literal["actual", "crc", "parametric"] = "actual"
+    controller: Literal["actual", "crc", "cra", "parametric"] = "actual"
     midway: bool = False
+    start: Literal["rotors", "idim-ls"] = "rotors"
 
 
 @dataclass(frozen=True)
@@ -233,8 +240,10 @@ class Laboratory:
         return Run(estimate, relative_errors(blocks, estimate.theta)[0], seconds, simulations)
 
     def _iterate(self, method: Method, case: Case, blocks: list[Block], auxiliary: AuxiliaryModel) -> Estimate:
-        # Zero but for the rotor inertias (section 4.1.4).
-        start = initial_parameters(self.model)
+        if case.start == "rotors":
+            start = initial_parameters(self.model)
+        else:
+            start = self.run("idim-ls", replace(case, controller="actual", start="rotors")).estimate.theta
         match method:
             case "idim-iv":
                 return idim_iv(blocks, auxiliary, start)
@@ -300,11 +309,15 @@ def derive(recording: Recorded, case: Case) -> Derivatives:
 
 
 def identify_controller(recording: Recorded, kind: str) -> IdentifiedController:
-    """The controller from reference, position and torque of each motor: ``crc`` or ``parametric`` (5.2.2, 5.2.3)."""
+    """The controller from reference, position and torque of each motor, by the kinds of ``Case`` (5.2.2, 5.2.3)."""
     robot, experiment = recording.robot, recording.experiment
     assert experiment.q_ref is not None
     ratios = robot.transmission_matrix
     q, reference = experiment.q @ ratios.T, experiment.q_ref @ ratios.T
     torque = experiment.tau @ np.linalg.inv(ratios)
-    method = identify_parametric if kind == "parametric" else identify_crc
-    return method([q], [reference], [torque], experiment.dt, saturation=saturation(robot))
+    signals, limits = ([q], [reference], [torque], experiment.dt), saturation(robot)
+    if kind == "parametric":
+        return identify_parametric(*signals, saturation=limits)
+    if kind == "crc":
+        return identify_crc(*signals, saturation=limits)
+    return identify_crc(*signals, length=RESPONSE_LENGTHS, velocity_loop=False, saturation=limits)

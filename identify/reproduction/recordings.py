@@ -58,24 +58,28 @@ class Recorded:
         return replace(self, experiment=replace(self.experiment, q=np.round(self.experiment.q / step) * step))
 
     def controller(self) -> DiscreteController:
-        """The drives' own controller: a velocity loop around a position loop, both on the tracking error (B.3).
+        """The drives' own controller: a velocity loop around a position loop (figure B.1).
 
-        ``nu = kv (kp eps + s)`` where ``s`` is the derivative of ``eps`` through a first-order low-pass.
+        ``nu = kv (kp eps + s)`` where ``s`` is, through a first-order low-pass, the derivative of ``eps``, or of ``-q``
+        where the drives feed back the velocity.
         """
         n, dt = self.robot.n, self.experiment.dt
         kp, kv = (np.array([self.truth[f"{gain}{j + 1}"] for j in range(n)]) for gain in ("kp", "kv"))
         loop = kv * np.array([joint.drive.gain for joint in self.robot.joints])
         keep = float(np.exp(-2 * np.pi * self.truth["velocity_filter_hz"] * dt))
+        proportional = np.stack([loop * kp, -keep * loop * kp], axis=1)
+        derivative = np.stack([loop * (1 - keep) / dt, -loop * (1 - keep) / dt], axis=1)
+        feedback = bool(self.truth["velocity_feedback"])
         return DiscreteController(
-            error_taps=np.stack([loop * (kp + (1 - keep) / dt), -loop * (keep * kp + (1 - keep) / dt)], axis=1),
-            position_taps=np.zeros((n, 1)),
+            error_taps=proportional if feedback else proportional + derivative,
+            position_taps=-derivative if feedback else np.zeros((n, 1)),
             output_taps=np.full((n, 1), keep),
             saturation=saturation(self.robot),
             dt=dt,
         )
 
 
-def virtual_recording(folder: Path, seed: int = 0) -> Recorded:
+def virtual_recording(folder: Path, seed: int = 0, velocity_feedback: bool = False) -> Recorded:
     """Record the virtual TX40 on its excitation trajectory, in a process of its own, or take it from ``folder``.
 
     Parameters
@@ -84,6 +88,8 @@ def virtual_recording(folder: Path, seed: int = 0) -> Recorded:
         Keeps recordings under a digest of what they were made with.
     seed
         Of the noise, whose size is that of table 6.3.
+    velocity_feedback
+        Of the drives; without it their velocity loop acts on the tracking error.
 
     Raises
     ------
@@ -93,6 +99,7 @@ def virtual_recording(folder: Path, seed: int = 0) -> Recorded:
         If the virtual arm fails.
     """
     arguments = ["--config", SESSION, "--seed", str(seed)]
+    arguments.append("--velocity-feedback" if velocity_feedback else "--velocity-error")
     name = _digest(arguments)
     recording, truth = folder / f"{name}.mcap", folder / f"{name}.json"
     if not (recording.is_file() and truth.is_file()):

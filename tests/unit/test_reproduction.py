@@ -252,7 +252,7 @@ def test_claims_are_computed_from_the_estimates(bench: Bench) -> None:
             forged.once((method, GOOD), lambda: nominal)
         forged.once(("idim-iv", WRONG), lambda: iv)
         forged.once(("didim", WRONG), lambda: didim)
-        return [finding.holds for finding in claims.robustness(Bench(forged))]
+        return [finding.holds for finding in claims.robustness(Bench(forged, forged))]
 
     assert found(nominal, moved) == [True, True]
     assert found(nominal, nominal) == [True, False]
