@@ -1,6 +1,6 @@
 """Which effects could sit where, and the columns they would add."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, product
 
@@ -53,29 +53,28 @@ class Workshop:
         The stretches.
     theta
         Parameters by which effects that depend on the model's torques predict them.
-    noise
-        AR models that whiten.
     """
 
     study: Study
     theta: Array
-    noise: tuple[ArModel, ...]
     kept: dict[Key, tuple[Array, ...]] = field(default_factory=dict)
     _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
 
-    def with_fit(self, theta: Array, noise: tuple[ArModel, ...]) -> "Workshop":
+    def with_theta(self, study: Study, theta: Array) -> "Workshop":
         """The same after a refit; columns that do not depend on theta stay."""
-        still = {key: value for key, value in self.kept.items() if not catalogue()[key[0]].predicts}
-        return Workshop(self.study, theta, noise, still)
+        still = {key: value for key, value in self.kept.items() if not _predicts(key[0])}
+        return Workshop(study, theta, still)
 
-    def instruments(self, effect: Effect, place: Place, shapes: Shapes, *, keep: bool = True) -> Array:
+    def instruments(
+        self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel], *, keep: bool = True
+    ) -> Array:
         """Whitened columns (R, k) at the simulated signals of the training data: what a search looks at."""
-        return whitened(self._decimated(effect, place, shapes, "train", "simulated", keep), self.noise)
+        return whitened(self.band(effect, place, shapes, "train", "simulated", keep=keep), noise)
 
-    def columns(self, effect: Effect, place: Place, shapes: Shapes) -> Columns:
+    def columns(self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel]) -> Columns:
         """Whitened columns of an effect."""
         parts = (
-            whitened(self._decimated(effect, place, shapes, part, kind, keep=True), self.noise)
+            whitened(self.band(effect, place, shapes, part, kind), noise)
             for part in ("train", "held")
             for kind in ("measured", "simulated")
         )
@@ -88,18 +87,27 @@ class Workshop:
             self._motions[key] = self.study.motion(getattr(stretch, kind), self.theta)
         return self._motions[key]
 
-    def _decimated(
-        self, effect: Effect, place: Place, shapes: Shapes, part: str, kind: str, keep: bool
+    def band(
+        self, effect: Effect, place: Place, shapes: Shapes, part: str, kind: str, *, keep: bool = True
     ) -> tuple[Array, ...]:
+        """Columns in the band of the comparison, (M, n, k) of every stretch.
+
+        Parameters
+        ----------
+        part, kind
+            ``train`` or ``held``; ``measured`` or ``simulated``.
+        keep
+            Whether they may be asked for again.
+        """
         key = (effect.name, place.joint, place.other, shapes, part, kind)
         if key in self.kept:
             return self.kept[key]
-        made = tuple(self._band(effect, place, shapes, self.motion(s, kind)) for s in getattr(self.study, part))
+        made = tuple(self._filtered(effect, place, shapes, self.motion(s, kind)) for s in getattr(self.study, part))
         if keep:
             self.kept[key] = made
         return made
 
-    def _band(self, effect: Effect, place: Place, shapes: Shapes, motion: Motion) -> Array:
+    def _filtered(self, effect: Effect, place: Place, shapes: Shapes, motion: Motion) -> Array:
         """Columns in the band of the comparison; joints that the effect leaves alone are not filtered."""
         columns = effect.columns(motion, place, **dict(shapes))
         if columns.ndim == 3:
@@ -108,6 +116,11 @@ class Workshop:
         whole = np.zeros((own.shape[0], motion.n, own.shape[1]))
         whole[:, place.joint] = own
         return whole
+
+
+def _predicts(name: str) -> bool:
+    effect = catalogue().get(name)
+    return effect is None or effect.predicts
 
 
 def candidates(workshop: Workshop) -> Iterator[Candidate]:
@@ -119,9 +132,10 @@ def candidates(workshop: Workshop) -> Iterator[Candidate]:
     study = workshop.study
     motion = workshop.motion(study.train[0], "measured")
     names = study.joints
-    present = {
-        (e.effect, names.index(e.joint), None if e.other is None else names.index(e.other)) for e in study.robot.effects
-    }
+    present: dict[tuple[str, int, int | None], list[Shapes]] = {}
+    for term in study.model.terms:
+        here = (term.effect.name, term.place.joint, term.place.other)
+        present.setdefault(here, []).append(tuple(term.shapes.items()))
     coupled = {frozenset(names.index(j) for j in c.joints) for c in study.robot.couplings}
     for effect in catalogue().values():
         if effect.rewires or effect.numbers is not None:
@@ -129,11 +143,12 @@ def candidates(workshop: Workshop) -> Iterator[Candidate]:
         for place in places(effect, study.robot.n):
             if effect.scope == "pair" and frozenset((place.joint, place.other)) in coupled:
                 continue
-            if (effect.name, place.joint, place.other) in present and not effect.together:
+            there = present.get((effect.name, place.joint, place.other), [])
+            if there and not effect.together:
                 continue
             if effect.visible is not None and effect.visible(motion, place) is not None:
                 continue
-            yield Candidate(effect, place, grid(effect, motion, place))
+            yield Candidate(effect, place, tuple(s for s in grid(effect, motion, place) if s not in there))
 
 
 def places(effect: Effect, n: int) -> list[Place]:

@@ -1,8 +1,9 @@
 """The instrumental-variable regression behind a diagnosis, whitened joint by joint."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,18 @@ class Rows:
     y: Array
 
 
+Equation = tuple[Array, Array, Array]
+"""Of one stretch: regressor at measured and at simulated signals (M, n, b) each, torques (M, n)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Equations in the band of the comparison, one entry per stretch."""
+
+    train: tuple[Equation, ...]
+    held: tuple[Equation, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Parameters, noise models, and the whitened rows of both parts of the data.
@@ -40,6 +53,10 @@ class Fit:
         AR model of each joint.
     train, held
         Whitened rows.
+    equations
+        The same before they were whitened.
+    fixed
+        Whether theta is given (a baseline), so that nothing of a candidate is absorbed by it.
     """
 
     study: Study
@@ -47,8 +64,17 @@ class Fit:
     noise: tuple[ArModel, ...]
     train: Rows
     held: Rows
+    equations: Equations
     fixed: bool = False
-    """Whether theta is given (a baseline), so that nothing of a candidate is absorbed by it."""
+
+    def renoised(self, noise: Sequence[ArModel]) -> "Fit":
+        """The fit with other noise models; a given theta stays."""
+        return solved(self.study, self.equations, noise, self.theta if self.fixed else None)
+
+    def errors(self, theta: Array, *, held: bool) -> list[Array]:
+        """``y - X theta`` at measured signals in the band of the comparison, (M, n) of every stretch."""
+        rows = self.equations.held if held else self.equations.train
+        return [y - x @ theta for x, _, y in rows]
 
     @cached_property
     def residual(self) -> Array:
@@ -61,7 +87,7 @@ class Fit:
         return self.held.y - self.held.x @ self.theta
 
     @cached_property
-    def _solver(self) -> tuple[Array, tuple[Array, Array]]:
+    def _solver(self) -> tuple[Array, Any]:
         scale = np.linalg.norm(self.train.z, axis=0)
         scale[scale == 0] = 1.0
         return scale, linalg.lu_factor((self.train.z / scale).T @ (self.train.x / scale))
@@ -112,25 +138,39 @@ def fit(study: Study, theta0: Array | None = None) -> Fit:
     DataError
         If the training motion leaves parameters undetermined.
     """
-    train = [regressors(study, s, theta0) for s in study.train]
-    held = [regressors(study, s, theta0) for s in study.held]
-    x, z, y = [a for a, _ in train], [b for _, b in train], [s.y for s in study.train]
-    flat = np.concatenate([a.reshape(-1, a.shape[-1]) for a in x])
-    names = study.model.base.names
-    require_excitation(flat, names)
-    theta = np.linalg.lstsq(flat, np.concatenate([b.reshape(-1) for b in y]), rcond=None)[0]
-    noise = noise_models([b - a @ theta for a, b in zip(x, y, strict=True)], theta.size, 0)
-    for _ in range(PASSES):
-        rows = Rows(whitened(x, noise), whitened(z, noise), whitened(y, noise))
-        result = Fit(study, np.zeros(theta.size), tuple(noise), rows, rows)
-        theta = result.absorbed(rows.y[:, None])[:, 0]
-        final = noise
-        noise = noise_models([b - a @ theta for a, b in zip(x, y, strict=True)], theta.size, MAX_AR_ORDER)
-    held_rows = Rows(
-        whitened([a for a, _ in held], final), whitened([b for _, b in held], final),
-        whitened([s.y for s in study.held], final),
-    )  # fmt: skip
-    return Fit(study, theta, tuple(final), rows, held_rows)
+    equations = Equations(
+        tuple((*regressors(study, s, theta0), s.y) for s in study.train),
+        tuple((*regressors(study, s, theta0), s.y) for s in study.held),
+    )
+    flat = np.concatenate([x.reshape(-1, x.shape[-1]) for x, _, _ in equations.train])
+    require_excitation(flat, study.model.base.names)
+    theta = np.linalg.lstsq(flat, np.concatenate([y.reshape(-1) for _, _, y in equations.train]), rcond=None)[0]
+    noise = noise_models([y - x @ theta for x, _, y in equations.train], theta.size, 0)
+    found = solved(study, equations, noise)
+    for _ in range(PASSES - 1):
+        found = found.renoised(noise_models(found.errors(found.theta, held=False), theta.size, MAX_AR_ORDER))
+    return found
+
+
+def solved(study: Study, equations: Equations, noise: Sequence[ArModel], theta: Array | None = None) -> Fit:
+    """Parameters by instrumental variables under given noise models; a given ``theta`` is kept as it is."""
+    train, held = (
+        Rows(*(whitened([row[k] for row in rows], noise) for k in range(3)))
+        for rows in (equations.train, equations.held)
+    )
+    blank = np.zeros(train.x.shape[1])
+    if theta is not None:
+        return Fit(study, theta, tuple(noise), train, held, equations, fixed=True)
+    found = Fit(study, blank, tuple(noise), train, held, equations)
+    return replace(found, theta=found.absorbed(train.y[:, None])[:, 0])
+
+
+def relative_errors(fit: Fit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
+    """``|y - X theta| / |y|`` in percent in the band of the comparison, overall and of each joint (n,)."""
+    y = np.concatenate([s.y for s in (fit.study.held if held else fit.study.train)])
+    error = np.concatenate(fit.errors(fit.theta if theta is None else theta, held=held))
+    each = np.linalg.norm(error, axis=0) / np.maximum(np.linalg.norm(y, axis=0), 1e-300)
+    return 100 * float(np.linalg.norm(error) / np.linalg.norm(y)), 100 * each
 
 
 def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Array, Array]:

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from identify.discrepancy.candidates import Candidate, Shapes, Workshop
-from identify.discrepancy.regression import Fit
+from identify.discrepancy.candidates import Candidate, Columns, Shapes, Workshop
+from identify.discrepancy.regression import MAX_AR_ORDER, Fit, noise_models
+from identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,8 @@ class Trial:
         Drop of the sum of squares of the whitened held-out residuals by that change.
     inflation
         Variance of the whitened residuals along the change, over that of white noise; at least 1.
+    away
+        Change of the model's own parameters that goes with it, (b,).
     share
         Share of the whitened held-out residuals' power of the joints concerned that the change takes away.
     """
@@ -49,7 +52,20 @@ class Trial:
     held_statistic: float
     gain: float
     inflation: float
+    away: Array
     share: float
+
+    @property
+    def forbidden(self) -> bool:
+        """Whether a linear parameter has a sign that physics does not allow."""
+        signs = [parameter.sign for parameter in self.candidate.effect.linear]
+        return any(sign * value < 0 for sign, value in zip(signs, self.values, strict=True))
+
+    @property
+    def p_value(self) -> float:
+        """Both p-values combined (Fisher's method): that a candidate without merit does so well on both parts."""
+        both = [max(self.p_train, 1e-300), max(self.p_held, 1e-300)]
+        return float(stats.combine_pvalues(both, method="fisher").pvalue)
 
     @property
     def p_train(self) -> float:
@@ -75,17 +91,22 @@ def best_trial(fit: Fit, candidate: Candidate, workshop: Workshop) -> Trial | No
     Returns
     -------
     Trial or None
-        ``None`` if the model already contains the candidate, the motion does not excite it, or what fits best has a
-        sign that physics forbids.
+        ``None`` if the model already contains the candidate or the motion does not excite it.
     """
+    found = screened(fit, candidate, workshop)
+    if found is None:
+        return None
+    return judge(fit, candidate, refined(fit, candidate, workshop, found), workshop)
+
+
+def screened(fit: Fit, candidate: Candidate, workshop: Workshop) -> tuple[float, Shapes] | None:
+    """Score statistic of a candidate at the shapes of its grid that fit the training data best, and these shapes."""
     best: tuple[float, Shapes] | None = None
     for shapes in candidate.grid:
-        statistic = score_statistic(fit, workshop.instruments(candidate.effect, candidate.place, shapes))
+        statistic = score_statistic(fit, workshop.instruments(candidate.effect, candidate.place, shapes, fit.noise))
         if statistic is not None and (best is None or statistic > best[0]):
             best = statistic, shapes
-    if best is None:
-        return None
-    return judge(fit, candidate, _refined(fit, candidate, workshop, best), workshop)
+    return best
 
 
 def score_statistic(fit: Fit, instruments: Array) -> float | None:
@@ -105,22 +126,16 @@ def judge(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) ->
     merit it has mean zero; its spread comes from the noise, from what serial correlation is left (Newey-West), and from
     theta, estimated from the training data.
     """
-    columns = workshop.columns(candidate.effect, candidate.place, shapes)
-    basis = _beside(fit, columns.z)
-    if basis is None:
+    screening = _beside_model(fit, candidate, shapes, workshop)
+    if screening is None:
         return None
-    u, right, scale = basis
-    score = u.T @ fit.residual
-    # (D~' C) in the coordinates of u: how much of the instrument's direction the measured columns have.
-    gram = u.T @ (columns.x / scale) @ right
-    try:
-        inverse = np.linalg.inv(gram)
-    except np.linalg.LinAlgError:
+    # What the model lacks must not pass for noise: the noise is that of the residual with the candidate in the model.
+    fit = fit.renoised(_noise_with(fit, candidate, shapes, workshop, *screening))
+    columns = workshop.columns(candidate.effect, candidate.place, shapes, fit.noise)
+    solution = _values(fit, columns)
+    if solution is None:
         return None
-    values = (right @ (inverse @ score)) / scale
-    std = np.sqrt(np.sum((right @ inverse) ** 2, axis=1)) / scale
-    if any(p.sign and value * p.sign <= 0 for p, value in zip(candidate.effect.linear, values, strict=True)):
-        return None
+    statistic, values, std = solution
     away = fit.absorbed(columns.x @ values[:, None])[:, 0]
     change = columns.held_z @ values - fit.held.z @ away
     before, after = fit.held_residual, fit.held_residual - change
@@ -137,12 +152,50 @@ def judge(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) ->
         shapes,
         values,
         std,
-        float(score @ score),
+        statistic,
         float(change @ before) / float(np.sqrt(variance)),
         gain,
         inflation,
+        away,
         share,
     )
+
+
+def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) -> tuple[Array, Array] | None:
+    """Linear parameters of a candidate beside the model, and the change of the model's own that goes with them."""
+    columns = workshop.columns(candidate.effect, candidate.place, shapes, fit.noise)
+    solution = _values(fit, columns)
+    if solution is None:
+        return None
+    return solution[1], fit.absorbed(columns.x @ solution[1][:, None])[:, 0]
+
+
+def _noise_with(
+    fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, values: Array, away: Array
+) -> list[ArModel]:
+    """Noise models of what is left of the training data with a candidate in the model."""
+    columns = workshop.band(candidate.effect, candidate.place, shapes, "train", "measured")
+    left = fit.errors(fit.theta - away, held=False)
+    errors = [e - c @ values for e, c in zip(left, columns, strict=True)]
+    return noise_models(errors, fit.theta.size + values.size, MAX_AR_ORDER)
+
+
+def _values(fit: Fit, columns: Columns) -> tuple[float, Array, Array] | None:
+    """Score statistic, linear parameters and their standard deviations; ``None`` if nothing can be said of them."""
+    basis = _beside(fit, columns.z)
+    if basis is None:
+        return None
+    u, right, scale = basis
+    score = u.T @ fit.residual
+    # (D~' C) in the coordinates of u: how much of the instrument's direction the measured columns have.
+    gram = u.T @ (columns.x / scale) @ right
+    try:
+        inverse = np.linalg.inv(gram)
+    except np.linalg.LinAlgError:
+        return None
+    values = (right @ (inverse @ score)) / scale
+    std = np.sqrt(np.sum((right @ inverse) ** 2, axis=1)) / scale
+    return float(score @ score), values, std
 
 
 def _beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
@@ -160,7 +213,7 @@ def _beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
     return (beside @ right) / np.sqrt(power[kept]), right, scale
 
 
-def _refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[float, Shapes]) -> Shapes:
+def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[float, Shapes]) -> Shapes:
     """Shapes between those of the grid, one continuous parameter after the other, on a logarithmic scale."""
     found = best
     for k, shape in enumerate(candidate.effect.shapes):
@@ -170,10 +223,12 @@ def _refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[flo
         at = int(np.argmin(np.abs(np.array(values) - found[1][k][1])))
         low, high = values[max(at - 1, 0)], values[min(at + 1, len(values) - 1)]
 
-        def loss(logarithm: float, k: int = k) -> float:
-            shapes = (*found[1][:k], (found[1][k][0], float(np.exp(logarithm))), *found[1][k + 1 :])
+        start = found[1]
+
+        def loss(logarithm: float, start: Shapes = start, k: int = k) -> float:
+            shapes = _replaced(start, k, float(np.exp(logarithm)))
             statistic = score_statistic(
-                fit, workshop.instruments(candidate.effect, candidate.place, shapes, keep=False)
+                fit, workshop.instruments(candidate.effect, candidate.place, shapes, fit.noise, keep=False)
             )
             return 0.0 if statistic is None else -statistic
 
@@ -181,8 +236,12 @@ def _refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[flo
             loss, bounds=(np.log(low), np.log(high)), method="bounded", options={"maxiter": REFINEMENTS}
         )
         if -result.fun > found[0]:
-            found = -float(result.fun), (*found[1][:k], (shape.name, float(np.exp(result.x))), *found[1][k + 1 :])
+            found = -float(result.fun), _replaced(start, k, float(np.exp(result.x)))
     return found[1]
+
+
+def _replaced(shapes: Shapes, k: int, value: float) -> Shapes:
+    return (*shapes[:k], (shapes[k][0], value), *shapes[k + 1 :])
 
 
 def _newey_west(products: Array) -> float:

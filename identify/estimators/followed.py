@@ -37,7 +37,7 @@ class FollowedMotion(AuxiliaryModel):
         """The motion of every experiment, with the torques that these base parameters need for it."""
         if not np.isfinite(theta).all():
             return None
-        runs = []
+        runs: list[Simulation] = []
         for q in self.references:
             qd = central_difference(q, self.dt)
             qdd = central_difference(qd, self.dt)

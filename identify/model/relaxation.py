@@ -1,9 +1,9 @@
 """Closed-loop simulation of an arm whose model has further terms, by waveform relaxation.
 
-The compiled loop knows the rigid arm with friction. What a term adds is computed along the whole simulated motion, taken
-for a load on the next simulation, and so on until the motion stays (Lelarasmee, Ruehli, Sangiovanni-Vincentelli 1982):
-a controller that tracks its reference makes the motion depend on the load so little that a few rounds are enough. Any
-effect of the catalogue, also one with a memory of its own, so has a place in the simulation by its columns alone.
+The compiled loop knows the rigid arm with friction. What a term adds is computed along the whole simulated motion,
+taken for a load on the next simulation, and so on until the motion stays (Lelarasmee, Ruehli, Sangiovanni-Vincentelli
+1982): a controller that tracks its reference makes the motion depend on the load so little that a few rounds are enough.
+Any effect of the catalogue, also one with a memory of its own, so has a place in the simulation by its columns alone.
 """
 
 from dataclasses import replace
@@ -67,7 +67,7 @@ def simulate_with_terms(
         # A torque held over a period acts like its mean between two samples.
         held = torque.copy()
         held[:-1] = 0.5 * (torque[1:] + torque[:-1])
-        step = float(np.linalg.norm(held - load) / max(np.linalg.norm(held), 1e-300))
+        step = float(np.linalg.norm(held - load)) / max(float(np.linalg.norm(held)), 1e-300)
         settled = replace(again, tau=again.tau + load)
         if step > change:
             # Too stiff for relaxation: the best round so far stays.

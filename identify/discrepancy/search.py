@@ -1,0 +1,245 @@
+"""One step after the other: add the effect that predicts unseen data best, take out what is no longer needed."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from configs import DataError, RobotConfig
+from configs.robot import Effect as Stanza
+from identify.catalogue.registry import known
+from identify.catalogue.terms import Term, stanza_of
+from identify.discrepancy.candidates import Workshop, candidates
+from identify.discrepancy.regression import Fit, fit, relative_errors
+from identify.discrepancy.screening import shortlist
+from identify.discrepancy.study import Study
+from identify.discrepancy.trial import Trial, judge
+from identify.model.arm import ArmModel
+
+Array = NDArray[np.float64]
+
+HELD_OUT_LEVEL = 0.05
+"""The held-out data alone must speak for a finding at this level, whatever the training data say."""
+NEEDED = 0.01
+"""Chance of its estimate by accident above which an effect found earlier is taken out again."""
+SHORTLIST = 15
+"""Candidates that get a trial of their own."""
+MOST = 8
+"""Most effects of one diagnosis."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a user may choose of a diagnosis.
+
+    Parameters
+    ----------
+    false_alarms
+        Chance that a plant without a missing effect is said to have one, over all tests of a diagnosis.
+    material
+        Share of a joint's held-out residual power that an effect must explain to be worth a finding.
+    """
+
+    false_alarms: float = 0.01
+    material: float = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The model as far as it has come, and how every candidate would do beside it.
+
+    Parameters
+    ----------
+    trials
+        Of the candidates that looked best, best first; those with a sign that physics forbids are among them.
+    tests
+        Number of candidates that they were chosen from.
+    """
+
+    study: Study
+    fit: Fit
+    workshop: Workshop
+    trials: tuple[Trial, ...]
+    tests: int
+
+    def passing(self, settings: Settings) -> list[Trial]:
+        """Trials that a finding may come from, best first."""
+        level = settings.false_alarms / max(self.tests, 1)
+        return [
+            t
+            for t in self.trials
+            if not t.forbidden
+            and t.p_value < level
+            and t.p_held < HELD_OUT_LEVEL
+            and t.gain > 0
+            and t.share >= settings.material
+        ]
+
+
+@dataclass
+class Search:
+    """Greedy search with exchange.
+
+    Parameters
+    ----------
+    study
+        The data, with the model to start from.
+    settings
+        Error rates.
+    progress
+        Called with what is being done.
+    """
+
+    study: Study
+    settings: Settings
+    progress: Callable[[str], None] = lambda stage: None
+    _states: dict[tuple[str, ...], State] = field(default_factory=dict)
+
+    def start(self) -> State:
+        """The model as configured."""
+        self.progress("base fit")
+        return self.state(self.study.robot, None)
+
+    def run(self) -> State:
+        """Add until nothing passes, then see whether another effect does better in each one's place."""
+        state = self.start()
+        own = len(self.study.robot.effects)
+        while len(state.study.robot.effects) - own < MOST:
+            better = self._extended(state)
+            if better is None:
+                break
+            state = self._pruned(better, own)
+        return self._exchanged(state, own)
+
+    def state(self, robot: RobotConfig, before: State | None) -> State:
+        """Fit the model of a robot and try all candidates beside it; made once."""
+        key = tuple(stanza.model_dump_json() for stanza in robot.effects)
+        if key not in self._states:
+            study, found = refit(self.study, robot, before)
+            previous = Workshop(study, found.theta) if before is None else before.workshop
+            workshop = previous.with_theta(study, found.theta)
+            every = list(candidates(workshop))
+            trials = [
+                trial
+                for candidate, shapes in shortlist(found, workshop, every, SHORTLIST)
+                if (trial := judge(found, candidate, shapes, workshop)) is not None
+            ]
+            trials.sort(key=lambda t: -t.score)
+            self._states[key] = State(study, found, workshop, tuple(trials), len(every))
+        return self._states[key]
+
+    def _extended(self, state: State) -> State | None:
+        """The state with the best candidate that passes and really makes the held-out error smaller."""
+        for trial in state.passing(self.settings):
+            robot = added(state.study.robot, trial)
+            self.progress(f"adding {trial.candidate.effect.name} of {state.study.joints[trial.candidate.place.joint]}")
+            try:
+                extended = self.state(robot, state)
+            except DataError:
+                continue
+            if relative_errors(extended.fit, held=True)[0] < relative_errors(state.fit, held=True)[0]:
+                return extended
+        return None
+
+    def _pruned(self, state: State, own: int) -> State:
+        """Without effects that the ones found later have made superfluous; those of the configuration stay."""
+        while True:
+            doubtful = [
+                (accident(state, term), k)
+                for k, term in enumerate(state.study.model.terms)
+                if _stanza_number(state.study.robot, k) >= own
+            ]
+            if not doubtful or max(doubtful)[0] < NEEDED:
+                return state
+            worst = _stanza_number(state.study.robot, max(doubtful)[1])
+            robot = without(state.study.robot, worst)
+            self.progress(f"taking out {state.study.robot.effects[worst].effect}")
+            state = self.state(robot, state)
+
+    def _exchanged(self, state: State, own: int) -> State:
+        """Every finding competes once more, with all others in the model."""
+        for k in range(own, len(state.study.robot.effects)):
+            if k >= len(state.study.robot.effects):
+                break
+            stanza = state.study.robot.effects[k]
+            rest = self.state(without(state.study.robot, k), state)
+            for trial in rest.passing(self.settings)[:1]:
+                effect, place = trial.candidate.effect, trial.candidate.place
+                if (effect.name, state.study.joints[place.joint]) == (stanza.effect, stanza.joint):
+                    continue
+                other = self.state(added(rest.study.robot, trial), rest)
+                if relative_errors(other.fit, held=True)[0] < relative_errors(state.fit, held=True)[0]:
+                    self.progress(f"{effect.name} instead of {stanza.effect}")
+                    state = other
+        return state
+
+
+def refit(study: Study, robot: RobotConfig, before: State | None) -> tuple[Study, Fit]:
+    """The data with the model of a robot, and its fit.
+
+    Raises
+    ------
+    DataError
+        If the motion does not determine the parameters of the model.
+    """
+    model = ArmModel.from_config(robot)
+    changed = replace(study, robot=robot, model=model)
+    theta: Array | None = None
+    if before is not None:
+        theta = padded(before, model)
+    elif any(term.effect.predicts for term in model.terms):
+        bare = robot.model_copy(update={"effects": ()})
+        rigid = fit(replace(study, robot=bare, model=ArmModel.from_config(bare)))
+        theta = np.concatenate([rigid.theta, np.zeros(model.e)])
+    return changed, fit(changed, theta)
+
+
+def padded(before: State, model: ArmModel) -> Array:
+    """Rigid parameters of an earlier fit, zeros for the terms, (b,)."""
+    rigid = before.fit.theta[: before.study.model.base.b - before.study.model.e]
+    return np.concatenate([rigid, np.zeros(model.e)])
+
+
+def added(robot: RobotConfig, trial: Trial) -> RobotConfig:
+    """The robot with what a trial found as its last stanza."""
+    parameters = dict(trial.shapes) | values_of(trial)
+    stanza = stanza_of(trial.candidate.effect, trial.candidate.place, robot, parameters)
+    return robot.model_copy(update={"effects": (*robot.effects, stanza)})
+
+
+def without(robot: RobotConfig, stanza: int) -> RobotConfig:
+    """The robot without one of its stanzas."""
+    return robot.model_copy(update={"effects": (*robot.effects[:stanza], *robot.effects[stanza + 1 :])})
+
+
+def values_of(trial: Trial) -> dict[str, float]:
+    """Linear parameters of a trial by name."""
+    names = (parameter.name for parameter in trial.candidate.effect.linear)
+    return {name: float(value) for name, value in zip(names, trial.values, strict=True)}
+
+
+def accident(state: State, term: Term) -> float:
+    """Chance that the linear parameters of a term are all zero (Wald test)."""
+    names = state.study.model.base.names
+    own = [names.index(name) for name in term.names]
+    values, covariance = state.fit.theta[own], state.fit.covariance[np.ix_(own, own)]
+    return float(stats.chi2.sf(values @ np.linalg.pinv(covariance) @ values, len(own)))
+
+
+def with_values(state: State, shapes: Mapping[int, Mapping[str, float]] | None = None) -> RobotConfig:
+    """The robot with the estimated values in its stanzas."""
+    stanzas: list[Stanza] = list(state.study.robot.effects)
+    for k, term in enumerate(state.study.model.terms):
+        number = _stanza_number(state.study.robot, k)
+        own = [state.study.model.base.names.index(name) for name in term.names]
+        linear = zip((p.name for p in term.effect.linear), state.fit.theta[own], strict=True)
+        found = {**term.shapes, **{name: float(value) for name, value in linear}, **dict((shapes or {}).get(k, {}))}
+        stanzas[number] = stanzas[number].model_copy(update={"parameters": found})
+    return state.study.robot.model_copy(update={"effects": tuple(stanzas)})
+
+
+def _stanza_number(robot: RobotConfig, term: int) -> int:
+    """Stanza of a robot's term: exchanges of signals are stanzas, but no terms."""
+    return [k for k, stanza in enumerate(robot.effects) if not known(stanza.effect).rewires][term]
