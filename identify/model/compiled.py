@@ -17,11 +17,9 @@ def compiled(function: F) -> F:
     return cast(F, numba.njit(cache=True, nogil=True, **_ARITHMETIC)(function))
 
 
-def leaf(function: F) -> F:
-    """Compile a kernel that allocates nothing, for other kernels to call once per sample."""
-    return cast(F, numba.njit(cache=True, nogil=True, **_ARITHMETIC, **_UNCOUNTED)(function))
-
-
 def inlined(function: F) -> F:
-    """Compile a small helper that allocates nothing into every kernel that calls it."""
-    return cast(F, numba.njit(**_ARITHMETIC, **_UNCOUNTED)(function))
+    """Compile a helper that allocates nothing into every kernel that calls it.
+
+    There the compiler knows which arrays are distinct and which loops are short, which a call would hide from it.
+    """
+    return cast(F, numba.njit(forceinline=True, **_ARITHMETIC, **_UNCOUNTED)(function))

@@ -7,7 +7,7 @@ acceleration ``-g`` of the base. Vectors of link j are written in frame j, scala
 import numpy as np
 
 from identify.model.chain import Chain, Columns, Floats, Values
-from identify.model.compiled import compiled, inlined, leaf
+from identify.model.compiled import compiled, inlined
 from identify.model.elementary import padded, sines_cosines
 
 TWO_OVER_PI = 2.0 / np.pi
@@ -34,9 +34,9 @@ def into_parent(ca: float, sa: float, c: float, s: float, x: float, y: float, z:
 
 
 @inlined
-def turn(chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: Floats) -> None:
+def turn(n: int, chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: Floats) -> None:
     """Joint angles at ``q`` (n,) with their sines and cosines, each in an array of `padded` length."""
-    for j in range(q.size):
+    for j in range(n):
         angle[j] = chain.theta[j] + (0.0 if chain.prismatic[j] else q[j])
     sines_cosines(angle, sine, cosine)
 
@@ -51,7 +51,7 @@ def fill_regressor(
     ang = np.empty((n, 3))
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
     for k in range(q.shape[0]):
-        turn(chain, q[k], angle, sine, cosine)
+        turn(n, chain, q[k], angle, sine, cosine)
         wx = wy = wz = bx = by = bz = 0.0
         ax, ay, az = -chain.gravity[0], -chain.gravity[1], -chain.gravity[2]
         for j in range(n):
@@ -141,7 +141,7 @@ def fill_regressor(
                 out[k, i, coulomb] = out[k, j, coulomb] = smooth_sign(qd[k, i] + qd[k, j], smoothing)
 
 
-@leaf
+@inlined
 def add_friction(values: Values, smoothing: float, qd: Floats, tau: Floats) -> None:
     """Add friction, offsets and coupled friction at velocity ``qd`` (n,) to ``tau`` (n,) (2.7, B.1)."""
     for j in range(qd.size):
@@ -155,8 +155,9 @@ def add_friction(values: Values, smoothing: float, qd: Floats, tau: Floats) -> N
         tau[j] += values.coupling[m, 1] * qd[i] + sign
 
 
-@leaf
+@inlined
 def rigid_torque(
+    n: int,
     chain: Chain,
     values: Values,
     q: Floats,
@@ -167,11 +168,10 @@ def rigid_torque(
     work: Floats,
     tau: Floats,
 ) -> None:
-    """Torques of the rigid chain, without friction and rotors, for one sample; ``work`` is (n, 6).
+    """Torques of the rigid chain of n joints, without friction and rotors, for one sample; ``work`` is (n, 6).
 
     ``sine`` and ``cosine`` are of the joint angles, as `turn` leaves them.
     """
-    n = chain.d.size
     wx = wy = wz = bx = by = bz = 0.0
     ax, ay, az = -chain.gravity[0], -chain.gravity[1], -chain.gravity[2]
     for j in range(n):
@@ -180,11 +180,13 @@ def rigid_torque(
         moves = chain.prismatic[j]
         r = chain.r[j] + (q[j] if moves else 0.0)
         c, s = cosine[j], sine[j]
-        px, py, pz = d, -r * sa, r * ca
-        ux, uy, uz = wy * pz - wz * py, wz * px - wx * pz, wx * py - wy * px
-        ax += by * pz - bz * py + wy * uz - wz * uy
-        ay += bz * px - bx * pz + wz * ux - wx * uz
-        az += bx * py - by * px + wx * uy - wy * ux
+        # In shoulders and wrists origins coincide: nothing to shift.
+        if d != 0.0 or r != 0.0:
+            px, py, pz = d, -r * sa, r * ca
+            ux, uy, uz = wy * pz - wz * py, wz * px - wx * pz, wx * py - wy * px
+            ax += by * pz - bz * py + wy * uz - wz * uy
+            ay += bz * px - bx * pz + wz * ux - wx * uz
+            az += bx * py - by * px + wx * uy - wy * ux
         ax, ay, az = into_child(ca, sa, c, s, ax, ay, az)
         wx, wy, wz = into_child(ca, sa, c, s, wx, wy, wz)
         bx, by, bz = into_child(ca, sa, c, s, bx, by, bz)
@@ -220,21 +222,24 @@ def rigid_torque(
         tau[j] = fz if moves else mz
         ca, sa, c, s = chain.cos_alpha[j], chain.sin_alpha[j], cosine[j], sine[j]
         r = chain.r[j] + (q[j] if moves else 0.0)
-        px, py, pz = chain.d[j], -r * sa, r * ca
+        d = chain.d[j]
         fx, fy, fz = into_parent(ca, sa, c, s, fx, fy, fz)
         mx, my, mz = into_parent(ca, sa, c, s, mx, my, mz)
-        mx += py * fz - pz * fy
-        my += pz * fx - px * fz
-        mz += px * fy - py * fx
+        if d != 0.0 or r != 0.0:
+            px, py, pz = d, -r * sa, r * ca
+            mx += py * fz - pz * fy
+            my += pz * fx - px * fz
+            mz += px * fy - py * fx
 
 
-@leaf
-def fill_mass_matrix(chain: Chain, values: Values, q: Floats, sine: Floats, cosine: Floats, mass: Floats) -> None:
+@inlined
+def fill_mass_matrix(
+    n: int, chain: Chain, values: Values, q: Floats, sine: Floats, cosine: Floats, mass: Floats
+) -> None:
     """Mass matrix (n, n) with rotors and couplings, by composite rigid bodies.
 
     ``sine`` and ``cosine`` are of the joint angles, as `turn` leaves them.
     """
-    n = chain.d.size
     xx = xy = xz = yy = yz = zz = hx = hy = hz = m = 0.0
     for j in range(n - 1, -1, -1):
         p = values.inertial[j]
@@ -258,18 +263,19 @@ def fill_mass_matrix(chain: Chain, values: Values, q: Floats, sine: Floats, cosi
         for i in range(j, 0, -1):
             ca, sa, c, s = chain.cos_alpha[i], chain.sin_alpha[i], cosine[i], sine[i]
             r = chain.r[i] + (q[i] if chain.prismatic[i] else 0.0)
-            px, py, pz = chain.d[i], -r * sa, r * ca
+            d = chain.d[i]
             fx, fy, fz = into_parent(ca, sa, c, s, fx, fy, fz)
             tx, ty, tz = into_parent(ca, sa, c, s, tx, ty, tz)
-            tx += py * fz - pz * fy
-            ty += pz * fx - px * fz
-            tz += px * fy - py * fx
+            if d != 0.0 or r != 0.0:
+                px, py, pz = d, -r * sa, r * ca
+                tx += py * fz - pz * fy
+                ty += pz * fx - px * fz
+                tz += px * fy - py * fx
             mass[i - 1, j] = mass[j, i - 1] = fz if chain.prismatic[i - 1] else tz
         if j == 0:
             break
         ca, sa, c, s = chain.cos_alpha[j], chain.sin_alpha[j], cosine[j], sine[j]
         r = chain.r[j] + (q[j] if chain.prismatic[j] else 0.0)
-        px, py, pz = chain.d[j], -r * sa, r * ca
         hx, hy, hz = into_parent(ca, sa, c, s, hx, hy, hz)
         # Rot(z) then Rot(x) of the inertia, then its shift from O_j to O_j-1.
         cc, ss, cs = c * c, s * s, c * s
@@ -280,19 +286,26 @@ def fill_mass_matrix(chain: Chain, values: Values, q: Floats, sine: Floats, cosi
         )
         jxz, jyz = c * xz - s * yz, s * xz + c * yz
         cc, ss, cs = ca * ca, sa * sa, ca * sa
-        gx, gy, gz = px * m + 2 * hx, py * m + 2 * hy, pz * m + 2 * hz
-        square = px * gx + py * gy + pz * gz
-        xx = jxx + square - px * gx
-        xy = ca * jxy - sa * jxz - px * hy - py * hx - m * px * py
-        xz = sa * jxy + ca * jxz - px * hz - pz * hx - m * px * pz
+        xx, xy, xz = jxx, ca * jxy - sa * jxz, sa * jxy + ca * jxz
         yy, yz, zz = (
-            cc * jyy - 2 * cs * jyz + ss * zz + square - py * gy,
-            cs * (jyy - zz) + (cc - ss) * jyz - py * hz - pz * hy - m * py * pz,
-            ss * jyy + 2 * cs * jyz + cc * zz + square - pz * gz,
+            cc * jyy - 2 * cs * jyz + ss * zz,
+            cs * (jyy - zz) + (cc - ss) * jyz,
+            ss * jyy + 2 * cs * jyz + cc * zz,
         )
-        hx += m * px
-        hy += m * py
-        hz += m * pz
+        d = chain.d[j]
+        if d != 0.0 or r != 0.0:
+            px, py, pz = d, -r * sa, r * ca
+            gx, gy, gz = px * m + 2 * hx, py * m + 2 * hy, pz * m + 2 * hz
+            square = px * gx + py * gy + pz * gz
+            xx += square - px * gx
+            yy += square - py * gy
+            zz += square - pz * gz
+            xy -= px * hy + py * hx + m * px * py
+            xz -= px * hz + pz * hx + m * px * pz
+            yz -= py * hz + pz * hy + m * py * pz
+            hx += m * px
+            hy += m * py
+            hz += m * pz
     for k in range(values.coupling_joints.shape[0]):
         i, j = values.coupling_joints[k]
         mass[i, j] += values.coupling[k, 0]
@@ -308,8 +321,8 @@ def fill_inverse_dynamics(
     work = np.empty((n, 6))
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
     for k in range(q.shape[0]):
-        turn(chain, q[k], angle, sine, cosine)
-        rigid_torque(chain, values, q[k], qd[k], qdd[k], sine, cosine, work, out[k])
+        turn(n, chain, q[k], angle, sine, cosine)
+        rigid_torque(n, chain, values, q[k], qd[k], qdd[k], sine, cosine, work, out[k])
         add_friction(values, smoothing, qd[k], out[k])
         for j in range(n):
             out[k, j] += values.ia[j] * qdd[k, j]
@@ -325,11 +338,11 @@ def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> 
     n = chain.d.size
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
     for k in range(q.shape[0]):
-        turn(chain, q[k], angle, sine, cosine)
-        fill_mass_matrix(chain, values, q[k], sine, cosine, out[k])
+        turn(n, chain, q[k], angle, sine, cosine)
+        fill_mass_matrix(n, chain, values, q[k], sine, cosine, out[k])
 
 
-@leaf
+@inlined
 def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
     """Factor the lower triangle of ``matrix`` as ``L D L'``; ``False`` if it is not positive definite.
 
@@ -353,7 +366,7 @@ def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
     return True
 
 
-@leaf
+@inlined
 def solve_factored(factor: Floats, n: int, x: Floats) -> None:
     """Solve in place with the factors left by `cholesky`."""
     for i in range(n):
@@ -380,10 +393,10 @@ def fill_forward_dynamics(
     bias = np.empty(n)
     still = np.zeros(n)
     for k in range(q.shape[0]):
-        turn(chain, q[k], angle, sine, cosine)
-        rigid_torque(chain, values, q[k], qd[k], still, sine, cosine, work, bias)
+        turn(n, chain, q[k], angle, sine, cosine)
+        rigid_torque(n, chain, values, q[k], qd[k], still, sine, cosine, work, bias)
         add_friction(values, smoothing, qd[k], bias)
-        fill_mass_matrix(chain, values, q[k], sine, cosine, mass)
+        fill_mass_matrix(n, chain, values, q[k], sine, cosine, mass)
         if not cholesky(mass, factor, n):
             return k
         for j in range(n):

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from identify.model.arm import ArmModel
-from identify.model.chain import Chain, Floats, Values
-from identify.model.compiled import compiled, leaf
+from identify.model.chain import Chain, Floats, Ints, Values
+from identify.model.compiled import compiled, inlined
 from identify.model.controller import DiscreteController
 from identify.model.elementary import arctangents, padded
 from identify.model.kernels import TWO_OVER_PI, cholesky, fill_mass_matrix, rigid_torque, solve_factored, turn
@@ -139,6 +139,8 @@ def simulate(
         qd,
         qdd,
         tau,
+        (0,) * n,
+        (0,) * values.coupling_joints.shape[0],
     )
     if stopped < 0:
         return Simulation(q, qd, qdd, tau, None)
@@ -147,25 +149,34 @@ def simulate(
     return Simulation(q, qd, qdd, tau, stopped)
 
 
-@leaf
+@inlined
 def friction(
-    values: Values, v: Floats, x: Floats, bend: Floats, steep: Floats, force: Floats, slope: Floats, pair_slope: Floats
+    n: int,
+    pairs: int,
+    values: Values,
+    v: Floats,
+    x: Floats,
+    bend: Floats,
+    steep: Floats,
+    force: Floats,
+    slope: Floats,
+    pair_slope: Floats,
 ) -> None:
     """Friction ``force`` (n,) at velocities ``v``, its diagonal ``slope`` (n,) and that of each coupling.
 
     ``x``, ``bend`` and ``steep`` are scratch of the `padded` number of joints and couplings.
     """
-    g, n = values.smoothing, v.size
+    g = values.smoothing
     for j in range(n):
         x[j] = g * v[j]
-    for m in range(values.coupling_joints.shape[0]):
+    for m in range(pairs):
         x[n + m] = g * (v[values.coupling_joints[m, 0]] + v[values.coupling_joints[m, 1]])
     arctangents(x, bend, steep)
     for j in range(n):
         coulomb = TWO_OVER_PI * values.fc[j]
         force[j] = values.off[j] + values.fv[j] * v[j] + coulomb * bend[j]
         slope[j] = values.fv[j] + coulomb * g * steep[j]
-    for m in range(values.coupling_joints.shape[0]):
+    for m in range(pairs):
         i, j = values.coupling_joints[m, 0], values.coupling_joints[m, 1]
         coulomb = TWO_OVER_PI * values.coupling[m, 2]
         common = coulomb * bend[n + m]
@@ -177,20 +188,34 @@ def friction(
         pair_slope[m] = pair + values.coupling[m, 1]
 
 
-@leaf
-def divisions(values: Values, v: Floats, a: Floats, dt: float) -> int:
+@inlined
+def divisions(n: int, pairs: int, values: Values, v: Floats, a: Floats, dt: float) -> int:
     """How many steps one sample needs: more while a joint with Coulomb friction passes standstill."""
     most = 1
-    for j in range(v.size):
+    for j in range(n):
         x, dx = values.smoothing * v[j], values.smoothing * a[j] * dt
         if values.fc[j] != 0.0 and abs(x) < abs(dx) + NEAR_STANDSTILL:
             most = max(most, 1 + int(STEPS_PER_UNIT * abs(dx)))
-    for m in range(values.coupling_joints.shape[0]):
+    for m in range(pairs):
         i, j = values.coupling_joints[m]
         x, dx = values.smoothing * (v[i] + v[j]), values.smoothing * (a[i] + a[j]) * dt
         if values.coupling[m, 2] != 0.0 and abs(x) < abs(dx) + NEAR_STANDSTILL:
             most = max(most, 1 + int(STEPS_PER_UNIT * abs(dx)))
     return min(most, MOST_STEPS)
+
+
+@inlined
+def stiffen(
+    n: int, pairs: int, mass: Floats, step: float, coupled: Ints, slope: Floats, pair_slope: Floats, stiff: Floats
+) -> None:
+    """Lower triangle of the matrix of the implicit stages over ``step``, ``mass`` and friction slopes."""
+    for i in range(n):
+        for j in range(i):
+            stiff[i, j] = mass[i, j]
+        stiff[i, i] = mass[i, i] + GAMMA * step * slope[i]
+    for m in range(pairs):
+        i, j = coupled[m, 0], coupled[m, 1]
+        stiff[max(i, j), min(i, j)] += GAMMA * step * pair_slope[m]
 
 
 @compiled
@@ -212,16 +237,19 @@ def run(
     qd: Floats,
     qdd: Floats,
     tau: Floats,
+    joints: tuple[int, ...],
+    couplings: tuple[int, ...],
 ) -> int:
     """Fill ``q, qd, qdd, tau`` (N, n) from their first sample on; returns where it stopped, or -1.
 
-    ``reference`` (N, n) is that of the motors.
+    ``reference`` (N, n) is that of the motors. ``joints`` and ``couplings`` have one entry each per joint and coupling:
+    the length of a tuple is known when the kernel is compiled, and its short loops become straight code.
     """
-    samples, n = reference.shape
+    samples, n = reference.shape[0], len(joints)
     coupled = values.coupling_joints
-    pairs = coupled.shape[0]
-    work, factor, stiff = np.empty((n, 6)), np.empty((n, n)), np.empty((n, n))
-    mass, mass_before = np.empty((n, n)), np.empty((n, n))
+    pairs = len(couplings)
+    work, factor, stiff_factor = np.empty((n, 6)), np.empty((n, n)), np.empty((n, n))
+    mass, mass_before, middle_mass, stiff = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
     terms = padded(n + pairs)
     x, bend, steep = np.zeros(terms), np.empty(terms), np.empty(terms)
@@ -240,10 +268,10 @@ def run(
         for j in range(n):
             if not (np.isfinite(p[j]) and abs(v[j]) <= max_velocity[j]):
                 return k
-        turn(chain, p, angle, sine, cosine)
-        rigid_torque(chain, values, p, v, still, sine, cosine, work, bias)
-        fill_mass_matrix(chain, values, p, sine, cosine, mass)
-        friction(values, v, x, bend, steep, force, slope, pair_slope)
+        turn(n, chain, p, angle, sine, cosine)
+        rigid_torque(n, chain, values, p, v, still, sine, cosine, work, bias)
+        fill_mass_matrix(n, chain, values, p, sine, cosine, mass)
+        friction(n, pairs, values, v, x, bend, steep, force, slope, pair_slope)
         now += 1
         if now == rows:
             for m in range(memory - 1):
@@ -288,39 +316,40 @@ def run(
             before = held[j] if k > 0 else torque
             held[j] = tau[k, j] = torque
             rate[j] = 0.5 * (before + torque) - bias[j] - force[j]
+        for i in range(n):
+            load[i] = held[i] - (1.5 * bias[i] - 0.5 * bias_before[i])
+            bias_before[i] = bias[i]
+            for j in range(i + 1):
+                middle_mass[i, j] = 1.5 * mass[i, j] - 0.5 * mass_before[i, j]
+                mass_before[i, j] = mass[i, j]
+        # One step over the whole sample is the rule: its factors are on their way while those at the sample are.
+        stiffen(n, pairs, middle_mass, dt, coupled, slope, pair_slope, stiff)
         if not cholesky(mass, factor, n):
             return k
+        solvable = cholesky(stiff, stiff_factor, n)
+        for i in range(n):
+            k1[i] = load[i] - force[i]
         solve_factored(factor, n, rate)
+        solve_factored(stiff_factor, n, k1)
         for i in range(n):
             qdd[k, i] = rate[i]
         if k + 1 == samples:
             break
-        for i in range(n):
-            load[i] = held[i] - (1.5 * bias[i] - 0.5 * bias_before[i])
-            for j in range(i + 1):
-                at_sample = mass[i, j]
-                mass[i, j] = 1.5 * at_sample - 0.5 * mass_before[i, j]
-                mass_before[i, j] = at_sample
-            bias_before[i] = bias[i]
-        steps = divisions(values, v, rate, dt)
+        steps = divisions(n, pairs, values, v, rate, dt)
         h = dt / steps
-        for step in range(steps):
-            if step > 0:
-                friction(values, v, x, bend, steep, force, slope, pair_slope)
-            for i in range(n):
-                for j in range(i):
-                    stiff[i, j] = mass[i, j]
-                stiff[i, i] = mass[i, i] + GAMMA * h * slope[i]
-                k1[i] = load[i] - force[i]
-            for m in range(pairs):
-                i, j = coupled[m, 0], coupled[m, 1]
-                stiff[max(i, j), min(i, j)] += GAMMA * h * pair_slope[m]
-            if not cholesky(stiff, factor, n):
+        for _ in range(steps):
+            if steps > 1:
+                friction(n, pairs, values, v, x, bend, steep, force, slope, pair_slope)
+                stiffen(n, pairs, middle_mass, h, coupled, slope, pair_slope, stiff)
+                solvable = cholesky(stiff, stiff_factor, n)
+                for i in range(n):
+                    k1[i] = load[i] - force[i]
+                solve_factored(stiff_factor, n, k1)
+            if not solvable:
                 return k + 1
-            solve_factored(factor, n, k1)
             for i in range(n):
                 middle[i] = v[i] + 0.5 * h * k1[i]
-            friction(values, middle, x, bend, steep, force_middle, slope_middle, pair_slope_middle)
+            friction(n, pairs, values, middle, x, bend, steep, force_middle, slope_middle, pair_slope_middle)
             # M k1 = load - force - gamma h F k1 spares the product with the mass matrix.
             for i in range(n):
                 k2[i] = force[i] - force_middle[i] + GAMMA * h * slope[i] * k1[i]
@@ -328,7 +357,7 @@ def run(
                 i, j = coupled[m, 0], coupled[m, 1]
                 k2[i] += GAMMA * h * pair_slope[m] * k1[j]
                 k2[j] += GAMMA * h * pair_slope[m] * k1[i]
-            solve_factored(factor, n, k2)
+            solve_factored(stiff_factor, n, k2)
             for i in range(n):
                 new = v[i] + h * (k1[i] + k2[i])
                 p[i] += 0.5 * h * (v[i] + new)
