@@ -116,17 +116,23 @@ def table_5_2(simulations: int = 100, sampling_hz: float = 5000.0, seed: int = 0
     for _ in range(simulations):
         measured = run.q + deviation * random.standard_normal(run.q.size)
         for label, found in _methods(run, measured, deviation).items():
-            errors.setdefault(label, []).append(_errors(run, found))
-    rows = []
-    for label, values in errors.items():
-        q, qd, qdd = np.mean(values, axis=0)
-        rows.append(Row(label, THESIS.get(label), (float(q), float(qd), float(qdd))))
-    return rows
+            errors.setdefault(label, []).append(relative_errors(run, found))
+    return [Row(label, THESIS.get(label), mean(values)) for label, values in errors.items()]
+
+
+def mean(errors: Sequence[Errors]) -> Errors:
+    """Means over the simulations."""
+    q, qd, qdd = np.mean(errors, axis=0)
+    return float(q), float(qd), float(qdd)
 
 
 def simulate_emps(dt: float) -> EmpsRun:
     """Closed loop of equations 5.28 and 5.29 along the moves, sampled every ``dt`` seconds."""
-    q_ref_dd = polynomial_moves(DURATIONS, dt)
+    return follow(polynomial_moves(DURATIONS, dt), dt)
+
+
+def follow(q_ref_dd: Array, dt: float) -> EmpsRun:
+    """Closed loop of equations 5.28 and 5.29 from rest along a reference given by its acceleration, (N,) m/s^2."""
     signals = np.empty((4, q_ref_dd.size))
     parameters = np.array([MASS, VISCOUS, COULOMB, SIGN_SMOOTHING, GAIN * KV, KP])
     _integrate(q_ref_dd, dt, int(np.ceil(dt / STEP - 1e-9)), parameters, signals)
@@ -153,7 +159,7 @@ def _methods(run: EmpsRun, measured: Array, deviation: float) -> dict[str, Deriv
         "bandpass": differentiate(y, dt, "bandpass", bandwidth_hz=MODE_HZ),
         "IRWSM 1": differentiate(y, dt, "irwsm"),
         "IRWSM 2": differentiate(y, dt, "irwsm2"),
-        "bandpass, forward differences": _forward(butterworth(y, dt, CUTOFF_HZ), dt),
+        "bandpass, forward differences": forward(butterworth(y, dt, CUTOFF_HZ), dt),
         "IRWSM 1, likelihood": differentiate(y, dt, "irwsm", "likelihood"),
         "IRWSM 2, likelihood": differentiate(y, dt, "irwsm2", "likelihood"),
         "IRWSM 1, tracking error": differentiate(y, dt, "irwsm", "tracking-error", **known),
@@ -163,15 +169,18 @@ def _methods(run: EmpsRun, measured: Array, deviation: float) -> dict[str, Deriv
     }
 
 
-def _forward(smooth: Array, dt: float) -> Derivatives:
+def forward(smooth: Array, dt: float) -> Derivatives:
     """Forward differences as they come: half a sample late for the velocity, a whole one for the acceleration."""
     qd = np.diff(smooth, axis=0, append=smooth[-1:]) / dt
     return Derivatives(smooth, qd, np.diff(qd, axis=0, append=qd[-1:]) / dt, None)
 
 
-def _errors(run: EmpsRun, found: Derivatives) -> Errors:
+def relative_errors(run: EmpsRun, found: Derivatives, border: int = 0) -> Errors:
+    """Relative errors without ``border`` samples at either end."""
+    inner = slice(border, run.q.size - border)
+
     def relative(estimate: Array, truth: Array) -> float:
-        return 100 * float(np.linalg.norm(estimate[:, 0] - truth) / np.linalg.norm(truth))
+        return 100 * float(np.linalg.norm((estimate[:, 0] - truth)[inner]) / np.linalg.norm(truth[inner]))
 
     return relative(found.q, run.q), relative(found.qd, run.qd), relative(found.qdd, run.qdd)
 
