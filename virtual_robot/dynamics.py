@@ -25,30 +25,32 @@ M2, M3 = 6.1697947043828245592553615689730, -0.42772256543218573326238373806514
 
 
 @njit(cache=True, error_model="numpy")
-def resist(q, qd, t, friction, smoothing, pairs, pair_friction, brake, ratio, table, load, out, slope):  # type: ignore[no-untyped-def]
+def resist(q, qd, t, friction, smoothing, pairs, ratio, table, load, out, slope):  # type: ignore[no-untyped-def]
     """Friction, couplings (eq. B.1), brakes and hidden torques: torque ``out`` (N,) and ``slope`` (N, N).
 
-    ``friction`` (n, 3) holds fv, fc and the offset; ``pairs`` (C, 2) and ``pair_friction`` (C, 2) the couplings;
-    ``table`` the hidden torques, ``load`` (n,) what the gears pass on.
+    ``friction`` (n, 4) holds fv, fc, the offset and the viscous coefficient of the brake; ``pairs`` (C, 4) the two
+    joints, fv and fc of the couplings; ``table`` the hidden torques, ``load`` (n,) what the gears pass on.
     """
     n = friction.shape[0]
     slope[:, :] = 0.0
     out[n:] = 0.0
     for i in range(n):
         x = smoothing * qd[i]
-        out[i] = (friction[i, 0] + brake[i]) * qd[i] + friction[i, 1] * 2.0 / math.pi * math.atan(x) + friction[i, 2]
-        slope[i, i] = friction[i, 0] + brake[i] + friction[i, 1] * 2.0 / math.pi * smoothing / (1.0 + x * x)
+        out[i] = (
+            (friction[i, 0] + friction[i, 3]) * qd[i] + friction[i, 1] * 2.0 / math.pi * math.atan(x) + friction[i, 2]
+        )
+        slope[i, i] = friction[i, 0] + friction[i, 3] + friction[i, 1] * 2.0 / math.pi * smoothing / (1.0 + x * x)
     for c in range(pairs.shape[0]):
-        i, j = pairs[c, 0], pairs[c, 1]
+        i, j = int(pairs[c, 0]), int(pairs[c, 1])
         x = smoothing * (qd[i] + qd[j])
-        dry = pair_friction[c, 1] * 2.0 / math.pi * math.atan(x)
-        dry_slope = pair_friction[c, 1] * 2.0 / math.pi * smoothing / (1.0 + x * x)
-        out[i] += pair_friction[c, 0] * qd[j] + dry
-        out[j] += pair_friction[c, 0] * qd[i] + dry
+        dry = pairs[c, 3] * 2.0 / math.pi * math.atan(x)
+        dry_slope = pairs[c, 3] * 2.0 / math.pi * smoothing / (1.0 + x * x)
+        out[i] += pairs[c, 2] * qd[j] + dry
+        out[j] += pairs[c, 2] * qd[i] + dry
         slope[i, i] += dry_slope
         slope[j, j] += dry_slope
-        slope[i, j] += pair_friction[c, 0] + dry_slope
-        slope[j, i] += pair_friction[c, 0] + dry_slope
+        slope[i, j] += pairs[c, 2] + dry_slope
+        slope[j, i] += pairs[c, 2] + dry_slope
     for e in range(table.shape[0]):
         code, j, other = int(table[e, 0]), int(table[e, 1]), int(table[e, 2])
         motor = 0.0
@@ -115,15 +117,16 @@ def _solve(a, x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def advance(  # type: ignore[no-untyped-def]
-    period, substeps, t, q, qd, z, middle, speed, tau, mass, bias, rotor, link,
-    friction, smoothing, pairs, pair_friction, brake, ratio, table, load, gears, bristles,
+    period, substeps, t, state, z, tau, mass, bias, rotor, link,
+    friction, smoothing, pairs, ratio, table, load, gears, bristles,
 ):  # fmt: skip
-    """Move ``q``, ``qd`` (N,) and the bristles ``z`` (B,) on by ``period`` under the held torque ``tau`` (n,).
+    """Move ``state`` (4, N) and the bristles ``z`` (B,) on by ``period`` under the held torque ``tau`` (n,), in place.
 
     ``mass`` (upper triangle) and ``bias`` are Pinocchio's mass matrix and nonlinear effects at the predicted
-    ``middle`` of the period, of the coordinates ``link``; ``rotor`` (N, N) is added to the mass matrix. ``middle``
-    and ``speed`` (N,) get the positions and velocities predicted for the middle of the next period.
+    middle of the period, of the coordinates ``link``; ``rotor`` (N, N) is added to the mass matrix. The rows of the
+    state are position, velocity, and the two as predicted for the middle of the next period.
     """
+    q, qd, middle, speed = state
     n, count, total = tau.size, bristles.shape[0], q.size
     full = rotor.copy()
     held = np.zeros(total)
@@ -138,32 +141,31 @@ def advance(  # type: ignore[no-untyped-def]
             full[a, b] += mass[i, j]
             full[b, a] += mass[i, j]
     force, slope, matrix = np.empty(total), np.empty((total, total)), np.empty((total, total))
-    stiff = np.zeros((total, total))
-    k1, k2, k3, mk = np.empty(total), np.empty(total), np.empty(total), np.empty(total)
-    x1, x2, x3 = np.empty(total), np.empty(total), np.empty(total)
-    q2, qd2 = np.empty(total), np.empty(total)
-    z1, z2, z3, rate, inverse, cross = (
-        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    gives = gears.shape[0] > 0
+    stiff = np.empty((total, total) if gives else (0, 0))
+    k1, k2, k3, x1, x2, x3 = (
+        np.empty(total), np.empty(total), np.empty(total), np.empty(total), np.empty(total), np.empty(total)
     )  # fmt: skip
-    pull = np.empty(count)
+    q2, qd2, mk = np.empty(total), np.empty(total), np.empty(total)
+    z1, z2, z3, rate, inverse, cross, pull = np.empty((7, count))
     loaded = False
     for e in range(table.shape[0]):
         loaded |= int(table[e, 0]) == LOAD_CODE
     before = qd.copy()
-    last = qd.copy()
+    last = before.copy() if loaded else before
     h = period / substeps
     hg = h * GAMMA
     for step in range(substeps):
         now = t + (step + 0.5) * h
-        resist(q, qd, now, friction, smoothing, pairs, pair_friction, brake, ratio, table, load, force, slope)
-        if gears.shape[0] > 0:
+        resist(q, qd, now, friction, smoothing, pairs, ratio, table, load, force, slope)
+        if gives:
             stiff[:, :] = 0.0
             give(q, qd, gears, force, slope, stiff)
         for i in range(total):
             for j in range(total):
                 matrix[i, j] = full[i, j] / hg + slope[i, j]
             k1[i] = held[i] - gravity[i] - force[i]
-        if gears.shape[0] > 0:
+        if gives:
             for i in range(total):
                 for j in range(total):
                     matrix[i, j] += hg * stiff[i, j]
@@ -182,8 +184,8 @@ def advance(  # type: ignore[no-untyped-def]
             x1[i] = hg * (qd[i] + k1[i])
             q2[i] = q[i] + x1[i]
             qd2[i] = qd[i] + k1[i]
-        resist(q2, qd2, now, friction, smoothing, pairs, pair_friction, brake, ratio, table, load, force, slope)
-        if gears.shape[0] > 0:
+        resist(q2, qd2, now, friction, smoothing, pairs, ratio, table, load, force, slope)
+        if gives:
             give(q2, qd2, gears, force, slope, slope)
         for b in range(count):
             j = int(bristles[b, 0])
@@ -196,7 +198,7 @@ def advance(  # type: ignore[no-untyped-def]
                 s += full[i, j] * k1[j]
             mk[i] = s / h
             k2[i] = held[i] - gravity[i] - force[i] + C21 * mk[i]
-        if gears.shape[0] > 0:
+        if gives:
             for i in range(total):
                 for j in range(total):
                     k2[i] -= hg * stiff[i, j] * (qd2[j] + C21 * x1[j] / h)
@@ -211,7 +213,7 @@ def advance(  # type: ignore[no-untyped-def]
                 s += full[i, j] * k2[j]
             k3[i] = held[i] - gravity[i] - force[i] + C31 * mk[i] + C32 * s / h
             x2[i] = hg * (qd2[i] + k2[i] + C21 * x1[i] / h)
-        if gears.shape[0] > 0:
+        if gives:
             for i in range(total):
                 for j in range(total):
                     k3[i] -= hg * stiff[i, j] * (qd2[j] + (C31 * x1[j] + C32 * x2[j]) / h)

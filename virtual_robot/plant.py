@@ -1,5 +1,6 @@
 """The arm's mechanics: Pinocchio's rigid bodies, rotor inertias, friction and whatever is hidden in it."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -64,13 +65,12 @@ class Plant:
         links = _symmetric(pin.crba(self.model, self._data, np.concatenate([start, swing])))[:n, :n]
         names = [joint.name for joint in robot.joints]
         rotor = np.diag([standard[f"ia{j + 1}"] for j in range(n)])
-        friction = np.array([[standard[f"{k}{j + 1}"] for k in ("fv", "fc", "off")] for j in range(n)])
-        pairs = np.array([[names.index(j) for j in c.joints] for c in robot.couplings], np.int64).reshape(-1, 2)
-        pair_friction = np.array([[standard[f"{k}{c.name}"] for k in ("fv", "fc")] for c in robot.couplings]).reshape(
-            -1, 2
-        )
-        for c, (i, j) in zip(robot.couplings, pairs, strict=True):
+        friction = np.array([[*(standard[f"{k}{j + 1}"] for k in ("fv", "fc", "off")), 0.0] for j in range(n)])
+        pairs: list[tuple[float, ...]] = []
+        for c in robot.couplings:
+            i, j = (names.index(joint) for joint in c.joints)
             rotor[i, j] = rotor[j, i] = standard[f"ia{c.name}"]
+            pairs.append((i, j, standard[f"fv{c.name}"], standard[f"fc{c.name}"]))
         add_rotors(rotor, hidden, links)
         table = force_table(hidden, robot, friction)
         bristles = bristle_table(hidden, robot, friction, np.diag(rotor) + np.diag(links))
@@ -79,8 +79,7 @@ class Plant:
             if h.effect == "coupling_friction":
                 viscous = h.given("viscous", 0.3 * h["coulomb"])
                 friction[[h.joint, h.other], 0] += viscous
-                pairs = np.vstack([pairs, [[h.joint, h.other]]])
-                pair_friction = np.vstack([pair_friction, [[viscous, h["coulomb"]]]])
+                pairs.append((h.joint, h.other, viscous, h["coulomb"]))
         # A bristle stands in place of the joint's Coulomb friction.
         friction[bristles[:, 0].astype(np.int64), 1] = 0.0
 
@@ -96,24 +95,26 @@ class Plant:
         hinges = [[n + soft + k, -1, 0.0, d, 0.0, 0.0] for k, d in enumerate(hinge_damping(hidden, self._gravity))]
         gears = np.vstack([gears, np.array(hinges).reshape(-1, gears.shape[1])])
 
-        self.coordinates = np.concatenate([start, start[behind], swing])
+        # Position, velocity, and both as predicted for the middle of the coming period.
+        self._state = np.zeros((4, total))
+        self.coordinates, self.velocities = self._state[:2]
+        self.coordinates[:] = np.concatenate([start, start[behind], swing])
         bias = pin.nonLinearEffects(self.model, self._data, self.coordinates[self._link], np.zeros(self._link.size))
         for e, j in enumerate(behind):
             self.coordinates[n + e] -= twist_under(gears[e], float(bias[j]))
-        self.velocities = np.zeros(total)
         self.q, self.qd = self.coordinates[:n], self.velocities[:n]
         self.bristles = np.zeros(len(bristles))
         self._time = 0.0
-        self._middle, self._speed = self.coordinates.copy(), np.zeros(total)
-        self.brake = np.zeros(n)
+        self._state[2] = self.coordinates
+        self.brake = friction[:, 3]
         self._load = bias[:n].copy()
         self._rows = bristles
         self._gears = gears
         self._resisting: tuple[Any, ...] = (
-            friction, robot.friction.sign_smoothing, pairs, pair_friction, self.brake, robot.transmission_matrix, table,
+            friction, robot.friction.sign_smoothing, np.array(pairs).reshape(-1, 4), robot.transmission_matrix, table,
             self._load,
         )  # fmt: skip
-        self._rigid = total == n
+        self._rigid, self._fine = total == n, bool(gears.size or bristles.size)
         self._check(robot, hidden)
 
     def _check(self, robot: RobotConfig, hidden: tuple[Hidden, ...]) -> None:
@@ -154,24 +155,26 @@ class Plant:
         force, slope = np.zeros(total), np.zeros((total, total))
         force[:n] = self.resistance(q[:n], qd[:n], t) - tau
         dynamics.give(q, qd, self._gears, force, slope, slope)
-        self._shake(t)
+        if self._shaking.size:
+            self._shake(t)
         force[self._link] += pin.nonLinearEffects(self.model, self._data, q[self._link], qd[self._link])
         return np.asarray(np.linalg.solve(self._inertia(q), -force), np.float64)
 
     def advance(self, tau: NDArray[np.float64], period: float) -> None:
         """Hold the joint torques ``tau`` (n,) for ``period`` seconds."""
-        self._shake(self._time + 0.5 * period)
-        middle, speed = self._middle, self._speed
+        if self._shaking.size:
+            self._shake(self._time + 0.5 * period)
+        middle, speed = self._state[2], self._state[3]
         steps = dynamics.SUBSTEPS
         if not self._rigid:
             middle, speed = middle[self._link], speed[self._link]
-        if self._gears.size or self._rows.size:
-            steps = max(steps, int(np.ceil(period / FINE_STEP)))
+        if self._fine:
+            steps = max(steps, math.ceil(period / FINE_STEP))
         mass = pin.crba(self.model, self._data, middle)
         bias = pin.nonLinearEffects(self.model, self._data, middle, speed)
         arguments = (
-            period, steps, self._time, self.coordinates, self.velocities, self.bristles, self._middle, self._speed, tau,
-            mass, bias, self.rotor, self._link, *self._resisting, self._gears, self._rows,
+            period, steps, self._time, self._state, self.bristles, tau, mass, bias, self.rotor, self._link,
+            *self._resisting, self._gears, self._rows,
         )  # fmt: skip
         dynamics.advance(*arguments)
         self._time += period
@@ -184,9 +187,8 @@ class Plant:
 
     def _shake(self, t: float) -> None:
         """Put the acceleration of the base at ``t`` into gravity."""
-        if len(self._shaking):
-            rows = self._shaking
-            self.model.gravity.linear = self._gravity - np.sin(rows[:, 3] * t) @ rows[:, :3]
+        rows = self._shaking
+        self.model.gravity.linear = self._gravity - np.sin(rows[:, 3] * t) @ rows[:, :3]
 
 
 def _symmetric(upper: NDArray[np.float64]) -> NDArray[np.float64]:
