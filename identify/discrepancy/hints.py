@@ -22,7 +22,7 @@ HINTS: dict[Kind, str] = {
         "the torque of {joint} is wrong in proportion to what it carries: check masses, the current scaling "
         "of its drive, and whether gear or link give way"
     ),
-    "load and direction": "friction of {joint} changes with the load on its gear: check preload and lubrication of the gear",
+    "load and direction": "friction of {joint} changes with the load on its gear: check its preload and lubrication",
     "torque": (
         "the drive of {joint} does not give the torque that it reports, most at {at}: check torque constant, "
         "current limit and saturation"

@@ -22,19 +22,25 @@ ROWS_PER_COLUMN = 12
 """Equations that each of their columns must have, so that short recordings are not overfitted."""
 
 
-def shortlist(fit: Fit, workshop: Workshop, every: list[Candidate], most: int) -> list[tuple[Candidate, Shapes]]:
-    """The candidates that fit the training data best, with their shapes, best first."""
-    calm = fit.renoised(_noise_beyond_shapes(fit, workshop))
-    looks = []
+def shortlist(
+    fit: Fit, workshop: Workshop, every: list[Candidate], most: int
+) -> tuple[list[tuple[Candidate, Shapes]], frozenset[tuple[str, int, int | None]]]:
+    """The candidates that fit the training data best, with their shapes, best first; and those that cannot be tried."""
+    calm = fit.renoised(noise_beyond_shapes(fit, workshop))
+    looks: list[tuple[float, Candidate, Shapes]] = []
+    hidden = set()
     for candidate in every:
         look = screened(calm, candidate, workshop)
-        if look is not None:
+        if look is None:
+            hidden.add(candidate.key)
+        else:
             looks.append((look[0], candidate, look[1]))
     looks.sort(key=lambda look: len(look[1].effect.linear) - look[0])
-    return [(candidate, refined(calm, candidate, workshop, (look, shapes))) for look, candidate, shapes in looks[:most]]
+    best = [(candidate, refined(calm, candidate, workshop, (look, shapes))) for look, candidate, shapes in looks[:most]]
+    return best, frozenset(hidden)
 
 
-def _noise_beyond_shapes(fit: Fit, workshop: Workshop) -> list[ArModel]:
+def noise_beyond_shapes(fit: Fit, workshop: Workshop) -> list[ArModel]:
     """Noise models of the residual that smooth functions of each joint's own motion leave."""
     errors = fit.errors(fit.theta, held=False)
     columns = [

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from identify.discrepancy.candidates import Columns
 from identify.discrepancy.regression import Fit
-from identify.discrepancy.trial import _beside
+from identify.discrepancy.trial import directions_beside
 
 Array = NDArray[np.float64]
 
@@ -39,10 +39,10 @@ def smoothed(fit: Fit, columns: Columns, basis: Array, pieces: Sequence[Array]) 
     value, band : ndarray
         The shape and two standard deviations of it, (G,). What the model itself can represent is not part of it.
     """
-    beside = _beside(fit, columns.z)
-    if beside is None:
+    found = directions_beside(fit, columns.z)
+    if found is None:
         return np.zeros(basis.shape[0]), np.zeros(basis.shape[0])
-    u, right, scale = beside
+    u, right, scale = found
     through = np.linalg.solve((u.T @ (columns.x / scale) @ right).T, right.T).T / scale[:, None]
     # In these coordinates the estimate has unit variance in every direction.
     estimate = u.T @ fit.residual

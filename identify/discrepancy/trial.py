@@ -111,7 +111,7 @@ def screened(fit: Fit, candidate: Candidate, workshop: Workshop) -> tuple[float,
 
 def score_statistic(fit: Fit, instruments: Array) -> float | None:
     """Power of the training residual along instruments (R, k) beside the model's own; ``None`` if nothing is left."""
-    basis = _beside(fit, instruments)
+    basis = directions_beside(fit, instruments)
     if basis is None:
         return None
     score = basis[0].T @ fit.residual
@@ -130,7 +130,7 @@ def judge(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) ->
     if screening is None:
         return None
     # What the model lacks must not pass for noise: the noise is that of the residual with the candidate in the model.
-    fit = fit.renoised(_noise_with(fit, candidate, shapes, workshop, *screening))
+    fit = fit.renoised(noise_with(fit, candidate, shapes, workshop, *screening))
     columns = workshop.columns(candidate.effect, candidate.place, shapes, fit.noise)
     solution = _values(fit, columns)
     if solution is None:
@@ -170,7 +170,7 @@ def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Work
     return solution[1], fit.absorbed(columns.x @ solution[1][:, None])[:, 0]
 
 
-def _noise_with(
+def noise_with(
     fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, values: Array, away: Array
 ) -> list[ArModel]:
     """Noise models of what is left of the training data with a candidate in the model."""
@@ -182,7 +182,7 @@ def _noise_with(
 
 def _values(fit: Fit, columns: Columns) -> tuple[float, Array, Array] | None:
     """Score statistic, linear parameters and their standard deviations; ``None`` if nothing can be said of them."""
-    basis = _beside(fit, columns.z)
+    basis = directions_beside(fit, columns.z)
     if basis is None:
         return None
     u, right, scale = basis
@@ -198,7 +198,7 @@ def _values(fit: Fit, columns: Columns) -> tuple[float, Array, Array] | None:
     return float(score @ score), values, std
 
 
-def _beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
+def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
     """Orthonormal directions (R, r) of instruments beside the model's, and how they map back."""
     scale = np.linalg.norm(instruments, axis=0)
     if np.any(scale == 0) or not np.isfinite(scale).all():

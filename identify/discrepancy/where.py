@@ -11,17 +11,22 @@ from identify.discrepancy.candidates import Candidate, Workshop
 from identify.discrepancy.hints import hint_of, unit_of
 from identify.discrepancy.lines import lowest_frequency, residuals, strongest_line
 from identify.discrepancy.maps import Kind, Map, maps
-from identify.discrepancy.regression import Fit, Rows
+from identify.discrepancy.regression import Equation, Equations, Fit, solved
+from identify.discrepancy.screening import noise_beyond_shapes
 from identify.discrepancy.smoothing import smoothed
-from identify.discrepancy.trial import Trial, _beside, judge, score_statistic
+from identify.discrepancy.trial import Trial, directions_beside, judge, noise_with, score_statistic
+from identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
 
 HELD_OUT_LEVEL = 0.05
 """The held-out data alone must speak for a dependence at this level."""
 
-SCREEN = 0.05
+SCREEN = 0.01
 """Maps that do not even fit the training residual at this level are not judged on the held-out data."""
+
+LOOKS = 8
+"""Most maps of one joint that are judged, those first that fit the training residual best."""
 
 MATERIAL = 0.02
 """Share of a joint's held-out residual power that an unexplained dependence must have to be reported."""
@@ -130,12 +135,12 @@ def unexplained(fit: Fit, workshop: Workshop, alpha: float = 0.01) -> list[Disag
     for j, joint in enumerate(study.joints):
         here: list[Disagreement] = [line for line in lines if line.joint == joint and line.share >= MATERIAL]
         rivals = [f for f in significant if f.map.joint == j and f.trial.share >= MATERIAL]
-        beside = fit
+        base = fit
         while rivals and len(here) < MOST:
             best = max(rivals, key=lambda f: f.trial.share)
-            here.append(best.disagreement(beside, own))
-            beside = _with(beside, best, own)
-            again = [_judged(beside, f.map, own) for f in rivals if f is not best]
+            here.append(best.disagreement(base, own))
+            base = _with(base, best, own)
+            again = [_judged(base, f.map, own) for f in rivals if f is not best]
             rivals = [f for f in again if f is not None and f.passes(level) and f.trial.share >= MATERIAL]
         found += here
     return sorted(found, key=lambda d: -d.share)
@@ -157,10 +162,11 @@ class _Found:
         x = np.linspace(m.low, m.high, 121)
         side = np.sign(x) if m.kind == "velocity" else np.ones_like(x)
         basis = m.shape(x, side)
-        columns = workshop.columns(m.effect(), Place(m.joint), ())
+        own = fit.renoised(_noise(fit, self.trial, workshop))
+        columns = workshop.columns(m.effect(), Place(m.joint), (), own.noise)
         # The kink that dry friction makes at standstill is no roughness.
         pieces = [basis[x <= 0], basis[x >= 0]] if m.kind == "velocity" else [basis]
-        value, band = smoothed(fit, columns, basis, pieces)
+        value, band = smoothed(own, columns, basis, pieces)
         return Disagreement(
             study.joints[m.joint],
             m.kind,
@@ -187,43 +193,53 @@ def _tests(fit: Fit, workshop: Workshop) -> int:
 
 
 def _significant(fit: Fit, workshop: Workshop, level: float) -> list[_Found]:
-    judged = (_judged(fit, m, workshop) for m in _maps(fit, workshop))
+    """Maps that pass, of those that a quick look at the training data finds worth a trial."""
+    calm = fit.renoised(noise_beyond_shapes(fit, workshop))
+    looks: dict[int, list[tuple[float, Map]]] = {}
+    for m in _maps(fit, workshop):
+        effect = m.effect()
+        instruments = workshop.instruments(effect, Place(m.joint), (), calm.noise, keep=False)
+        statistic = score_statistic(calm, instruments)
+        if statistic is None:
+            continue
+        p = float(stats.chi2.sf(statistic, len(effect.linear)))
+        if p < SCREEN:
+            looks.setdefault(m.joint, []).append((p, m))
+    chosen = [m for look in looks.values() for _, m in sorted(look, key=lambda pm: pm[0])[:LOOKS]]
+    judged = (_judged(fit, m, workshop) for m in chosen)
     return [f for f in judged if f is not None and f.passes(level)]
 
 
 def _judged(fit: Fit, m: Map, workshop: Workshop) -> _Found | None:
-    effect, place = m.effect(), Place(m.joint)
-    instruments = workshop.instruments(effect, place, (), keep=False)
-    seen = np.abs(instruments).max(axis=0) > 0
-    if not seen.all():
-        return None
-    statistic = score_statistic(fit, instruments)
-    if statistic is None or stats.chi2.sf(statistic, len(effect.linear)) > SCREEN:
-        return None
-    trial = judge(fit, Candidate(effect, place, ((),)), (), workshop)
+    trial = judge(fit, Candidate(m.effect(), Place(m.joint), ((),)), (), workshop)
     return None if trial is None else _Found(m, trial)
 
 
+def _noise(fit: Fit, trial: Trial, workshop: Workshop) -> list[ArModel]:
+    return noise_with(fit, trial.candidate, trial.shapes, workshop, trial.values, trial.away)
+
+
 def _with(fit: Fit, found: _Found, workshop: Workshop) -> Fit:
-    """The fit with a map among the parameters of the model, without what the model contained of it before."""
-    columns = workshop.columns(found.map.effect(), Place(found.map.joint), ())
-    basis = _beside(fit, columns.z)
+    """The fit with a map among the terms of the model, without what the model contained of it before."""
+    effect, place = found.map.effect(), Place(found.map.joint)
+    own = fit.renoised(_noise(fit, found.trial, workshop))
+    basis = directions_beside(own, workshop.instruments(effect, place, (), own.noise))
     assert basis is not None
     _, right, scale = basis
     through = right / scale[:, None]
-    train = Rows(
-        np.column_stack([fit.train.x, columns.x @ through]),
-        np.column_stack([fit.train.z, columns.z @ through]),
-        fit.train.y,
-    )
-    held = Rows(
-        np.column_stack([fit.held.x, columns.held_x @ through]),
-        np.column_stack([fit.held.z, columns.held_z @ through]),
-        fit.held.y,
-    )
-    values = np.linalg.lstsq(through, found.trial.values, rcond=None)[0]
-    theta = np.concatenate([fit.theta - found.trial.away, values])
-    return replace(fit, theta=theta, train=train, held=held)
+
+    def extended(part: str, rows: tuple[Equation, ...]) -> tuple[Equation, ...]:
+        measured, simulated = (workshop.band(effect, place, (), part, kind) for kind in ("measured", "simulated"))
+        return tuple(
+            (np.concatenate([x, c @ through], axis=2), np.concatenate([z, d @ through], axis=2), y)
+            for (x, z, y), c, d in zip(rows, measured, simulated, strict=True)
+        )
+
+    equations = Equations(extended("train", fit.equations.train), extended("held", fit.equations.held))
+    theta = None
+    if fit.fixed:
+        theta = np.concatenate([fit.theta, np.linalg.lstsq(through, found.trial.values, rcond=None)[0]])
+    return solved(fit.study, equations, own.noise, theta)
 
 
 def _lines(fit: Fit, level: float) -> list[Disagreement]:
