@@ -184,12 +184,16 @@ def _responses(drives: str, lab: Laboratory, *, exact: bool) -> list[Finding]:
     try:
         responses = lab.run("didim", IMPULSE_RESPONSES)
     except DataError:
-        far, works, text = None, False, "finds no closed loop that can be simulated"
+        works, text = False, "finds no closed loop that can be simulated"
     else:
-        far = farthest(lab.names, responses, lab.truth, actual["didim"].std)
-        works = responses.estimate.converged and far.score < FAR
+        moved = apart(responses.estimate.theta, actual["didim"])
+        works = responses.estimate.converged and moved < SAME
         converges = "converges" if responses.estimate.converged else "does not converge"
-        text = f"{converges} and takes {far} from the truth ({'less' if exact else 'more'} than {FAR:g})"
+        farther = farthest(lab.names, responses, lab.truth, actual["didim"].std)
+        text = (
+            f"{converges} and differs by {moved:.2f} standard deviations ({'less' if exact else 'more'} than {SAME:g}), "
+            f"{farther} from the truth"
+        )
     fits = [response.fit_pct for response in lab.identified(IMPULSE_RESPONSES).responses]
     found = [
         Finding(
