@@ -14,7 +14,7 @@ SOURCES := configs drivers daq identify virtual_robot tests
 PYTEST := $(PY) -m pytest
 WITH_VCAN := $(PY) -m drivers.vcan -n 2 --
 
-.PHONY: help install demo test check lint vcan bench lock clean
+.PHONY: help install demo test check lint vcan suite bench lock clean
 
 help: ## what there is to do
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -71,6 +71,9 @@ test: lint ## everything, the tests on vcan included
 vcan: install ## fetch what the vcan guest needs, where this kernel has no SocketCAN
 	@$(PY) -m drivers.vcan --setup
 
+suite: install ## hide effects in virtual arms and count what is found (SUITE="--quick" passes options), two hours
+	@$(VENV)/bin/armident diagnose-suite $(SUITE)
+
 bench: install ## figures of ours beside those of named alternatives
 	@$(PY) -m tests.benchmarks.run
 
@@ -80,4 +83,4 @@ lock: install ## write requirements.lock anew from the ranges in pyproject.toml
 		--no-annotate -q -o requirements.lock pyproject.toml
 
 clean: ## remove what make and the tools created
-	@rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out demo
+	@rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info build dist out demo suite

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 from configs.errors import ConfigError
 from configs.robot import RobotConfig
 from configs.session import SessionConfig
+from configs.suite import SuiteConfig
 from configs.trajectory import Trajectory
 from configs.urdf import UrdfGeometry, geometry_from_urdf
 
@@ -109,6 +110,17 @@ def load_session(name: str | Path) -> SessionConfig:
                 f"({', '.join(sorted(joints))})"
             )
     return session
+
+
+def load_suite(name: str | Path) -> SuiteConfig:
+    """A suite of hidden effects from a file.
+
+    Raises
+    ------
+    ConfigError
+        Naming file, key and what was expected.
+    """
+    return _load(config_path(name), SuiteConfig)
 
 
 def _load(path: Path, kind: type[T]) -> T:

@@ -104,3 +104,41 @@ def demo(
     from daq.demo import demo as run_demo
 
     run_demo(out=out, keep_going=keep_going, quick=quick)
+
+
+def diagnose_suite(
+    suite: Annotated[Path, typer.Option("--suite", help="What to hide, where and how strongly.")] = Path("suite.yaml"),
+    out: Annotated[Path, typer.Option("--out", help="Directory of results and tables; a run goes on there.")] = Path(
+        "suite"
+    ),
+    quick: Annotated[bool, typer.Option("--quick", help="One place, strength and run of each effect.")] = False,
+    only: Annotated[
+        str, typer.Option("--only", help="Effects by name, or clean, clean_baseline, pair, outside: A,B,...")
+    ] = "",
+    strength: Annotated[str, typer.Option("--strength", help="detectable, typical, obvious: A,B,...")] = "",
+    jobs: Annotated[int | None, typer.Option("--jobs", help="Cases at a time. [default: processors]", min=1)] = None,
+    minutes: Annotated[
+        float | None, typer.Option("--minutes", help="Begin no case after so long; call again to go on.", min=0)
+    ] = None,
+    any_version: Annotated[
+        bool, typer.Option("--any-version", help="Use results that another version of the code made.")
+    ] = False,
+    list_cases: Annotated[bool, typer.Option("--list", help="Print the cases and end.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print tables and scores as JSON.")] = False,
+) -> None:
+    """Hide effects in virtual arms, diagnose them, and say how often they are found by name.
+
+    Results are kept case by case: a run that was stopped goes on where it was.
+
+    Example: armident diagnose-suite --quick --out suite
+    """
+    from daq.suite.run import Chosen, list_suite, run_suite
+
+    def words(text: str) -> tuple[str, ...]:
+        return tuple(word.strip() for word in text.split(",") if word.strip())
+
+    options = Chosen(suite, out, quick, words(only), words(strength), jobs, minutes, any_version)
+    if list_cases:
+        list_suite(options)
+    else:
+        run_suite(options, as_json=as_json)

@@ -1,0 +1,148 @@
+"""What a diagnosis is worth, beside what was hidden."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from daq.suite.cases import Case, HiddenPart
+from daq.suite.store import Record
+
+Document = dict[str, Any]
+
+SIGMAS = 3.0
+"""Distance from the truth, in standard deviations, that a parameter may have."""
+LEAST_GAP = 0.01
+"""Injected gap on held-out data, as a share of the noise's power, under which the share closed means nothing."""
+LOW_CONFIDENCE = 0.5
+"""A name that is stated with less is called more probably wrong than right by the diagnosis itself."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """How one case went.
+
+    Parameters
+    ----------
+    verdict
+        Of the diagnosis.
+    first, second
+        Whether every hidden effect has its right name and place among the findings; among the findings and what each
+        of them calls its closest rival. ``None`` where nothing is hidden that has a name.
+    missed
+        Nothing was found, and nothing left unexplained.
+    invisible
+        Missed, and the diagnosis says that this motion cannot show the effect.
+    extra
+        Findings beside what is hidden.
+    closed
+        Share of the injected gap above the noise floor that is closed on held-out data; ``None`` without a gap.
+    within
+        Of every parameter that can be compared, whether it is within three standard deviations of the truth.
+    confidence
+        Highest of any finding; zero without one.
+    named
+        First finding, as ``effect joint``.
+    """
+
+    verdict: str
+    first: bool | None
+    second: bool | None
+    missed: bool
+    invisible: bool
+    extra: int
+    closed: float | None
+    within: tuple[bool, ...]
+    confidence: float
+    named: str | None
+
+
+def score(case: Case, record: Record, healthy: Record | None) -> Score:
+    """Judge the record of a case.
+
+    Parameters
+    ----------
+    healthy
+        Record of its healthy twin, which says what the noise alone costs; ``None`` where nothing is hidden.
+    """
+    document: Document = record["document"]
+    findings: list[Document] = document["findings"]
+    matched = [next((f for f in findings if matches(part, f)), None) for part in case.parts]
+    known = bool(case.parts) and case.kind != "outside"
+    first = second = None
+    if known:
+        first = all(f is not None for f in matched)
+        if len(case.parts) == 1:
+            # One effect: what the diagnosis names before all else.
+            first = bool(findings) and matches(case.parts[0], findings[0])
+        second = all(_among(part, findings) for part in case.parts)
+    missed = document["verdict"] == "no_gap" and bool(case.parts)
+    right = [f for f in matched if f is not None] if known else []
+    return Score(
+        verdict=document["verdict"],
+        first=first,
+        second=second,
+        missed=missed,
+        invisible=missed and all(_called_invisible(part, document) for part in case.parts),
+        extra=sum(not any(matches(part, f) for part in case.parts) for f in findings),
+        closed=None if healthy is None else closed_share(case, document, healthy["document"]),
+        within=tuple(
+            ok
+            for f, truth in zip(matched, record["truth"], strict=False)
+            if f is not None and f in right
+            for ok in within(f, truth)
+        ),
+        confidence=max((f["confidence"] for f in findings), default=0.0),
+        named=f"{findings[0]['effect']} {findings[0]['joint']}" if findings else None,
+    )
+
+
+def matches(part: HiddenPart, finding: Document) -> bool:
+    """Whether a finding (or a rival of one) names a hidden effect and its place; a pair in either order."""
+    if finding["effect"] not in part.names:
+        return False
+    if part.arm:
+        return True
+    places = {part.joint, part.other} - {None}
+    found = {finding["joint"], finding.get("other")} - {None}
+    return found == places or (finding.get("other") is None and found <= places)
+
+
+def closed_share(case: Case, document: Document, healthy: Document) -> float | None:
+    """``(before^2 - after^2) / (before^2 - clean^2)`` of the held-out torque errors, over the joints concerned."""
+    joints = {j for part in case.parts for j in (part.joint, part.other) if j is not None}
+    whole = any(part.arm for part in case.parts)
+    numbers = [f for f in document["findings"] if f["kind"] == "numbers"]
+
+    def power(gap: Document) -> float:
+        return float(gap["all"] ** 2) if whole else sum(float(gap["by_joint"][j]) ** 2 for j in joints)
+
+    validation = document["gap"]["validation"]
+    before, after = power(validation["before"]), power(validation["after"])
+    clean = power(healthy["gap"]["validation"]["before"])
+    if case.baseline and numbers:
+        place = numbers[0]["joint"]
+        before, after = float(numbers[0]["gap_before"]) ** 2, float(numbers[-1]["gap_after"]) ** 2
+        clean = float(healthy["gap"]["validation"]["before"]["by_joint"][place]) ** 2
+    if before - clean < LEAST_GAP * clean:
+        return None
+    return (before - after) / (before - clean)
+
+
+def within(finding: Document, truth: dict[str, float]) -> list[bool]:
+    """Of the parameters that finding and truth share, whether they agree."""
+    deviations = finding["evidence"].get("std", {})
+    out = []
+    for name, value in truth.items():
+        std = deviations.get(name)
+        if name in finding["parameters"] and std is not None and math.isfinite(std):
+            out.append(abs(finding["parameters"][name] - value) <= SIGMAS * std)
+    return out
+
+
+def _among(part: HiddenPart, findings: Sequence[Document]) -> bool:
+    return any(matches(part, f) or any(matches(part, rival) for rival in f["alternatives"][:1]) for f in findings)
+
+
+def _called_invisible(part: HiddenPart, document: Document) -> bool:
+    return any(matches(part, entry) for entry in document.get("invisible", []))
