@@ -109,11 +109,15 @@ class Alternative(Document):
     score: float
 
 
+Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
+
+
 class Finding(Document):
     """One missing effect; gaps are relative torque errors in percent on held-out data."""
 
     effect: str
     joint: str
+    other: str | None = None
     kind: Literal["structure", "numbers"]
     parameters: dict[str, float]
     confidence: float
@@ -130,6 +134,15 @@ class Unexplained(Document):
     share_of_residual: float
     varies_with: str
     hint: str
+
+
+class Invisible(Document):
+    """An effect of the catalogue that these recordings cannot show at a joint, whatever its size."""
+
+    effect: str
+    joint: str
+    reason: str
+    needs: str
 
 
 class Gap(Document):
@@ -159,7 +172,7 @@ class DiagnosisDocument(Document):
     schema_: Literal["armident/diagnosis/1"] = Field("armident/diagnosis/1", alias="schema")
     robot: str
     recordings: list[RecordingReference]
-    verdict: Literal["no_gap", "explained", "partly_explained", "unexplained"]
+    verdict: Verdict
     findings: list[Finding]
     unexplained: list[Unexplained]
     gap: Gaps
@@ -169,6 +182,8 @@ class DiagnosisDocument(Document):
     timing_s: dict[str, float]
     versions: dict[str, str]
     warnings: list[str]
+    not_visible: list[Invisible] = []
+    simulated: dict[str, dict[str, float]] | None = None
 
 
 SCHEMA_FILES: dict[str, type[Document]] = {

@@ -56,6 +56,8 @@ class State:
         Of the candidates that looked best, best first; those with a sign that physics forbids are among them.
     tests
         Number of candidates that they were chosen from.
+    hidden
+        Candidates that the model contains or the motion does not excite.
     """
 
     study: Study
@@ -63,6 +65,7 @@ class State:
     workshop: Workshop
     trials: tuple[Trial, ...]
     tests: int
+    hidden: frozenset[tuple[str, int, int | None]]
 
     def passing(self, settings: Settings) -> list[Trial]:
         """Trials that a finding may come from, best first."""
@@ -121,13 +124,11 @@ class Search:
             previous = Workshop(study, found.theta) if before is None else before.workshop
             workshop = previous.with_theta(study, found.theta)
             every = list(candidates(workshop))
-            trials = [
-                trial
-                for candidate, shapes in shortlist(found, workshop, every, SHORTLIST)
-                if (trial := judge(found, candidate, shapes, workshop)) is not None
-            ]
+            promising, hidden = shortlist(found, workshop, every, SHORTLIST)
+            judged = [judge(found, candidate, shapes, workshop) for candidate, shapes in promising]
+            trials = [trial for trial in judged if trial is not None]
             trials.sort(key=lambda t: -t.score)
-            self._states[key] = State(study, found, workshop, tuple(trials), len(every))
+            self._states[key] = State(study, found, workshop, tuple(trials), len(every) - len(hidden), hidden)
         return self._states[key]
 
     def _extended(self, state: State) -> State | None:

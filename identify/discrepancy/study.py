@@ -10,6 +10,7 @@ from configs import DataError, RobotConfig
 from identify.catalogue.motion import Motion
 from identify.catalogue.wiring import rewired
 from identify.closed_loop import closed_loop
+from identify.estimators.auxiliary import AuxiliaryModel
 from identify.estimators.idim_ls import idim_ls
 from identify.experiment import Experiment
 from identify.methods import decimation_of
@@ -50,6 +51,10 @@ class Stretch:
         Their instants, s, (M,).
     experiment
         Number of the experiment that it is cut from.
+    rows
+        Its samples in that experiment, (N,).
+    span
+        The same after the thinning.
     """
 
     measured: Derivatives
@@ -58,6 +63,8 @@ class Stretch:
     torque: Array
     t: Array
     experiment: int
+    rows: NDArray[np.int64]
+    span: slice
 
 
 @dataclass(frozen=True)
@@ -78,6 +85,10 @@ class Study:
         Of all recordings, s.
     loop
         Which closed loop the instruments come from.
+    auxiliary
+        That loop, of the rigid arm.
+    thinning
+        From the recorded to the working rate.
     """
 
     robot: RobotConfig
@@ -88,6 +99,8 @@ class Study:
     train: tuple[Stretch, ...]
     held: tuple[Stretch, ...]
     loop: str
+    auxiliary: AuxiliaryModel
+    thinning: Decimation
     warnings: tuple[str, ...] = ()
 
     @property
@@ -129,7 +142,7 @@ def build_study(training: Sequence[Experiment], validation: Sequence[Experiment]
     first = design(dt, 0.4 / (dt * factor), factor) if factor > 1 else design(dt, 0.5 / dt, 1)
     second = design(dt * factor, cutoff)
     signals = [replace(differentiate(e.q, dt, bandwidth_hz=bandwidth), start=e.start) for e in experiments]
-    simulated, loop, warnings = _simulated(model, experiments, signals, bandwidth)
+    simulated, loop, auxiliary, warnings = _simulated(model, experiments, signals, bandwidth)
     train: list[Stretch] = []
     held: list[Stretch] = []
     for k, (e, s, z) in enumerate(zip(experiments, signals, simulated, strict=True)):
@@ -143,14 +156,17 @@ def build_study(training: Sequence[Experiment], validation: Sequence[Experiment]
             rows = kept[span]
             y = second(torque[span])
             t = e.start + dt * (rows[0] + factor * second.instants(rows.size))
-            into.append(Stretch(_at(s, rows, dt, factor), _at(z, rows, dt, factor), y, torque[span], t, k))
+            measured, noiseless = _at(s, rows, dt, factor), _at(z, rows, dt, factor)
+            into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span))
     duration = max(e.start + dt * e.q.shape[0] for e in experiments)
-    return Study(robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, tuple(warnings))
+    return Study(
+        robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first, tuple(warnings)
+    )
 
 
 def _simulated(
     model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], bandwidth: float
-) -> tuple[list[Derivatives], str, list[str]]:
+) -> tuple[list[Derivatives], str, AuxiliaryModel, list[str]]:
     """Motion of the simulated closed loop with the parameters of IDIM-LS, one per experiment."""
     dt, warnings = experiments[0].dt, list[str]()
     rigid = model.without_terms()
@@ -164,7 +180,7 @@ def _simulated(
     if runs is None:
         raise DataError("the closed loop cannot be simulated with the model as it stands")
     motions = [Derivatives(run.q, run.qd, run.qdd, None, dt, e.start) for run, e in zip(runs, experiments, strict=True)]
-    return motions, str(description["kind"]), warnings
+    return motions, str(description["kind"]), auxiliary, warnings
 
 
 def _at(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: int) -> Derivatives:

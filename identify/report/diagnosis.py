@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.discrepancy.catalogue import CATALOGUE
 from identify.discrepancy.diagnose import Diagnosis
 from identify.document import DiagnosisDocument
 from identify.report.page import MEASURED, MODEL, MUTED, RESIDUAL, figure, render
@@ -31,7 +30,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
         findings=[
             {
                 "f": finding,
-                "says": CATALOGUE[finding.effect].says if finding.effect in CATALOGUE else finding.evidence["says"],
+                "says": finding.evidence["says"],
                 "share": finding.evidence.get("share_of_residual"),
                 "friction": finding.evidence.get("relative_to_friction_pct"),
                 "picture": _finding_figure(diagnosis, joints.index(finding.joint)),

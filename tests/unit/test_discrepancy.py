@@ -6,9 +6,12 @@ import pytest
 from configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
 from configs.robot import Effect
 from configs.scenario import HiddenEffect, Scenario
-from identify.discrepancy.catalogue import CATALOGUE, effect_names, effect_regressor, effect_values
+from identify.catalogue.effect import Place
+from identify.catalogue.registry import catalogue
+from identify.catalogue.terms import stanza_of
 from identify.discrepancy.diagnose import Diagnosis, diagnose
 from identify.from_recording import experiments_from_recording
+from identify.model.arm import ArmModel
 from identify.options import Options
 from identify.service import identify_recording, robot_yaml
 from virtual_robot.offline import simulate_recording
@@ -70,28 +73,43 @@ def test_held_out_error_of_the_joint_falls_with_every_finding(robot: RobotConfig
 def test_a_diagnosed_model_is_a_robot_configuration_again(robot: RobotConfig) -> None:
     from configs.loading import parse
 
-    stanza = Effect(effect="stribeck_friction", joint="joint_4", parameters={"relative_speed": 0.04, "fst": 0.5})
+    stanza = Effect(effect="stribeck_friction", joint="joint_4", parameters={"velocity": 0.04, "fst": 0.5})
     changed = robot.model_copy(update={"effects": (stanza,)})
     assert parse(robot_yaml(changed), RobotConfig, "model.yaml") == changed
-    assert effect_names(changed) == ["fst4"]
-    np.testing.assert_array_equal(effect_values(changed), [0.5])
+    (term,) = ArmModel.from_config(changed).terms
+    assert term.names == ("fst4",)
+    np.testing.assert_array_equal(term.values, [0.5])
 
 
-@pytest.mark.parametrize("name", sorted(CATALOGUE))
-def test_every_effect_acts_on_its_joint_only(robot: RobotConfig, name: str) -> None:
-    shape = CATALOGUE[name].grid()[0]
-    changed = robot.model_copy(update={"effects": (Effect(effect=name, joint="joint_3", parameters=shape),)})
+ELSEWHERE = ("encoder_eccentricity", "backlash")
+"""A wrong position of one joint is felt by all of them."""
+JOINT_EFFECTS = sorted(
+    name for name, e in catalogue().items() if not e.rewires and e.scope == "joint" and name not in ELSEWHERE
+)
+
+
+@pytest.mark.parametrize("name", JOINT_EFFECTS)
+def test_an_effect_of_a_joint_acts_on_that_joint_only(robot: RobotConfig, name: str) -> None:
     rng = np.random.default_rng(0)
-    columns = effect_regressor(changed, rng.normal(size=(50, 6)), rng.normal(size=(50, 6)))
-    assert columns.shape == (50, 6, len(CATALOGUE[name].linear))
-    assert np.abs(columns[:, 2]).max() > 0
+    model = ArmModel.from_config(robot)
+    motion = model.anchored(rng.normal(size=model.base.b)).motion(*(rng.normal(size=(50, 6)) for _ in range(3)), 1e-3)
+    effect, place = catalogue()[name], Place(2)
+    shapes = {shape.name: shape.grid(motion, 2)[0] for shape in effect.shapes}
+    columns = effect.torque(motion, place, shapes)
+    assert columns.shape == (50, 6, len(effect.linear))
     assert np.abs(np.delete(columns, 2, axis=1)).max() == 0
 
 
 def test_an_unknown_effect_is_refused_naming_the_known_ones(robot: RobotConfig) -> None:
     changed = robot.model_copy(update={"effects": (Effect(effect="gremlins", joint="joint_1"),)})
     with pytest.raises(ConfigError, match=r"'gremlins'.*stribeck_friction"):
-        effect_names(changed)
+        ArmModel.from_config(changed)
+
+
+def test_a_stanza_with_a_parameter_of_another_effect_is_refused(robot: RobotConfig) -> None:
+    stanza = stanza_of(catalogue()["joint_spring"], Place(0), robot, {"fst": 1.0})
+    with pytest.raises(ConfigError, match=r"joint_spring of joint_1: parameters\.fst: unknown"):
+        ArmModel.from_config(robot.model_copy(update={"effects": (stanza,)}))
 
 
 def test_identifying_with_the_effect_inside_brings_the_torque_error_down(
@@ -105,4 +123,7 @@ def test_identifying_with_the_effect_inside_brings_the_torque_error_down(
     plain = identify_recording(recording, robot, Options(method="idim-ls")).document
     better = identify_recording(recording, model, Options(method="idim-ls")).document
     assert better.relative_error_pct_by_joint["joint_2"] < plain.relative_error_pct_by_joint["joint_2"]
-    assert any("asymmetric_viscous_friction of joint_2" in warning for warning in better.warnings)
+    (added,) = [p for p in better.parameters if p.name == "fva2"]
+    # 0.4 of the 5.5 N m s/rad of table B.4.
+    assert added.value == pytest.approx(0.4 * 5.5, abs=3 * added.std)
+    assert added.unit == "N m s/rad"

@@ -1,0 +1,144 @@
+"""What a search found, as the document says it: sizes, certainty, rivals, and what could not be seen."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from configs.robot import Effect as Stanza
+from identify.catalogue.effect import Effect
+from identify.catalogue.registry import catalogue, known
+from identify.catalogue.terms import place_of
+from identify.discrepancy.candidates import places
+from identify.discrepancy.precision import standard_deviations
+from identify.discrepancy.regression import relative_errors
+from identify.discrepancy.search import Search, State, with_values, without
+from identify.discrepancy.where import Disagreement
+from identify.document import Alternative, Finding, Gap, Invisible
+
+Array = NDArray[np.float64]
+
+RIVALS = 3
+"""Alternatives named beside every finding."""
+
+CLOSE = float(np.log(20.0))
+"""Difference in log-likelihood below which a rival cannot be told apart: odds of less than 20 to 1."""
+
+
+def described(search: Search, first: State, final: State, left: Sequence[Disagreement]) -> list[Finding]:
+    """Findings in the order in which they were made.
+
+    Every one is compared with its rivals beside all the others: its confidence is the share of the likelihood that is
+    its own, times the share of what is wrong with the joint that it explains.
+    """
+    own = len(first.study.robot.effects)
+    stanzas = list(with_values(final).effects)
+    deviations = dict(zip(_terms(final), standard_deviations(final), strict=True))
+    findings: list[Finding] = []
+    for k in range(own, len(stanzas)):
+        rest = search.state(without(final.study.robot, k), final)
+        findings.append(_finding(rest, final, stanzas[k], deviations.get(k, {}), left))
+    return findings
+
+
+def _finding(rest: State, final: State, stanza: Stanza, std: dict[str, float], left: Sequence[Disagreement]) -> Finding:
+    study = final.study
+    effect = known(stanza.effect)
+    place = place_of(stanza, effect, study.robot, stanza.effect)
+    trials = [t for t in rest.trials if not t.forbidden]
+    mine = next((t for t in trials if t.candidate.key == (effect.name, place.joint, place.other)), None)
+    scores = np.array([t.score for t in trials])
+    rivals = [t for t in trials if t is not mine]
+    share = 0.0 if mine is None else mine.share
+    alone = 0.0 if mine is None else float(np.exp(mine.score - special.logsumexp(scores)))
+    remaining = max((d.share for d in left if d.joint == stanza.joint), default=0.0)
+    # What is left is a share of the smaller residual that the finding leaves.
+    explained = share / max(share + (1 - share) * remaining, 1e-300) if share > 0 else 0.0
+    joint = place.joint
+    return Finding(
+        effect=effect.name,
+        joint=stanza.joint,
+        other=stanza.other,
+        kind="structure",
+        parameters=stanza.parameters,
+        confidence=alone * explained,
+        alternatives=[
+            Alternative(effect=t.candidate.effect.name, joint=study.joints[t.candidate.place.joint], score=t.score)
+            for t in rivals[:RIVALS]
+        ],
+        gap_before=float(relative_errors(rest.fit, held=True)[1][joint]),
+        gap_after=float(relative_errors(final.fit, held=True)[1][joint]),
+        evidence={
+            "title": effect.title,
+            "says": effect.says,
+            "reference": effect.reference,
+            "score": None if mine is None else mine.score,
+            "p_value": None if mine is None else mine.p_value,
+            "tests": rest.tests,
+            "share_of_residual": share,
+            "std": std,
+            "units": _units(effect, study.robot.joints[joint].type == "prismatic"),
+            "ambiguous_with": [t.candidate.effect.name for t in rivals if mine and t.score > mine.score - CLOSE],
+        },
+    )
+
+
+def gap_of(state: State, *, held: bool) -> Gap:
+    """Relative torque errors of a model."""
+    overall, each = relative_errors(state.fit, held=held)
+    return Gap(all=overall, by_joint=dict(zip(state.study.joints, (float(v) for v in each), strict=True)))
+
+
+def noise_floor(final: State, left: Sequence[Disagreement]) -> Gap:
+    """What remains on the held-out data, less the shares that are known not to be noise."""
+    study = final.study
+    _, each = relative_errors(final.fit, held=True)
+    power = np.sum(np.concatenate([s.y for s in study.held]) ** 2, axis=0)
+    known_shares = {name: 0.0 for name in study.joints}
+    for d in left:
+        known_shares[d.joint] = min(1.0, known_shares[d.joint] + d.share)
+    floor = np.array([e * np.sqrt(1 - known_shares[name]) for e, name in zip(each, study.joints, strict=True)])
+    overall = float(np.sqrt((floor**2) @ power / power.sum()))
+    return Gap(all=overall, by_joint=dict(zip(study.joints, (float(v) for v in floor), strict=True)))
+
+
+def undetectable(state: State) -> list[Invisible]:
+    """Effects of the catalogue that this motion cannot show at some joint, with the reason."""
+    study = state.study
+    motion = state.workshop.motion(study.train[0], "measured")
+    found: list[Invisible] = []
+    for effect in catalogue().values():
+        if effect.rewires or effect.scope == "pair":
+            continue
+        for place in places(effect, study.robot.n):
+            reason = None if effect.visible is None else effect.visible(motion, place)
+            if effect.numbers is not None:
+                reason = "it changes numbers of the model, not its structure: it shows against a baseline only"
+            elif (effect.name, place.joint, place.other) in state.hidden:
+                reason = "the motion does not excite it, or the model contains it"
+            if reason is not None:
+                joint = study.joints[place.joint]
+                found.append(Invisible(effect=effect.name, joint=joint, reason=reason, needs=effect.needs))
+    return found
+
+
+def experiment_to_separate(findings: Sequence[Finding], state: State) -> str | None:
+    """An experiment that separates a finding from a rival nearly as good."""
+    for finding in findings:
+        for name in finding.evidence.get("ambiguous_with", []):
+            mine, other = known(finding.effect), known(name)
+            return (
+                f"{mine.title} and {other.title} cannot be told apart here: record {mine.needs}, and {other.needs}; "
+                f"armident trajectory --for {mine.name} --against {other.name} --joint {finding.joint} designs it"
+            )
+    return None
+
+
+def _terms(state: State) -> list[int]:
+    """Numbers of the stanzas that are terms."""
+    return [k for k, stanza in enumerate(state.study.robot.effects) if not known(stanza.effect).rewires]
+
+
+def _units(effect: Effect, prismatic: bool) -> dict[str, str]:
+    return {p.name: p.unit[int(prismatic)] for p in (*effect.linear, *effect.shapes)}

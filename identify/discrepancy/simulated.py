@@ -1,0 +1,62 @@
+"""The simulated closed loop against the measured one, with the model as configured and with what was found."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.discrepancy.search import State
+from identify.estimators.auxiliary import AuxiliaryModel
+from identify.preparation import aligned_torque
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SimulatedErrors:
+    """Errors of simulated velocities and torques on the held-out data, percent of the measured ones, (n,) each."""
+
+    joints: tuple[str, ...]
+    velocity_before: Array
+    velocity_after: Array
+    torque_before: Array
+    torque_after: Array
+
+    def document(self) -> dict[str, Any]:
+        """As it stands in ``diagnosis.json``."""
+        return {
+            name: dict(zip(self.joints, (float(v) for v in getattr(self, name)), strict=True))
+            for name in ("velocity_before", "velocity_after", "torque_before", "torque_after")
+        }
+
+
+def simulated_errors(first: State, final: State) -> SimulatedErrors | None:
+    """Simulate the references with both models; ``None`` where a loop diverges or there is nothing to simulate."""
+    before, after = _errors(first), _errors(final)
+    if before is None or after is None:
+        return None
+    return SimulatedErrors(tuple(first.study.joints), before[0], after[0], before[1], after[1])
+
+
+def _errors(state: State) -> tuple[Array, Array] | None:
+    study = state.study
+    auxiliary: AuxiliaryModel = replace(
+        study.auxiliary.fresh(), model=study.model.anchored(state.fit.theta), anchor=None
+    )
+    runs = auxiliary.simulate(state.fit.theta)
+    if runs is None:
+        return None
+    totals = np.zeros((4, study.robot.n))
+    for stretch in study.held:
+        run = runs[stretch.experiment]
+        qd = run.qd[stretch.rows]
+        y = study.decimation(study.thinning(aligned_torque(run.tau))[stretch.span])
+        totals[0] += np.sum((qd - stretch.measured.qd) ** 2, axis=0)
+        totals[1] += np.sum(stretch.measured.qd**2, axis=0)
+        totals[2] += np.sum((y - stretch.y) ** 2, axis=0)
+        totals[3] += np.sum(stretch.y**2, axis=0)
+    if not np.isfinite(totals).all():
+        return None
+    velocity, torque = (100 * np.sqrt(totals[k] / np.maximum(totals[k + 1], 1e-300)) for k in (0, 2))
+    return velocity, torque
