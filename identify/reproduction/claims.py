@@ -191,8 +191,8 @@ def _responses(drives: str, lab: Laboratory, *, exact: bool) -> list[Finding]:
         converges = "converges" if responses.estimate.converged else "does not converge"
         farther = farthest(lab.names, responses, lab.truth, actual["didim"].std)
         text = (
-            f"{converges} and differs by {moved:.2f} standard deviations ({'less' if exact else 'more'} than {SAME:g}), "
-            f"{farther} from the truth"
+            f"{converges} and differs by {moved:.2f} standard deviations "
+            f"({'less' if exact else 'more'} than {SAME:g}), {farther} from the truth"
         )
     fits = [response.fit_pct for response in lab.identified(IMPULSE_RESPONSES).responses]
     found = [
@@ -243,12 +243,12 @@ def noise(bench: Bench) -> list[Finding]:
 
 def _biased(what: str, lab: Laboratory) -> list[Finding]:
     """Where IDIM-LS is biased by degraded encoders, and where not."""
-    std = lab.run("idim-ls", GOOD).estimate.std
     known, *others = tried = degraded(lab)
     near = nearest(others)
     hz = near.case.cutoff_hz
-    bias, rest = (farthest(lab.names, one.run, lab.truth, std) for one in (near, known))
-    careless = farthest(lab.names, lab.run("idim-ls", COARSE_CARELESS), lab.truth, std)
+    runs = near.run, known.run, lab.run("idim-ls", COARSE_CARELESS)
+    # In its own standard deviations, which the rounding has made larger.
+    bias, rest, careless = (farthest(lab.names, run, lab.truth, run.estimate.std) for run in runs)
     return [
         Finding(
             bias.score > FAR and nearest(tried) is near,
