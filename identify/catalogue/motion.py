@@ -64,7 +64,8 @@ class Motion:
     @cached_property
     def t(self) -> Array:
         """Time since the beginning of the first recording, s, (N,)."""
-        return self.start + self.dt * np.arange(self.samples)
+        t: Array = self.start + self.dt * np.arange(self.samples)
+        return t
 
     @cached_property
     def motor(self) -> Array:

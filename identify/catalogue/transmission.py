@@ -39,7 +39,8 @@ def _elasticity(motion: Motion, place: Place, *, frequency: float) -> Array:
     b, a = signal.bilinear([w**2], [1.0, 2 * DAMPING * w, w**2], 1 / motion.dt)
     load = motion.transmitted[:, place.joint]
     behind = signal.lfilter(b, a, load, zi=signal.lfilter_zi(b, a) * load[0])[0]
-    return (behind - load)[:, None]
+    column: Array = (behind - load)[:, None]
+    return column
 
 
 def frequencies(motion: Motion, joint: int) -> Sequence[float]:

@@ -141,4 +141,5 @@ def _terms(state: State) -> list[int]:
 
 
 def _units(effect: Effect, prismatic: bool) -> dict[str, str]:
-    return {p.name: p.unit[int(prismatic)] for p in (*effect.linear, *effect.shapes)}
+    of_linear = {p.name: p.unit[int(prismatic)] for p in effect.linear}
+    return of_linear | {shape.name: shape.unit[int(prismatic)] for shape in effect.shapes}

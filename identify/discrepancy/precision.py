@@ -20,8 +20,8 @@ STEP = 0.01
 def standard_deviations(state: State) -> list[dict[str, float]]:
     """Standard deviations of all parameters of every term of the model, by their names in the configuration.
 
-    The derivative of the torque with respect to a nonlinear parameter is one more column, so that its uncertainty enters
-    that of the linear ones (Gauss-Newton); parameters taken from a set of whole numbers count as known.
+    The derivative of the torque with respect to a nonlinear parameter is one more column, so that its uncertainty
+    enters that of the linear ones (Gauss-Newton); parameters taken from a set of whole numbers count as known.
     """
     study, fit = state.study, state.fit
     slopes: list[Array] = []

@@ -10,7 +10,17 @@ from configs import ArmidentError, RobotConfig
 from identify.catalogue.motion import Motion
 from identify.catalogue.terms import Term, terms_of
 from identify.model.base_parameters import BaseParameters, base_parameters, with_terms
-from identify.model.chain import INERTIAL, Chain, Columns, Floats, Values, chain_of, columns_of, standard_names, values_of
+from identify.model.chain import (
+    INERTIAL,
+    Chain,
+    Columns,
+    Floats,
+    Values,
+    chain_of,
+    columns_of,
+    standard_names,
+    values_of,
+)
 from identify.model.kernels import (
     fill_forward_dynamics,
     fill_inverse_dynamics,
@@ -106,7 +116,8 @@ class ArmModel:
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, dt: float, start: float = 0.0, *, sharp_sign: bool = False
     ) -> Motion:
         """A motion as the terms see it; every array (N, n), ``dt`` and ``start`` in s."""
-        return Motion(self, *self._motion(q, qd, qdd), dt, start, self.anchor, sharp=sharp_sign)
+        q, qd, qdd = self._motion(q, qd, qdd)
+        return Motion(self, q, qd, qdd, dt, start, self.anchor, sharp=sharp_sign)
 
     def term_regressor(self, motion: Motion) -> Floats:
         """Columns of the terms, shape (N, n, e): torque per unit of their linear parameters."""

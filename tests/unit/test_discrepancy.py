@@ -92,7 +92,8 @@ JOINT_EFFECTS = sorted(
 def test_an_effect_of_a_joint_acts_on_that_joint_only(robot: RobotConfig, name: str) -> None:
     rng = np.random.default_rng(0)
     model = ArmModel.from_config(robot)
-    motion = model.anchored(rng.normal(size=model.base.b)).motion(*(rng.normal(size=(50, 6)) for _ in range(3)), 1e-3)
+    q, qd, qdd = rng.normal(size=(3, 50, 6))
+    motion = model.anchored(rng.normal(size=model.base.b)).motion(q, qd, qdd, 1e-3)
     effect, place = catalogue()[name], Place(2)
     shapes = {shape.name: shape.grid(motion, 2)[0] for shape in effect.shapes}
     columns = effect.torque(motion, place, shapes)
