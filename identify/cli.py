@@ -94,20 +94,40 @@ def diagnose(
     baseline: Annotated[
         Path | None, typer.Option(help="An identification.json whose numbers are to be judged too.")
     ] = None,
+    false_alarms: Annotated[
+        float, typer.Option(min=1e-6, max=0.5, help="Chance that a diagnosis of a faultless model finds something.")
+    ] = 0.01,
+    material: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Share of a joint's residual power worth a finding.")
+    ] = 0.01,
     out: OutDirectory = None,
     json: Json = False,
 ) -> None:
     """Find what a model lacks: where it disagrees with the data, which effect is missing, what is left.
 
-    Exit code 4 if something was found or stays unexplained.
+    Exit code 4 if something was found or stays unexplained. `armident effects` lists what it looks for.
 
     Example: armident diagnose monday.mcap --validate tuesday.mcap
     """
     from identify.service import diagnose_command
 
-    code = diagnose_command(recordings, config, validate, baseline, out, as_json=json)
+    chosen = {"false_alarms": false_alarms, "material": material}
+    code = diagnose_command(recordings, config, validate, baseline, chosen, out, as_json=json)
     if code:
         raise typer.Exit(code)
+
+
+def effects(
+    name: Annotated[str | None, typer.Argument(help="One effect. [default: all]")] = None,
+    json: Json = False,
+) -> None:
+    """List the effects that a model can have and a diagnosis looks for, with their parameters.
+
+    Example: armident effects stribeck_friction
+    """
+    from identify.catalogue.listing import effects_command
+
+    effects_command(name, as_json=json)
 
 
 def trajectory(

@@ -104,12 +104,14 @@ def diagnose_command(
     config: Path | None,
     validate: Path | None,
     baseline: Path | None,
+    chosen: Mapping[str, float],
     out: Path | None,
     *,
     as_json: bool,
 ) -> int:
-    """Carry out ``armident diagnose``; returns the exit code."""
+    """Carry out ``armident diagnose``; ``chosen`` are the fields of its `Settings`; returns the exit code."""
     from identify.discrepancy.diagnose import diagnose
+    from identify.discrepancy.search import Settings
     from identify.report.diagnosis import diagnosis_report
     from identify.terminal import diagnosis_table, progress, warn
 
@@ -126,7 +128,14 @@ def diagnose_command(
         validation = _experiments(recordings[-1], robot, notes)
     with progress("diagnose") as report:
         found = diagnose(
-            training, validation, robot, [reference(r) for r in recordings], numbers, list(dict.fromkeys(notes)), report
+            training,
+            validation,
+            robot,
+            [reference(r) for r in recordings],
+            numbers,
+            list(dict.fromkeys(notes)),
+            report,
+            Settings(**chosen),
         )
     folder = out or _beside(paths[0], "diagnosis")
     document = found.document

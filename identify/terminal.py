@@ -132,16 +132,26 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
         for heading in ("joint", "effect", "parameters", "confidence", "held-out gap"):
             table.add_column(heading, overflow="fold")
         for f in document.findings:
-            values = ", ".join(f"{k} {v:.4g}" for k, v in f.parameters.items())
+            std = f.evidence.get("std", {})
+            values = ", ".join(
+                f"{k} {v:.4g}" + (f" ± {std[k]:.2g}" if k in std else "") for k, v in f.parameters.items()
+            )
+            where = f.joint if f.other is None else f"{f.joint}, {f.other}"
             table.add_row(
-                f.joint, f.effect, values, f"{100 * f.confidence:.0f} %", f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
+                where, f.effect, values, f"{100 * f.confidence:.0f} %", f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
             )
         console.print(table)
+        for f in document.findings:
+            rivals = f.evidence.get("ambiguous_with", [])
+            unsure = f"; could also be {', '.join(rivals)}" if rivals else ""
+            console.print(f"{f.joint}: {f.evidence['says']}{unsure}", highlight=False)
     for u in document.unexplained:
         console.print(
             f"unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % of its residual varies with {u.varies_with}",
             highlight=False,
         )
+    if document.recommended_experiment is not None:
+        console.print(f"to decide: {document.recommended_experiment}", highlight=False)
     gap = document.gap.validation
     console.print(
         f"torque error on held-out data: {gap.before.all:.2f} % before, {gap.after.all:.2f} % after", highlight=False
