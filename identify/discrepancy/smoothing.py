@@ -14,6 +14,9 @@ Array = NDArray[np.float64]
 UNPENALISED = 1e-9
 """Roughness, relative to the roughest direction, below which a direction counts as smooth altogether."""
 
+CONTAINED = 0.1
+"""Directions of which so little is left beside the model (relative norm) are no part of a shape: the model has them."""
+
 STRENGTHS = np.geomspace(1e-8, 1e8, 129)
 """Smoothing strengths tried, relative to the data's."""
 
@@ -43,6 +46,10 @@ def smoothed(fit: Fit, columns: Columns, basis: Array, pieces: Sequence[Array]) 
     if found is None:
         return np.zeros(basis.shape[0]), np.zeros(basis.shape[0])
     u, right, scale = found
+    left = np.linalg.norm(fit.beside((columns.z / scale) @ right), axis=0)
+    u, right = u[:, left > CONTAINED], right[:, left > CONTAINED]
+    if right.shape[1] == 0:
+        return np.zeros(basis.shape[0]), np.zeros(basis.shape[0])
     through = np.linalg.solve((u.T @ (columns.x / scale) @ right).T, right.T).T / scale[:, None]
     # In these coordinates the estimate has unit variance in every direction.
     estimate = u.T @ fit.residual

@@ -22,10 +22,10 @@ Array = NDArray[np.float64]
 HELD_OUT_LEVEL = 0.05
 """The held-out data alone must speak for a dependence at this level."""
 
-SCREEN = 0.01
+SCREEN = 1e-3
 """Maps that do not even fit the training residual at this level are not judged on the held-out data."""
 
-LOOKS = 8
+LOOKS = 6
 """Most maps of one joint that are judged, those first that fit the training residual best."""
 
 MATERIAL = 0.02
