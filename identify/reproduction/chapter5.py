@@ -1,6 +1,7 @@
 """Chapter 5: derivatives without knowledge of the bandwidth, and an unknown controller."""
 
 from dataclasses import replace
+from typing import Literal
 
 from configs import DataError
 from identify.controller.crc import PREWHITENING_ORDER
@@ -8,7 +9,7 @@ from identify.reproduction.bench import Bench, TableFunction, estimates, figures
 from identify.reproduction.emps_protocol import evidence, inferred_rows
 from identify.reproduction.laboratory import Case, Method
 from identify.reproduction.tables import Column, Table
-from identify.reproduction.two_stages import First, Second, TwoStages, two_stages
+from identify.reproduction.two_stages import TwoStages, structure_given, two_stages
 
 GOOD = Case("bandpass")
 """The bandwidth is known: 50 Hz and 20 Hz (5.3.1)."""
@@ -93,13 +94,19 @@ def table_5_2(bench: Bench) -> Table:
 
 def table_5_3(bench: Bench) -> Table:
     """Two-stage methods, by what the corresponding pair of ours comes to on the virtual arm."""
-    pairs: dict[str, tuple[First, Second]] = {
-        "PEM2": ("parametric", "didim"),
-        "PROJ": ("crc", "didim"),
-        "RIV2": ("parametric", "idim-iv"),
-        "CRC, then IDIM-IV": ("crc", "idim-iv"),
+    pairs: dict[str, tuple[Case, Literal["idim-iv", "didim"]]] = {
+        "PEM2": (KNOWN_STRUCTURE, "didim"),
+        "PROJ": (IMPULSE_RESPONSES, "didim"),
+        "RIV2": (KNOWN_STRUCTURE, "idim-iv"),
+        "CRC, IDIM-IV": (IMPULSE_RESPONSES, "idim-iv"),
+        "CRC with velocity, DIDIM": (OWN_RESPONSES, "didim"),
     }
-    rows = {label: _in_numbers(two_stages(bench.virtual, *pair)) for label, pair in pairs.items()}
+    rows = {
+        label: [
+            figure for lab in (bench.virtual, bench.feedback) for figure in _in_numbers(two_stages(lab, method, case))
+        ]
+        for label, (case, method) in pairs.items()
+    }
     return figures(
         "5.3",
         rows,
@@ -107,37 +114,37 @@ def table_5_3(bench: Bench) -> Table:
             "the thesis's methods are for linear systems; ours of the same steps: PEM2 a parametric controller by "
             "refined IV, then DIDIM; PROJ impulse responses, then DIDIM; RIV2 that parametric controller, then IDIM-IV",
             "VCM has no column of ours: its four filters are designed by hand, and the thesis does not use it",
+            "nothing: no closed loop that can be simulated, or no convergence",
             DISTANCE,
+            CONTROLLERS,
         ],
-        names=IN_NUMBERS,
+        names=[f"{name}{drives}" for drives in ("", FEEDBACK) for name in IN_NUMBERS],
     )
 
 
 def table_5_4(bench: Bench) -> Table:
     """Approaches by what is known and wanted, by what they come to on the virtual arm."""
-    lab = bench.virtual
-    responses = two_stages(lab, "crc", "idim-iv")
-    parametric: dict[str, First] = {
-        "structure known": "parametric, structure given",
-        "structure unknown": "parametric",
-    }
-    rows = {
-        label: [
-            *_in_numbers(two_stages(lab, first, "idim-iv"))[:3],
-            *_in_numbers(responses)[:2],
-        ]
-        for label, first in parametric.items()
-    }
+    rows: dict[str, list[float | None]] = {"structure known": [], "structure unknown": []}
+    for lab in (bench.virtual, bench.feedback):
+        responses = _in_numbers(two_stages(lab, "idim-iv", IMPULSE_RESPONSES))
+        parametric = {
+            "structure known": structure_given(lab),
+            "structure unknown": two_stages(lab, "idim-iv", KNOWN_STRUCTURE),
+        }
+        for label, found in parametric.items():
+            rows[label] += [*_in_numbers(found)[:3], *responses[:2]]
     names = [f"parametric: {name}" for name in IN_NUMBERS[:3]] + [f"non-parametric: {name}" for name in IN_NUMBERS[:2]]
     return figures(
         "5.4",
         rows,
         [
-            "whole closed loop: error of the torques simulated with both, and of the drives' gains; robot: distance",
-            "parametric: structure chosen on held-out data where it is unknown; non-parametric: CRC; then IDIM-IV",
+            "whole closed loop: errors of the torques simulated with both, and of the drives' gains; robot: distance",
+            "parametric: by refined IV, its structure chosen on held-out data where unknown; non-parametric: CRC; then "
+            "IDIM-IV",
             DISTANCE,
+            CONTROLLERS,
         ],
-        names=names,
+        names=[f"{name}{drives}" for drives in ("", FEEDBACK) for name in names],
     )
 
 

@@ -200,8 +200,18 @@ class Laboratory:
 
     def identified(self, case: Case) -> IdentifiedController:
         """The identified controller of a case (5.2)."""
+        return self.first_stage(case)[0]
+
+    def first_stage(self, case: Case) -> tuple[IdentifiedController, float]:
+        """The identified controller of a case, and the seconds that it took."""
         kind, recording = case.controller, self.recording(case)
-        return self.once(("controller", kind, case.encoder_points), lambda: identify_controller(recording, kind))
+
+        def timed() -> tuple[IdentifiedController, float]:
+            begin = time.perf_counter()
+            found = identify_controller(recording, kind)
+            return found, time.perf_counter() - begin
+
+        return self.once(("controller", kind, case.encoder_points), timed)
 
     def controller(self, case: Case) -> DiscreteController:
         """The simulator's controller."""

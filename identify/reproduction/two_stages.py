@@ -12,16 +12,9 @@ from identify.controller.crc import IdentifiedController
 from identify.controller.law import Structure
 from identify.controller.nominal import saturation
 from identify.controller.parametric import ControlLaw, identify_parametric
-from identify.estimators.didim import didim
 from identify.estimators.idim_iv import idim_iv
-from identify.reproduction.laboratory import Case, Laboratory, identify_controller
+from identify.reproduction.laboratory import Case, Laboratory, Run
 from identify.result import relative_errors
-
-First = Literal["parametric", "parametric, structure given", "crc"]
-Second = Literal["idim-iv", "didim"]
-
-ACTUAL_STRUCTURE = Structure(velocity="error", filtered="velocity")
-"""Of the virtual arm's drives: a PD on the tracking error, its derivative through a first-order low-pass (B.3)."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +28,7 @@ class TwoStages:
         actual controller; about 1 where the controller is as good as the actual one.
     loop_pct
         Relative error of the torques that identified controller and identified arm give together, in simulation along
-        the recorded reference.
+        the recorded reference; ``None`` where that simulation runs away.
     gain_pct
         Largest relative error of a drive's gains; ``None`` where the controller has none.
     simulations, seconds
@@ -43,63 +36,51 @@ class TwoStages:
     """
 
     distance: float
-    loop_pct: float
+    loop_pct: float | None
     gain_pct: float | None
     simulations: int
     seconds: float
 
 
-def two_stages(lab: Laboratory, first: First, second: Second) -> TwoStages | None:
-    """Identify the controller, then the arm beside it; ``None`` where the second stage does not converge."""
-    return lab.once(("two stages", first, second), lambda: _two_stages(lab, first, second))
+def two_stages(lab: Laboratory, method: Literal["idim-iv", "didim"], case: Case) -> TwoStages | None:
+    """The controller of a case, then the arm beside it; ``None`` where the second stage does not converge."""
+    identified, took = lab.first_stage(case)
+    try:
+        run = lab.run(method, case)
+    except DataError:
+        return None
+    return _in_figures(lab, identified, took, case, run) if run.estimate.converged else None
 
 
-def controller_of(lab: Laboratory, first: First) -> tuple[IdentifiedController, float]:
-    """The controller of the first stage, and the seconds that it took."""
-
-    def identified() -> tuple[IdentifiedController, float]:
-        recording = lab.recording(Case())
-        begin = time.perf_counter()
-        if first != "parametric, structure given":
-            return identify_controller(recording, first), time.perf_counter() - begin
-        robot, experiment = recording.robot, recording.experiment
-        assert experiment.q_ref is not None
-        ratios = robot.transmission_matrix
-        found = identify_parametric(
-            [experiment.q @ ratios.T],
-            [experiment.q_ref @ ratios.T],
-            [experiment.tau @ np.linalg.inv(ratios)],
-            experiment.dt,
-            structure=ACTUAL_STRUCTURE,
-            saturation=saturation(robot),
-        )
-        return found, time.perf_counter() - begin
-
-    return lab.once(("first stage", first), identified)
-
-
-def _two_stages(lab: Laboratory, first: First, second: Second) -> TwoStages | None:
-    identified, took = controller_of(lab, first)
+def structure_given(lab: Laboratory) -> TwoStages:
+    """The gains of a controller whose structure is known, then the arm by IDIM-IV."""
+    recording = lab.recording(Case())
+    robot, experiment = recording.robot, recording.experiment
+    assert experiment.q_ref is not None
+    ratios = robot.transmission_matrix
+    begin = time.perf_counter()
+    identified = identify_parametric(
+        [experiment.q @ ratios.T],
+        [experiment.q_ref @ ratios.T],
+        [experiment.tau @ np.linalg.inv(ratios)],
+        experiment.dt,
+        structure=actual_structure(lab),
+        saturation=saturation(robot),
+    )
+    took = time.perf_counter() - begin
     auxiliary = replace(lab.auxiliary(Case()), controller=identified.controller, asked=[])
     blocks = lab.equations(Case())
     begin = time.perf_counter()
-    try:
-        method = idim_iv if second == "idim-iv" else didim
-        estimate = method(blocks, auxiliary, initial_parameters(lab.model))
-    except DataError:
-        return None
-    seconds = took + time.perf_counter() - begin
-    if not estimate.converged:
-        return None
-    std = lab.run("idim-iv", Case()).estimate.std
-    simulated = auxiliary.equations(blocks, estimate.theta)
-    return TwoStages(
-        distance=lab.distance(estimate.theta, std),
-        loop_pct=relative_errors(simulated, estimate.theta)[0],
-        gain_pct=gain_error(lab, identified),
-        simulations=len(auxiliary.asked),
-        seconds=seconds,
-    )
+    estimate = idim_iv(blocks, auxiliary, initial_parameters(lab.model))
+    run = Run(estimate, np.nan, time.perf_counter() - begin, len(auxiliary.asked))
+    found = _in_figures(lab, identified, took, Case(), run)
+    return replace(found, loop_pct=relative_errors(auxiliary.equations(blocks, estimate.theta), estimate.theta)[0])
+
+
+def actual_structure(lab: Laboratory) -> Structure:
+    """Of the virtual arm's drives: their velocity, through a first-order low-pass, is of the arm or of the error."""
+    feedback = bool(lab.recording(Case()).truth["velocity_feedback"])
+    return Structure(velocity="position" if feedback else "error", filtered="velocity")
 
 
 def gain_error(lab: Laboratory, identified: IdentifiedController) -> float | None:
@@ -109,7 +90,22 @@ def gain_error(lab: Laboratory, identified: IdentifiedController) -> float | Non
     for j, law in enumerate(identified.responses):
         if not isinstance(law, ControlLaw):
             return None
-        true_kp, true_kv = (recording.truth[f"{name}{j + 1}"] for name in ("kp", "kv"))
-        kv = true_kv * recording.robot.joints[j].drive.gain
-        errors += [law.gains["kp"].value / true_kp - 1, law.gains["kv"].value / kv - 1]
+        kp, kv = (recording.truth[f"{name}{j + 1}"] for name in ("kp", "kv"))
+        torque = kv * recording.robot.joints[j].drive.gain
+        errors += [law.gains["kp"].value / kp - 1, law.gains["kv"].value / torque - 1]
     return 100 * float(np.abs(errors).max())
+
+
+def _in_figures(lab: Laboratory, identified: IdentifiedController, took: float, case: Case, run: Run) -> TwoStages:
+    try:
+        loop = relative_errors(lab.simulated(run, case), run.estimate.theta)[0]
+    except DataError:
+        loop = None
+    std = lab.run("idim-iv", Case()).estimate.std
+    return TwoStages(
+        distance=lab.distance(run.estimate.theta, std),
+        loop_pct=loop,
+        gain_pct=gain_error(lab, identified),
+        simulations=run.simulations,
+        seconds=took + run.seconds,
+    )
