@@ -68,18 +68,22 @@ def give(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-def]
     """Add the torques of the gears that give to ``out`` (N,), their slopes to ``slope`` and ``stiff`` (N, N)."""
     for e in range(gears.shape[0]):
         a, b = int(gears[e, 0]), int(gears[e, 1])
-        if b < 0:
-            torque, steep, damping = gear_torque(gears[e], q[a], qd[a])
-            out[a] += torque
-            slope[a, a] += damping
-            stiff[a, a] += steep
-            continue
-        torque, steep, damping = gear_torque(gears[e], q[a] - q[b], qd[a] - qd[b])
+        twist, rate = q[a], qd[a]
+        if b >= 0:
+            twist -= q[b]
+            rate -= qd[b]
+        torque, steep, damping = gear_torque(gears[e], twist, rate)
         out[a] += torque
-        out[b] -= torque
-        for i, j, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
-            slope[i, j] += sign * damping
-            stiff[i, j] += sign * steep
+        slope[a, a] += damping
+        stiff[a, a] += steep
+        if b >= 0:
+            out[b] -= torque
+            slope[b, b] += damping
+            stiff[b, b] += steep
+            slope[a, b] -= damping
+            stiff[a, b] -= steep
+            slope[b, a] -= damping
+            stiff[b, a] -= steep
 
 
 @njit(cache=True, error_model="numpy")

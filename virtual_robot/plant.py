@@ -26,6 +26,9 @@ BRAKE = 1e9
 FINE_STEP = 34e-6
 """Longest inner step (s) with gears that give or bristles: a twentieth of the fastest contact's period."""
 
+SETTLING = 20
+"""Iterations for the twist of gears under the weight of their links, which turns with the twist."""
+
 
 class Plant:
     """State and equations of motion of the arm; SI, joint side.
@@ -99,9 +102,10 @@ class Plant:
         self._state = np.zeros((4, total))
         self.coordinates, self.velocities = self._state[:2]
         self.coordinates[:] = np.concatenate([start, start[behind], swing])
-        bias = pin.nonLinearEffects(self.model, self._data, self.coordinates[self._link], np.zeros(self._link.size))
-        for e, j in enumerate(behind):
-            self.coordinates[n + e] -= twist_under(gears[e], float(bias[j]))
+        for _ in range(SETTLING if soft else 1):
+            bias = pin.nonLinearEffects(self.model, self._data, self.coordinates[self._link], np.zeros(self._link.size))
+            for e, j in enumerate(behind):
+                self.coordinates[n + e] = start[j] - twist_under(gears[e], float(bias[j]))
         self.q, self.qd = self.coordinates[:n], self.velocities[:n]
         self.bristles = np.zeros(len(bristles))
         self._time = 0.0

@@ -17,7 +17,17 @@ CONTACT_HZ = 100.0
 MOTOR_SHARE = 0.3
 """Share of the motor in a joint's inertia where the robot's parameters do not tell them apart."""
 ROUNDING = 0.02
-"""Rounding of the contact's kink, of the gap."""
+"""Way over which a contact closes, of the gap, to either side of its edge."""
+
+
+@njit(cache=True, error_model="numpy")
+def _press(way, rounding):  # type: ignore[no-untyped-def]
+    """How far a contact is pressed in that has closed by ``way`` (negative: open), and its slope."""
+    if way <= -rounding:
+        return 0.0, 0.0
+    if way >= rounding:
+        return way, 1.0
+    return (way + rounding) ** 2 / (4.0 * rounding), (way + rounding) / (2.0 * rounding)
 
 
 @njit(cache=True, error_model="numpy")
@@ -25,11 +35,10 @@ def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
     """Torque between motor and link (N m) at a ``twist`` (rad) and its rate, and its slopes over both."""
     if row[4] == 0.0:
         return row[2] * twist + row[3] * rate, row[2], row[3]
-    up, down = twist - 0.5 * row[4], -twist - 0.5 * row[4]
-    root_up, root_down = math.sqrt(up * up + row[5] * row[5]), math.sqrt(down * down + row[5] * row[5])
-    contact = 0.5 * (1.0 + up / root_up) + 0.5 * (1.0 + down / root_down)
-    press = 0.5 * (up + root_up) - 0.5 * (down + root_down)
-    return row[2] * press + row[3] * contact * rate, row[2] * contact, row[3] * contact
+    one, share = _press(twist - 0.5 * row[4], row[5])
+    two, other = _press(-twist - 0.5 * row[4], row[5])
+    contact = share + other
+    return row[2] * (one - two) + row[3] * contact * rate, row[2] * contact, row[3] * contact
 
 
 def twist_under(row: NDArray[np.float64], torque: float) -> float:
