@@ -1,0 +1,155 @@
+"""Effects in a robot configuration are terms of its model: identified, simulated, refused where they make no sense."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from configs import ConfigError, RobotConfig, load_robot, load_trajectory
+from configs.robot import Effect
+from configs.scenario import HiddenEffect, Scenario
+from identify.catalogue.registry import catalogue
+from identify.catalogue.wiring import rewired
+from identify.controller.nominal import nominal_controller
+from identify.experiment import Experiment
+from identify.model.arm import ArmModel
+from identify.model.relaxation import simulate_with_terms
+from identify.model.simulation import simulate
+from identify.options import Method, Options
+from identify.service import identify_recording
+from virtual_robot.inertias import plant_parameters
+from virtual_robot.offline import simulate_recording
+
+DT = 1e-3
+
+
+def with_effects(robot: RobotConfig, *stanzas: Effect) -> RobotConfig:
+    return robot.model_copy(update={"effects": stanzas})
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotConfig:
+    return load_robot("tx40")
+
+
+@pytest.fixture(scope="module")
+def theta(robot: RobotConfig) -> Any:
+    model, plant = ArmModel.from_config(robot), plant_parameters(robot)
+    return model.base.regroup @ np.array([plant[name] for name in model.names])
+
+
+def reference(robot: RobotConfig) -> Any:
+    t = DT * np.arange(3000)
+    phases = np.linspace(0.0, 2.0, robot.n)
+    return np.stack([0.5 * np.sin(2 * np.pi * (0.6 + 0.1 * j) * t + phases[j]) for j in range(robot.n)], axis=1)
+
+
+def test_viscous_friction_as_a_term_moves_the_simulated_arm_like_that_of_the_model(
+    robot: RobotConfig, theta: Any
+) -> None:
+    model = ArmModel.from_config(robot)
+    q_ref = reference(robot)
+    controller = nominal_controller(model, theta, q_ref[::50], DT, 10.0)
+    more = theta.copy()
+    more[model.base.names.index("fv2")] += 2.0
+    expected = simulate(model, more, controller, q_ref, DT)
+    stanza = Effect(effect="nonlinear_viscous_friction", joint="joint_2", parameters={"exponent": 1.0})
+    extended = ArmModel.from_config(with_effects(robot, stanza))
+    # The term's parameter is the torque at the joint's top speed.
+    found = simulate_with_terms(
+        extended, np.append(theta, 2.0 * robot.joints[1].limits.velocity), controller, q_ref, DT
+    )
+    lag = np.abs(expected.q - simulate(model, theta, controller, q_ref, DT).q).max()
+    # A load held over a sample instead of acting at once is worth a few thousandths of its effect.
+    assert np.abs(found.q - expected.q).max() < 0.02 * lag
+    assert np.linalg.norm(found.tau - expected.tau) < 0.002 * np.linalg.norm(expected.tau)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv", "didim"])
+def test_every_method_estimates_a_term_with_the_rest(robot: RobotConfig, method: Method) -> None:
+    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.4})
+    scenario = Scenario(schema="armident/scenario/1", effects=(worn,))
+    recording = simulate_recording(robot, load_trajectory("trajectories/tx40_excitation.yaml"), 3, scenario=scenario)
+    known = with_effects(robot, Effect(effect="asymmetric_viscous_friction", joint="joint_2"))
+    document = identify_recording(recording, known, Options(method=method)).document
+    (added,) = [p for p in document.parameters if p.name == "fva2"]
+    # 0.4 of the 5.5 N m s/rad of table B.4.
+    assert added.value == pytest.approx(0.4 * 5.5, abs=3.5 * added.std)
+    assert added.essential
+    assert added.unit == "N m s/rad"
+
+
+@pytest.mark.slow
+def test_a_wrong_drive_gain_is_identified_beside_the_dynamics(robot: RobotConfig) -> None:
+    recording = simulate_recording(robot, load_trajectory("trajectories/tx40_excitation.yaml"), 4)
+    joints = list(robot.joints)
+    drive = joints[1].drive
+    joints[1] = joints[1].model_copy(update={"drive": drive.model_copy(update={"gain": 1.2 * drive.gain})})
+    mistaken = robot.model_copy(update={"joints": tuple(joints)})
+    known = with_effects(mistaken, Effect(effect="drive_gain_error", joint="joint_2"))
+    document = identify_recording(recording, known, Options(method="idim-iv")).document
+    (gain,) = [p for p in document.parameters if p.name == "gain_error2"]
+    # Torques reported 1.2 times too large are 0.2 more than those the model predicts.
+    assert gain.value == pytest.approx(0.2, abs=3.5 * gain.std)
+    (inertia,) = [p for p in document.parameters if p.name == "mx2r"]
+    assert inertia.value == pytest.approx(2.21, abs=4 * inertia.std)
+
+
+def test_two_harmonics_of_one_ripple_have_names_of_their_own(robot: RobotConfig) -> None:
+    ripples = [Effect(effect="cogging_torque", joint="joint_3", parameters={"harmonic": h}) for h in (1.0, 2.0)]
+    names = ArmModel.from_config(with_effects(robot, *ripples)).base.names
+    assert names[-4:] == ("cgc3", "cgs3", "cgc3_2", "cgs3_2")
+
+
+def test_a_pair_needs_its_second_joint_and_others_must_have_none(robot: RobotConfig) -> None:
+    with pytest.raises(ConfigError, match=r"coupling_friction of joint_1: other: expected the second joint"):
+        ArmModel.from_config(with_effects(robot, Effect(effect="coupling_friction", joint="joint_1")))
+    alone = Effect(effect="joint_spring", joint="joint_1", other="joint_2")
+    with pytest.raises(ConfigError, match=r"joint_spring of joint_1: other: only an effect between two joints"):
+        ArmModel.from_config(with_effects(robot, alone))
+
+
+def test_a_missing_nonlinear_parameter_is_asked_for(robot: RobotConfig) -> None:
+    with pytest.raises(ConfigError, match=r"stribeck_friction of joint_1 needs velocity"):
+        ArmModel.from_config(with_effects(robot, Effect(effect="stribeck_friction", joint="joint_1")))
+
+
+def test_terms_of_the_wrist_coupling_are_those_of_the_configured_coupling(robot: RobotConfig) -> None:
+    rng = np.random.default_rng(5)
+    q, qd, qdd = rng.normal(size=(3, 40, 6))
+    coupled = ArmModel.from_config(robot)
+    bare = robot.model_copy(update={"couplings": ()})
+    as_term = ArmModel.from_config(
+        with_effects(bare, Effect(effect="coupling_friction", joint="joint_5", other="joint_6"))
+    )
+    np.testing.assert_allclose(
+        as_term.base_regressor(q, qd, qdd, dt=DT)[:, :, -3:], coupled.base_regressor(q, qd, qdd)[:, :, -3:], atol=1e-14
+    )
+
+
+def test_exchanged_drives_are_put_right_before_anything_else(robot: RobotConfig) -> None:
+    rng = np.random.default_rng(6)
+    right = Experiment(rng.normal(size=(20, 6)), rng.normal(size=(20, 6)), rng.normal(size=(20, 6)), DT)
+    swapped = with_effects(
+        robot,
+        Effect(effect="joint_order", joint="joint_5", other="joint_6", parameters={"position": 1.0, "torque": 1.0}),
+        Effect(effect="sign_error", joint="joint_2", parameters={"torque": 1.0}),
+    )
+    (wrong,) = rewired([right], swapped)
+    ratios = robot.transmission_matrix
+    motors, torques = wrong.q @ ratios.T, wrong.tau @ np.linalg.inv(ratios)
+    np.testing.assert_allclose(motors[:, [4, 5]], (right.q @ ratios.T)[:, [5, 4]])
+    np.testing.assert_allclose(torques[:, 1], -(right.tau @ np.linalg.inv(ratios))[:, 1])
+    (again,) = rewired([wrong], swapped)
+    np.testing.assert_allclose(again.q, right.q)
+    np.testing.assert_allclose(again.tau, right.tau)
+
+
+def test_every_entry_of_the_catalogue_says_what_it_is(robot: RobotConfig) -> None:
+    for effect in catalogue().values():
+        assert effect.title, effect.name
+        assert effect.says, effect.name
+        assert effect.reference, effect.name
+        assert effect.needs, effect.name
+        assert len({p.name for p in (*effect.linear, *effect.shapes)}) == len(effect.linear) + len(effect.shapes)
