@@ -1,7 +1,8 @@
 """The closed loop that the auxiliary model simulates: which controller, which reference, which first parameters."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,11 @@ def closed_loop(
     dt = experiments[0].dt
     starts = [("idim-ls", ls), ("initial_parameters", initial_parameters(model))]
     fastest = RUNAWAY * np.max([np.abs(s.qd).max(axis=0) for s in signals], axis=0) + 1e-3
-    surrogate = [butterworth(s.q, dt, min(PIV_CUTOFF * bandwidth, 0.4 / dt)) for s in signals]
+
+    @cache
+    def surrogate() -> list[Array]:
+        return [butterworth(s.q, dt, min(PIV_CUTOFF * bandwidth, 0.4 / dt)) for s in signals]
+
     closest: tuple[float, AuxiliaryModel, Array, dict[str, Any]] | None = None
     for controller, references, description in _controllers(
         model, experiments, signals, options, ls, bandwidth, surrogate
@@ -68,12 +73,8 @@ def closed_loop(
             runs = auxiliary.simulate(start)
             if runs is None:
                 continue
-            miss = float(
-                np.sqrt(
-                    sum(np.sum((r.qd - s.qd) ** 2) for r, s in zip(runs, signals, strict=True))
-                    / sum(np.sum(s.qd**2) for s in signals)
-                )
-            )
+            apart = [float(np.linalg.norm(r.qd - s.qd)) for r, s in zip(runs, signals, strict=True)]
+            miss = float(np.linalg.norm(apart) / np.linalg.norm([np.linalg.norm(s.qd) for s in signals]))
             found = description | {"start": origin, "velocity_error_pct": 100 * miss}
             if closest is None or miss < closest[0]:
                 closest = (miss, auxiliary, start, found)
@@ -85,7 +86,7 @@ def closed_loop(
             raise DataError("no closed loop could be simulated: it diverges with every controller and start tried")
         reason = "no closed loop could be simulated with this estimate: instruments from the smoothed motion itself"
         warnings.append(reason)
-        return FollowedMotion.of(model, surrogate, dt, decimation), ls, {"kind": "followed", "reason": reason}
+        return FollowedMotion.of(model, surrogate(), dt, decimation), ls, {"kind": "followed", "reason": reason}
     _, auxiliary, start, found = closest
     if found["kind"] == "nominal":
         warnings.append(found["reason"])
@@ -99,7 +100,7 @@ def _controllers(
     options: Options,
     ls: Array,
     bandwidth: float,
-    surrogate: Sequence[Array],
+    surrogate: Callable[[], Sequence[Array]],
 ) -> Iterator[tuple[DiscreteController, Sequence[Array], dict[str, Any]]]:
     """Controllers with their references, the preferred one first, a stiff stand-in last."""
     robot, dt = model.robot, experiments[0].dt
@@ -117,7 +118,7 @@ def _controllers(
     except DataError:
         # Inertias that are not positive: no gain can be chosen by them.
         return
-    yield stand_in, surrogate, {"kind": "nominal", "reason": reason, "error_taps": stand_in.error_taps.tolist()}
+    yield stand_in, surrogate(), {"kind": "nominal", "reason": reason, "error_taps": stand_in.error_taps.tolist()}
 
 
 def _identified(

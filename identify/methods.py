@@ -169,6 +169,8 @@ class Solution:
             Derivatives(run.q, run.qd, run.qdd, None, e.dt, e.start)
             for run, e in zip(runs, problem.experiments, strict=True)
         ]
+        # The simulated torques are as large as the recorded ones, and nobody asks for them.
+        del runs
         return torque_delay(problem.auxiliary.model, problem.experiments, problem.signals, problem.plain, motions)
 
 

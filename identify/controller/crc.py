@@ -23,6 +23,8 @@ HELD_OUT = 0.3
 GAIN_WORTH_A_TAP = 0.002
 """Relative gain in held-out error below which the shorter response is taken."""
 
+PIECE = 16384
+"""Samples of a signal whose products at all lags are formed while they are in the cache."""
 
 NO_FILTER = ArModel(np.empty(0), 1.0, 0.0)
 
@@ -105,7 +107,7 @@ def identify_crc(
         error = [r[:, j] - q[:, j] for r, q in zip(reference_motor, q_motor, strict=True)]
         if not any(np.ptp(e) > 0 for e in error):
             raise DataError(f"controller of motor {j + 1}: position and reference never differ")
-        nu = [t[:, j] for t in torque_motor]
+        nu = [np.ascontiguousarray(t[:, j]) for t in torque_motor]
         motion = [np.diff(q[:, j], prepend=q[0, j]) for q in q_motor]
         responses.append(_identify_joint(error, motion, nu, lengths[j], structures))
     return IdentifiedController(_assemble(responses, dt, saturation), tuple(responses))
@@ -188,7 +190,7 @@ def _sums(
 ) -> _Correlations:
     """Correlations over the samples ``first .. last - 1``; no matrix of lagged inputs is ever formed."""
     auto = np.block([[_lag_products(u, v, length, first, last) for v in inputs] for u in inputs])
-    cross = np.array([u[first - lag : last - lag] @ b[first:last] for u in inputs for lag in range(length)])
+    cross = np.concatenate([_products(b, u, length, first, last) for u in inputs])
     return _Correlations(auto, cross, float(b[first:last] @ b[first:last]))
 
 
@@ -197,13 +199,22 @@ def _lag_products(
 ) -> NDArray[np.float64]:
     """``sum_k u(k - i) v(k - j)`` for lags i, j, shape (length, length): one edge, and steps along the diagonals."""
     out = np.empty((length, length))
-    for lag in range(length):
-        out[0, lag] = u[first:last] @ v[first - lag : last - lag]
-        out[lag, 0] = u[first - lag : last - lag] @ v[first:last]
+    out[0], out[:, 0] = _products(u, v, length, first, last), _products(v, u, length, first, last)
     for i in range(1, length):
         begins = u[first - i] * v[first - length + 1 : first][::-1]
         ends = u[last - i] * v[last - length + 1 : last][::-1]
         out[i, 1:] = out[i - 1, :-1] + begins - ends
+    return out
+
+
+def _products(
+    u: NDArray[np.float64], v: NDArray[np.float64], length: int, first: int, last: int
+) -> NDArray[np.float64]:
+    """``sum_k u(k) v(k - lag)`` for every lag, shape (length,), all lags of a piece while it is in the cache."""
+    out = np.zeros(length)
+    for begin in range(first, last, PIECE):
+        end = min(begin + PIECE, last)
+        out += [u[begin:end] @ v[begin - lag : end - lag] for lag in range(length)]
     return out
 
 

@@ -14,6 +14,7 @@ from configs import DataError
 from identify.estimators.noise import WHITE, ArModel, fit_ar, lagged_sums
 from identify.estimators.triangular import triangularize
 from identify.model.arm import ArmModel
+from identify.model.kernels import fill_regressor
 from identify.signals.decimate import Decimation
 from identify.signals.differentiate import Derivatives
 
@@ -35,7 +36,11 @@ COVARIANCE_PASSES = 3
 RANK_TOLERANCE = 1e-10
 """Smallest singular value of the column-normalised regressor, relative to the greatest, that counts as excited."""
 
-_CHUNK_ROWS = 4096
+PIECE = 128
+"""Samples whose regressors are in the cache together; they enter the filter as one product of matrices."""
+
+ROWS_PER_TASK, SAMPLES_PER_TASK = 256, 4096
+"""Filtered rows that one thread makes at a time, at least so many and at least of so many samples."""
 
 
 @dataclass(frozen=True)
@@ -94,11 +99,11 @@ def filtered_regressor(
 ) -> NDArray[np.float64]:
     """Base regressor after the parallel filter, shape (M, n, b).
 
-    Chunk by chunk, so that memory stays small, and on all processors: neither kernel holds the interpreter lock. Terms
-    of the model, which may remember, see the motion in one piece.
+    Piece by piece, so that what is filtered never leaves the cache, and on all processors: neither kernel nor product
+    holds the interpreter lock. Terms of the model, which may remember, see the motion in one piece.
     """
     count = decimation.count(signals.q.shape[0])
-    rows = max(1, _CHUNK_ROWS // decimation.factor)
+    rows = max(ROWS_PER_TASK, SAMPLES_PER_TASK // decimation.factor)
     if count == 0:
         decimation(signals.q)
 
@@ -110,11 +115,28 @@ def filtered_regressor(
         motion = model.motion(signals.q, signals.qd, signals.qdd, signals.dt, signals.start, sharp_sign=sharp_sign)
         filtered[:, :, rigid:] = decimation(model.term_regressor(motion))
 
+    smoothing = 0.0 if sharp_sign else model.smoothing
+    q, qd, qdd = (np.ascontiguousarray(x, dtype=np.float64) for x in (signals.q, signals.qd, signals.qdd))
+
     def fill(first: int) -> None:
         last = min(first + rows, count)
-        span = slice(first * decimation.factor, (last - 1) * decimation.factor + decimation.taps.size)
-        phi = model.rigid_regressor(signals.q[span], signals.qd[span], signals.qdd[span], sharp_sign=sharp_sign)
-        filtered[first:last, :, :rigid] = decimation(phi)
+        end = (last - 1) * decimation.factor + decimation.taps.size
+        if decimation.taps.size == 1:
+            kept = slice(first * decimation.factor, end, decimation.factor)
+            phi = model.rigid_regressor(signals.q[kept], signals.qd[kept], signals.qdd[kept], sharp_sign=sharp_sign)
+            filtered[first:last, :, :rigid] = decimation.taps[0] * phi
+            return
+        total, piece = np.zeros((last - first, model.n * rigid)), np.zeros((PIECE, model.n, rigid))
+        for begin in range(first * decimation.factor, end, PIECE):
+            stop = min(begin + PIECE, end)
+            # The kernel writes the same places every time: what it leaves out stays zero.
+            span, phi = slice(begin, stop), piece[: stop - begin]
+            fill_regressor(model.chain, model.base_columns, smoothing, q[span], qd[span], qdd[span], phi)
+            touched = decimation.rows_of(begin, stop)
+            touched = slice(max(touched.start, first), min(touched.stop, last))
+            weights = decimation.weights(touched, begin, stop)
+            total[touched.start - first : touched.stop - first] += weights @ phi.reshape(stop - begin, -1)
+        filtered[first:last, :, :rigid] = total.reshape(-1, model.n, rigid)
 
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         for _ in pool.map(fill, range(0, count, rows)):

@@ -40,6 +40,16 @@ class Decimation:
         """Index of the sample at the centre of each window, shape (M,)."""
         return self.margin + self.factor * np.arange(self.count(samples), dtype=np.int64)
 
+    def rows_of(self, begin: int, end: int) -> slice:
+        """Rows of the result that a sample of ``begin .. end - 1`` counts for, of an endless record."""
+        return slice(max(0, -(-(begin - self.taps.size + 1) // self.factor)), (end - 1) // self.factor + 1)
+
+    def weights(self, rows: slice, begin: int, end: int) -> NDArray[np.float64]:
+        """What the samples ``begin .. end - 1`` weigh in some rows of the result, shape (rows, samples)."""
+        tap = np.arange(begin, end) - self.factor * np.arange(rows.start, rows.stop)[:, None]
+        inside = (tap >= 0) & (tap < self.taps.size)
+        return np.where(inside, self.taps[np.where(inside, tap, 0)], 0.0)
+
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Filter and thin out along the first axis: (N, ...) to (M, ...)."""
         count = self.count(x.shape[0])

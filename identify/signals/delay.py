@@ -40,7 +40,7 @@ MAX_AR_ORDER = 10
 REWEIGHTINGS = 2
 """Weighted fits after the first, unweighted one."""
 
-_CHUNK_ROWS = 4096
+_CHUNK_SAMPLES = 32768
 
 Array = NDArray[np.float64]
 
@@ -131,8 +131,8 @@ def torque_delay(
     theta, blocks = solve(z, x, joint_variances(blocks, theta))
     noise: Sequence[ArModel] = joint_variances(blocks, theta)
     for _ in range(REWEIGHTINGS):
-        rates = [decimation(_rate(model, s, theta[:b])) for s in signals]
-        known = [decimation(_rate(model, s, theta[:b])) for s in instruments] if instrumented else rates
+        rates = [_rate(model, s, theta[:b], decimation) for s in signals]
+        known = [_rate(model, s, theta[:b], decimation) for s in instruments] if instrumented else rates
         wide = [_with_delays(value, rate) for value, rate in zip(x, rates, strict=True)]
         zeta = [_with_delays(value, rate) for value, rate in zip(z, known, strict=True)]
         theta, blocks = solve(zeta, wide, noise)
@@ -149,14 +149,16 @@ def _with_delays(x: Array, rate: Array) -> Array:
     return np.concatenate([x, columns], axis=2)
 
 
-def _rate(model: ArmModel, s: Derivatives, theta: Array) -> Array:
-    """Change per sample of the torque that the model needs for the measured motion, (N, n), chunk by chunk."""
-    torque = np.concatenate(
-        [
-            model.rigid_regressor(s.q[k : k + _CHUNK_ROWS], s.qd[k : k + _CHUNK_ROWS], s.qdd[k : k + _CHUNK_ROWS])
-            @ theta[: theta.size - model.e]
-            for k in range(0, s.q.shape[0], _CHUNK_ROWS)
-        ]
-    )
-    change: Array = np.gradient(torque, axis=0)
-    return change
+def _rate(model: ArmModel, s: Derivatives, theta: Array, decimation: Decimation) -> Array:
+    """Filtered change per sample of the torque that the rigid model needs for a motion, (M, n), piece by piece."""
+    samples, count = s.q.shape[0], decimation.count(s.q.shape[0])
+    rows = max(1, _CHUNK_SAMPLES // decimation.factor)
+    filtered = np.empty((count, model.n))
+    for first in range(0, count, rows):
+        last = min(first + rows, count)
+        begin, end = first * decimation.factor, (last - 1) * decimation.factor + decimation.taps.size
+        # One more sample at each end, where there is one: the change is that between the neighbours.
+        before, after = max(begin - 1, 0), min(end + 1, samples)
+        torque = model.inverse_dynamics(theta, s.q[before:after], s.qd[before:after], s.qdd[before:after])
+        filtered[first:last] = decimation(np.gradient(torque, axis=0)[begin - before : end - before])
+    return filtered

@@ -1,6 +1,8 @@
 """Velocity and acceleration from measured positions, aligned to the samples."""
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
 
@@ -94,17 +96,17 @@ def differentiate(
         qd = central_difference(smooth, dt)
         return Derivatives(smooth, qd, central_difference(qd, dt), None, dt)
     rule, given = _ratios(q, derivatives, nvr, q_ref, resolution)
-    if derivatives == "irwsm":
-        columns = [_irwsm1(q[:, j], dt, rule, given[j]) for j in range(q.shape[1])]
-    else:
-        columns = [_irwsm2(q[:, j], dt, rule, given[j]) for j in range(q.shape[1])]
-    return Derivatives(
-        q=np.stack([c[0] for c in columns], axis=1),
-        qd=np.stack([c[1] for c in columns], axis=1),
-        qdd=np.stack([c[2] for c in columns], axis=1),
-        nvr=np.array([c[3] for c in columns]),
-        dt=dt,
-    )
+    smoother = _irwsm1 if derivatives == "irwsm" else _irwsm2
+    level, qd, qdd = np.empty(q.shape), np.empty(q.shape), np.empty(q.shape)
+
+    def derive(j: int) -> list[float]:
+        level[:, j], qd[:, j], qdd[:, j], used = smoother(q[:, j], dt, rule, given[j])
+        return used
+
+    # On all processors: the kernels hold no interpreter lock.
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        ratios = list(pool.map(derive, range(q.shape[1])))
+    return Derivatives(q=level, qd=qd, qdd=qdd, nvr=np.array(ratios), dt=dt)
 
 
 def tracking_error_nvr(

@@ -72,7 +72,7 @@ def irwsm(y: NDArray[np.float64], order: int, nvr: float) -> Smoothed:
     y = _checked(y, order)
     if not nvr > 0:
         raise ValueError(f"nvr: expected a positive number, got {nvr}")
-    level = y - _correction(np.diff(y, n=order), _band(order, nvr), _STENCIL[order])
+    level = y - _correction(np.diff(y, n=order), _band(order, nvr), _STENCIL[order], _transient(order, nvr))
     return Smoothed(level=level, slope=np.diff(level), nvr=nvr)
 
 
@@ -211,7 +211,7 @@ def _transient(order: int, nvr: float) -> int:
     return int(SETTLED * nvr ** (-0.5 / order)) + 10
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
     """Row i of ``V = L diag(d) L'``: fills ``low[i % p]`` (distance 1..p) and returns d_i; rings of length p."""
     for j in range(min(p, i), 0, -1):
@@ -225,7 +225,7 @@ def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
     return pivot
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _profile(w, band, transient):  # type: ignore[no-untyped-def]
     """``m log(w' V^-1 w) + log|V|`` in one forward sweep; the factors of a Toeplitz band become constant."""
     m, p = w.size, band.size - 1
@@ -257,41 +257,13 @@ def _profile(w, band, transient):  # type: ignore[no-untyped-def]
     return m * np.log(quadratic) + logdet
 
 
-@numba.njit(cache=True)
-def _correction(w, band, stencil):  # type: ignore[no-untyped-def]
-    """``D' V^-1 w``, shape (m + order,)."""
+@numba.njit(cache=True, nogil=True)
+def _forward(w, band, transient):  # type: ignore[no-untyped-def]
+    """``L^-1 w`` with ``V = L diag(d) L'``, and rows of L and d up to those that stand for all that follow."""
     m, p = w.size, band.size - 1
     d, low, z = np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.empty(m)
-    pivots, rows = np.empty(m), np.zeros((m, p + 1))
-    for i in range(m):
-        d_i = _row(band, d, low, i, p)
-        d[i % (p + 1)] = d_i
-        pivots[i] = d_i
-        value = w[i]
-        for k in range(1, min(p, i) + 1):
-            rows[i, k] = low[i % (p + 1), k]
-            value -= rows[i, k] * z[i - k]
-        z[i] = value
-    for i in range(m):
-        z[i] /= pivots[i]
-    for i in range(m - 1, -1, -1):
-        for k in range(1, min(p, m - 1 - i) + 1):
-            z[i] -= rows[i + k, k] * z[i + k]
-    out = np.zeros(m + p)
-    for i in range(m):
-        for k in range(p + 1):
-            out[i + k] += stencil[k] * z[i]
-    return out
-
-
-@numba.njit(cache=True)
-def _residual_sum(w, band, stencil, transient):  # type: ignore[no-untyped-def]
-    """``|D' V^-1 w|^2``; as in :func:`_profile` the factors of a Toeplitz band become constant."""
-    m, p = w.size, band.size - 1
-    d, low, z = np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.empty(m)
-    # Row `last` of the factor stands for all that follow.
-    pivots, rows = np.empty(m), np.zeros((m, p + 1))
     last = min(m, transient) - 1
+    pivots, rows = np.empty(last + 1), np.zeros((last + 1, p + 1))
     for i in range(last + 1):
         pivots[i] = _row(band, d, low, i, p)
         d[i % (p + 1)] = pivots[i]
@@ -300,15 +272,45 @@ def _residual_sum(w, band, stencil, transient):  # type: ignore[no-untyped-def]
             rows[i, k] = low[i % (p + 1), k]
             value -= rows[i, k] * z[i - k]
         z[i] = value
-    l1, l2 = rows[last, 1], rows[last, 2]
-    l3 = rows[last, 3] if p == 3 else 0.0
     if last + 1 < m:
+        l1, l2 = rows[last, 1], rows[last, 2]
+        l3 = rows[last, 3] if p == 3 else 0.0
         z1, z2 = z[last], z[last - 1]
         z3 = z[last - 2] if p == 3 else 0.0
         for i in range(last + 1, m):
             value = w[i] - l1 * z1 - l2 * z2 - l3 * z3
             z[i] = value
             z3, z2, z1 = z2, z1, value
+    return z, rows, pivots
+
+
+@numba.njit(cache=True, nogil=True)
+def _correction(w, band, stencil, transient):  # type: ignore[no-untyped-def]
+    """``D' V^-1 w``, shape (m + order,); the factors of a Toeplitz band become constant."""
+    m, p = w.size, band.size - 1
+    z, rows, pivots = _forward(w, band, transient)
+    last = pivots.size - 1
+    out = np.zeros(m + p)
+    # Solved backwards: u1, u2, u3 are the solution one, two and three places later, zero beyond the end.
+    u1 = u2 = u3 = 0.0
+    for i in range(m - 1, -1, -1):
+        value = z[i] / pivots[min(i, last)] - rows[min(i + 1, last), 1] * u1 - rows[min(i + 2, last), 2] * u2
+        if p == 3:
+            value -= rows[min(i + 3, last), 3] * u3
+        for k in range(p + 1):
+            out[i + k] += stencil[k] * value
+        u3, u2, u1 = u2, u1, value
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _residual_sum(w, band, stencil, transient):  # type: ignore[no-untyped-def]
+    """``|D' V^-1 w|^2``; as in :func:`_profile` the factors of a Toeplitz band become constant."""
+    m, p = w.size, band.size - 1
+    z, rows, pivots = _forward(w, band, transient)
+    last = pivots.size - 1
+    l1, l2 = rows[last, 1], rows[last, 2]
+    l3 = rows[last, 3] if p == 3 else 0.0
     total = 0.0
     # Solved backwards: u1, u2, u3 are the solution one, two and three places later, zero beyond the end.
     u1 = u2 = u3 = 0.0
