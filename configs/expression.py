@@ -42,8 +42,10 @@ def evaluate(expression: str | float, names: Mapping[str, float], where: str = "
     except (SyntaxError, TypeError, KeyError, ValueError) as error:
         detail = f"unknown name {error.args[0]!r}" if isinstance(error, KeyError) else str(error)
         raise ConfigError(f"{where}: {expression!r}: {detail} (names: {', '.join(sorted(names))})") from error
-    except (ZeroDivisionError, OverflowError) as error:
-        raise ConfigError(f"{where}: {expression!r}: {error}") from error
+    except ZeroDivisionError as error:
+        raise ConfigError(f"{where}: {expression!r}: division by zero") from error
+    except OverflowError as error:
+        raise ConfigError(f"{where}: {expression!r}: the number is too large") from error
     if not math.isfinite(value):
         raise ConfigError(f"{where}: {expression!r} is not a finite number")
     return value

@@ -83,7 +83,7 @@ def score(case: Case, record: Record, healthy: Record | None) -> Score:
         first=first,
         second=second,
         missed=missed,
-        invisible=missed and all(_called_invisible(part, document) for part in case.parts),
+        invisible=missed and not case.baseline and all(_called_invisible(part, document) for part in case.parts),
         extra=sum(not any(matches(part, f) for part in case.parts) for f in findings),
         closed=None if healthy is None else closed_share(case, document, healthy["document"]),
         within=tuple(
@@ -145,4 +145,4 @@ def _among(part: HiddenPart, findings: Sequence[Document]) -> bool:
 
 
 def _called_invisible(part: HiddenPart, document: Document) -> bool:
-    return any(matches(part, entry) for entry in document.get("invisible", []))
+    return any(matches(part, entry) for entry in document["not_visible"])

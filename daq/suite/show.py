@@ -18,6 +18,8 @@ from daq.suite.table import AIM_COLUMNS, COLUMNS, HEALTHY_COLUMNS, OUTSIDE_COLUM
 
 PLAIN_EVERY_S = 30.0
 """Between two lines of progress where stderr is no terminal."""
+LEAST_WIDTH = 120
+"""Columns of text that the widest table needs."""
 
 
 @contextmanager
@@ -67,6 +69,8 @@ def progress(total: int) -> Iterator[Done]:
 def show(result: Tables, missing: int) -> None:
     """Print the tables."""
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=LEAST_WIDTH)
     for title, columns, rows in (
         ("hidden effects", COLUMNS, result.effects),
         ("pairs of effects", COLUMNS, result.pairs),
@@ -83,7 +87,8 @@ def show(result: Tables, missing: int) -> None:
 def _table(title: str, columns: Sequence[tuple[str, Callable[[Any], str]]], rows: Sequence[Any]) -> Table:
     table = Table(title=title, title_justify="left")
     for k, (heading, _) in enumerate(columns):
-        table.add_column(heading, justify="right" if k and heading not in ("strength", "most often") else "left")
+        left = not k or heading in ("strength", "most often")
+        table.add_column(heading, justify="left" if left else "right", no_wrap=left)
     for row in rows:
         table.add_row(*(value(row) for _, value in columns))
     return table

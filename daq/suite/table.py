@@ -261,11 +261,11 @@ COLUMNS: tuple[tuple[str, Callable[[Any], str]], ...] = (
     ("top-1 %", lambda r: percent(r.first)),
     ("top-2 %", lambda r: percent(r.second)),
     ("missed %", lambda r: percent(r.missed)),
-    ("invisible %", lambda r: percent(r.invisible)),
+    ("unseeable %", lambda r: percent(r.invisible)),
     ("extra %", lambda r: percent(r.extra)),
-    ("gap closed, median %", lambda r: percent(r.closed)),
-    ("90 % closed %", lambda r: percent(r.closed_enough)),
-    ("within 3 sigma %", lambda r: percent(r.within)),
+    ("closed %", lambda r: percent(r.closed)),
+    (">= 90 %", lambda r: percent(r.closed_enough)),
+    ("3 sigma %", lambda r: percent(r.within)),
 )
 HEALTHY_COLUMNS: tuple[tuple[str, Callable[[Any], str]], ...] = (
     ("healthy arms", lambda r: r.label),

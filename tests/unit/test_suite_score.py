@@ -1,0 +1,150 @@
+"""What a diagnosis is worth, and the tables."""
+
+from typing import Any
+
+import pytest
+
+from daq.suite.cases import Case, HiddenPart
+from daq.suite.score import Score, closed_share, matches, score, within
+from daq.suite.table import clopper_pearson, tables
+
+SPRING = HiddenPart("joint_spring", "joint_2", None, ("joint_spring",), {}, {}, 1.0)
+SHAFT = HiddenPart("coupling_friction", "joint_4", "joint_5", ("coupling_friction",), {}, {}, 1.0)
+GRIPPER = HiddenPart("payload", "joint_6", None, ("payload", "rotor_inertia"), {}, {}, 1.0, arm=True)
+
+
+def case(
+    *parts: HiddenPart, kind: Any = "effect", level: Any = "typical", seed: int = 1, baseline: bool = False
+) -> Case:
+    return Case(kind, level, "tx40", "tx40.yaml", "t.yaml", 1, 1e-3, seed, parts, baseline)
+
+
+def finding(effect: str, joint: str, other: str | None = None, **more: Any) -> dict[str, Any]:
+    return {
+        "effect": effect, "joint": joint, "other": other, "kind": "structure", "parameters": {}, "confidence": 0.99,
+        "alternatives": [], "gap_before": 10.0, "gap_after": 8.0, "evidence": {}, **more,
+    }  # fmt: skip
+
+
+def record(
+    *findings: dict[str, Any], before: float = 10.0, after: float = 8.0, verdict: str = "explained", truth: Any = ()
+) -> dict[str, Any]:
+    def gap(value: float) -> dict[str, Any]:
+        return {"all": value, "by_joint": {f"joint_{k}": value for k in range(1, 7)}}
+
+    validation = {"before": gap(before), "after": gap(after)}
+    document = {"verdict": verdict, "findings": list(findings), "gap": {"validation": validation}, "not_visible": []}
+    return {"document": document, "truth": list(truth)}
+
+
+HEALTHY = record(before=8.0, after=8.0, verdict="no_gap")
+
+
+def test_a_finding_counts_with_the_right_name_at_the_right_place_only() -> None:
+    assert matches(SPRING, finding("joint_spring", "joint_2"))
+    assert not matches(SPRING, finding("joint_spring", "joint_1"))
+    assert not matches(SPRING, finding("cogging_torque", "joint_2"))
+
+
+def test_a_pair_counts_in_either_order_and_an_arm_has_no_wrong_joint() -> None:
+    assert matches(SHAFT, finding("coupling_friction", "joint_5", "joint_4"))
+    assert not matches(SHAFT, finding("coupling_friction", "joint_5", "joint_6"))
+    assert matches(GRIPPER, finding("payload", "joint_1"))
+    assert matches(GRIPPER, finding("rotor_inertia", "joint_1"))
+
+
+def test_only_the_first_finding_is_the_name_of_a_single_effect() -> None:
+    late = score(
+        case(SPRING), record(finding("cogging_torque", "joint_2"), finding("joint_spring", "joint_2")), HEALTHY
+    )
+    assert (late.first, late.second, late.extra) == (False, True, 1)
+    rival = finding(
+        "cogging_torque", "joint_2", alternatives=[{"effect": "joint_spring", "joint": "joint_2", "score": 9.0}]
+    )
+    assert (score(case(SPRING), record(rival), HEALTHY).first, score(case(SPRING), record(rival), HEALTHY).second) == (
+        False,
+        True,
+    )
+    right = score(case(SPRING), record(finding("joint_spring", "joint_2")), HEALTHY)
+    assert (right.first, right.second, right.extra, right.missed) == (True, True, 0, False)
+
+
+def test_a_pair_of_effects_needs_both_names() -> None:
+    both = case(SPRING, SHAFT, kind="pair")
+    one = score(both, record(finding("joint_spring", "joint_2")), HEALTHY)
+    assert (one.first, one.second) == (False, False)
+    two = score(
+        both, record(finding("coupling_friction", "joint_4", "joint_5"), finding("joint_spring", "joint_2")), HEALTHY
+    )
+    assert (two.first, two.extra) == (True, 0)
+
+
+def test_nothing_found_is_missed_unless_the_motion_cannot_show_it() -> None:
+    silent = record(before=8.1, after=8.1, verdict="no_gap")
+    assert score(case(SPRING), silent, HEALTHY).missed
+    assert not score(case(SPRING), silent, HEALTHY).invisible
+    silent["document"]["not_visible"] = [{"effect": "joint_spring", "joint": "joint_2"}]
+    assert score(case(SPRING), silent, HEALTHY).invisible
+    # What a baseline would show is no excuse where there is one.
+    assert not score(case(SPRING, baseline=True), silent, HEALTHY).invisible
+
+
+def test_the_gap_closed_is_measured_above_the_noise_of_the_healthy_twin() -> None:
+    whole = record(finding("joint_spring", "joint_2"), before=10.0, after=8.0)["document"]
+    assert closed_share(case(SPRING), whole, HEALTHY["document"]) == pytest.approx(1.0)
+    half = record(finding("joint_spring", "joint_2"), before=10.0, after=82.0**0.5)["document"]
+    assert closed_share(case(SPRING), half, HEALTHY["document"]) == pytest.approx(0.5)
+    none = record(before=8.01, after=8.0)["document"]
+    assert closed_share(case(SPRING), none, HEALTHY["document"]) is None
+
+
+def test_stale_numbers_are_judged_by_the_gap_of_their_own_findings() -> None:
+    stale = finding("payload", "joint_6", kind="numbers", gap_before=12.0, gap_after=8.0)
+    document = record(stale, before=8.0, after=8.0)["document"]
+    assert closed_share(case(GRIPPER, baseline=True), document, HEALTHY["document"]) == pytest.approx(1.0)
+
+
+def test_parameters_are_compared_in_their_own_standard_deviations() -> None:
+    found = finding("joint_spring", "joint_2", parameters={"ks": 1.2}, evidence={"std": {"ks": 0.1}})
+    assert within(found, {"ks": 1.0}) == [True]
+    assert within(found, {"ks": 0.8}) == [False]
+    assert within(found, {"other": 0.8}) == []
+
+
+def _score(**more: Any) -> Score:
+    base: dict[str, Any] = {
+        "verdict": "explained", "first": True, "second": True, "missed": False, "invisible": False, "extra": 0,
+        "closed": 1.0, "within": (True,), "confidence": 0.9, "named": "joint_spring joint_2",
+    }  # fmt: skip
+    return Score(**{**base, **more})
+
+
+def test_the_tables_count_what_happened() -> None:
+    scored = [
+        (case(SPRING, seed=1), _score()),
+        (case(SPRING, seed=2), _score(first=False, closed=0.5, within=(False,))),
+        (case(SPRING, seed=3), _score(first=False, second=False, missed=True, invisible=True, closed=None, within=())),
+        (case(kind="clean", level=None, seed=1), _score(verdict="no_gap", first=None, second=None)),
+        (case(kind="clean", level=None, seed=2), _score(verdict="explained", first=None, second=None)),
+        (case(SPRING, kind="outside", seed=1), _score(confidence=0.4)),
+        (case(SPRING, kind="outside", seed=2), _score(confidence=0.9)),
+        (case(SPRING, kind="outside", seed=3), _score(confidence=0.0, verdict="unexplained")),
+        (case(SPRING, kind="outside", seed=4), _score(confidence=0.0, verdict="no_gap")),
+    ]
+    result = tables(scored, [case(SPRING, seed=4)])
+    row = result.effects[0]
+    assert (row.n, row.failed, row.first, row.second, row.missed) == (3, 1, 0.5, 1.0, 0.0)
+    assert (row.invisible, row.closed, row.closed_enough, row.within) == (1 / 3, 0.75, 0.5, 0.5)
+    outside = result.outside[0]
+    assert (outside.low_confidence, outside.named, outside.unexplained, outside.unseen) == (0.25, 0.25, 0.25, 0.25)
+    assert result.healthy[0].alarms == 1
+    aims = {aim.what: aim.value for aim in result.aims}
+    assert aims["name and place right"] == 0.5
+    assert aims["healthy arms called healthy"] == 0.5
+    assert aims["outside the catalogue, of those seen: not named with confidence"] == pytest.approx(2 / 3)
+
+
+def test_the_bounds_of_false_alarms_are_clopper_and_pearsons() -> None:
+    # Rule of three: none of n is compatible with 1 - 0.025^(1/n).
+    assert clopper_pearson(0, 60) == pytest.approx((0.0, 1 - 0.025 ** (1 / 60)))
+    assert clopper_pearson(1, 90) == pytest.approx((0.000281, 0.0604), rel=2e-2)
