@@ -32,11 +32,20 @@ def robot(
             show_default=False,
         ),
     ] = None,
+    list_effects: Annotated[
+        bool, typer.Option("--list-effects", help="List the effects that a scenario can hide, and exit.")
+    ] = False,
 ) -> None:
     """Put the virtual arm on a bus: six CiA 402 drives, or a measured recording behind them.
 
     Example: armident robot --config tx40_cell.yaml --scenario scenarios/tx40_worn_joint2.yaml
     """
+    if list_effects:
+        from virtual_robot.effects import describe_effects
+
+        print(describe_effects())
+        return
+
     from configs import ConfigError
     from virtual_robot.run import record_robot, run_robot
 

@@ -1,15 +1,25 @@
 """Effects hidden in the virtual arm: what a scenario may say, and that each effect is the physics it is named for."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from configs import ConfigError, RobotConfig, load_robot
 from configs.scenario import HiddenEffect, Scenario
+from virtual_robot.arm import Arm
+from virtual_robot.cli import robot as robot_command
 from virtual_robot.effects import CATALOGUE, EFFECTS, OUTSIDE, describe_effects, hidden_effects
 from virtual_robot.effects.forces import CODES, effect_torque, force_table
+from virtual_robot.inertias import rest_posture
 from virtual_robot.plant import Plant
+from virtual_robot.scenario import SCENARIOS, load_scenario
+
+cli = typer.Typer()
+cli.command()(robot_command)
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +68,11 @@ EXAMPLES: dict[str, dict[str, float]] = {
 }
 """The one number that each effect needs."""
 
+HEALTHY = (
+    0.04804163140280711, 0.14355670318505015, 1.8563242080086155,
+    0.06016075942464121, 0.0006689536512731999, 0.01959493721133968,
+)  # fmt: skip
+
 
 def scenario(*effects: tuple[str, str, str | None, dict[str, float]]) -> Scenario:
     hidden = tuple(HiddenEffect(effect=e, joint=j, other=o, parameters=p) for e, j, o, p in effects)
@@ -68,6 +83,32 @@ def with_effect(
     robot: RobotConfig, effect: str, joint: str, parameters: dict[str, float], other: str | None = None
 ) -> Plant:
     return Plant(robot, np.zeros(robot.n), scenario((effect, joint, other, parameters)))
+
+
+def test_the_command_lists_the_effects() -> None:
+    result = CliRunner().invoke(cli, ["--list-effects"])
+    assert result.exit_code == 0
+    assert result.stdout == describe_effects() + "\n"
+
+
+@pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_shipped_scenarios_can_be_hidden_in_their_arm(path: Path) -> None:
+    robot = load_robot(path.stem.split("_")[0] + ".yaml")
+    hidden = load_scenario(path)
+    arm = Arm(robot, rest_posture(robot), noise=0.0, scenario=hidden)
+    for _ in range(20):
+        arm.advance()
+    assert np.isfinite(arm.plant.coordinates).all()
+    assert len(hidden.effects) == len(hidden_effects(hidden, robot))
+
+
+def test_without_hidden_effects_the_arm_moves_as_it_always_did(tx40: RobotConfig) -> None:
+    """Figures of the plant as it was before there was anything to hide but six simple effects."""
+    plant = Plant(tx40, rest_posture(tx40))
+    t = np.arange(1000) * 200e-6
+    for x in np.sin(2 * np.pi * 4 * t):
+        plant.advance(x * np.array([20.0, 30.0, 15.0, 5.0, 5.0, 3.0]), 200e-6)
+    np.testing.assert_allclose(plant.q, HEALTHY, rtol=1e-10)
 
 
 def test_every_effect_of_the_catalogue_can_be_hidden_and_at_least_five_outside_it() -> None:
