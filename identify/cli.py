@@ -140,14 +140,19 @@ def trajectory(
         typer.Option(help="An identification.json of the robot: torques stay within limits, precision is predicted."),
     ] = None,
     evaluations: Annotated[int, typer.Option(min=1, help="Candidates to try.")] = 2000,
+    wanted: Annotated[
+        str | None, typer.Option("--for", help="Effect of the catalogue that the trajectory is to show.")
+    ] = None,
+    joint: Annotated[str | None, typer.Option(help="Joint at which it is to show. [default: all]")] = None,
+    against: Annotated[str | None, typer.Option(help="Another effect, from which it is to be told.")] = None,
 ) -> None:
-    """Design an exciting trajectory inside the limits of a robot.
+    """Design an exciting trajectory inside the limits of a robot, for the base parameters or for one effect.
 
     Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
     from identify.service import trajectory_command
 
-    trajectory_command(config, out, duration, seed, known, evaluations)
+    trajectory_command(config, out, duration, seed, known, evaluations, wanted, joint, against)
 
 
 def reproduce(

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 import numpy as np
@@ -84,6 +84,16 @@ def design_table(robot: RobotConfig, theta: NDArray[np.float64], std: NDArray[np
     for name, value, deviation in zip(ArmModel.from_config(robot).base.names, theta, std, strict=True):
         relative = "" if value == 0 else f"{100 * deviation / abs(value):.1f}"
         table.add_row(name, f"{value:.4f}", f"{deviation:.4f}", relative)
+    Console().print(table)
+
+
+def wanted_table(std: Mapping[str, float]) -> None:
+    """What a designed trajectory will tell of the effects that it was designed for."""
+    table = Table(title="predicted precision, wanted effect", title_justify="left")
+    table.add_column("parameter")
+    table.add_column("std", justify="right")
+    for name, deviation in std.items():
+        table.add_row(name, f"{deviation:.4g}" if np.isfinite(deviation) else "not visible")
     Console().print(table)
 
 
