@@ -4,7 +4,7 @@ from functools import cache
 from importlib.metadata import entry_points
 
 from configs import ConfigError
-from identify.catalogue import drive, friction, link, transmission, wiring
+from identify.catalogue import drive, friction, link, numbers, transmission, wiring
 from identify.catalogue.effect import Effect
 
 ENTRY_POINTS = "armident.effects"
@@ -20,7 +20,8 @@ def catalogue() -> dict[str, Effect]:
     ConfigError
         If an entry point cannot be loaded, is not an effect, or takes a name that is taken.
     """
-    ours = (*friction.EFFECTS, *link.EFFECTS, *transmission.EFFECTS, *drive.EFFECTS, *wiring.EFFECTS)
+    modules = (friction, link, transmission, drive, numbers, wiring)
+    ours = [effect for module in modules for effect in module.EFFECTS]
     found = {e.name: e for e in ours}
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda p: p.name):
         where = f"effect {point.name} ({point.value})"

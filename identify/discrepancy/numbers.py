@@ -1,0 +1,440 @@
+"""Whether the numbers of a baseline still hold, and what has changed where they do not.
+
+A fit and a baseline of the same plant differ by their errors alone: ``d = theta - theta_0`` has the covariance
+``S = C + C_0``. A change of the plant moves d along a few directions, ``d = B p``: those that the catalogue gives for
+a payload, other friction, another drive gain. Candidates compete by how well they explain d, and have to predict
+held-out torques better than the baseline's numbers do.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, stats
+
+from configs import DataError
+from identify.catalogue.effect import Effect, Place
+from identify.catalogue.registry import catalogue
+from identify.discrepancy.candidates import Workshop, places
+from identify.discrepancy.regression import Fit, relative_errors
+from identify.document import IdentificationDocument
+from identify.estimators.noise import ArModel
+
+Array = NDArray[np.float64]
+
+STRUCTURAL = ("drive_gain_error", "gravity_direction", "rotor_inertia")
+"""Effects that a model can also lack, which parameters of an arm take over in part: another number against a baseline,
+of either sign."""
+
+RANK_TOLERANCE = 1e-7
+"""Directions of normalised changes shorter than this are none."""
+
+ESTIMABLE = 0.999
+"""Share of a parameter that must lie in the directions seen for it to have a value of its own."""
+
+ALTERNATIVES = 3
+NEWEY_WEST_LAGS = 20
+
+
+@dataclass(frozen=True)
+class NumbersFinding:
+    """One reason why numbers of a baseline no longer hold.
+
+    Parameters
+    ----------
+    effect, joint, other
+        Entry of the catalogue and where, or ``changed_parameters`` for what no entry explains.
+    parameters, std
+        Changes against the baseline, as far as the data tell them one by one, and their standard deviations, which
+        hold the uncertainty of the baseline too.
+    p_value
+        Chance of so great a change of numbers if there were none, all candidates counted.
+    gap_before, gap_after
+        Relative torque error on held-out data, percent, with the baseline's numbers and all findings before this one,
+        and with this one: of the joint, or of all joints where the arm as a whole is concerned.
+    alternatives
+        Effect, joint and p-value of the candidates next to this one.
+    words
+        What it means, in plain language.
+    """
+
+    effect: str
+    joint: str
+    other: str | None
+    parameters: dict[str, float]
+    std: dict[str, float]
+    p_value: float
+    gap_before: float
+    gap_after: float
+    alternatives: tuple[tuple[str, str, float], ...]
+    words: str
+
+
+@dataclass(frozen=True)
+class _Change:
+    """A candidate: an effect at a place, and what the known parameters (k,) do per unit of its own, (k, m)."""
+
+    effect: Effect
+    place: Place
+    directions: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """A fit beside a baseline.
+
+    Parameters
+    ----------
+    known
+        Which parameters of the fit the baseline has, (k,).
+    theta0, covariance0
+        The baseline's, (k,) and (k, k).
+    covariance
+        Of the difference, (k, k).
+    absorbed
+        What terms that the baseline has not would have done to its parameters had they been in its data, (k, m):
+        nobody knows which of the two models it was, so differences along these directions are no evidence.
+    """
+
+    fit: Fit
+    known: NDArray[np.int64]
+    theta0: Array
+    covariance0: Array
+    covariance: Array
+    absorbed: Array
+
+    @property
+    def difference(self) -> Array:
+        """Fit less baseline, (k,)."""
+        difference: Array = self.fit.theta[self.known] - self.theta0
+        return difference
+
+    def whitened(self, values: Array) -> Array:
+        """``L^-1 values`` with ``L L'`` the covariance of the difference."""
+        scale = np.sqrt(np.diag(self.covariance))
+        lower = linalg.cholesky(self.covariance / np.outer(scale, scale), lower=True)
+        out: Array = linalg.solve_triangular(lower, (values.T / scale).T, lower=True)
+        return out
+
+    def solved(self, changes: Sequence[_Change]) -> tuple[Array, Array, Array, float, int]:
+        """Parameters of changes by generalised least squares.
+
+        Returns
+        -------
+        tuple
+            Parameters (of `absorbed` first), covariance, which of them have a value of their own, the chi-square that
+            is left and its degrees of freedom.
+        """
+        stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
+        target = self.whitened(self.difference)
+        columns = self.whitened(stack)
+        scale = np.linalg.norm(columns, axis=0)
+        scale[scale == 0] = 1.0
+        u, s, vt = np.linalg.svd(columns / scale, full_matrices=False)
+        kept = s > RANK_TOLERANCE * max(float(s.max(initial=0.0)), 1e-300)
+        u, s, vt = u[:, kept], s[kept], vt[kept]
+        inverse = (vt.T / s) / scale[:, None]
+        rest = target - u @ (u.T @ target)
+        own = np.einsum("kj,kj->j", vt, vt) > ESTIMABLE
+        return inverse @ (u.T @ target), inverse @ inverse.T, own, float(rest @ rest), target.size - int(kept.sum())
+
+    def predicted(self, changes: Sequence[_Change]) -> Array:
+        """Parameters (b,) with the baseline's numbers after these changes; the terms it has not go along."""
+        values = self.solved(changes)[0]
+        stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
+        return self.completed(self.theta0 + stack @ values)
+
+    def completed(self, known: Array) -> Array:
+        """All parameters of the fit (b,), those that the baseline has as given."""
+        theta = self.fit.theta.copy()
+        free = np.setdiff1d(np.arange(theta.size), self.known)
+        if free.size:
+            c = self.fit.covariance
+            scale = np.sqrt(np.diag(c))[self.known]
+            inner = c[np.ix_(self.known, self.known)] / np.outer(scale, scale)
+            theta[free] += (
+                c[np.ix_(free, self.known)] / scale @ np.linalg.solve(inner, (known - theta[self.known]) / scale)
+            )
+        theta[self.known] = known
+        return theta
+
+
+def stale_numbers(
+    fit: Fit, workshop: Workshop, baseline: IdentificationDocument, alpha: float = 0.01
+) -> list[NumbersFinding]:
+    """Name what has changed since a baseline was identified.
+
+    Parameters
+    ----------
+    fit
+        Of the model with everything it lacked in structure.
+    workshop
+        Of the same study.
+    baseline
+        Result of an earlier identification of the same robot.
+    alpha
+        Chance of a false alarm.
+
+    Raises
+    ------
+    DataError
+        If the baseline is of another model, or has no covariance.
+    """
+    comparison = compared(fit, baseline)
+    if not _stale(comparison, alpha):
+        return []
+    pool = list(_changes(comparison, workshop))
+    found: list[_Change] = []
+    barred: list[_Change] = []
+    while True:
+        ranked = _ranked(comparison, found, [c for c in pool if c not in found and c not in barred])
+        if not ranked or ranked[0][0] * len(pool) > alpha:
+            break
+        best = ranked[0][1]
+        if _closes(comparison, found, [*found, best], alpha):
+            found.append(best)
+            found = [c for c in found if _p_value(comparison, [o for o in found if o is not c], c) * len(pool) <= alpha]
+            if best not in found:
+                barred.append(best)
+        else:
+            barred.append(best)
+    findings = []
+    for k, change in enumerate(found):
+        findings.append(_described(comparison, found[:k], change, found, pool))
+    return [*findings, *_rest(comparison, found, alpha)]
+
+
+def compared(fit: Fit, baseline: IdentificationDocument) -> _Comparison:
+    """Put a fit beside a baseline.
+
+    Raises
+    ------
+    DataError
+        See `stale_numbers`.
+    """
+    names = fit.study.model.base.names
+    rigid = names[: len(names) - fit.study.model.e]
+    listed = [p.name for p in baseline.parameters]
+    missing = [name for name in rigid if name not in listed]
+    if missing:
+        raise DataError(
+            f"the baseline of robot {baseline.robot!r} lacks {', '.join(missing[:5])}"
+            f"{' and more' if len(missing) > 5 else ''}: it was identified with another model"
+        )
+    theirs = np.array(baseline.covariance, dtype=np.float64)
+    if theirs.shape != (len(listed), len(listed)):
+        raise DataError(f"the baseline's covariance has shape {theirs.shape} for {len(listed)} parameters")
+    known = np.array([k for k, name in enumerate(names) if name in listed], dtype=np.int64)
+    chosen = [listed.index(names[k]) for k in known]
+    theta0 = np.array([baseline.parameters[k].value for k in chosen])
+    covariance0 = theirs[np.ix_(chosen, chosen)]
+    free = np.setdiff1d(np.arange(len(names)), known)
+    z, x = fit.train.z[:, known], fit.train.x
+    absorbed = np.zeros((known.size, 0))
+    if free.size:
+        scale = np.linalg.norm(z, axis=0)
+        scale[scale == 0] = 1.0
+        absorbed = np.linalg.solve((z / scale).T @ (x[:, known] / scale), (z / scale).T @ x[:, free]) / scale[:, None]
+    covariance = _widening(fit) * fit.covariance[np.ix_(known, known)] + covariance0
+    return _Comparison(fit, known, theta0, covariance0, covariance, absorbed)
+
+
+def _widening(fit: Fit) -> float:
+    """Of the fit's covariance for noise models being estimates; see `ArModel.widened`."""
+    samples = sum(y.shape[0] for _, _, y in fit.equations.train)
+
+    def of(noise: ArModel) -> float:
+        return noise.widened(samples).variance / noise.variance
+
+    return max(of(noise) for noise in fit.noise)
+
+
+def _stale(comparison: _Comparison, alpha: float) -> bool:
+    """Whether all parameters together, or any of them by itself, differ; half the false alarms for either test."""
+    _, _, _, rest, free = comparison.solved([])
+    together = float(stats.chi2.sf(rest, free))
+    return together < alpha / 2 or bool(_changed_names(comparison, [], alpha / 2))
+
+
+def _changed_names(comparison: _Comparison, changes: Sequence[_Change], alpha: float) -> list[tuple[int, float, float]]:
+    """Known parameters that differ beyond the changes: number, difference and standard deviation, by Holm's method."""
+    stack = np.column_stack([comparison.absorbed, *(c.directions for c in changes)])
+    rest = comparison.difference - stack @ comparison.solved(changes)[0]
+    std = np.sqrt(np.diag(comparison.covariance))
+    p = 2 * stats.norm.sf(np.abs(rest) / std)
+    found = []
+    for rank, k in enumerate(np.argsort(p)):
+        if p[k] * (p.size - rank) > alpha:
+            break
+        found.append((int(k), float(rest[k]), float(std[k])))
+    return found
+
+
+def _changes(comparison: _Comparison, workshop: Workshop) -> Iterator[_Change]:
+    """All effects that are other numbers, at all their places."""
+    fit = comparison.fit
+    motion = workshop.motion(fit.study.train[0], "measured")
+    rigid = fit.theta.size - fit.study.model.e
+    for effect in catalogue().values():
+        if effect.numbers is None and effect.name not in STRUCTURAL:
+            continue
+        for place in places(effect, fit.study.robot.n):
+            if effect.numbers is not None:
+                exact = effect.numbers(motion, place)
+                directions = np.zeros((fit.theta.size, exact.shape[1]))
+                directions[:rigid] = exact[:rigid]
+            elif effect.name == "gravity_direction" and effect.visible is not None and effect.visible(motion, place):
+                continue
+            else:
+                directions = fit.absorbed(workshop.columns(effect, place, (), fit.noise).x)
+            directions = directions[comparison.known]
+            if directions.any():
+                yield _Change(effect, place, directions)
+
+
+def _p_value(comparison: _Comparison, others: Sequence[_Change], change: _Change) -> float:
+    """That a change beside others explains so much of the difference without merit."""
+    _, _, _, before, free_before = comparison.solved(others)
+    _, _, _, after, free_after = comparison.solved([*others, change])
+    if free_before == free_after:
+        return 1.0
+    return float(stats.chi2.sf(before - after, free_before - free_after))
+
+
+def _ranked(
+    comparison: _Comparison, found: Sequence[_Change], pool: Sequence[_Change]
+) -> list[tuple[float, _Change, float]]:
+    """Candidates by p-value: it, the candidate, and its logarithm, which does not underflow."""
+    _, _, _, before, free_before = comparison.solved(found)
+    trials = []
+    for change in pool:
+        _, _, _, after, free_after = comparison.solved([*found, change])
+        if free_before > free_after:
+            gain, size = before - after, free_before - free_after
+            trials.append((float(stats.chi2.sf(gain, size)), change, float(stats.chi2.logsf(gain, size))))
+    return sorted(trials, key=lambda trial: trial[2])
+
+
+def _closes(comparison: _Comparison, before: Sequence[_Change], after: Sequence[_Change], alpha: float) -> bool:
+    """Whether held-out torques follow the change."""
+    return _held_out(comparison, comparison.predicted(before), comparison.predicted(after)) > stats.norm.isf(alpha)
+
+
+def _held_out(comparison: _Comparison, before: Array, after: Array) -> float:
+    """Projection of the held-out residual on the change of prediction in its standard deviations.
+
+    Its spread comes from the noise, from what serial correlation is left (Newey-West), and from the baseline.
+    """
+    held = comparison.fit.held
+    change = held.z @ (after - before)
+    size = float(change @ change)
+    if size == 0.0:
+        return 0.0
+    residual = held.y - held.x @ before
+    inflation = max(1.0, _newey_west(change * (residual - change)) / size)
+    through = change @ held.x[:, comparison.known]
+    spread = float(through @ comparison.covariance0 @ through)
+    return float(change @ residual) / float(np.sqrt(size * inflation + spread))
+
+
+def _newey_west(products: Array) -> float:
+    """Variance of a sum of serially correlated terms of mean zero, with Bartlett weights."""
+    centred = products - products.mean()
+    lags = min(NEWEY_WEST_LAGS, centred.size - 1)
+    sums = [float(centred[lag:] @ centred[: centred.size - lag]) for lag in range(lags + 1)]
+    return max(sums[0] + 2 * sum((1 - k / (lags + 1)) * sums[k] for k in range(1, lags + 1)), 0.0)
+
+
+def _described(
+    comparison: _Comparison,
+    before: Sequence[_Change],
+    change: _Change,
+    found: Sequence[_Change],
+    pool: Sequence[_Change],
+) -> NumbersFinding:
+    """A change with its values in the model of all changes, the gaps of the order in which they were found."""
+    fit = comparison.fit
+    others = [c for c in found if c is not change]
+    values, covariance, own, _, _ = comparison.solved([*others, change])
+    m = change.directions.shape[1]
+    names = [p.name for p in change.effect.linear]
+    told = {n: float(v) for n, v, o in zip(names, values[-m:], own[-m:], strict=True) if o}
+    std = {n: float(np.sqrt(v)) for n, v, o in zip(names, np.diag(covariance)[-m:], own[-m:], strict=True) if o}
+    gap_before = _gap(fit, comparison.predicted(before), change)
+    gap_after = _gap(fit, comparison.predicted([*before, change]), change)
+    p = min(1.0, _p_value(comparison, others, change) * len(pool))
+    rivals = [r for r in _ranked(comparison, others, [c for c in pool if c not in found])][:ALTERNATIVES]
+    robot = fit.study.robot
+    # A payload hangs on the last joint, whatever the arm's stanzas say of the place of the arm as a whole.
+    joint = robot.n - 1 if change.effect.name == "payload" else change.place.joint
+    return NumbersFinding(
+        effect=change.effect.name,
+        joint=robot.joints[joint].name,
+        other=None,
+        parameters=told,
+        std=std,
+        p_value=p,
+        gap_before=gap_before,
+        gap_after=gap_after,
+        alternatives=tuple((c.effect.name, robot.joints[c.place.joint].name, q) for q, c, _ in rivals),
+        words=_words(change.effect, robot.joints[joint].name, told, std),
+    )
+
+
+def _gap(fit: Fit, theta: Array, change: _Change) -> float:
+    """Relative torque error on held-out data, percent, of the joint or of all."""
+    overall, each = relative_errors(fit, theta, held=True)
+    return overall if change.effect.scope == "arm" else float(each[change.place.joint])
+
+
+def _words(effect: Effect, joint: str, values: dict[str, float], std: dict[str, float]) -> str:
+    if effect.name == "payload" and "mp" in values:
+        mass = values["mp"]
+        words = f"{abs(mass):.3g} kg (standard deviation {std['mp']:.2g} kg) {'more' if mass > 0 else 'less'}"
+        words += " on the flange than in the baseline"
+        moments = [values.get(f"m{axis}p") for axis in "xyz"]
+        if mass > 3 * std["mp"] and None not in moments:
+            at = ", ".join(f"{moment / mass:.3f}" for moment in moments if moment is not None)
+            words += f", centre of mass at ({at}) m in the frame of the last link"
+        return words
+    told = ", ".join(f"{name} {value:+.3g} (standard deviation {std[name]:.2g})" for name, value in values.items())
+    return f"{effect.title} at {joint}: {told}" if told else f"{effect.title} at {joint}"
+
+
+def _rest(comparison: _Comparison, found: Sequence[_Change], alpha: float) -> list[NumbersFinding]:
+    """What has changed and no candidate explains, in one finding."""
+    fit = comparison.fit
+    _, _, _, left, free = comparison.solved(found)
+    p = float(stats.chi2.sf(left, free))
+    changed = _changed_names(comparison, found, alpha)
+    if p > alpha and not changed:
+        return []
+    before = comparison.predicted(found)
+    if _held_out(comparison, before, fit.theta) <= stats.norm.isf(alpha):
+        return []
+    model = fit.study.model
+    names = [model.base.names[comparison.known[k]] for k, _, _ in changed]
+    numbers = Counter(m.group(1) for name in names if (m := re.search(r"(\d)r?$", name)))
+    joint = model.robot.joints[min(int(numbers.most_common(1)[0][0]), model.n) - 1 if numbers else 0].name
+    told = "; ".join(
+        f"{name} was {comparison.theta0[k]:.4g}, differs by {rest:+.3g} (standard deviation {std:.2g})"
+        for name, (k, rest, std) in zip(names, changed, strict=True)
+    )
+    says = told or "no single number, but all together are further off than their errors allow"
+    return [
+        NumbersFinding(
+            effect="changed_parameters",
+            joint=joint,
+            other=None,
+            parameters={name: rest for name, (_, rest, _) in zip(names, changed, strict=True)},
+            std={name: std for name, (_, _, std) in zip(names, changed, strict=True)},
+            p_value=p,
+            gap_before=relative_errors(fit, before, held=True)[0],
+            gap_after=relative_errors(fit, held=True)[0],
+            alternatives=(),
+            words=f"numbers differ from the baseline and no effect of the catalogue explains it: {says}",
+        )
+    ]
