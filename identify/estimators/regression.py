@@ -246,7 +246,7 @@ def least_squares(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.
     """Solve ``min |y - x theta|`` by QR of the column-normalised regressor."""
     b = x.shape[1]
     scale = column_norms(x)
-    top = triangularize(x / scale, y, columns=b)
+    top = triangularize(x, y, columns=b, scales=(scale,))
     theta: NDArray[np.float64] = linalg.solve_triangular(top[:, :b], top[:, b]) / scale
     return theta
 
@@ -257,7 +257,7 @@ def instrumental_variable(
     """Solve ``z' (y - x theta) = 0`` (2.33) through the QR factors of ``z``: no product ``z' x`` is formed."""
     b = x.shape[1]
     scale = column_norms(x)
-    top = triangularize(z / column_norms(z), x / scale, y, columns=b)
+    top = triangularize(z, x, y, columns=b, scales=(column_norms(z), scale))
     theta: NDArray[np.float64] = np.linalg.solve(top[:, b : 2 * b], top[:, 2 * b]) / scale
     return theta
 
@@ -265,7 +265,7 @@ def instrumental_variable(
 def inverse_gram(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """``(x' x)^-1`` from the triangular factor of ``x``."""
     scale = column_norms(x)
-    factor = triangularize(x / scale, columns=x.shape[1])
+    factor = triangularize(x, columns=x.shape[1], scales=(scale,))
     inverse = linalg.solve_triangular(factor, np.eye(x.shape[1])) / scale[:, None]
     gram: NDArray[np.float64] = inverse @ inverse.T
     return gram
@@ -278,7 +278,7 @@ def iv_covariance(z: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.
     approximate, as an identified impulse response is.
     """
     scale = column_norms(x)
-    top = triangularize(z / column_norms(z), x / scale, columns=x.shape[1])
+    top = triangularize(z, x, columns=x.shape[1], scales=(column_norms(z), scale))
     inverse = np.linalg.inv(top[:, x.shape[1] :]) / scale[:, None]
     covariance: NDArray[np.float64] = inverse @ inverse.T
     return covariance

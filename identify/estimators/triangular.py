@@ -5,6 +5,8 @@ waiting for each other costs more than the work as soon as the processor has any
 a few rows at a time, in cache, by one thread, and the same rows always give the same bits.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +16,9 @@ _ROWS = 64
 """Rows eliminated at a time: with a hundred columns they fit the second-level cache."""
 
 
-def triangularize(*blocks: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
+def triangularize(
+    *blocks: NDArray[np.float64], columns: int, scales: Sequence[NDArray[np.float64]] = ()
+) -> NDArray[np.float64]:
     """Reflect ``[A1 A2 ...]`` until its first columns are upper triangular (Householder, ``Q' A``).
 
     Parameters
@@ -23,6 +27,8 @@ def triangularize(*blocks: NDArray[np.float64], columns: int) -> NDArray[np.floa
         Arrays (m, p_i) or (m,), side by side.
     columns
         How many of the leading columns, b, to make triangular.
+    scales
+        What to divide the columns (p_i,) of the first arrays by.
 
     Returns
     -------
@@ -30,9 +36,13 @@ def triangularize(*blocks: NDArray[np.float64], columns: int) -> NDArray[np.floa
         The first b rows of ``Q' [A1 A2 ...]``, shape (b, sum of p_i): the triangular factor, then the projections of
         the other columns on the space of the first.
     """
-    work = np.column_stack(blocks)
+    matrices = [block.reshape(block.shape[0], -1) for block in blocks]
+    ends = np.cumsum([0, *(matrix.shape[1] for matrix in matrices)])
+    work = np.empty((matrices[0].shape[0], ends[-1]))
+    for k, matrix in enumerate(matrices):
+        np.divide(matrix, scales[k] if k < len(scales) else 1.0, out=work[:, ends[k] : ends[k + 1]])
     top = np.zeros((columns, work.shape[1]))
-    _reflect(np.ascontiguousarray(work), top)
+    _reflect(work, top)
     return top
 
 
