@@ -9,11 +9,19 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from configs import RobotConfig
-from identify.discrepancy.findings import described, experiment_to_separate, gap_of, noise_floor, undetectable
+from identify.discrepancy.findings import (
+    described,
+    experiment_to_separate,
+    gap_of,
+    miswired,
+    noise_floor,
+    undetectable,
+)
 from identify.discrepancy.search import Search, Settings, State, with_values
 from identify.discrepancy.simulated import SimulatedErrors, simulated_errors
 from identify.discrepancy.study import build_study
 from identify.discrepancy.where import Disagreement, unexplained, where
+from identify.discrepancy.wiring_check import find_wiring
 from identify.document import (
     BeforeAfter,
     DiagnosisDocument,
@@ -148,8 +156,11 @@ def _diagnose(
     steps: _Steps,
     settings: Settings,
 ) -> Diagnosis:
+    steps("wiring")
+    wiring = find_wiring([*training, *validation], robot)
+    wired = robot if wiring is None else robot.model_copy(update={"effects": (*wiring.stanzas, *robot.effects)})
     steps("derivatives and closed loop")
-    study = build_study(training, validation, robot)
+    study = build_study(training, validation, wired)
     steps("base fit")
     search = Search(study, settings, steps)
     first = search.start()
@@ -158,7 +169,7 @@ def _diagnose(
     final = search.run()
     steps("what is left")
     left = unexplained(final.fit, final.workshop, settings.false_alarms)
-    findings = described(search, first, final, left)
+    findings = [*([] if wiring is None else miswired(wiring, robot)), *described(search, first, final, left)]
     steps("simulation")
     simulated = simulated_errors(first, final)
     document = DiagnosisDocument(

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from configs import RobotConfig
 from configs.robot import Effect as Stanza
 from identify.catalogue.effect import Effect
 from identify.catalogue.registry import catalogue, known
@@ -15,6 +16,7 @@ from identify.discrepancy.precision import standard_deviations
 from identify.discrepancy.regression import relative_errors
 from identify.discrepancy.search import Search, State, with_values, without
 from identify.discrepancy.where import Disagreement
+from identify.discrepancy.wiring_check import WiringFinding
 from identify.document import Alternative, Finding, Gap, Invisible
 
 Array = NDArray[np.float64]
@@ -82,6 +84,37 @@ def _finding(rest: State, final: State, stanza: Stanza, std: dict[str, float], l
             "ambiguous_with": [t.candidate.effect.name for t in rivals if mine and t.score > mine.score - CLOSE],
         },
     )
+
+
+def miswired(wiring: WiringFinding, robot: RobotConfig) -> list[Finding]:
+    """Mistakes of wiring as findings; their gaps are what a physical model leaves of the motor's torque, percent."""
+    names = [joint.name for joint in robot.joints]
+    findings = []
+    for stanza, words, p_value, rivals in zip(
+        wiring.stanzas, wiring.words, wiring.p_values, wiring.alternatives, strict=True
+    ):
+        effect, motor = known(stanza.effect), names.index(stanza.joint)
+        findings.append(
+            Finding(
+                effect=effect.name,
+                joint=stanza.joint,
+                other=stanza.other,
+                kind="structure",
+                parameters=stanza.parameters,
+                confidence=1.0 / (1 + len(rivals)),
+                alternatives=[],
+                gap_before=100 * float(np.sqrt(wiring.unexplained_before[motor])),
+                gap_after=100 * float(np.sqrt(wiring.unexplained_after[motor])),
+                evidence={
+                    "title": effect.title,
+                    "says": words,
+                    "reference": effect.reference,
+                    "p_value": p_value,
+                    "equally_good": list(rivals),
+                },
+            )
+        )
+    return findings
 
 
 def gap_of(state: State, *, held: bool) -> Gap:
