@@ -7,7 +7,7 @@ linearly over a sample. Errors are relative 2-norms from sample 50 on: position,
 measured position after the zero-phase filter of the fit, force against the recorded voltage.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +15,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from configs import RobotConfig, load_robot
+from configs import DataError, RobotConfig, load_robot
 from configs.robot import Effect
 from identify.controller.crc import identify_crc
 from identify.controller.parametric import identify_parametric
-from identify.discrepancy.catalogue import effect_names, effect_regressor
 from identify.estimators.auxiliary import AuxiliaryModel
 from identify.estimators.didim import didim
 from identify.estimators.idim_iv import idim_iv
-from identify.estimators.idim_ls import idim_ls
 from identify.experiment import Experiment
 from identify.model.arm import ArmModel
 from identify.model.controller import DiscreteController
@@ -33,7 +31,6 @@ from identify.preparation import equations, published_equations
 from identify.result import relative_errors
 from identify.run import identify_experiment
 from identify.signals.bandpass import butterworth, central_difference
-from identify.signals.classical import chebyshev_decimate
 from identify.signals.decimate import design
 from identify.signals.differentiate import differentiate
 
@@ -92,22 +89,27 @@ def switching(robot: RobotConfig) -> RobotConfig:
     return robot.model_copy(update={"friction": robot.friction.model_copy(update={"sign_smoothing": SWITCHING})})
 
 
+def with_effects(*names: str) -> RobotConfig:
+    effects = tuple(Effect(effect=name, joint="joint_1") for name in names)
+    return load_robot("emps").model_copy(update={"effects": effects})
+
+
 def test_asymmetric_friction_prints_the_published_digits(plain: Axis) -> None:
     # Coulomb friction that differs between the directions is the offset of the model.
-    effects = (Effect(effect="asymmetric_viscous_friction", joint="joint_1"),)
-    robot = load_robot("emps").model_copy(update={"effects": effects})
-    p = robot.preprocessing
-    assert p is not None
-    (block,) = published_equations(ArmModel.from_config(robot), [plain.experiment], p)
-    q = butterworth(plain.q, DT, p.cutoff_hz, p.order, p.padlen)
-    added = effect_regressor(robot, q, central_difference(q, DT), sharp_sign=True)[p.drop :]
-    added = chebyshev_decimate(added, p.decimation, p.decimation_order, p.decimation_ripple_db, p.decimation_padlen)
-    worn = replace(block, x=np.concatenate([block.x, added], axis=2))
-    names = ("m1", "fv1", "fc1", "off1", *effect_names(robot))
-    m, fv, fc, off, fva = idim_ls([worn], names).theta
+    found = identify_experiment(
+        plain.experiment, with_effects("asymmetric_viscous_friction"), Options(method="idim-ls")
+    )
+    assert found.names == ("m1", "fv1", "fc1", "off1", "fva1")
+    m, fv, fc, off, fva = found.theta
     both = (m, fv + fva, fv - fva, fc + off, fc - off)
     assert [f"{value:.4f}" for value in both] == ["95.1540", "166.7061", "240.4236", "20.1440", "20.6277"]
-    assert f"{relative_errors([worn], np.array([m, fv, fc, off, fva]))[0]:.4f}" == "3.1117"
+    assert f"{found.relative_error_pct:.4f}" == "3.1117"
+
+
+def test_dry_friction_that_differs_between_the_directions_is_the_offset_by_another_name(plain: Axis) -> None:
+    robot = with_effects("asymmetric_viscous_friction", "asymmetric_coulomb_friction")
+    with pytest.raises(DataError, match="not excited: fca1, off1"):
+        identify_experiment(plain.experiment, robot, Options(method="idim-ls"))
 
 
 def test_cross_test_on_the_pulses_prints_the_published_digits(plain: Axis, pulsed: Axis) -> None:
