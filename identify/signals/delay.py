@@ -117,8 +117,9 @@ def torque_delay(
     if instruments is None:
         instruments = [differentiate(q, experiments[0].dt) for q in references] if instrumented else signals
     n, b = model.n, len(model.base.names)
-    x = [filtered_regressor(model, s, decimation) for s in signals]
-    z = [filtered_regressor(model, s, decimation) for s in instruments] if instrumented else x
+    joints = np.arange(n)
+    x = [_with_delays(filtered_regressor(model, s, decimation)) for s in signals]
+    z = [_with_delays(filtered_regressor(model, s, decimation)) for s in instruments] if instrumented else x
     y = [decimation(e.tau) for e in experiments]
     keep = [np.ones(value.shape, dtype=np.bool_) for value in y]
 
@@ -127,26 +128,25 @@ def torque_delay(
         theta = instrumental_variable(*rows)
         return theta, [Block(*parts, np.zeros(parts[0].shape[0])) for parts in zip(y, phi, keep, strict=True)]
 
-    theta, blocks = solve(z, x, unweighted(n))
-    theta, blocks = solve(z, x, joint_variances(blocks, theta))
+    without = [value[:, :, :b] for value in z], [value[:, :, :b] for value in x]
+    theta, blocks = solve(*without, unweighted(n))
+    theta, blocks = solve(*without, joint_variances(blocks, theta))
     noise: Sequence[ArModel] = joint_variances(blocks, theta)
     for _ in range(REWEIGHTINGS):
-        rates = [_rate(model, s, theta[:b], decimation) for s in signals]
-        known = [_rate(model, s, theta[:b], decimation) for s in instruments] if instrumented else rates
-        wide = [_with_delays(value, rate) for value, rate in zip(x, rates, strict=True)]
-        zeta = [_with_delays(value, rate) for value, rate in zip(z, known, strict=True)]
-        theta, blocks = solve(zeta, wide, noise)
+        for regressors, motions in ((x, signals), (z, instruments)) if instrumented else ((x, signals),):
+            for value, motion in zip(regressors, motions, strict=True):
+                value[:, joints, b + joints] = _rate(model, motion, theta[:b], decimation)
+        theta, blocks = solve(z, x, noise)
         noise = joint_variances(blocks, theta)
-    covariance = serial_covariance(zeta, wide, keep, noise, noise)
+    covariance = serial_covariance(z, x, keep, noise, noise)
     coloured = noise_models(blocks, theta, covariance, MAX_AR_ORDER)
-    covariance = serial_covariance(zeta, wide, keep, noise, coloured)
+    covariance = serial_covariance(z, x, keep, noise, coloured)
     return TorqueDelay(theta[b:], np.sqrt(np.diag(covariance)[b:]), experiments[0].dt, instrumented)
 
 
-def _with_delays(x: Array, rate: Array) -> Array:
-    """Regressor (M, n, b) with a column for every joint's delay, (M, n, b + n)."""
-    columns: Array = rate[:, :, None] * np.eye(rate.shape[1])
-    return np.concatenate([x, columns], axis=2)
+def _with_delays(x: Array) -> Array:
+    """Regressor (M, n, b) with an empty column for every joint's delay, (M, n, b + n)."""
+    return np.concatenate([x, np.zeros((*x.shape[:2], x.shape[1]))], axis=2)
 
 
 def _rate(model: ArmModel, s: Derivatives, theta: Array, decimation: Decimation) -> Array:
