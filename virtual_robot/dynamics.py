@@ -130,7 +130,7 @@ def advance(  # type: ignore[no-untyped-def]
     middle of the period, of the coordinates ``link``; ``rotor`` (N, N) is added to the mass matrix. The rows of the
     state are position, velocity, and the two as predicted for the middle of the next period.
     """
-    q, qd, middle, speed = state
+    q, qd, middle, speed = state[0], state[1], state[2], state[3]
     n, count, total = tau.size, bristles.shape[0], q.size
     full = rotor.copy()
     held = np.zeros(total)
@@ -151,7 +151,8 @@ def advance(  # type: ignore[no-untyped-def]
         np.empty(total), np.empty(total), np.empty(total), np.empty(total), np.empty(total), np.empty(total)
     )  # fmt: skip
     q2, qd2, mk = np.empty(total), np.empty(total), np.empty(total)
-    z1, z2, z3, rate, inverse, cross, pull = np.empty((7, count))
+    rows = np.empty((7, count))
+    z1, z2, z3, rate, inverse, cross, pull = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6]
     loaded = False
     for e in range(table.shape[0]):
         loaded |= int(table[e, 0]) == LOAD_CODE
