@@ -35,7 +35,7 @@ def run_robot(
 
     ``truth`` names a file for the arm's own parameters: standard ones, base ones where several act as one, and the
     drives' (``kp``, 1/s; ``kv``, units of their signal per rad/s or m/s at the motor; ``velocity_samples``;
-    ``velocity_filter_hz``, null without filter; ``velocity_feedback``, 0 or 1). ``velocity_feedback`` chooses the
+    ``velocity_filter_hz`` where there is a filter; ``velocity_feedback``, 0 or 1). ``velocity_feedback`` chooses the
     latter, see ``servo.design``.
 
     Raises
@@ -119,10 +119,11 @@ def _write_truth(robot: RobotConfig, q: ArrayLike, path: Path, velocity_feedback
     """Parameters of the plant, and of the drives, tuned at posture ``q`` (n,)."""
     parameters = plant_parameters(robot)
     drives = servo.design(robot, Plant(robot, q).mass_matrix(), velocity_feedback)
-    values: dict[str, float | None] = {**parameters, **base_parameters(parameters)}
+    values = parameters | base_parameters(parameters)
     values["velocity_feedback"] = float(drives.velocity_feedback)
     values["velocity_samples"] = float(drives.velocity_samples)
-    values["velocity_filter_hz"] = drives.filter_hz if math.isfinite(drives.filter_hz) else None
+    if math.isfinite(drives.filter_hz):
+        values["velocity_filter_hz"] = drives.filter_hz
     for j in range(robot.n):
         values |= {f"kp{j + 1}": float(drives.kp[j]), f"kv{j + 1}": float(drives.kv[j])}
     path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")

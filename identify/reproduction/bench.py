@@ -27,6 +27,8 @@ class Bench:
         The measured one, without reference and controller; ``None``: not at hand.
     emps
         The measured EMPS; ``None``: not at hand.
+    axis
+        The virtual one; ``None``: not asked for.
     simulations
         Noise realisations of the simulated EMPS.
     """
@@ -36,6 +38,7 @@ class Bench:
     measured: Laboratory | None = None
     emps: Recorded | None = None
     simulations: int = SIMULATIONS
+    axis: Laboratory | None = None
 
     def emps_derivatives(self) -> list[Row]:
         """Errors of the derivatives on the simulated EMPS, by method."""

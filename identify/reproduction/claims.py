@@ -162,19 +162,20 @@ def controller(bench: Bench) -> list[Finding]:
     """Impulse responses from the tracking error serve IDIM-IV for a controller; DIDIM where they are exact (5.3.3)."""
     found = _responses("drives on the tracking error alone", bench.virtual, exact=True)
     found += _responses("drives that feed back the velocity", bench.feedback, exact=False)
-    if bench.emps is None:
-        return found
-    emps = controllers_on_emps(bench.emps)
-    (law, response), (direct, shifted) = emps.idim_iv, emps.didim
-    near, moved = apart(response.theta, law), apart(shifted.theta, direct)
-    return [
-        *found,
-        Finding(
-            near < SAME < moved,
-            f"measured EMPS, whose drive feeds back the velocity (the response explains {emps.fit_pct:.1f} % of the "
-            f"force): IDIM-IV with it differs by {near:.2f} standard deviations, DIDIM by {moved:.1f}",
-        ),
-    ]
+    axes = [] if bench.axis is None else [("virtual", bench.axis.recording(Case()))]
+    axes += [] if bench.emps is None else [("measured", bench.emps)]
+    for kind, recorded in axes:
+        emps = controllers_on_emps(recorded)
+        (law, response), (direct, shifted) = emps.idim_iv, emps.didim
+        near, moved = apart(response.theta, law), apart(shifted.theta, direct)
+        found.append(
+            Finding(
+                near < SAME < moved,
+                f"{kind} EMPS, whose drive feeds back the velocity (the response explains {emps.fit_pct:.1f} % of the "
+                f"force): IDIM-IV with it differs by {near:.2f} standard deviations, DIDIM by {moved:.1f}",
+            )
+        )
+    return found
 
 
 def _responses(drives: str, lab: Laboratory, *, exact: bool) -> list[Finding]:

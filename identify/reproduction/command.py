@@ -10,7 +10,7 @@ from identify.reproduction.bench import SIMULATIONS, SIMULATIONS_QUICK, Bench, T
 from identify.reproduction.claims import Claim, judged
 from identify.reproduction.laboratory import Laboratory
 from identify.reproduction.printing import document, markdown, print_tables
-from identify.reproduction.recordings import measured_emps, measured_recording, virtual_recording
+from identify.reproduction.recordings import EMPS_SESSION, measured_emps, measured_recording, virtual_recording
 from identify.reproduction.tables import Table
 from identify.terminal import Report, progress
 
@@ -98,6 +98,7 @@ def make_bench(folder: Path, measured: Path | None = None, *, quick: bool = Fals
         measured=real,
         emps=None if measured is None else measured_emps(measured),
         simulations=SIMULATIONS_QUICK if quick else SIMULATIONS,
+        axis=Laboratory(lambda: virtual_recording(folder / "recordings", velocity_feedback=True, session=EMPS_SESSION)),
     )
 
 

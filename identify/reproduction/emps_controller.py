@@ -1,4 +1,4 @@
-"""Section 5.3.3 on a measured axis whose drive feeds back the velocity: what an impulse response is good for there."""
+"""Section 5.3.3 on an axis whose drive feeds back the velocity: what an impulse response is good for there."""
 
 from dataclasses import dataclass
 
@@ -20,6 +20,8 @@ from identify.signals.differentiate import differentiate
 
 MODE_HZ = 20.0
 """Highest mode of the closed loop (5.1.4)."""
+LENGTH = 10
+"""Of the impulse response, samples; as many explain as much as 20, with which the virtual axis's loop is unstable."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Controllers:
 
 
 def controllers_on_emps(recorded: Recorded) -> Controllers:
-    """IDIM-IV and DIDIM on the measured EMPS with both identified controllers (5.2.2, 5.2.3)."""
+    """IDIM-IV and DIDIM on EMPS with both identified controllers (5.2.2, 5.2.3)."""
     experiment = recorded.experiment
     assert experiment.q_ref is not None
     model, dt = ArmModel.from_config(recorded.robot), experiment.dt
@@ -44,7 +46,9 @@ def controllers_on_emps(recorded: Recorded) -> Controllers:
     blocks = equations(model, [experiment], [signals], decimation)
     start = idim_ls(blocks, model.base.names).theta
     law = identify_parametric([experiment.q], [experiment.q_ref], [experiment.tau], dt)
-    response = identify_crc([experiment.q], [experiment.q_ref], [experiment.tau], dt, velocity_loop=False)
+    response = identify_crc(
+        [experiment.q], [experiment.q_ref], [experiment.tau], dt, length=LENGTH, velocity_loop=False
+    )
     loops = [
         AuxiliaryModel(
             model=model,

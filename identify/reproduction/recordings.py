@@ -22,6 +22,7 @@ from identify.from_recording import experiments_from_recording
 from identify.model.controller import DiscreteController
 
 SESSION = "tx40_cell.yaml"
+EMPS_SESSION = "emps_cell.yaml"
 COMMAND = (sys.executable, "-m", "daq.cli", "robot")
 
 MEASURED_POSITIONS, MEASURED_TORQUES = "pos_read_data.csv", "curr_data.csv"
@@ -60,15 +61,18 @@ class Recorded:
     def controller(self) -> DiscreteController:
         """The drives' own controller: a velocity loop around a position loop (figure B.1).
 
-        ``nu = kv (kp eps + s)`` where ``s`` is, through a first-order low-pass, the derivative of ``eps``, or of ``-q``
-        where the drives feed back the velocity.
+        ``nu = kv (kp eps + s)`` where ``s`` is, through a first-order low-pass if there is one, the derivative of
+        ``eps``, or of ``-q`` where the drives feed back the velocity.
         """
-        n, dt = self.robot.n, self.experiment.dt
+        n, dt, samples = self.robot.n, self.experiment.dt, int(self.truth["velocity_samples"])
         kp, kv = (np.array([self.truth[f"{gain}{j + 1}"] for j in range(n)]) for gain in ("kp", "kv"))
         loop = kv * np.array([joint.drive.gain for joint in self.robot.joints])
-        keep = float(np.exp(-2 * np.pi * self.truth["velocity_filter_hz"] * dt))
-        proportional = np.stack([loop * kp, -keep * loop * kp], axis=1)
-        derivative = np.stack([loop * (1 - keep) / dt, -loop * (1 - keep) / dt], axis=1)
+        corner = self.truth.get("velocity_filter_hz", np.inf)
+        keep = float(np.exp(-2 * np.pi * corner * dt))
+        proportional, derivative = np.zeros((2, n, samples + 1))
+        proportional[:, 0], proportional[:, 1] = loop * kp, -keep * loop * kp
+        derivative[:, 0] = loop * (1 - keep) / (samples * dt)
+        derivative[:, -1] = -derivative[:, 0]
         feedback = bool(self.truth["velocity_feedback"])
         return DiscreteController(
             error_taps=proportional if feedback else proportional + derivative,
@@ -79,15 +83,15 @@ class Recorded:
         )
 
 
-def virtual_recording(folder: Path, seed: int = 0, velocity_feedback: bool = False) -> Recorded:
-    """Record the virtual TX40 on its excitation trajectory, in a process of its own, or take it from ``folder``.
+def virtual_recording(folder: Path, seed: int = 0, velocity_feedback: bool = False, session: str = SESSION) -> Recorded:
+    """Record the virtual arm of a session, in a process of its own, or take it from ``folder``.
 
     Parameters
     ----------
     folder
         Keeps recordings under a digest of what they were made with.
     seed
-        Of the noise, whose size is that of table 6.3.
+        Of the noise, whose size is that measured, for the TX40 in table 6.3.
     velocity_feedback
         Of the drives; without it their velocity loop acts on the tracking error.
 
@@ -98,9 +102,9 @@ def virtual_recording(folder: Path, seed: int = 0, velocity_feedback: bool = Fal
     ArmidentError
         If the virtual arm fails.
     """
-    arguments = ["--config", SESSION, "--seed", str(seed)]
+    arguments = ["--config", session, "--seed", str(seed)]
     arguments.append("--velocity-feedback" if velocity_feedback else "--velocity-error")
-    name = _digest(arguments)
+    name = _digest(session, arguments)
     recording, truth = folder / f"{name}.mcap", folder / f"{name}.json"
     if not (recording.is_file() and truth.is_file()):
         try:
@@ -113,13 +117,13 @@ def virtual_recording(folder: Path, seed: int = 0, velocity_feedback: bool = Fal
     return Recorded(read.robot, experiment, json.loads(truth.read_text(encoding="utf-8")))
 
 
-def _digest(arguments: list[str]) -> str:
+def _digest(session: str, arguments: list[str]) -> str:
     """Of the arguments, the files they name, and the version of the program."""
-    session = load_session(SESSION)
+    cell = load_session(session)
     digest = hashlib.sha256("\0".join([version("armident"), *arguments]).encode())
-    files = [config_path(SESSION), session.robot]
-    if session.setpoints is not None:
-        files.append(session.setpoints.trajectory)
+    files = [config_path(session), cell.robot]
+    if cell.setpoints is not None:
+        files.append(cell.setpoints.trajectory)
     for file in files:
         digest.update(Path(file).read_bytes())
     return digest.hexdigest()[:16]

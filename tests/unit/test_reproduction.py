@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from configs import ArmidentError, ConfigError, DataError, load_robot, load_trajectory
 from daq.recording import read_recording
+from identify.controller.nominal import known_controller
 from identify.estimators.idim_ls import idim_ls
 from identify.from_recording import experiments_from_recording
 from identify.model.arm import ArmModel
@@ -431,3 +432,26 @@ def test_emps_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     (tmp_path / "emps" / recordings.EMPS_FILE).write_text("not what MATLAB writes")
     with pytest.raises(DataError, match=r"DATA_EMPS\.mat: cannot be read"):
         measured_emps(tmp_path)
+
+
+def test_on_virtual_emps_an_impulse_response_serves_idim_iv_and_not_didim(bench: Bench) -> None:
+    assert bench.axis is not None
+    recorded = bench.axis.recording(Case())
+    found = controllers_on_emps(recorded)
+    assert found.fit_pct < 99
+    (law, response), (direct, shifted) = found.idim_iv, found.didim
+    assert claims.apart(response.theta, law) < 0.5
+    assert claims.apart(shifted.theta, direct) > 2
+    own = np.array([recorded.truth[name] for name in ("m1", "fv1", "fc1", "off1")])
+    assert (np.abs(response.theta - own) < 4 * response.std).all()
+    assert (np.abs(shifted.theta - own) > 4 * direct.std).any()
+
+
+def test_law_of_the_axis_is_the_one_of_its_configuration(bench: Bench) -> None:
+    assert bench.axis is not None
+    recorded = bench.axis.recording(Case())
+    ours, known = recorded.controller(), known_controller(recorded.robot, recorded.experiment.dt)
+    np.testing.assert_allclose(ours.error_taps[:, :1], known.error_taps)
+    assert not ours.error_taps[:, 1:].any()
+    np.testing.assert_allclose(ours.position_taps, known.position_taps)
+    assert not ours.output_taps.any()
