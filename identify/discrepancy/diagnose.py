@@ -15,8 +15,10 @@ from identify.discrepancy.findings import (
     gap_of,
     miswired,
     noise_floor,
+    outdated,
     undetectable,
 )
+from identify.discrepancy.numbers import stale_numbers
 from identify.discrepancy.search import Search, Settings, State, with_values
 from identify.discrepancy.simulated import SimulatedErrors, simulated_errors
 from identify.discrepancy.study import build_study
@@ -170,6 +172,9 @@ def _diagnose(
     steps("what is left")
     left = unexplained(final.fit, final.workshop, settings.false_alarms)
     findings = [*([] if wiring is None else miswired(wiring, robot)), *described(search, first, final, left)]
+    if baseline is not None:
+        steps("numbers")
+        findings += outdated(stale_numbers(final.fit, final.workshop, baseline, settings.false_alarms))
     steps("simulation")
     simulated = simulated_errors(first, final)
     document = DiagnosisDocument(
@@ -185,7 +190,7 @@ def _diagnose(
             validation=BeforeAfter(before=gap_of(first, held=True), after=gap_of(final, held=True)),
         ),
         noise_floor=noise_floor(final, left),
-        recommended_experiment=experiment_to_separate(findings, final),
+        recommended_experiment=experiment_to_separate(findings),
         model=None,
         timing_s=steps.finish(),
         versions=versions(),

@@ -12,6 +12,8 @@ from identify.catalogue.effect import Effect
 from identify.catalogue.registry import catalogue, known
 from identify.catalogue.terms import place_of
 from identify.discrepancy.candidates import places
+from identify.discrepancy.experiment import recommended_experiment
+from identify.discrepancy.numbers import NumbersFinding
 from identify.discrepancy.precision import standard_deviations
 from identify.discrepancy.regression import relative_errors
 from identify.discrepancy.search import Search, State, with_values, without
@@ -23,6 +25,9 @@ Array = NDArray[np.float64]
 
 RIVALS = 3
 """Alternatives named beside every finding."""
+
+DOUBTFUL = 0.6
+"""Confidence below which another experiment is recommended."""
 
 CLOSE = float(np.log(20.0))
 """Difference in log-likelihood below which a rival cannot be told apart: odds of less than 20 to 1."""
@@ -156,16 +161,40 @@ def undetectable(state: State) -> list[Invisible]:
     return found
 
 
-def experiment_to_separate(findings: Sequence[Finding], state: State) -> str | None:
-    """An experiment that separates a finding from a rival nearly as good."""
+def outdated(numbers: Sequence[NumbersFinding]) -> list[Finding]:
+    """Numbers of a baseline that no longer hold, as findings."""
+    return [
+        Finding(
+            effect=n.effect,
+            joint=n.joint,
+            other=n.other,
+            kind="numbers",
+            parameters=n.parameters,
+            confidence=1.0 - n.p_value,
+            alternatives=[
+                Alternative(effect=e, joint=j, score=float(-np.log(max(p, 1e-300)))) for e, j, p in n.alternatives
+            ],
+            gap_before=n.gap_before,
+            gap_after=n.gap_after,
+            evidence={
+                "title": known(n.effect).title if n.effect in catalogue() else "numbers that have changed",
+                "says": n.words,
+                "p_value": n.p_value,
+                "std": n.std,
+            },
+        )
+        for n in numbers
+    ]
+
+
+def experiment_to_separate(findings: Sequence[Finding]) -> str | None:
+    """An experiment that separates a finding from a rival nearly as good, or makes a doubtful one surer."""
     for finding in findings:
-        for name in finding.evidence.get("ambiguous_with", []):
-            mine, other = known(finding.effect), known(name)
-            return (
-                f"{mine.title} and {other.title} cannot be told apart here: record {mine.needs}, and {other.needs}; "
-                f"armident trajectory --for {mine.name} --against {other.name} --joint {finding.joint} designs it"
-            )
-    return None
+        rivals = [known(name) for name in finding.evidence.get("ambiguous_with", [])]
+        if rivals:
+            return recommended_experiment(known(finding.effect), finding.joint, rivals)
+    doubtful = [f for f in findings if f.kind == "structure" and f.confidence < DOUBTFUL]
+    return recommended_experiment(known(doubtful[0].effect), doubtful[0].joint) if doubtful else None
 
 
 def _terms(state: State) -> list[int]:
