@@ -256,11 +256,21 @@ CASES = [("tx40", effect) for effect in sorted(EXAMPLES)]
 CASES += [("emps", effect) for effect in sorted(EXAMPLES) if EFFECTS[effect].other != "required"]
 
 
+@pytest.fixture(scope="module")
+def quiet(tx40: RobotConfig, emps: RobotConfig) -> dict[str, dict[str, NDArray[np.float64]]]:
+    """What the healthy arms record without noise."""
+    return {robot.name: record(robot, None, noise=0.0) for robot in (tx40, emps)}
+
+
 @pytest.mark.parametrize(("name", "effect"), CASES)
 def test_every_effect_shows_in_a_recording_and_leaves_the_arm_under_control(
-    tx40: RobotConfig, emps: RobotConfig, name: str, effect: str
+    tx40: RobotConfig,
+    emps: RobotConfig,
+    quiet: dict[str, dict[str, NDArray[np.float64]]],
+    name: str,
+    effect: str,
 ) -> None:
-    robot = {"tx40": tx40, "emps": emps}[name]
+    robot, healthy = {"tx40": tx40, "emps": emps}[name], quiet[name]
     pair = EFFECTS[effect].other == "required"
     needed = next(key for key, parameter in EFFECTS[effect].parameters.items() if parameter.default is None)
     options = {needed: (EXAMPLES if name == "tx40" else ON_EMPS)[effect]}
@@ -269,7 +279,6 @@ def test_every_effect_shows_in_a_recording_and_leaves_the_arm_under_control(
     if effect == "stick_events":
         options["every"] = 0.3
     joint = "joint_1" if EFFECTS[effect].first_joint or robot.n == 1 else "joint_2"
-    healthy = record(robot, None, noise=0.0)
     hidden = record(robot, hide(effect, joint, "joint_3" if pair else None, **options), noise=0.0)
     inside = slice(len(healthy["effort"]) // 5, None)
     shown = np.abs(hidden["effort"] - healthy["effort"])[inside].max(axis=0)
