@@ -66,7 +66,8 @@ def _one(effect: Effect) -> None:
     for parameter in _parameters(effect):
         print(f"  {parameter}")
     print(f"needs: {effect.needs}\nsource: {effect.reference}")
-    values = [f"{p.name}: ..." for p in (*effect.shapes, *effect.linear)]
+    names = [shape.name for shape in effect.shapes] + [parameter.name for parameter in effect.linear]
+    values = [f"{parameter}: ..." for parameter in names]
     other = ", other: joint_2" if effect.scope == "pair" else ""
     print(f"stanza: {{effect: {effect.name}, joint: joint_1{other}, parameters: {{{', '.join(values)}}}}}")
 
