@@ -19,9 +19,9 @@ from configs import DataError
 from identify.catalogue.effect import Effect, Place
 from identify.catalogue.registry import catalogue
 from identify.discrepancy.candidates import Workshop, places
-from identify.discrepancy.regression import Fit, relative_errors
+from identify.discrepancy.regression import MAX_AR_ORDER, Fit, relative_errors
 from identify.document import IdentificationDocument
-from identify.estimators.noise import ArModel
+from identify.estimators.regression import COVARIANCE_PASSES, Block, noise_models
 
 Array = NDArray[np.float64]
 
@@ -183,7 +183,7 @@ def stale_numbers(
     DataError
         If the baseline is of another model, or has no covariance.
     """
-    comparison = compared(fit, baseline)
+    comparison = compared(cautious(fit), baseline)
     if not _stale(comparison, alpha):
         return []
     pool = list(_changes(comparison, workshop))
@@ -238,18 +238,21 @@ def compared(fit: Fit, baseline: IdentificationDocument) -> _Comparison:
         scale = np.linalg.norm(z, axis=0)
         scale[scale == 0] = 1.0
         absorbed = np.linalg.solve((z / scale).T @ (x[:, known] / scale), (z / scale).T @ x[:, free]) / scale[:, None]
-    covariance = _widening(fit) * fit.covariance[np.ix_(known, known)] + covariance0
+    covariance = fit.covariance[np.ix_(known, known)] + covariance0
     return _Comparison(fit, known, theta0, covariance0, covariance, absorbed)
 
 
-def _widening(fit: Fit) -> float:
-    """Of the fit's covariance for noise models being estimates; see `ArModel.widened`."""
-    samples = sum(y.shape[0] for _, _, y in fit.equations.train)
+def cautious(fit: Fit) -> Fit:
+    """The fit with noise models that count what its parameters have absorbed, and that they are estimates.
 
-    def of(noise: ArModel) -> float:
-        return noise.widened(samples).variance / noise.variance
-
-    return max(of(noise) for noise in fit.noise)
+    A search compares candidates in one recording, and needs neither; two recordings are compared by covariances.
+    """
+    blocks = [
+        Block(y, x, np.ones(y.shape, dtype=np.bool_), np.arange(float(y.shape[0]))) for x, _, y in fit.equations.train
+    ]
+    for _ in range(COVARIANCE_PASSES - 1):
+        fit = fit.renoised(noise_models(blocks, fit.theta, fit.covariance, MAX_AR_ORDER))
+    return fit
 
 
 def _stale(comparison: _Comparison, alpha: float) -> bool:
