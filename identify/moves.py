@@ -50,7 +50,10 @@ AIM_REACH = (0.02, 0.9)
 AIM_SLOWEST_PACE = 6.0
 """As `REACH` and `SLOWEST_PACE`, where an effect is wanted: it may need small, slow or lonely moves."""
 
-BASE_WEIGHT = 0.2
+STEPS, AIM_STEPS = (0.05, 0.2, 0.5), (0.01, 0.05, 0.2, 0.5)
+"""Standard deviations of the changes of waypoints, over the range; small ones where an effect is wanted."""
+
+BASE_WEIGHT = 0.05
 """Weight of the base parameters' precision beside that of a wanted effect's."""
 
 
@@ -97,18 +100,13 @@ class Search:
 
     def random(self) -> Moves:
         """Waypoints within reach of each other, the last one home, as many as fit the duration."""
-        if self.aim is None:
-            reach = self.rng.uniform(*REACH) * (self.high - self.low)
-        else:
-            # Each joint its own, so that the wanted one can turn often while others hardly move.
-            reach = np.exp(self.rng.uniform(np.log(AIM_REACH[0]), np.log(AIM_REACH[1]), self.low.size)) * (
-                self.high - self.low
-            )
+        reach = self.rng.uniform(*REACH) * (self.high - self.low) if self.aim is None else None
         points: list[Floats] = []
         paces: list[float] = []
         here, left = self.home, self.duration
         while True:
-            point = np.clip(here + self.rng.uniform(-reach, reach), self.low, self.high)
+            way = self._far() if reach is None else reach
+            point = np.clip(here + self.rng.uniform(-way, way), self.low, self.high)
             pace = float(self._pace(1)[0])
             left -= pace * max(float(self._shortest((point - here)[None, :])[0]), SHORTEST_MOVE)
             if left < 0.0 and points:
@@ -119,11 +117,18 @@ class Search:
         points[-1] = self.home
         return Moves(np.array(points), np.array(paces))
 
+    def _far(self) -> Floats:
+        """How far the joints may go in one move (n,), each its own: the wanted one slowly while others hardly move."""
+        share = np.exp(self.rng.uniform(np.log(AIM_REACH[0]), np.log(AIM_REACH[1]), self.low.size))
+        far: Floats = share * (self.high - self.low)
+        return far
+
     def neighbour(self, candidate: Moves) -> Moves:
         """The candidate with a few coordinates changed."""
         points, paces = candidate.points.copy(), candidate.paces.copy()
         change = self.rng.random(points.shape) < self.rng.choice([0.03, 0.1, 0.3])
-        step = self.rng.normal(0.0, self.rng.choice([0.05, 0.2, 0.5]), points.shape) * (self.high - self.low)
+        sizes = STEPS if self.aim is None else AIM_STEPS
+        step = self.rng.normal(0.0, self.rng.choice(sizes), points.shape) * (self.high - self.low)
         points = np.where(change, np.clip(points + step, self.low, self.high), points)
         points[-1] = self.home
         change_pace = self.rng.random(paces.shape) < 0.1
