@@ -12,8 +12,8 @@ HINTS: dict[Kind, str] = {
         "hose under tension, an end stop, a spring, a tight spot of the gear, or a wrong mass in the model"
     ),
     "position and direction": (
-        "{joint} moves harder at some positions than at others, most at {at}: look for a tight spot, a bent "
-        "shaft or a worn stretch of the guide"
+        "friction of {joint} is higher at some positions than at others, most unlike the model at {at}: look for a "
+        "tight spot, a bent shaft or a worn stretch of the guide"
     ),
     "motor angle": (
         "a torque ripple repeats with the motor of {other}: look at the motor, its encoder and the first gear stage"

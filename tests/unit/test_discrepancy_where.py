@@ -1,6 +1,7 @@
 """Where model and data disagree: shapes without a formula, lines, and silence where there is nothing."""
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from identify.discrepancy.regression import Fit, fit
 from identify.discrepancy.study import build_study
 from identify.discrepancy.where import Disagreement, unexplained, where
 from identify.from_recording import experiments_from_recording
+from identify.reproduction.recordings import measured_emps
 from virtual_robot.offline import simulate_recording
 
 BUMP = 5.0
@@ -82,6 +84,19 @@ def test_an_arm_as_its_model_says_shows_nothing() -> None:
     data = healthy()
     assert where(*data) == []
     assert unexplained(*data) == []
+
+
+def test_the_measured_emps_disagrees_in_its_friction_first(shared_data: Path) -> None:
+    """What it lacks is known: viscous friction that differs between the directions (Janot, Gautier, Brunot 2019)."""
+    measured = measured_emps(shared_data)
+    if measured is None:
+        pytest.skip("no DATA_EMPS.mat in the measured data")
+    study = build_study([measured.experiment], [], measured.robot)
+    found = fit(study)
+    first = where(found, Workshop(study, found.theta))[0]
+    assert first.varies_with == "velocity"
+    assert first.share > 0.05
+    assert first.hint.startswith("Friction of joint_1 does not follow the model")
 
 
 def test_every_map_has_its_own_name_and_a_hint() -> None:
