@@ -13,27 +13,24 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import stats
 
-from configs import DataError
-from identify.catalogue.effect import Effect, Place
+from identify.catalogue.effect import Effect
 from identify.catalogue.registry import catalogue
+from identify.discrepancy.baseline import Change, Comparison, cautious, compared
 from identify.discrepancy.candidates import Workshop, places
-from identify.discrepancy.regression import MAX_AR_ORDER, Fit, relative_errors
+from identify.discrepancy.regression import Fit, relative_errors
 from identify.document import IdentificationDocument
-from identify.estimators.regression import COVARIANCE_PASSES, Block, noise_models
 
 Array = NDArray[np.float64]
 
-STRUCTURAL = ("drive_gain_error", "gravity_direction", "rotor_inertia")
+STRUCTURAL = {
+    "drive_gain_error": "another torque per ampere than in the baseline",
+    "gravity_direction": "gravity comes from another direction than in the baseline",
+    "rotor_inertia": "another inertia at the motor than in the baseline",
+}
 """Effects that a model can also lack, which parameters of an arm take over in part: another number against a baseline,
-of either sign."""
-
-RANK_TOLERANCE = 1e-7
-"""Directions of normalised changes shorter than this are none."""
-
-ESTIMABLE = 0.999
-"""Share of a parameter that must lie in the directions seen for it to have a value of its own."""
+of either sign; and how to say so."""
 
 ALTERNATIVES = 3
 NEWEY_WEST_LAGS = 20
@@ -73,95 +70,6 @@ class NumbersFinding:
     words: str
 
 
-@dataclass(frozen=True)
-class _Change:
-    """A candidate: an effect at a place, and what the known parameters (k,) do per unit of its own, (k, m)."""
-
-    effect: Effect
-    place: Place
-    directions: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _Comparison:
-    """A fit beside a baseline.
-
-    Parameters
-    ----------
-    known
-        Which parameters of the fit the baseline has, (k,).
-    theta0, covariance0
-        The baseline's, (k,) and (k, k).
-    covariance
-        Of the difference, (k, k).
-    absorbed
-        What terms that the baseline has not would have done to its parameters had they been in its data, (k, m):
-        nobody knows which of the two models it was, so differences along these directions are no evidence.
-    """
-
-    fit: Fit
-    known: NDArray[np.int64]
-    theta0: Array
-    covariance0: Array
-    covariance: Array
-    absorbed: Array
-
-    @property
-    def difference(self) -> Array:
-        """Fit less baseline, (k,)."""
-        difference: Array = self.fit.theta[self.known] - self.theta0
-        return difference
-
-    def whitened(self, values: Array) -> Array:
-        """``L^-1 values`` with ``L L'`` the covariance of the difference."""
-        scale = np.sqrt(np.diag(self.covariance))
-        lower = linalg.cholesky(self.covariance / np.outer(scale, scale), lower=True)
-        out: Array = linalg.solve_triangular(lower, (values.T / scale).T, lower=True)
-        return out
-
-    def solved(self, changes: Sequence[_Change]) -> tuple[Array, Array, Array, float, int]:
-        """Parameters of changes by generalised least squares.
-
-        Returns
-        -------
-        tuple
-            Parameters (of `absorbed` first), covariance, which of them have a value of their own, the chi-square that
-            is left and its degrees of freedom.
-        """
-        stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
-        target = self.whitened(self.difference)
-        columns = self.whitened(stack)
-        scale = np.linalg.norm(columns, axis=0)
-        scale[scale == 0] = 1.0
-        u, s, vt = np.linalg.svd(columns / scale, full_matrices=False)
-        kept = s > RANK_TOLERANCE * max(float(s.max(initial=0.0)), 1e-300)
-        u, s, vt = u[:, kept], s[kept], vt[kept]
-        inverse = (vt.T / s) / scale[:, None]
-        rest = target - u @ (u.T @ target)
-        own = np.einsum("kj,kj->j", vt, vt) > ESTIMABLE
-        return inverse @ (u.T @ target), inverse @ inverse.T, own, float(rest @ rest), target.size - int(kept.sum())
-
-    def predicted(self, changes: Sequence[_Change]) -> Array:
-        """Parameters (b,) with the baseline's numbers after these changes; the terms it has not go along."""
-        values = self.solved(changes)[0]
-        stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
-        return self.completed(self.theta0 + stack @ values)
-
-    def completed(self, known: Array) -> Array:
-        """All parameters of the fit (b,), those that the baseline has as given."""
-        theta = self.fit.theta.copy()
-        free = np.setdiff1d(np.arange(theta.size), self.known)
-        if free.size:
-            c = self.fit.covariance
-            scale = np.sqrt(np.diag(c))[self.known]
-            inner = c[np.ix_(self.known, self.known)] / np.outer(scale, scale)
-            theta[free] += (
-                c[np.ix_(free, self.known)] / scale @ np.linalg.solve(inner, (known - theta[self.known]) / scale)
-            )
-        theta[self.known] = known
-        return theta
-
-
 def stale_numbers(
     fit: Fit, workshop: Workshop, baseline: IdentificationDocument, alpha: float = 0.01
 ) -> list[NumbersFinding]:
@@ -187,8 +95,8 @@ def stale_numbers(
     if not _stale(comparison, alpha):
         return []
     pool = list(_changes(comparison, workshop))
-    found: list[_Change] = []
-    barred: list[_Change] = []
+    found: list[Change] = []
+    barred: list[Change] = []
     while True:
         ranked = _ranked(comparison, found, [c for c in pool if c not in found and c not in barred])
         if not ranked or ranked[0][0] * len(pool) > alpha:
@@ -207,62 +115,14 @@ def stale_numbers(
     return [*findings, *_rest(comparison, found, alpha)]
 
 
-def compared(fit: Fit, baseline: IdentificationDocument) -> _Comparison:
-    """Put a fit beside a baseline.
-
-    Raises
-    ------
-    DataError
-        See `stale_numbers`.
-    """
-    names = fit.study.model.base.names
-    rigid = names[: len(names) - fit.study.model.e]
-    listed = [p.name for p in baseline.parameters]
-    missing = [name for name in rigid if name not in listed]
-    if missing:
-        raise DataError(
-            f"the baseline of robot {baseline.robot!r} lacks {', '.join(missing[:5])}"
-            f"{' and more' if len(missing) > 5 else ''}: it was identified with another model"
-        )
-    theirs = np.array(baseline.covariance, dtype=np.float64)
-    if theirs.shape != (len(listed), len(listed)):
-        raise DataError(f"the baseline's covariance has shape {theirs.shape} for {len(listed)} parameters")
-    known = np.array([k for k, name in enumerate(names) if name in listed], dtype=np.int64)
-    chosen = [listed.index(names[k]) for k in known]
-    theta0 = np.array([baseline.parameters[k].value for k in chosen])
-    covariance0 = theirs[np.ix_(chosen, chosen)]
-    free = np.setdiff1d(np.arange(len(names)), known)
-    z, x = fit.train.z[:, known], fit.train.x
-    absorbed = np.zeros((known.size, 0))
-    if free.size:
-        scale = np.linalg.norm(z, axis=0)
-        scale[scale == 0] = 1.0
-        absorbed = np.linalg.solve((z / scale).T @ (x[:, known] / scale), (z / scale).T @ x[:, free]) / scale[:, None]
-    covariance = fit.covariance[np.ix_(known, known)] + covariance0
-    return _Comparison(fit, known, theta0, covariance0, covariance, absorbed)
-
-
-def cautious(fit: Fit) -> Fit:
-    """The fit with noise models that count what its parameters have absorbed, and that they are estimates.
-
-    A search compares candidates in one recording, and needs neither; two recordings are compared by covariances.
-    """
-    blocks = [
-        Block(y, x, np.ones(y.shape, dtype=np.bool_), np.arange(float(y.shape[0]))) for x, _, y in fit.equations.train
-    ]
-    for _ in range(COVARIANCE_PASSES - 1):
-        fit = fit.renoised(noise_models(blocks, fit.theta, fit.covariance, MAX_AR_ORDER))
-    return fit
-
-
-def _stale(comparison: _Comparison, alpha: float) -> bool:
+def _stale(comparison: Comparison, alpha: float) -> bool:
     """Whether all parameters together, or any of them by itself, differ; half the false alarms for either test."""
     _, _, _, rest, free = comparison.solved([])
     together = float(stats.chi2.sf(rest, free))
     return together < alpha / 2 or bool(_changed_names(comparison, [], alpha / 2))
 
 
-def _changed_names(comparison: _Comparison, changes: Sequence[_Change], alpha: float) -> list[tuple[int, float, float]]:
+def _changed_names(comparison: Comparison, changes: Sequence[Change], alpha: float) -> list[tuple[int, float, float]]:
     """Known parameters that differ beyond the changes: number, difference and standard deviation, by Holm's method."""
     stack = np.column_stack([comparison.absorbed, *(c.directions for c in changes)])
     rest = comparison.difference - stack @ comparison.solved(changes)[0]
@@ -276,7 +136,7 @@ def _changed_names(comparison: _Comparison, changes: Sequence[_Change], alpha: f
     return found
 
 
-def _changes(comparison: _Comparison, workshop: Workshop) -> Iterator[_Change]:
+def _changes(comparison: Comparison, workshop: Workshop) -> Iterator[Change]:
     """All effects that are other numbers, at all their places."""
     fit = comparison.fit
     motion = workshop.motion(fit.study.train[0], "measured")
@@ -295,10 +155,10 @@ def _changes(comparison: _Comparison, workshop: Workshop) -> Iterator[_Change]:
                 directions = fit.absorbed(workshop.columns(effect, place, (), fit.noise).x)
             directions = directions[comparison.known]
             if directions.any():
-                yield _Change(effect, place, directions)
+                yield Change(effect, place, directions)
 
 
-def _p_value(comparison: _Comparison, others: Sequence[_Change], change: _Change) -> float:
+def _p_value(comparison: Comparison, others: Sequence[Change], change: Change) -> float:
     """That a change beside others explains so much of the difference without merit."""
     _, _, _, before, free_before = comparison.solved(others)
     _, _, _, after, free_after = comparison.solved([*others, change])
@@ -308,8 +168,8 @@ def _p_value(comparison: _Comparison, others: Sequence[_Change], change: _Change
 
 
 def _ranked(
-    comparison: _Comparison, found: Sequence[_Change], pool: Sequence[_Change]
-) -> list[tuple[float, _Change, float]]:
+    comparison: Comparison, found: Sequence[Change], pool: Sequence[Change]
+) -> list[tuple[float, Change, float]]:
     """Candidates by p-value: it, the candidate, and its logarithm, which does not underflow."""
     _, _, _, before, free_before = comparison.solved(found)
     trials = []
@@ -321,12 +181,12 @@ def _ranked(
     return sorted(trials, key=lambda trial: trial[2])
 
 
-def _closes(comparison: _Comparison, before: Sequence[_Change], after: Sequence[_Change], alpha: float) -> bool:
+def _closes(comparison: Comparison, before: Sequence[Change], after: Sequence[Change], alpha: float) -> bool:
     """Whether held-out torques follow the change."""
     return _held_out(comparison, comparison.predicted(before), comparison.predicted(after)) > stats.norm.isf(alpha)
 
 
-def _held_out(comparison: _Comparison, before: Array, after: Array) -> float:
+def _held_out(comparison: Comparison, before: Array, after: Array) -> float:
     """Projection of the held-out residual on the change of prediction in its standard deviations.
 
     Its spread comes from the noise, from what serial correlation is left (Newey-West), and from the baseline.
@@ -347,16 +207,18 @@ def _newey_west(products: Array) -> float:
     """Variance of a sum of serially correlated terms of mean zero, with Bartlett weights."""
     centred = products - products.mean()
     lags = min(NEWEY_WEST_LAGS, centred.size - 1)
-    sums = [float(centred[lag:] @ centred[: centred.size - lag]) for lag in range(lags + 1)]
-    return max(sums[0] + 2 * sum((1 - k / (lags + 1)) * sums[k] for k in range(1, lags + 1)), 0.0)
+    sums = np.array([centred[lag:] @ centred[: centred.size - lag] for lag in range(lags + 1)])
+    weights = 2 * (1 - np.arange(lags + 1) / (lags + 1))
+    weights[0] = 1.0
+    return max(float(weights @ sums), 0.0)
 
 
 def _described(
-    comparison: _Comparison,
-    before: Sequence[_Change],
-    change: _Change,
-    found: Sequence[_Change],
-    pool: Sequence[_Change],
+    comparison: Comparison,
+    before: Sequence[Change],
+    change: Change,
+    found: Sequence[Change],
+    pool: Sequence[Change],
 ) -> NumbersFinding:
     """A change with its values in the model of all changes, the gaps of the order in which they were found."""
     fit = comparison.fit
@@ -369,25 +231,29 @@ def _described(
     gap_before = _gap(fit, comparison.predicted(before), change)
     gap_after = _gap(fit, comparison.predicted([*before, change]), change)
     p = min(1.0, _p_value(comparison, others, change) * len(pool))
-    rivals = [r for r in _ranked(comparison, others, [c for c in pool if c not in found])][:ALTERNATIVES]
-    robot = fit.study.robot
-    # A payload hangs on the last joint, whatever the arm's stanzas say of the place of the arm as a whole.
-    joint = robot.n - 1 if change.effect.name == "payload" else change.place.joint
+    rivals = _ranked(comparison, others, [c for c in pool if c not in found])[:ALTERNATIVES]
+    joint = _joint(fit, change)
     return NumbersFinding(
         effect=change.effect.name,
-        joint=robot.joints[joint].name,
+        joint=joint,
         other=None,
         parameters=told,
         std=std,
         p_value=p,
         gap_before=gap_before,
         gap_after=gap_after,
-        alternatives=tuple((c.effect.name, robot.joints[c.place.joint].name, q) for q, c, _ in rivals),
-        words=_words(change.effect, robot.joints[joint].name, told, std),
+        alternatives=tuple((c.effect.name, _joint(fit, c), q) for q, c, _ in rivals),
+        words=_words(change.effect, joint, told, std),
     )
 
 
-def _gap(fit: Fit, theta: Array, change: _Change) -> float:
+def _joint(fit: Fit, change: Change) -> str:
+    """Name of the joint; a payload hangs on the last one, as its stanza does."""
+    joints = fit.study.joints
+    return joints[-1] if change.effect.name == "payload" else joints[change.place.joint]
+
+
+def _gap(fit: Fit, theta: Array, change: Change) -> float:
     """Relative torque error on held-out data, percent, of the joint or of all."""
     overall, each = relative_errors(fit, theta, held=True)
     return overall if change.effect.scope == "arm" else float(each[change.place.joint])
@@ -404,10 +270,11 @@ def _words(effect: Effect, joint: str, values: dict[str, float], std: dict[str, 
             words += f", centre of mass at ({at}) m in the frame of the last link"
         return words
     told = ", ".join(f"{name} {value:+.3g} (standard deviation {std[name]:.2g})" for name, value in values.items())
-    return f"{effect.title} at {joint}: {told}" if told else f"{effect.title} at {joint}"
+    title = STRUCTURAL.get(effect.name, effect.title)
+    return f"{title} at {joint}: {told}" if told else f"{title} at {joint}"
 
 
-def _rest(comparison: _Comparison, found: Sequence[_Change], alpha: float) -> list[NumbersFinding]:
+def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list[NumbersFinding]:
     """What has changed and no candidate explains, in one finding."""
     fit = comparison.fit
     _, _, _, left, free = comparison.solved(found)
@@ -420,7 +287,7 @@ def _rest(comparison: _Comparison, found: Sequence[_Change], alpha: float) -> li
         return []
     model = fit.study.model
     names = [model.base.names[comparison.known[k]] for k, _, _ in changed]
-    numbers = Counter(m.group(1) for name in names if (m := re.search(r"(\d)r?$", name)))
+    numbers = Counter(m.group(1) for name in names if (m := re.search(r"(\d)r?(?:_\d+)?$", name)))
     joint = model.robot.joints[min(int(numbers.most_common(1)[0][0]), model.n) - 1 if numbers else 0].name
     told = "; ".join(
         f"{name} was {comparison.theta0[k]:.4g}, differs by {rest:+.3g} (standard deviation {std:.2g})"
