@@ -22,7 +22,7 @@ from identify.discrepancy.numbers import stale_numbers
 from identify.discrepancy.search import Search, Settings, State, with_values
 from identify.discrepancy.simulated import SimulatedErrors, simulated_errors
 from identify.discrepancy.study import build_study
-from identify.discrepancy.where import Disagreement, unexplained, where
+from identify.discrepancy.where import Disagreement, survey, unexplained, where
 from identify.discrepancy.wiring_check import find_wiring
 from identify.document import (
     BeforeAfter,
@@ -167,10 +167,11 @@ def _diagnose(
     search = Search(study, settings, steps)
     first = search.start()
     steps("where")
-    places = where(first.fit, first.workshop, settings.false_alarms)
+    seen = survey(first.fit, first.workshop, settings.false_alarms)
+    places = where(first.fit, first.workshop, seen=seen)
     final = search.run()
     steps("what is left")
-    left = unexplained(final.fit, final.workshop, settings.false_alarms)
+    left = unexplained(final.fit, final.workshop, settings.false_alarms, seen=seen if final is first else None)
     findings = [*([] if wiring is None else miswired(wiring, robot)), *described(search, first, final, left)]
     if baseline is not None:
         steps("numbers")

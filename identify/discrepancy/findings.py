@@ -135,6 +135,9 @@ def noise_floor(final: State, left: Sequence[Disagreement]) -> Gap:
     power = np.sum(np.concatenate([s.y for s in study.held]) ** 2, axis=0)
     known_shares = {name: 0.0 for name in study.joints}
     for d in left:
+        if d.kind == "frequency":
+            # Its share is one of the working rate, most of which lies beyond the band of the comparison.
+            continue
         known_shares[d.joint] = min(1.0, known_shares[d.joint] + d.share)
     floor = np.array([e * np.sqrt(1 - known_shares[name]) for e, name in zip(each, study.joints, strict=True)])
     overall = float(np.sqrt((floor**2) @ power / power.sum()))

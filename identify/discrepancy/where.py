@@ -99,7 +99,24 @@ class Disagreement:
         return hint_of(self.kind, self.joint, self.other, f"{at:.3g} {self.unit}")
 
 
-def where(fit: Fit, workshop: Workshop, alpha: float = 0.01) -> list[Disagreement]:
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Everything that a fit's residual significantly depends on, tried once for both questions below."""
+
+    bench: Workshop
+    level: float
+    significant: tuple["_Found", ...]
+    lines: tuple[Disagreement, ...]
+
+
+def survey(fit: Fit, workshop: Workshop, alpha: float = 0.01) -> Survey:
+    """Try all variables on all joints; see `where` for the arguments."""
+    own = _bench(workshop)
+    level = alpha / _tests(fit, own)
+    return Survey(own, level, tuple(_significant(fit, own, level)), tuple(_lines(fit, level)))
+
+
+def where(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Survey | None = None) -> list[Disagreement]:
     """All variables on which a residual depends, those first that explain most of it on unseen data.
 
     Every variable is one anonymous effect with a free shape, and passes the same judge as the effects of the
@@ -113,24 +130,25 @@ def where(fit: Fit, workshop: Workshop, alpha: float = 0.01) -> list[Disagreemen
         Of the same fit.
     alpha
         Chance that a plant whose model is right shows any disagreement, over all variables and joints.
+    seen
+        The survey of this fit, if there is one already.
     """
-    own = _bench(workshop)
-    level = alpha / _tests(fit, own)
+    seen = seen or survey(fit, workshop, alpha)
     best: dict[tuple[int, Kind, int | None], _Found] = {}
-    for f in sorted(_significant(fit, own, level), key=lambda f: -f.trial.share):
+    for f in sorted(seen.significant, key=lambda f: -f.trial.share):
         best.setdefault((f.map.joint, f.map.kind, f.map.other), f)
-    found = [f.disagreement(fit, own) for f in best.values()]
-    return sorted([*found, *_lines(fit, level)], key=lambda d: -d.share)
+    found = [f.disagreement(fit, seen.bench) for f in best.values()]
+    return sorted([*found, *seen.lines], key=lambda d: -d.share)
 
 
-def unexplained(fit: Fit, workshop: Workshop, alpha: float = 0.01) -> list[Disagreement]:
+def unexplained(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Survey | None = None) -> list[Disagreement]:
     """What is left and matters, at most `MOST` dependences of each joint, each beside the ones before it.
 
-    A variable that merely goes along with a stronger one (speed with torque, say) is not named again.
+    A variable that merely goes along with a stronger one (speed with torque, say) is not named again. Arguments as
+    those of `where`.
     """
-    study, own = fit.study, _bench(workshop)
-    level = alpha / _tests(fit, own)
-    significant, lines = _significant(fit, own, level), _lines(fit, level)
+    study, seen = fit.study, seen or survey(fit, workshop, alpha)
+    own, level, significant, lines = seen.bench, seen.level, seen.significant, seen.lines
     found: list[Disagreement] = []
     for j, joint in enumerate(study.joints):
         here: list[Disagreement] = [line for line in lines if line.joint == joint and line.share >= MATERIAL]
