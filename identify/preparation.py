@@ -112,9 +112,7 @@ def published_equations(
         q = butterworth(experiment.q, experiment.dt, p.cutoff_hz, p.order, p.padlen)
         qd = central_difference(q, experiment.dt)
         qdd = central_difference(qd, experiment.dt)
-        x = model.base_regressor(
-            q, qd, qdd, sharp_sign=True, dt=experiment.dt, start=experiment.start
-        )[p.drop :]
+        x = model.base_regressor(q, qd, qdd, sharp_sign=True, dt=experiment.dt, start=experiment.start)[p.drop :]
         filters = (p.decimation, p.decimation_order, p.decimation_ripple_db, p.decimation_padlen)
         y = chebyshev_decimate(experiment.tau[p.drop :], *filters)
         t = np.asarray((p.drop + kept_samples(x.shape[0], p.decimation)) * experiment.dt, dtype=np.float64)

@@ -2,8 +2,9 @@
 
 The compiled loop knows the rigid arm with friction. What a term adds is computed along the whole simulated motion,
 taken for a load on the next simulation, and so on until the motion stays (Lelarasmee, Ruehli, Sangiovanni-Vincentelli
-1982): a controller that tracks its reference makes the motion depend on the load so little that a few rounds are enough.
-Any effect of the catalogue, also one with a memory of its own, so has a place in the simulation by its columns alone.
+1982): a controller that tracks its reference makes the motion depend so little on the load that a few rounds are
+enough. Any effect of the catalogue, also one with a memory of its own, so has a place in the simulation by its columns
+alone.
 """
 
 from dataclasses import replace

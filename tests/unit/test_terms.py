@@ -152,4 +152,5 @@ def test_every_entry_of_the_catalogue_says_what_it_is(robot: RobotConfig) -> Non
         assert effect.says, effect.name
         assert effect.reference, effect.name
         assert effect.needs, effect.name
-        assert len({p.name for p in (*effect.linear, *effect.shapes)}) == len(effect.linear) + len(effect.shapes)
+        names = [p.name for p in effect.linear] + [shape.name for shape in effect.shapes]
+        assert len(set(names)) == len(names)
