@@ -41,25 +41,25 @@ def _bandwidth(motion: Motion, place: Place) -> Array:
     return motion.of_motor(place.joint, motion.rate(motion.motor_torque[:, place.joint]))
 
 
+def _within_a_sample(values: Array, dt: float) -> bool:
+    """Whether a torque of one instant may as well be that of the next: drives differ in what they latch when."""
+    return bool(np.all(np.abs(values) < dt))
+
+
 def _eccentricity(motion: Motion, place: Place, *, harmonic: float) -> Array:
     """Measured positions are ``q + c cos(h q) + s sin(h q)``: the real ones move by as much less."""
     j = place.joint
     angle, w, a = harmonic * motion.q[:, j], harmonic * motion.qd[:, j], harmonic * motion.qdd[:, j]
     c, s = np.cos(angle), np.sin(angle)
-    columns = []
-    for shift, rate, acceleration in ((c, -s * w, -s * a - c * w**2), (s, c * w, c * a - s * w**2)):
-        moves = [np.zeros_like(motion.q) for _ in range(3)]
-        for move, values in zip(moves, (shift, rate, acceleration), strict=True):
-            move[:, j] = -values
-        columns.append(motion.moved(*moves))
-    return np.stack(columns, axis=2)
+    ways = ((c, -s * w, -s * a - c * w**2), (s, c * w, c * a - s * w**2))
+    return -np.stack([motion.response(j, *way) for way in ways], axis=2)
 
 
 def rounds(motion: Motion, joint: int) -> Sequence[float]:
     """Once and twice per turn of the joint and of its motor; of a prismatic axis wave numbers of its travel."""
     if motion.model.robot.joints[joint].type == "prismatic":
         resolution = np.pi / float(motion.span[joint])
-        return [float(resolution * k) for k in range(4, 81, 2)]
+        return [float(resolution * k) for k in (*np.arange(2.0, 16.0, 0.5), *range(16, 81))]
     ratio = float(np.max(np.abs(motion.model.robot.transmission_matrix[joint])))
     return sorted({1.0, 2.0, ratio, 2 * ratio})
 
@@ -68,7 +68,7 @@ EFFECTS = (
     Effect(
         name="drive_gain_error",
         title="a wrong torque constant",
-        says="a drive gives another torque per ampere than configured: a wrong data sheet, weak magnets, a changed drive",
+        says="a drive gives another torque per ampere than configured: wrong data, weak magnets, a changed drive",
         reference="Gautier, Briot 2014, IEEE Trans. Automatic Control 59(10), Global identification of drive gains",
         linear=(Linear("gain_error", ("", "")),),
         columns=_gain,
@@ -98,6 +98,7 @@ EFFECTS = (
         linear=(Linear("delay", ("s", "s"), sign=1),),
         columns=_delay,
         predicts=True,
+        negligible=_within_a_sample,
         needs="quick changes of the torque",
         scope="motor",
         excitation=("accelerations",),
@@ -105,11 +106,13 @@ EFFECTS = (
     Effect(
         name="actuator_bandwidth",
         title="torque that lags behind the command",
-        says="the reported torque is a command that the motor follows late: a slow current loop",
+        says="the reported torque is a command that the motor follows late: a slow current loop; positions that are "
+        "reported late look the same",
         reference="Leonhard 2001, Control of Electrical Drives, chapter 7",
         linear=(Linear("lag", ("s", "s"), sign=1),),
         columns=_bandwidth,
         predicts=True,
+        negligible=_within_a_sample,
         needs="quick changes of the torque",
         scope="motor",
         excitation=("accelerations",),

@@ -92,6 +92,9 @@ class Effect:
         recording, and there are no columns.
     predicts
         Whether the columns depend on the torques that the model predicts, and so on its parameters.
+    negligible
+        Whether linear parameters (k,) are a convention of sampling instead of a fault, at the sampling period of the
+        recording in s; ``None``: never.
     """
 
     name: str
@@ -109,6 +112,7 @@ class Effect:
     excitation: tuple[str, ...] = field(default=("reversals", "speeds"))
     rewires: bool = False
     predicts: bool = False
+    negligible: Callable[[Array, float], bool] | None = None
 
     def torque(self, motion: Motion, place: "Place", shapes: Mapping[str, float]) -> Array:
         """Columns of all joints, shape (N, n, k)."""

@@ -12,6 +12,8 @@ from identify.model.compiled import compiled
 Array = NDArray[np.float64]
 
 TORQUE = ("N m", "N")
+EXPONENTS = (0.5, 0.6, 0.7, 0.8, 1.25, 1.5, 2.0, 2.5, 3.0)
+"""Of speed; below a half it is dry friction, close to one it is what every model has."""
 VISCOUS = ("N m s/rad", "N s/m")
 
 
@@ -137,7 +139,7 @@ EFFECTS = (
         says="friction does not grow in proportion to speed: the lubricant thins or churns",
         reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
         linear=(Linear("fvn", TORQUE),),
-        shapes=(Shape("exponent", ("", ""), lambda motion, joint: (0.3, 0.5, 0.7, 1.5, 2.0, 3.0)),),
+        shapes=(Shape("exponent", ("", ""), lambda motion, joint: EXPONENTS, continuous=False),),
         columns=_nonlinear_viscous,
         needs="slow and fast motion",
         excitation=("speeds",),
@@ -146,7 +148,7 @@ EFFECTS = (
         name="load_dependent_friction",
         title="friction in proportion to the load",
         says="dry friction grows with the torque that the gear transmits",
-        reference="Hamon, Gautier, Garrec 2010, IROS, Dynamic identification with a dry friction model dependent on load",
+        reference="Hamon, Gautier, Garrec 2010, IROS, Dynamic identification with load-dependent dry friction",
         linear=(Linear("fcl", ("", ""), sign=1),),
         columns=_load_dependent,
         predicts=True,

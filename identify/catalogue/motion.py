@@ -1,6 +1,6 @@
 """A motion as the effects of the catalogue see it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from identify.model.arm import ArmModel
 
 Array = NDArray[np.float64]
+
+STEPS = (1e-6, 1e-6, 1.0)
+"""Of the finite differences, rad, rad/s and rad/s^2, or in metres; torques are linear in accelerations."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,9 @@ class Motion:
     theta: Array | None = None
     duration: float = 0.0
     sharp: bool = False
+    _slopes: dict[tuple[int, bool], tuple[Array, Array, Array]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @property
     def samples(self) -> int:
@@ -58,13 +64,13 @@ class Motion:
         """Sign of the velocity, smoothed as the model smooths it (thesis appendix B.2), (N, n)."""
         if self.sharp:
             return np.sign(self.qd)
-        smooth: Array = 2 / np.pi * np.arctan(self.model.smoothing * self.qd)
+        smooth: Array = self.model.smooth_sign(self.qd)
         return smooth
 
     @cached_property
     def t(self) -> Array:
         """Time since the beginning of the first recording, s, (N,)."""
-        t: Array = self.start + self.dt * np.arange(self.samples)
+        t: Array = self.start + self.dt * np.arange(self.samples, dtype=np.float64)
         return t
 
     @cached_property
@@ -124,23 +130,35 @@ class Motion:
         joints: Array = (torque[:, None] * self.model.robot.transmission_matrix[motor])[:, :, None]
         return joints
 
-    def moved(self, shift: Array, rate: Array, acceleration: Array, *, links: bool = False) -> Array:
-        """Change (N, n) of the predicted torque per unit of a change of the motion.
+    def response(self, joint: int, shift: Array, rate: Array, acceleration: Array, *, links: bool = False) -> Array:
+        """Change (N, n) of the predicted torques when one joint moves otherwise, to first order.
 
         Parameters
         ----------
         shift, rate, acceleration
-            Changes of positions, velocities and accelerations, (N, n) each.
+            Changes of the joint's position, velocity and acceleration, (N,) each.
         links
             Of the links alone, without friction and rotors.
         """
-        theta = self.links if links else self._theta
-        step = 1e-6 / max(float(np.abs(shift).max()), 1e-300)
-        moved = self.model.inverse_dynamics(
-            theta, self.q + step * shift, self.qd + step * rate, self.qdd + step * acceleration
-        )
-        change: Array = (moved - self._predicted(theta)) / step
+        position, velocity, inertia = self.slopes(joint, links=links)
+        change: Array = position * shift[:, None] + velocity * rate[:, None] + inertia * acceleration[:, None]
         return change
+
+    def slopes(self, joint: int, *, links: bool = False) -> tuple[Array, Array, Array]:
+        """Slopes of the predicted torques over position, velocity and acceleration of a joint, (N, n) each."""
+        key = (joint, links)
+        if key not in self._slopes:
+            theta = self.links if links else self._theta
+            # The sign is smoothed even where the motion has it sharp: a jump has no slope.
+            here = self.model.inverse_dynamics(theta, self.q, self.qd, self.qdd)
+            slopes = []
+            for k, step in enumerate(STEPS):
+                moved = [self.q, self.qd, self.qdd]
+                moved[k] = moved[k].copy()
+                moved[k][:, joint] += step
+                slopes.append((self.model.inverse_dynamics(theta, *moved) - here) / step)
+            self._slopes[key] = slopes[0], slopes[1], slopes[2]
+        return self._slopes[key]
 
     def rate(self, values: Array) -> Array:
         """Time derivative along the first axis, central differences."""

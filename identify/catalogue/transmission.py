@@ -8,11 +8,15 @@ from scipy import signal
 
 from identify.catalogue.effect import Effect, Linear, Place, Shape
 from identify.catalogue.motion import Motion
+from identify.model.compiled import compiled
 
 Array = NDArray[np.float64]
 
-DAMPING = 0.05
-"""Damping ratio taken for the resonance of an elastic joint: far below it, it does not show."""
+DAMPING = 0.7
+"""Damping ratio of the link on its spring: the controlled motor gives way to its swinging, and so calms it."""
+
+LEAST_INERTIA = 0.1
+"""Inertia at a joint below which it is not believed, of the largest along the motion: a fit may make it negative."""
 
 
 def _cogging(motion: Motion, place: Place, *, harmonic: float) -> Array:
@@ -34,13 +38,14 @@ def harmonics(motion: Motion, joint: int) -> Sequence[float]:
 
 
 def _elasticity(motion: Motion, place: Place, *, frequency: float) -> Array:
-    """Load of a link behind a spring, less the load of a stiff one, both driven by the motor that is measured."""
-    w = 2 * np.pi * frequency
-    b, a = signal.bilinear([w**2], [1.0, 2 * DAMPING * w, w**2], 1 / motion.dt)
-    load = motion.transmitted[:, place.joint]
-    behind = signal.lfilter(b, a, load, zi=signal.lfilter_zi(b, a) * load[0])[0]
-    column: Array = (behind - load)[:, None]
-    return column
+    """The link stands behind the motor by compliance times load, and swings there at its own frequency."""
+    w, j = 2 * np.pi * frequency, place.joint
+    behind = -motion.transmitted[:, j]
+    moves = []
+    for numerator in ([w**2], [w**2, 0.0], [w**2, 0.0, 0.0]):
+        b, a = signal.bilinear(numerator, [1.0, 2 * DAMPING * w, w**2], 1 / motion.dt)
+        moves.append(signal.lfilter(b, a, behind, zi=signal.lfilter_zi(b, a) * behind[0])[0])
+    return motion.response(j, *moves, links=True)[:, :, None]
 
 
 def frequencies(motion: Motion, joint: int) -> Sequence[float]:
@@ -48,24 +53,47 @@ def frequencies(motion: Motion, joint: int) -> Sequence[float]:
     return [float(f) for f in np.geomspace(4.0, min(100.0, 0.2 / motion.dt), 10)]
 
 
-def _backlash(motion: Motion, place: Place, *, threshold: float) -> Array:
-    """The link stands half a gap behind the side of the teeth that carries, so the teeth's change of side moves it."""
+def _backlash(motion: Motion, place: Place, *, gap: float) -> Array:
+    """Between the sides of the gap nothing drives the link: it coasts and falls on, until the teeth catch it."""
     j = place.joint
-    load = motion.transmitted[:, j]
-    side = np.tanh(load / threshold)
-    rate = motion.rate(side)
-    shift = np.zeros_like(motion.q)
-    shift[:, j] = -0.5 * side
-    velocity, acceleration = np.zeros_like(shift), np.zeros_like(shift)
-    velocity[:, j], acceleration[:, j] = -0.5 * rate, -0.5 * motion.rate(rate)
-    moved: Array = motion.moved(shift, velocity, acceleration, links=True)[:, :, None]
-    return moved
+    moves = crossing(falls(motion, j), gap, motion.dt)
+    return motion.response(j, *moves, links=True)[:, :, None]
 
 
-def loads(motion: Motion, joint: int) -> Sequence[float]:
-    """Loads within which the teeth change sides: shares of the load's own spread."""
-    spread = max(float(np.std(motion.transmitted[:, joint])), 1e-9)
-    return [spread * share for share in (0.03, 0.1, 0.3)]
+def falls(motion: Motion, joint: int) -> Array:
+    """Acceleration (N,) of a link from its motor where no tooth touches, over position and time as they are."""
+    inertia = motion.slopes(joint, links=True)[2][:, joint]
+    if inertia.max() <= 0.0:
+        return np.zeros(motion.samples)
+    away: Array = -motion.transmitted[:, joint] / np.maximum(inertia, LEAST_INERTIA * inertia.max())
+    return away
+
+
+@compiled
+def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
+    """Way, speed and acceleration (N,) of a link against its motor under ``pull`` (N,), caught at half a gap.
+
+    Impacts are plastic; speeds and accelerations are the differences of the way, so that none of it is lost.
+    """
+    way, rate, acceleration = np.zeros(pull.size), np.zeros(pull.size), np.zeros(pull.size)
+    x = 0.5 * gap if pull[0] > 0.0 else -0.5 * gap
+    v = 0.0
+    for k in range(pull.size):
+        before = v
+        v += dt * pull[k]
+        if x + dt * v > 0.5 * gap:
+            v = (0.5 * gap - x) / dt
+        elif x + dt * v < -0.5 * gap:
+            v = (-0.5 * gap - x) / dt
+        x += dt * v
+        way[k], rate[k], acceleration[k] = x, v, (v - before) / dt
+    return way, rate, acceleration
+
+
+def gaps(motion: Motion, joint: int) -> Sequence[float]:
+    """Gaps that the link crosses in 5 to 100 ms under the load that there mostly is."""
+    usual = max(float(np.std(falls(motion, joint))), 1e-9)
+    return [0.5 * usual * float(time) ** 2 for time in np.geomspace(0.005, 0.1, 8)]
 
 
 EFFECTS = (
@@ -87,7 +115,7 @@ EFFECTS = (
         title="an elastic joint",
         says="the link swings behind its motor: an elastic gear, belt or coupling, or a bending link",
         reference="Spong 1987, J. Dyn. Sys. Meas. Control 109(4)",
-        linear=(Linear("els", ("", ""), sign=1),),
+        linear=(Linear("compliance", ("rad/(N m)", "m/N"), sign=1),),
         shapes=(Shape("frequency", ("Hz", "Hz"), frequencies),),
         columns=_elasticity,
         predicts=True,
@@ -97,10 +125,10 @@ EFFECTS = (
     Effect(
         name="backlash",
         title="play in the gear",
-        says="the motor turns a little before the link follows whenever the load changes sides: worn teeth, a loose key",
+        says="the motor turns a little before the link follows when the load changes sides: worn teeth, a loose key",
         reference="Nordin, Gutman 2002, Automatica 38(10)",
-        linear=(Linear("gap", ("rad", "m"), sign=1),),
-        shapes=(Shape("threshold", ("N m", "N"), loads),),
+        linear=(Linear("behind", ("", ""), sign=1),),
+        shapes=(Shape("gap", ("rad", "m"), gaps),),
         columns=_backlash,
         predicts=True,
         needs="many changes of the load's direction",

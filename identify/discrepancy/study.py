@@ -104,6 +104,11 @@ class Study:
     warnings: tuple[str, ...] = ()
 
     @property
+    def sample(self) -> float:
+        """Sampling period of the recording, s."""
+        return self.dt / self.thinning.factor
+
+    @property
     def joints(self) -> list[str]:
         """Names of the joints."""
         return [joint.name for joint in self.robot.joints]
