@@ -280,7 +280,8 @@ def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list
     _, _, _, left, free = comparison.solved(found)
     p = float(stats.chi2.sf(left, free))
     changed = _changed_names(comparison, found, alpha)
-    if p > alpha and not changed:
+    # All together can be off without one that could be named; nobody can act on that.
+    if not changed:
         return []
     before = comparison.predicted(found)
     if _held_out(comparison, before, fit.theta) <= stats.norm.isf(alpha):
@@ -293,7 +294,6 @@ def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list
         f"{name} was {comparison.theta0[k]:.4g}, differs by {rest:+.3g} (standard deviation {std:.2g})"
         for name, (k, rest, std) in zip(names, changed, strict=True)
     )
-    says = told or "no single number, but all together are further off than their errors allow"
     return [
         NumbersFinding(
             effect="changed_parameters",
@@ -305,6 +305,6 @@ def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list
             gap_before=relative_errors(fit, before, held=True)[0],
             gap_after=relative_errors(fit, held=True)[0],
             alternatives=(),
-            words=f"numbers differ from the baseline and no effect of the catalogue explains it: {says}",
+            words=f"numbers differ from the baseline and no effect of the catalogue explains it: {told}",
         )
     ]
