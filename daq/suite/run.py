@@ -60,7 +60,7 @@ def run_suite(options: Chosen, *, as_json: bool = False) -> Tables:
     if not cases:
         raise ConfigError("no case of the suite is at once of that effect, strength and subset")
     jobs = options.jobs or len(os.sched_getaffinity(0))
-    store = Store(options.out / RESULTS, None if options.any_version else code_version())
+    store = Store(options.out / RESULTS, code_version(), any_version=options.any_version)
     waiting = [case for case in cases if store.get(case.key) is None]
     print(
         f"diagnose-suite: {len(cases)} cases, {len(cases) - len(waiting)} done before, {jobs} at a time",

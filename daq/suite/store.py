@@ -32,14 +32,16 @@ def code_version() -> str:
 
 
 class Store:
-    """The file of results; lines of another version of the code are kept, and not used.
+    """The file of results; lines of another version of the code are kept in it.
 
     Parameters
     ----------
     path
         The file, made when the first result comes.
     version
-        Of the code that is running; ``None`` takes every line there is.
+        Of the code that is running.
+    any_version
+        Use the lines of other versions, too.
 
     Raises
     ------
@@ -47,7 +49,7 @@ class Store:
         If a line other than the last is not JSON; a torn last line is what a stopped run leaves.
     """
 
-    def __init__(self, path: Path, version: str | None) -> None:
+    def __init__(self, path: Path, version: str, *, any_version: bool = False) -> None:
         self.path, self.version = path, version
         self._lock = threading.Lock()
         self._records: dict[str, Record] = {}
@@ -60,7 +62,7 @@ class Store:
                     self._drop_torn_line()
                     break
                 raise DataError(f"{path}:{number}: not JSON: {error.msg}") from error
-            if version in (None, record["code"]):
+            if any_version or record["code"] == version:
                 self._records[record["key"]] = record
 
     def get(self, key: str) -> Record | None:

@@ -6,6 +6,7 @@ import pytest
 import yaml
 
 from configs import ConfigError, load_robot, load_suite, load_trajectory
+from configs.scenario import Scenario
 from configs.suite import LEVELS
 from daq.suite.cases import all_cases, chosen, twin
 from virtual_robot.batch import resolved
@@ -45,7 +46,8 @@ def test_every_hidden_effect_is_one_that_the_virtual_arm_takes() -> None:
         for path in arm.trajectories:
             once[path].check(robots[name], str(path))
     for case in CASES:
-        for part in case.parts:
+        # Runs of one effect differ in trajectory and noise alone.
+        for part in case.parts if case.seed == 1 else ():
             entry = {
                 "effect": part.effect, "joint": part.joint, "other": part.other, "parameters": part.parameters,
                 "truth": part.truth, "strength": part.strength,
@@ -53,8 +55,6 @@ def test_every_hidden_effect_is_one_that_the_virtual_arm_takes() -> None:
             effect, truth = resolved(entry, robots[case.robot], once[Path(case.trajectory)])
             assert set(truth) == set(part.truth)
             if part.hide:
-                from configs.scenario import Scenario
-
                 scenario = Scenario(schema="armident/scenario/1", effects=(effect,))
                 assert hidden_effects(scenario, robots[case.robot], case.name)
 
