@@ -84,10 +84,17 @@ def turns(motion: Motion, joint: int) -> Sequence[float]:
     return [(high - low) / k for k in (4, 3, 2, 1)]
 
 
-def _drift(motion: Motion, place: Place) -> Array:
-    j = place.joint
-    progress = motion.t / max(motion.duration, motion.dt * motion.samples) - 0.5
+def _drift(motion: Motion, place: Place, *, time_constant: float) -> Array:
+    """Friction goes from half a change below to half a change above the model's, as a warming body does."""
+    j, whole = place.joint, max(motion.duration, motion.dt * motion.samples)
+    progress = np.expm1(-motion.t / time_constant) / np.expm1(-whole / time_constant) - 0.5
     return np.stack([motion.sign[:, j] * progress, motion.qd[:, j] * progress], axis=1)
+
+
+def warming(motion: Motion, joint: int) -> Sequence[float]:
+    """Time constants from a tenth of the recordings to three times all of them: hardly another curve than a line."""
+    whole = max(motion.duration, motion.dt * motion.samples)
+    return [whole * share for share in (0.1, 0.3, 1.0, 3.0)]
 
 
 def _coupling(motion: Motion, place: Place) -> Array:
@@ -190,6 +197,7 @@ EFFECTS = (
         says="friction at the end of the recording is not what it was at its beginning: the gear warms up",
         reference="Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators",
         linear=(Linear("fcdr", TORQUE), Linear("fvdr", VISCOUS)),
+        shapes=(Shape("time_constant", ("s", "s"), warming),),
         columns=_drift,
         needs="the same motion early and late in the recordings",
         excitation=("repeats",),

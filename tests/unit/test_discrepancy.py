@@ -81,7 +81,7 @@ def test_a_diagnosed_model_is_a_robot_configuration_again(robot: RobotConfig) ->
     np.testing.assert_array_equal(term.values, [0.5])
 
 
-ELSEWHERE = ("encoder_eccentricity", "backlash")
+ELSEWHERE = ("encoder_eccentricity", "backlash", "joint_elasticity")
 """A wrong position of one joint is felt by all of them."""
 JOINT_EFFECTS = sorted(
     name for name, e in catalogue().items() if not e.rewires and e.scope == "joint" and name not in ELSEWHERE
