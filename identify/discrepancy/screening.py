@@ -2,7 +2,7 @@
 
 An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away; a
 spring is weighed forty times too lightly. So the noise for the look comes from a residual that smooth functions of
-position, speed and time have been taken out of. It is used for the ranking alone; trials estimate their own noise.
+position, speed and time have been taken out of. Trials start from it and end with a noise of their own.
 """
 
 import numpy as np
@@ -24,8 +24,15 @@ ROWS_PER_COLUMN = 12
 
 def shortlist(
     fit: Fit, workshop: Workshop, every: list[Candidate], most: int
-) -> tuple[list[tuple[Candidate, Shapes]], frozenset[tuple[str, int, int | None]]]:
-    """The candidates that fit the training data best, with their shapes, best first; and those that cannot be tried."""
+) -> tuple[list[tuple[Candidate, Shapes]], frozenset[tuple[str, int, int | None]], tuple[ArModel, ...]]:
+    """The candidates that fit the training data best.
+
+    Returns
+    -------
+    tuple
+        Candidates with their shapes, best first; the keys of those that cannot be tried; and the noise models, one for
+        each joint, that they were looked at with.
+    """
     calm = fit.renoised(noise_beyond_shapes(fit, workshop))
     looks: list[tuple[float, Candidate, Shapes]] = []
     hidden = set()
@@ -37,7 +44,7 @@ def shortlist(
             looks.append((look[0], candidate, look[1]))
     looks.sort(key=lambda look: len(look[1].effect.linear) - look[0])
     best = [(candidate, refined(calm, candidate, workshop, (look, shapes))) for look, candidate, shapes in looks[:most]]
-    return best, frozenset(hidden)
+    return best, frozenset(hidden), calm.noise
 
 
 def noise_beyond_shapes(fit: Fit, workshop: Workshop) -> list[ArModel]:

@@ -124,8 +124,8 @@ class Search:
             previous = Workshop(study, found.theta) if before is None else before.workshop
             workshop = previous.with_theta(study, found.theta)
             every = list(candidates(workshop))
-            promising, hidden = shortlist(found, workshop, every, SHORTLIST)
-            judged = [judge(found, candidate, shapes, workshop) for candidate, shapes in promising]
+            promising, hidden, calm = shortlist(found, workshop, every, SHORTLIST)
+            judged = [judge(found, candidate, shapes, workshop, calm) for candidate, shapes in promising]
             trials = [trial for trial in judged if trial is not None]
             trials.sort(key=lambda t: -t.score)
             self._states[key] = State(study, found, workshop, tuple(trials), len(every) - len(hidden), hidden)

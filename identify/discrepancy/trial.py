@@ -1,5 +1,7 @@
 """One candidate beside the model: fitted on the training data, judged by what it predicts on data it has not seen."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +17,8 @@ Array = NDArray[np.float64]
 NEWEY_WEST_LAGS = 20
 RANK_TOLERANCE = 1e-3
 """Columns that the model nearly contains (relative norm left beside it) cannot be tested."""
+NOISE_PASSES = 2
+"""Between a candidate's parameters and the noise models that go with it."""
 REFINEMENTS = 12
 """Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""
 
@@ -42,6 +46,8 @@ class Trial:
         Change of the model's own parameters that goes with it, (b,).
     share
         Share of the whitened held-out residuals' power of the joints concerned that the change takes away.
+    score
+        Gain in log-likelihood over both parts, less what fitting alone gains on the training part.
     """
 
     candidate: Candidate
@@ -54,6 +60,7 @@ class Trial:
     inflation: float
     away: Array
     share: float
+    score: float
 
     @property
     def forbidden(self) -> bool:
@@ -77,12 +84,6 @@ class Trial:
     def p_held(self) -> float:
         """That a candidate without merit predicts the held-out residual so well."""
         return float(stats.norm.sf(self.held_statistic))
-
-    @property
-    def score(self) -> float:
-        """Gain in log-likelihood over both parts, less what fitting alone gains on the training part."""
-        fitted = self.values.size + len(self.shapes)
-        return 0.5 * (self.statistic - fitted + self.gain) / self.inflation
 
 
 def best_trial(fit: Fit, candidate: Candidate, workshop: Workshop) -> Trial | None:
@@ -118,19 +119,29 @@ def score_statistic(fit: Fit, instruments: Array) -> float | None:
     return float(score @ score)
 
 
-def judge(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) -> Trial | None:
+def judge(
+    fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, calm: Sequence[ArModel] | None = None
+) -> Trial | None:
     """Fit a candidate by instrumental variables beside the model and judge it on the held-out data.
 
     The judge is the projection of the held-out residual of the model without the candidate on the change of prediction
     that the candidate asks for, at simulated signals: noise that the motion has followed has no part in it. Without
     merit it has mean zero; its spread comes from the noise, from what serial correlation is left (Newey-West), and from
     theta, estimated from the training data.
+
+    Parameters
+    ----------
+    calm
+        Noise models that the gap cannot fool, to start from at the joints that the candidate acts on: those of ``fit``
+        may hold the gap for noise and whiten it away.
     """
-    screening = _beside_model(fit, candidate, shapes, workshop)
-    if screening is None:
-        return None
+    alone, fit = fit, _start(fit, candidate, shapes, workshop, calm)
     # What the model lacks must not pass for noise: the noise is that of the residual with the candidate in the model.
-    fit = fit.renoised(noise_with(fit, candidate, shapes, workshop, *screening))
+    for _ in range(NOISE_PASSES):
+        screening = _beside_model(fit, candidate, shapes, workshop)
+        if screening is None:
+            return None
+        fit = alone.renoised(noise_with(fit, candidate, shapes, workshop, *screening))
     columns = workshop.columns(candidate.effect, candidate.place, shapes, fit.noise)
     solution = _values(fit, columns)
     if solution is None:
@@ -147,6 +158,9 @@ def judge(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) ->
     gain = float(before @ before - after @ after)
     concerned = np.abs(columns.held_z).any(axis=1)
     share = gain / max(float(before[concerned] @ before[concerned]), 1e-300)
+    fitted = 0.5 * (values.size + len(shapes))
+    # Measured signals hold noise that the torques hold too: no more evidence than the instruments support.
+    supported = 0.5 * (statistic + gain)
     return Trial(
         candidate,
         shapes,
@@ -158,7 +172,45 @@ def judge(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) ->
         inflation,
         away,
         share,
+        min(supported, _evidence(alone, fit, candidate, shapes, workshop, values, away)) - fitted,
     )
+
+
+def _start(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, calm: Sequence[ArModel] | None) -> Fit:
+    """The fit with calm noise models at the joints that a candidate acts on."""
+    if calm is None:
+        return fit
+    columns = np.concatenate(workshop.band(candidate.effect, candidate.place, shapes, "train", "simulated"))
+    acts = [bool(np.any(columns[:, j])) for j in range(columns.shape[1])]
+    return fit.renoised([c if there else own for c, own, there in zip(calm, fit.noise, acts, strict=True)])
+
+
+def _evidence(
+    alone: Fit, fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, values: Array, away: Array
+) -> float:
+    """Gain in log-likelihood over both parts at measured signals, each model with noise models of its own.
+
+    A whitening that suits one model would weigh the other's residual wrongly; the model without the candidate may
+    choose at every joint between its own and the candidate's.
+    """
+    with_it, without = np.zeros(len(fit.noise)), np.zeros((2, len(fit.noise)))
+    for part in ("train", "held"):
+        held = part == "held"
+        band = workshop.band(candidate.effect, candidate.place, shapes, part, "measured")
+        left = [e - c @ values for e, c in zip(fit.errors(fit.theta - away, held=held), band, strict=True)]
+        with_it += log_likelihoods(left, fit.noise)
+        without += np.stack([log_likelihoods(f.errors(f.theta, held=held), f.noise) for f in (alone, fit)])
+    return float(np.sum(with_it - without.max(axis=0)))
+
+
+def log_likelihoods(errors: Sequence[Array], noise: Sequence[ArModel]) -> Array:
+    """Of the errors (M, n) of all stretches under AR noise, up to a constant, (n,); the same rows at every order."""
+    found = np.zeros(len(noise))
+    for j, ar in enumerate(noise):
+        for stretch in errors:
+            e = ar.whiten(stretch[:, j])[MAX_AR_ORDER - ar.order :]
+            found[j] -= 0.5 * (float(e @ e) + e.size * math.log(ar.variance))
+    return found
 
 
 def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) -> tuple[Array, Array] | None:
