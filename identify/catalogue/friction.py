@@ -12,8 +12,8 @@ from identify.model.compiled import compiled
 Array = NDArray[np.float64]
 
 TORQUE = ("N m", "N")
-EXPONENTS = (0.5, 0.6, 0.7, 0.8, 1.25, 1.5, 2.0, 2.5, 3.0)
-"""Of speed; below a half it is dry friction, close to one it is what every model has."""
+EXPONENTS = (2 / 3, 0.8, 1.25, 1.5, 2.0, 2.5, 3.0)
+"""Of speed, from the two thirds of a rolling bearing (Palmgren) up; close to one it is what every model has."""
 VISCOUS = ("N m s/rad", "N s/m")
 
 

@@ -72,7 +72,7 @@ EFFECTS = (
     Effect(
         name="joint_spring",
         title="a spring on the joint",
-        says="a torque in proportion to the joint's position: a spring, a gravity compensator, or a stiff cable harness",
+        says="a torque in proportion to the joint's position: a spring, a gravity compensator, a stiff cable harness",
         reference="Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 9",
         linear=(Linear("ks", ("N m/rad", "N/m")),),
         columns=_spring,

@@ -78,6 +78,7 @@ class State:
             and t.p_held < HELD_OUT_LEVEL
             and t.gain > 0
             and t.share >= settings.material
+            and not (t.candidate.effect.negligible and t.candidate.effect.negligible(t.values, self.study.sample))
         ]
 
 
