@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from configs import ConfigError, RobotConfig, config_path, load_robot, load_session, load_trajectory
+from configs import ConfigError, RobotConfig, config_path, load_robot, load_session, load_suite, load_trajectory
 from configs.loading import HERE, parse
 
 TX40 = yaml.safe_load((HERE / "tx40.yaml").read_text())
@@ -19,7 +19,7 @@ def robot_with(**changes: object) -> str:
 @pytest.mark.parametrize("path", sorted(HERE.glob("*.yaml")), ids=lambda p: p.name)
 def test_every_shipped_configuration_loads(path: Path) -> None:
     kind = yaml.safe_load(path.read_text())["schema"]
-    load = {"armident/robot/1": load_robot, "armident/session/1": load_session}[kind]
+    load = {"armident/robot/1": load_robot, "armident/session/1": load_session, "armident/suite/1": load_suite}[kind]
     assert load(path) == load(path)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from configs import ConfigError, load_robot, load_suite, load_trajectory
+from configs import ConfigError, config_path, load_robot, load_suite, load_trajectory
 from configs.scenario import Scenario
 from configs.suite import LEVELS
 from daq.suite.cases import all_cases, chosen, twin
@@ -92,7 +92,7 @@ def test_cases_can_be_chosen_by_effect_and_by_strength() -> None:
 
 
 def test_a_suite_that_names_an_unknown_robot_is_refused(tmp_path: Path) -> None:
-    content = yaml.safe_load(Path("configs/suite.yaml").read_text(encoding="utf-8"))
+    content = yaml.safe_load(config_path("suite").read_text(encoding="utf-8"))
     content["clean"]["kuka"] = 3
     path = tmp_path / "suite.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
@@ -101,7 +101,7 @@ def test_a_suite_that_names_an_unknown_robot_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_pair_that_is_not_among_the_effects_is_refused(tmp_path: Path) -> None:
-    content = yaml.safe_load(Path("configs/suite.yaml").read_text(encoding="utf-8"))
+    content = yaml.safe_load(config_path("suite").read_text(encoding="utf-8"))
     content["pairs"][0]["effects"][0] = ["joint_spring", "joint_6"]
     path = tmp_path / "suite.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
