@@ -19,6 +19,7 @@ from identify.discrepancy.trial import Trial, judge
 from identify.model.arm import ArmModel
 
 Array = NDArray[np.float64]
+Places = tuple[tuple[str, str, str], ...]
 
 HELD_OUT_LEVEL = 0.05
 """The held-out data alone must speak for a finding at this level, whatever the training data say."""
@@ -110,11 +111,13 @@ class Search:
         """Add until nothing passes, then see whether another effect does better in each one's place."""
         state = self.start()
         own = len(self.study.robot.effects)
+        been = {_places(state)}
         while len(state.study.robot.effects) - own < MOST:
-            better = self._extended(state)
+            better = self._extended(state, own, been)
             if better is None:
                 break
-            state = self._pruned(better, own)
+            state = better
+            been.add(_places(state))
         return self._exchanged(state, own)
 
     def state(self, robot: RobotConfig, before: State | None) -> State:
@@ -132,8 +135,11 @@ class Search:
             self._states[key] = State(study, found, workshop, tuple(trials), len(every) - len(hidden), hidden)
         return self._states[key]
 
-    def _extended(self, state: State) -> State | None:
-        """The state with the best candidate that passes and really makes the held-out error smaller."""
+    def _extended(self, state: State, own: int, been: set[Places]) -> State | None:
+        """The state with the best candidate that passes and really makes the held-out error smaller, pruned.
+
+        States that have been left before are not returned to: two effects could take each other's place for ever.
+        """
         for trial in state.passing(self.settings):
             robot = added(state.study.robot, trial)
             self.progress(f"adding {trial.candidate.effect.name} of {state.study.joints[trial.candidate.place.joint]}")
@@ -142,7 +148,9 @@ class Search:
             except DataError:
                 continue
             if relative_errors(extended.fit, held=True)[0] < relative_errors(state.fit, held=True)[0]:
-                return extended
+                pruned = self._pruned(extended, own)
+                if _places(pruned) not in been:
+                    return pruned
         return None
 
     def _pruned(self, state: State, own: int) -> State:
@@ -240,6 +248,11 @@ def with_values(state: State, shapes: Mapping[int, Mapping[str, float]] | None =
         found = {**term.shapes, **{name: float(value) for name, value in linear}, **dict((shapes or {}).get(k, {}))}
         stanzas[number] = stanzas[number].model_copy(update={"parameters": found})
     return state.study.robot.model_copy(update={"effects": tuple(stanzas)})
+
+
+def _places(state: State) -> Places:
+    """What the model of a state has beyond the rigid one, and where, whatever the values and the order."""
+    return tuple(sorted((e.effect, e.joint, e.other or "") for e in state.study.robot.effects))
 
 
 def _stanza_number(robot: RobotConfig, term: int) -> int:

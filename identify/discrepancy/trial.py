@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 NEWEY_WEST_LAGS = 20
 RANK_TOLERANCE = 1e-3
 """Columns that the model nearly contains (relative norm left beside it) cannot be tested."""
-NOISE_PASSES = 2
-"""Between a candidate's parameters and the noise models that go with it."""
+CALM_PASSES = 2
+"""Between a candidate's parameters and the noise models that go with it, from calm ones."""
 REFINEMENTS = 12
 """Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""
 
@@ -132,12 +132,22 @@ def judge(
     Parameters
     ----------
     calm
-        Noise models that the gap cannot fool, to start from at the joints that the candidate acts on: those of ``fit``
-        may hold the gap for noise and whiten it away.
+        Noise models that the gap cannot fool, to start from, too, at the joints that the candidate acts on: those of
+        ``fit`` may hold the gap for noise and whiten it away. The likelier end of both starts counts.
     """
-    alone, fit = fit, _start(fit, candidate, shapes, workshop, calm)
+    tried = [_judged(fit, fit, candidate, shapes, workshop, 1)]
+    if calm is not None:
+        start = _calmed(fit, candidate, shapes, workshop, calm)
+        tried.append(_judged(fit, start, candidate, shapes, workshop, CALM_PASSES))
+    return max((trial for trial in tried if trial is not None), key=lambda trial: trial.score, default=None)
+
+
+def _judged(
+    alone: Fit, fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, passes: int
+) -> Trial | None:
+    """See `judge`; with the noise models of ``fit`` to start from."""
     # What the model lacks must not pass for noise: the noise is that of the residual with the candidate in the model.
-    for _ in range(NOISE_PASSES):
+    for _ in range(passes):
         screening = _beside_model(fit, candidate, shapes, workshop)
         if screening is None:
             return None
@@ -176,10 +186,8 @@ def judge(
     )
 
 
-def _start(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, calm: Sequence[ArModel] | None) -> Fit:
+def _calmed(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, calm: Sequence[ArModel]) -> Fit:
     """The fit with calm noise models at the joints that a candidate acts on."""
-    if calm is None:
-        return fit
     columns = np.concatenate(workshop.band(candidate.effect, candidate.place, shapes, "train", "simulated"))
     acts = [bool(np.any(columns[:, j])) for j in range(columns.shape[1])]
     return fit.renoised([c if there else own for c, own, there in zip(calm, fit.noise, acts, strict=True)])
