@@ -5,8 +5,9 @@ another one, twice as fast, which the first two alone do not determine. It repea
 as one recording can be predicted from another.
 
 Three things keep a rigid upright arm from that, and stand as effects in its configuration: the base is one degree
-askew, joint 6 has a ripple of four periods per turn, joint 7 an elastic torque. They were recognised in the residuals
-of all recordings, and each training part by itself shows the ripple. All their values are estimated on training data.
+askew, joint 6 has a ripple of four periods per turn, joint 7 one of one period. A diagnosis of the second and third
+recording names that of joint 7 (`cogging_torque`); each training part by itself shows that of joint 6. All their values
+are estimated on training data.
 """
 
 from collections.abc import Sequence
@@ -168,14 +169,11 @@ def test_the_last_thirds_of_all_recordings_of_the_kuka_are_predicted_up_to_1_7_p
     tilt, std = np.array([askew["tilt_x1"], askew["tilt_y1"]]).T
     assert 0.9 < np.degrees(np.linalg.norm(tilt)) < 1.3
     assert np.linalg.norm(tilt) > 10 * std.max()
-    errors = [
-        held_out_error(robot, first, last)
-        for robot in (RIGID, with_stanzas("gravity_direction"), with_stanzas("gravity_direction", "cogging_torque"))
-    ]
+    errors = [held_out_error(robot, first, last) for robot in (RIGID, with_stanzas("gravity_direction"), KUKA)]
     # Each effect earns its place on data it has not seen.
     assert errors[0] - errors[1] > 0.1
-    assert errors[1] - errors[2] > 0.05
-    assert prediction_error(found.theta, KUKA, last) < min(1.7, errors[2] - 0.02)
+    assert errors[1] - errors[2] > 0.1
+    assert errors[2] < 1.7
 
 
 def test_the_second_recording_of_the_kuka_is_predicted_from_the_others_up_to_1_6_percent(
@@ -184,10 +182,10 @@ def test_the_second_recording_of_the_kuka_is_predicted_from_the_others_up_to_1_6
     assert held_out_error(KUKA, [settled[0], settled[2]], [settled[1]]) < 1.6
 
 
-def test_the_first_recording_of_the_kuka_is_predicted_from_the_others_up_to_1_75_percent(
+def test_the_first_recording_of_the_kuka_is_predicted_from_the_others_up_to_1_7_percent(
     settled: list[Experiment],
 ) -> None:
-    assert held_out_error(KUKA, [settled[1], settled[2]], [settled[0]]) < 1.75
+    assert held_out_error(KUKA, [settled[1], settled[2]], [settled[0]]) < 1.7
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
@@ -205,17 +203,18 @@ def test_every_training_part_by_itself_shows_four_ripples_per_turn_of_joint_6(
         misses[harmonic] = found.relative_error_pct_by_joint[5]
     ordered = sorted(misses, key=misses.__getitem__)
     assert ordered[0] == 4.0
-    assert 2 * misses[4.0] < misses[ordered[1]]
+    # Over 0.6 of a turn, which the joint covers, five periods per turn are not far from four.
+    assert 1.8 * misses[4.0] < misses[ordered[1]]
 
 
 def test_physics_predicts_motion_twice_as_fast_three_times_better_than_least_squares(
     settled: list[Experiment],
 ) -> None:
-    found = identify_experiment(settled[:2], RIGID, Options(method="idim-ls", physical=True))
+    found = identify_experiment(settled[:2], KUKA, Options(method="idim-ls", physical=True))
     assert found.physical is not None
-    free = prediction_error(found.theta, RIGID, settled[2:])
-    physical = prediction_error(found.physical.theta_base, RIGID, settled[2:])
-    assert physical < 5.0
+    free = prediction_error(found.theta, KUKA, settled[2:])
+    physical = prediction_error(found.physical.theta_base, KUKA, settled[2:])
+    assert physical < 4.0
     assert 2.5 * physical < free
 
 
