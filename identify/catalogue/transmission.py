@@ -39,18 +39,22 @@ def harmonics(motion: Motion, joint: int) -> Sequence[float]:
 
 def _elasticity(motion: Motion, place: Place, *, frequency: float) -> Array:
     """The link stands behind the motor by compliance times load, and swings there at its own frequency."""
-    w, j = 2 * np.pi * frequency, place.joint
-    behind = -motion.transmitted[:, j]
+    j, behind = place.joint, -motion.transmitted[:, place.joint]
+    # Tustin's rule for w^2 s^k / (s^2 + 2 damping w s + w^2), k = 0, 1, 2: way, speed and acceleration of the link.
+    w, tustin = 2 * np.pi * frequency, 2 / motion.dt
+    swing = 2 * DAMPING * w * tustin
+    a = np.array([tustin**2 + swing + w**2, 2 * w**2 - 2 * tustin**2, tustin**2 - swing + w**2])
     moves = []
-    for numerator in ([w**2], [w**2, 0.0], [w**2, 0.0, 0.0]):
-        b, a = signal.bilinear(numerator, [1.0, 2 * DAMPING * w, w**2], 1 / motion.dt)
-        moves.append(signal.lfilter(b, a, behind, zi=signal.lfilter_zi(b, a) * behind[0])[0])
+    for numerator in ([1.0, 2.0, 1.0], [tustin, 0.0, -tustin], [tustin**2, -2 * tustin**2, tustin**2]):
+        b = w**2 * np.array(numerator)
+        start = signal.lfilter_zi(b / a[0], a / a[0]) * behind[0]
+        moves.append(signal.lfilter(b / a[0], a / a[0], behind, zi=start)[0])
     return motion.response(j, *moves, links=True)[:, :, None]
 
 
 def frequencies(motion: Motion, joint: int) -> Sequence[float]:
     """Resonances up to a fifth of the sampling rate."""
-    return [float(f) for f in np.geomspace(4.0, min(100.0, 0.2 / motion.dt), 10)]
+    return [float(f) for f in np.geomspace(4.0, min(100.0, 0.2 / motion.dt), 7)]
 
 
 def _backlash(motion: Motion, place: Place, *, gap: float) -> Array:

@@ -211,7 +211,7 @@ def test_a_tilted_base_feels_a_turned_gravity(arm: Motion) -> None:
 
 
 def test_a_wrong_gain_scales_the_motor_torque(arm: Motion) -> None:
-    tau = arm.model.inverse_dynamics(arm.theta, arm.q, arm.qd, arm.qdd)
+    tau = arm.model.inverse_dynamics(arm.standard, arm.q, arm.qd, arm.qdd)
     # tau_joint = ratios' tau_motor: motor 6 turns with joints 5 and 6, motor 5 with joint 5 alone.
     found = columns("drive_gain_error", arm, 5)[:, :, 0]
     np.testing.assert_allclose(found[:, 5], tau[:, 5], rtol=1e-9, atol=1e-12)
@@ -278,5 +278,5 @@ def test_an_eccentric_encoder_shows_a_motion_that_is_not_there(arm: Motion) -> N
     real = [arm.q.copy(), arm.qd.copy(), arm.qdd.copy()]
     for signal, error in zip(real, (wave(t), rate, acceleration), strict=True):
         signal[:, joint] -= size * error
-    expected = (arm.model.inverse_dynamics(arm.theta, *real) - arm.torque) / size
+    expected = (arm.model.inverse_dynamics(arm.standard, *real) - arm.torque) / size
     np.testing.assert_allclose(found[:, :, 1], expected, atol=1e-3 * np.abs(expected).max())

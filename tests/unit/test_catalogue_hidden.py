@@ -105,7 +105,7 @@ def healthy(robot: str) -> Any:
     """Trials beside the model of a healthy arm."""
     recording = simulate_recording(load_robot(robot), trajectory(robot), 7, period=PERIOD, setpoint_every=1)
     experiments, _ = experiments_from_recording(recording, load_robot(robot))
-    with threadpool_limits(1):
+    with threadpool_limits(1):  # type: ignore[no-untyped-call]
         return Search(build_study(experiments, [], load_robot(robot)), Settings()).start()
 
 
@@ -116,7 +116,7 @@ def test_what_is_hidden_comes_out_first(case: Case) -> None:
     whole, known = load_robot(case.robot), known_of(case)
     recording = simulate_recording(whole, trajectory(case.robot), 1, scenario=scenario, period=PERIOD, setpoint_every=1)
     experiments, _ = experiments_from_recording(recording, whole)
-    with threadpool_limits(1):
+    with threadpool_limits(1):  # type: ignore[no-untyped-call]
         state = Search(build_study(experiments, [], known), Settings()).start()
     passing = state.passing(Settings())
     assert passing, [(t.candidate.key, t.score) for t in state.trials[:3]]
