@@ -70,7 +70,7 @@ EFFECTS = (
         title="a wrong torque constant",
         says="a drive gives another torque per ampere than configured: wrong data, weak magnets, a changed drive",
         reference="Gautier, Briot 2014, IEEE Trans. Automatic Control 59(10), Global identification of drive gains",
-        linear=(Linear("gain_error", ("", "")),),
+        linear=(Linear("gain_error", ("", ""), bounds=(-0.6, 1.5)),),
         columns=_gain,
         visible=_alone,
         predicts=True,

@@ -1,5 +1,6 @@
 """What an entry of the catalogue is."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -28,11 +29,14 @@ class Linear:
         Of a revolute joint; and of a prismatic one.
     sign
         +1 or -1 where physics knows it, 0 where both are possible.
+    bounds
+        Values beyond which the effect would be something else.
     """
 
     name: str
     unit: tuple[str, str]
     sign: int = 0
+    bounds: tuple[float, float] = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)

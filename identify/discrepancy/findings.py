@@ -16,7 +16,7 @@ from identify.discrepancy.experiment import recommended_experiment
 from identify.discrepancy.numbers import NumbersFinding
 from identify.discrepancy.precision import standard_deviations
 from identify.discrepancy.regression import relative_errors
-from identify.discrepancy.search import Search, State, with_values, without
+from identify.discrepancy.search import Search, Settings, State, with_values, without
 from identify.discrepancy.where import Disagreement
 from identify.discrepancy.wiring_check import WiringFinding
 from identify.document import Alternative, Finding, Gap, Invisible
@@ -45,19 +45,23 @@ def described(search: Search, first: State, final: State, left: Sequence[Disagre
     findings: list[Finding] = []
     for k in range(own, len(stanzas)):
         rest = search.state(without(final.study.robot, k), final)
-        findings.append(_finding(rest, final, stanzas[k], deviations.get(k, {}), left))
+        findings.append(_finding(rest, final, stanzas[k], deviations.get(k, {}), left, search.settings))
     return findings
 
 
-def _finding(rest: State, final: State, stanza: Stanza, std: dict[str, float], left: Sequence[Disagreement]) -> Finding:
+def _finding(
+    rest: State, final: State, stanza: Stanza, std: dict[str, float], left: Sequence[Disagreement], settings: Settings
+) -> Finding:
     study = final.study
     effect = known(stanza.effect)
     place = place_of(stanza, effect, study.robot, stanza.effect)
     trials = [t for t in rest.trials if not t.forbidden]
     mine = next((t for t in trials if t.candidate.key == (effect.name, place.joint, place.other)), None)
-    scores = np.array([t.score for t in trials])
     rivals = [t for t in trials if t is not mine]
+    # Only what could have been found in its place takes confidence from a finding.
+    serious = [t for t in rest.passing(settings) if t is not mine]
     share = 0.0 if mine is None else mine.share
+    scores = [] if mine is None else [mine.score, *(t.score for t in serious)]
     alone = 0.0 if mine is None else float(np.exp(mine.score - special.logsumexp(scores)))
     remaining = max((d.share for d in left if d.joint == stanza.joint), default=0.0)
     # What is left is a share of the smaller residual that the finding leaves.
@@ -86,7 +90,7 @@ def _finding(rest: State, final: State, stanza: Stanza, std: dict[str, float], l
             "share_of_residual": share,
             "std": std,
             "units": _units(effect, study.robot.joints[joint].type == "prismatic"),
-            "ambiguous_with": [t.candidate.effect.name for t in rivals if mine and t.score > mine.score - CLOSE],
+            "ambiguous_with": [t.candidate.effect.name for t in serious if mine and t.score > mine.score - CLOSE],
         },
     )
 

@@ -19,6 +19,9 @@ RANK_TOLERANCE = 1e-3
 """Columns that the model nearly contains (relative norm left beside it) cannot be tested."""
 CALM_PASSES = 2
 """Between a candidate's parameters and the noise models that go with it, from calm ones."""
+SUPPORT = 3.0
+"""Evidence may be at most this many times what the instruments support: measured signals hold noise that the torques
+hold too, simulated ones are only as good as the simulated loop, so a candidate counts by the better of both."""
 REFINEMENTS = 12
 """Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""
 
@@ -64,9 +67,12 @@ class Trial:
 
     @property
     def forbidden(self) -> bool:
-        """Whether a linear parameter has a sign that physics does not allow."""
-        signs = [parameter.sign for parameter in self.candidate.effect.linear]
-        return any(sign * value < 0 for sign, value in zip(signs, self.values, strict=True))
+        """Whether a linear parameter has a sign or a size that physics does not allow."""
+        linear = self.candidate.effect.linear
+        return any(
+            p.sign * value < 0 or not p.bounds[0] <= value <= p.bounds[1]
+            for p, value in zip(linear, self.values, strict=True)
+        )
 
     @property
     def p_value(self) -> float:
@@ -169,8 +175,10 @@ def _judged(
     concerned = np.abs(columns.held_z).any(axis=1)
     share = gain / max(float(before[concerned] @ before[concerned]), 1e-300)
     fitted = 0.5 * (values.size + len(shapes))
-    # Measured signals hold noise that the torques hold too: no more evidence than the instruments support.
     supported = 0.5 * (statistic + gain)
+    evidence = max(
+        _evidence(alone, fit, candidate, shapes, workshop, values, away, kind) for kind in ("simulated", "measured")
+    )
     return Trial(
         candidate,
         shapes,
@@ -182,7 +190,7 @@ def _judged(
         inflation,
         away,
         share,
-        min(supported, _evidence(alone, fit, candidate, shapes, workshop, values, away)) - fitted,
+        min(SUPPORT * supported, evidence) - fitted,
     )
 
 
@@ -194,21 +202,32 @@ def _calmed(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, 
 
 
 def _evidence(
-    alone: Fit, fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, values: Array, away: Array
+    alone: Fit,
+    fit: Fit,
+    candidate: Candidate,
+    shapes: Shapes,
+    workshop: Workshop,
+    values: Array,
+    away: Array,
+    kind: str,
 ) -> float:
-    """Gain in log-likelihood over both parts at measured signals, each model with noise models of its own.
+    """Gain in log-likelihood over both parts, each model with noise of its own.
 
-    A whitening that suits one model would weigh the other's residual wrongly; the model without the candidate may
-    choose at every joint between its own and the candidate's.
+    A whitening that suits one candidate would weigh another's residual wrongly, so each has noise models of what it
+    leaves itself; they are all held against the same model without any, with the noise models that it has itself.
     """
-    with_it, without = np.zeros(len(fit.noise)), np.zeros((2, len(fit.noise)))
-    for part in ("train", "held"):
-        held = part == "held"
-        band = workshop.band(candidate.effect, candidate.place, shapes, part, "measured")
-        left = [e - c @ values for e, c in zip(fit.errors(fit.theta - away, held=held), band, strict=True)]
-        with_it += log_likelihoods(left, fit.noise)
-        without += np.stack([log_likelihoods(f.errors(f.theta, held=held), f.noise) for f in (alone, fit)])
-    return float(np.sum(with_it - without.max(axis=0)))
+    left: dict[str, list[Array]] = {}
+    for part, rows in (("train", alone.equations.train), ("held", alone.equations.held)):
+        band = workshop.band(candidate.effect, candidate.place, shapes, part, kind)
+        errors = alone.errors(fit.theta, held=part == "held")
+        regressors = [z if kind == "simulated" else x for x, z, _ in rows]
+        left[part] = [e - c @ values + r @ away for e, c, r in zip(errors, band, regressors, strict=True)]
+    own = noise_models(left["train"], fit.theta.size + values.size, MAX_AR_ORDER)
+    gain = 0.0
+    for part, errors in left.items():
+        before = alone.errors(alone.theta, held=part == "held")
+        gain += float(np.sum(log_likelihoods(errors, own) - log_likelihoods(before, alone.noise)))
+    return gain
 
 
 def log_likelihoods(errors: Sequence[Array], noise: Sequence[ArModel]) -> Array:

@@ -60,12 +60,7 @@ TX40 = (
     Case("tx40", "time_delay", "joint_2", {"delay": 0.004}, {"delay": 0.004}),
     Case("tx40", "actuator_bandwidth", "joint_1", {"time_constant": 0.005}, {"lag": 0.005}),
 )
-STRIBECK = pytest.param(
-    Case("tx40", "stribeck_friction", "joint_5", {"extra": 1.2, "velocity": 0.36}),
-    marks=pytest.mark.xfail(
-        strict=True, reason="score at measured signals prefers nonlinear_viscous_friction, though it explains less"
-    ),
-)
+STRIBECK = Case("tx40", "stribeck_friction", "joint_5", {"extra": 1.2, "velocity": 0.36})
 EMPS = (
     Case("emps", "asymmetric_viscous_friction", "joint_1", {"ratio": 0.05}),
     Case("emps", "load_dependent_friction", "joint_1", {"coefficient": 0.03}, {"fcl": 0.03}),
@@ -134,5 +129,6 @@ def test_what_is_hidden_comes_out_first(case: Case) -> None:
 def test_nothing_passes_beside_the_model_of_a_healthy_arm(robot: str) -> None:
     state = healthy(robot)
     assert not state.passing(Settings())
-    assert max(t.score for t in state.trials if not t.forbidden) < 8.0
+    # Not by a hair either: no candidate reaches a tenfold rate of false alarms.
+    assert not state.passing(Settings(false_alarms=0.1))
     assert np.isfinite([t.score for t in state.trials]).all()

@@ -51,7 +51,8 @@ def measured(shared_data: Path, robot: RobotConfig) -> list[Experiment]:
         np.loadtxt(folder / name, delimiter=",", skiprows=1)[:37500] for name in ("pos_read_data.csv", "curr_data.csv")
     )
     ratios = robot.transmission_matrix
-    return [Experiment(np.linalg.solve(ratios, q.T).T, tau @ ratios, None, 2e-4)]
+    joints = np.asarray(np.linalg.solve(ratios, q.T).T, dtype=np.float64)
+    return [Experiment(joints, tau @ ratios, None, 2e-4)]
 
 
 @pytest.fixture(scope="module")
