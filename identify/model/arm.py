@@ -1,5 +1,7 @@
 """The dynamic model of a serial arm: regressor, inverse and direct dynamics, base parameters."""
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -27,6 +29,9 @@ from identify.model.kernels import (
     fill_mass_matrices,
     fill_regressor,
 )
+
+PIECE = 4096
+"""Samples of a long regressor that one processor fills at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +129,15 @@ class ArmModel:
         columns = [term.columns(motion) for term in self.terms]
         return np.concatenate(columns, axis=2) if columns else np.zeros((motion.samples, self.n, 0))
 
-    def regressor(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False) -> Floats:
+    def regressor(
+        self,
+        q: ArrayLike,
+        qd: ArrayLike,
+        qdd: ArrayLike,
+        *,
+        sharp_sign: bool = False,
+        out: Floats | None = None,
+    ) -> Floats:
         """Regressor of the standard parameters without those of the terms.
 
         Parameters
@@ -133,13 +146,15 @@ class ArmModel:
             Positions, velocities, accelerations, each (N, n); rad or m, s.
         sharp_sign
             ``sign(qd)`` instead of its smoothed form.
+        out
+            Where to write: zeros, or an earlier regressor of this model and length, which saves a large one its memory.
 
         Returns
         -------
         ndarray
             Shape (N, n, p - e): row j of sample k times ``theta`` is the torque of joint j.
         """
-        return self._regressor(self.columns, len(self.names) - self.e, q, qd, qdd, sharp_sign)
+        return self._regressor(self.columns, len(self.names) - self.e, q, qd, qdd, sharp_sign, out)
 
     def base_regressor(
         self,
@@ -246,9 +261,31 @@ class ArmModel:
         return arrays
 
     def _regressor(
-        self, columns: Columns, width: int, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, sharp_sign: bool
+        self,
+        columns: Columns,
+        width: int,
+        q: ArrayLike,
+        qd: ArrayLike,
+        qdd: ArrayLike,
+        sharp_sign: bool,
+        given: Floats | None = None,
     ) -> Floats:
         q, qd, qdd = self._motion(q, qd, qdd)
-        out = np.zeros((q.shape[0], self.n, width))
-        fill_regressor(self.chain, columns, 0.0 if sharp_sign else self.smoothing, q, qd, qdd, out)
+        shape = (q.shape[0], self.n, width)
+        if given is not None and given.shape != shape:
+            raise ValueError(f"out has shape {given.shape}; expected {shape}")
+        out = np.zeros(shape) if given is None else given
+        smoothing = 0.0 if sharp_sign else self.smoothing
+
+        def fill(first: int) -> None:
+            rows = slice(first, first + PIECE)
+            fill_regressor(self.chain, columns, smoothing, q[rows], qd[rows], qdd[rows], out[rows])
+
+        if q.shape[0] <= PIECE:
+            fill(0)
+            return out
+        # On all processors: the kernel holds no interpreter lock, and most of the time is the memory's.
+        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+            for _ in pool.map(fill, range(0, q.shape[0], PIECE)):
+                pass
         return out

@@ -345,8 +345,9 @@ JUDGEMENTS = (
         ("5.2",),
         derivatives,
         "the bandpass here is aligned to its samples; the thesis's errors of it, 0.55 % and 1.15 %, stand as 1 to 2.1, "
-        "as differences make them that come half a sample late (velocity) and a whole one (acceleration); such ones "
-        "put it an order of magnitude behind on velocity here too, at 1 kHz",
+        "as differences make them that come half a sample late (velocity) and a whole one (acceleration); with "
+        "such differences the protocol beside table 5.2, fitted to its figures, puts it one to two orders of magnitude "
+        "behind IRWSM 1",
     ),
     Judgement(
         4,

@@ -110,7 +110,9 @@ def _regressor(model: ArmModel, theta: Floats) -> Row:
     oracle = pinocchio_model(model.robot, values.inertial, values.ia)
     data = oracle.createData()
     model.regressor(q[:10], qd[:10], qdd[:10])
-    ours = best_of(lambda: model.regressor(q, qd, qdd))
+    # Both write into memory that they have written to before.
+    ours_out = model.regressor(q, qd, qdd)
+    ours = best_of(lambda: model.regressor(q, qd, qdd, out=ours_out))
     theirs_out = np.empty((SAMPLES, model.n, 10 * model.n))
 
     def loop() -> None:
