@@ -111,7 +111,7 @@ def diagnose_suite(
     out: Annotated[Path, typer.Option("--out", help="Directory of results and tables; a run goes on there.")] = Path(
         "suite"
     ),
-    quick: Annotated[bool, typer.Option("--quick", help="One place, strength and run of each effect.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="One arm, place, strength and run of each effect.")] = False,
     only: Annotated[
         str, typer.Option("--only", help="Effects by name, or clean, clean_baseline, pair, outside: A,B,...")
     ] = "",

@@ -199,12 +199,13 @@ def _part(suite: SuiteConfig, effect: SuiteEffect, robot: str, place: str, level
 def _single(suite: SuiteConfig, kind: Kind, effects: Sequence[SuiteEffect]) -> list[Case]:
     out = []
     for number, effect in enumerate(effects):
+        robots = list(effect.strength)
         for robot, places in effect.strength.items():
             for nth, place in enumerate(places):
                 for level in effect.levels:
                     for seed in range(1, suite.runs + 1):
-                        # One place, one strength and one run of each, the runs in turn.
-                        quick = nth == 0 and seed == 1 + number % suite.runs
+                        # One place, one strength and one run of each; arms and runs in turn.
+                        quick = robot == robots[number % len(robots)] and nth == 0 and seed == 1 + number % suite.runs
                         quick = quick and level == ("typical" if "typical" in effect.levels else effect.levels[0])
                         out.append(
                             Case(

@@ -77,12 +77,12 @@ def test_a_case_that_fails_is_reported_and_not_swallowed(small: Path, tmp_path: 
 
 
 LEAST = {
-    "name and place right": 0.70,
+    "name and place right": 0.65,
     "healthy arms called healthy": 0.90,
-    "at least 90% of the injected gap closed, where named": 0.65,
-    "parameters within three standard deviations": 0.70,
+    "at least 90% of the injected gap closed, where named": 0.60,
+    "parameters within three standard deviations": 0.65,
 }
-"""Two to three binomial deviations under the 84, 100, 82 and 86 % that 51, 12, 38 and 35 cases came to."""
+"""Measured: 84, 100, 82 and 86 %; less two to three binomial deviations of some 30, 12, 20 and 20 cases."""
 
 
 def test_the_quick_subset_is_found_by_name_and_healthy_arms_are_left_alone(tmp_path: Path) -> None:
