@@ -107,6 +107,9 @@ def filtered_regressor(
     if count == 0:
         decimation(signals.q)
 
+    if decimation.passes_all and not model.terms:
+        return model.rigid_regressor(signals.q, signals.qd, signals.qdd, sharp_sign=sharp_sign)
+
     rigid = model.base.b - model.e
     filtered = np.empty((count, model.n, model.base.b))
     if model.terms:

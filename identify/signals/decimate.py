@@ -32,6 +32,11 @@ class Decimation:
         """Samples dropped at each end."""
         return (self.taps.size - 1) // 2
 
+    @property
+    def passes_all(self) -> bool:
+        """Whether nothing is filtered and every sample kept."""
+        return self.factor == 1 and self.taps.size == 1 and self.taps[0] == 1.0
+
     def count(self, samples: int) -> int:
         """How many samples are left of ``samples``."""
         return max(0, (samples - self.taps.size) // self.factor + 1)
