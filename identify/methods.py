@@ -16,9 +16,8 @@ from identify.estimators.idim_iv import idim_iv
 from identify.estimators.idim_piv import idim_piv
 from identify.estimators.regression import Block, Estimate, joint_variances
 from identify.estimators.sep_pem import sep_pem
-from identify.experiment import Experiment
 from identify.options import Method, Options
-from identify.preparation import LS_CUTOFF, PIV_CUTOFF, decimated_rows, equations, sufficient
+from identify.preparation import LS_CUTOFF, PIV_CUTOFF, Prepared, decimated_rows, sufficient
 from identify.signals.decimate import Decimation, design
 from identify.signals.delay import TorqueDelay, torque_delay
 from identify.signals.differentiate import Derivatives
@@ -97,8 +96,7 @@ class Problem:
         Decimation of the methods without a noise model.
     """
 
-    experiments: Sequence[Experiment]
-    signals: Sequence[Derivatives]
+    prepared: Prepared
     auxiliary: AuxiliaryModel
     start: Array
     plain: Decimation
@@ -107,7 +105,7 @@ class Problem:
     @cached_property
     def blocks(self) -> list[Block]:
         """Equations at measured signals, decimated as the method wants them."""
-        return equations(self.auxiliary.model, self.experiments, self.signals, self.auxiliary.decimation)
+        return self.prepared.equations(self.auxiliary.decimation)
 
     @cached_property
     def plain_problem(self) -> "Problem":
@@ -140,10 +138,26 @@ class Solution:
     noise_of: str = "joint torque"
     warnings: tuple[str, ...] = ()
 
+    @cached_property
+    def motions(self) -> list[Derivatives]:
+        """The recorded references as the estimate follows them, without what disturbed the recordings.
+
+        Raises
+        ------
+        DataError
+            If neither the estimate nor any point between it and the last good one can be simulated.
+        """
+        return self.problem.auxiliary.fresh().motions(self.estimate.theta)
+
+    @cached_property
+    def instruments(self) -> list[Array]:
+        """Regressors at these motions, thinned out to the band of the instruments, one (M, n, b) per experiment."""
+        return self.problem.in_band.auxiliary.regressors(self.motions)
+
     def diagnostics(self, essential: NDArray[np.bool_]) -> Diagnostics:
         """Tests of the estimate on the equations it solves, thinned out to the band of its instruments."""
         problem, estimate = self.problem.in_band, self.estimate
-        instruments = problem.auxiliary.fresh().instruments(estimate.theta)
+        instruments = self.instruments
         blocks, method = problem.blocks, problem.options.method
         if method not in MEASURED:
             blocks = [replace(b, x=z) for b, z in zip(blocks, instruments, strict=True)]
@@ -159,19 +173,13 @@ class Solution:
             essential=essential,
         )
 
-    def delay(self) -> TorqueDelay | None:
+    def delay(self) -> TorqueDelay:
         """Delay of the recorded torques, with the motion simulated along the recorded reference as instruments."""
-        problem = self.problem
-        runs = problem.auxiliary.simulate(self.estimate.theta)
-        if runs is None:
-            return None
-        motions = [
-            Derivatives(run.q, run.qd, run.qdd, None, e.dt, e.start)
-            for run, e in zip(runs, problem.experiments, strict=True)
-        ]
-        # The simulated torques are as large as the recorded ones, and nobody asks for them.
-        del runs
-        return torque_delay(problem.auxiliary.model, problem.experiments, problem.signals, problem.plain, motions)
+        problem, prepared = self.problem, self.problem.prepared
+        x = [block.x for block in prepared.equations(problem.plain)]
+        thinned = problem.in_band.auxiliary.decimation == problem.plain
+        z = self.instruments if thinned else problem.plain_problem.auxiliary.regressors(self.motions)
+        return torque_delay(prepared.model, prepared.experiments, prepared.signals, problem.plain, self.motions, (x, z))
 
 
 def solve(problem: Problem) -> Solution:
@@ -228,7 +236,7 @@ def _clie(problem: Problem) -> Solution:
 
 
 def _cloe(problem: Problem) -> Solution:
-    positions = [problem.auxiliary.decimation(e.q) for e in problem.experiments]
+    positions = [problem.auxiliary.decimation(e.q) for e in problem.prepared.experiments]
     estimate = cloe(problem.blocks, positions, problem.auxiliary, problem.start)
     return Solution(estimate, problem, noise_of="joint position")
 

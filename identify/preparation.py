@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +101,30 @@ def equations(
         t = np.asarray(kept * experiment.dt, dtype=np.float64)
         blocks.append(Block(y, filtered_regressor(model, s, decimation), keep, t))
     return blocks
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Recordings with the derivatives of their positions, and their equations, made once for every decimation.
+
+    Parameters
+    ----------
+    model
+        The arm.
+    experiments, signals
+        Recordings of one sampling rate, and the derivatives of their positions.
+    """
+
+    model: ArmModel
+    experiments: Sequence[Experiment]
+    signals: Sequence[Derivatives]
+    _made: dict[Decimation, list[Block]] = field(default_factory=dict, repr=False)
+
+    def equations(self, decimation: Decimation) -> list[Block]:
+        """:func:`equations` after a decimation, the same arrays whenever it is asked for again."""
+        if decimation not in self._made:
+            self._made[decimation] = equations(self.model, self.experiments, self.signals, decimation)
+        return self._made[decimation]
 
 
 def published_equations(

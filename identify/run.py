@@ -20,7 +20,7 @@ from identify.methods import PREFILTERED, Problem, decimation_of, solve
 from identify.model.arm import ArmModel
 from identify.model.consistent import nearest_consistent
 from identify.options import CONTROLLERS, Options
-from identify.preparation import aligned_torque, equations, least_rows, published_equations
+from identify.preparation import Prepared, aligned_torque, equations, least_rows, published_equations
 from identify.result import Array, Identification, make_result
 from identify.signals.bandwidth import motion_bandwidth
 from identify.signals.delay import HELD, TorqueDelay
@@ -94,16 +94,17 @@ def _identify(
     # A factor given by hand is that of the method; a method with a noise model keeps its own for the comparison.
     factor = options.decimation if isinstance(options.decimation, int) else None
     plain = decimate("idim-ls", dt, bandwidth, None if options.method in PREFILTERED else factor)
+    prepared = Prepared(model, experiments, signals)
     if options.derivatives is None and options.decimation is None and robot.preprocessing is not None:
         ls_blocks = published_equations(model, experiments, robot.preprocessing)
     else:
-        ls_blocks = equations(model, experiments, signals, plain)
+        ls_blocks = prepared.equations(plain)
     ls = idim_ls(ls_blocks, model.base.names, weighted=options.weighted)
     if options.decimation == "noise":
         factor = _memory_of_noise(model, experiments, signals, ls.theta, warnings)
         if options.method not in PREFILTERED:
             plain = decimate("idim-ls", dt, bandwidth, factor)
-            ls_blocks = equations(model, experiments, signals, plain)
+            ls_blocks = prepared.equations(plain)
             ls = idim_ls(ls_blocks, model.base.names, weighted=options.weighted)
 
     controller: dict[str, Any] = {"kind": "none"}
@@ -116,7 +117,7 @@ def _identify(
             model, experiments, signals, options, ls.theta, decimation, bandwidth, warnings
         )
         clock.enter(options.method, 0.5)
-        solution = solve(Problem(experiments, signals, auxiliary, start, plain, options))
+        solution = solve(Problem(prepared, auxiliary, start, plain, options))
         estimate, blocks = solution.estimate, solution.problem.blocks
         warnings += [*solution.warnings, *estimate.warnings]
         if not estimate.converged:

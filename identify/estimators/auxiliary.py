@@ -154,11 +154,22 @@ class AuxiliaryModel:
         DataError
             If neither theta nor any point between it and the last good estimate can be simulated.
         """
+        return self.regressors(self.motions(theta))
+
+    def motions(self, theta: NDArray[np.float64]) -> list[Derivatives]:
+        """Simulated signals of every experiment.
+
+        Raises
+        ------
+        DataError
+            As `instruments`.
+        """
         _, runs = self._nearest(theta)
-        return [
-            filtered_regressor(self.model, self._in_band(run, self._start(k)), self.decimation)
-            for k, run in enumerate(runs)
-        ]
+        return [Derivatives(run.q, run.qd, run.qdd, None, self.dt, self._start(k)) for k, run in enumerate(runs)]
+
+    def regressors(self, motions: Sequence[Derivatives]) -> list[NDArray[np.float64]]:
+        """Filtered regressor at motions that know no noise, one (M, n, b) per experiment."""
+        return [filtered_regressor(self.model, self._in_band(motion), self.decimation) for motion in motions]
 
     def equations(self, blocks: Sequence[Block], theta: NDArray[np.float64]) -> list[Block]:
         """The equations with the simulated regressor in place of the measured one (2.32).
@@ -184,12 +195,12 @@ class AuxiliaryModel:
     def _start(self, experiment: int) -> float:
         return 0.0 if self.starts is None else self.starts[experiment]
 
-    def _in_band(self, run: Simulation, start: float) -> Derivatives:
-        """Simulated signals, without what is faster than ``band_hz`` where the decimation leaves that in."""
+    def _in_band(self, motion: Derivatives) -> Derivatives:
+        """A motion without what is faster than ``band_hz`` where the decimation leaves that in."""
         if not self.limits_band:
-            return Derivatives(run.q, run.qd, run.qdd, None, self.dt, start)
-        q, qd, qdd = (butterworth(s, self.dt, self.band_hz) for s in (run.q, run.qd, run.qdd))
-        return Derivatives(q, qd, qdd, None, self.dt, start)
+            return motion
+        q, qd, qdd = (butterworth(s, self.dt, self.band_hz) for s in (motion.q, motion.qd, motion.qdd))
+        return replace(motion, q=q, qd=qd, qdd=qdd)
 
     def _filtered(self, runs: Sequence[Simulation]) -> Response:
         return Response(

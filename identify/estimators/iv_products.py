@@ -28,6 +28,9 @@ SAMPLE = 64
 CHUNK_ROWS = 2048
 """Rows whitened at a time."""
 
+ORTHOGONAL_ENOUGH = 1e3
+"""Condition number of normalised instruments up to which plain products, losing six digits of sixteen, will do."""
+
 NEGLIGIBLE = 1e-14
 """Share of an instrument, beside the others, that counts as rounding: such a one is left as it is."""
 
@@ -91,7 +94,8 @@ def iv_products(instruments: Sequence[Array], blocks: Sequence[Block], noise: Se
         for first in range(0, x.shape[0] - taps.size + 1, CHUNK_ROWS):
             span = slice(first, first + CHUNK_ROWS + taps.size - 1)
             use = kept[span][taps.size - 1 :]
-            q = _rows(filter_columns(taps, z[span]), use) @ combine
+            q = _rows(filter_columns(taps, z[span]), use)
+            q = q * combine if combine.ndim == 1 else q @ combine
             p = _rows(filter_columns(taps, x[span]), use)
             e = _rows(filter_columns(taps, y[span]), use)[:, 0]
             for total, term in zip(sums, (q.T @ q, q.T @ p, q.T @ e, np.einsum("ij,ij->j", p, p)), strict=True):
@@ -108,7 +112,10 @@ def iv_products(instruments: Sequence[Array], blocks: Sequence[Block], noise: Se
 
 
 def _combinations(instruments: Sequence[Array], blocks: Sequence[Block], noise: Sequence[ArModel]) -> Array:
-    """``T`` (b, b) that makes the columns of ``Z T`` nearly orthonormal, from every so many whitened rows."""
+    """``T`` (b, b) that makes the columns of ``Z T`` nearly orthonormal, from every so many whitened rows.
+
+    Only its diagonal (b,), of the inverse norms, where the columns are far enough from dependent as they are.
+    """
     b = instruments[0].shape[2]
     total = sum(int(block.keep.sum()) for block in blocks)
     every = max(1, total // (SAMPLE * b))
@@ -121,6 +128,9 @@ def _combinations(instruments: Sequence[Array], blocks: Sequence[Block], noise: 
     norms = np.sqrt(np.einsum("ij,ij->j", rows, rows))
     norms[norms == 0.0] = 1.0
     factor = triangularize(rows / norms, columns=b)
+    if np.linalg.cond(factor) < ORTHOGONAL_ENOUGH:
+        inverse_norms: Array = 1.0 / norms
+        return inverse_norms
     weak = np.abs(np.diag(factor)) < NEGLIGIBLE
     factor[weak, weak] = 1.0
     combined: Array = linalg.solve_triangular(factor, np.eye(b)) / norms[:, None]

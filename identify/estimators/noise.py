@@ -129,9 +129,9 @@ def _levinson(r: NDArray[np.float64]) -> Iterator[tuple[NDArray[np.float64], flo
         yield c, variance
 
 
-def lagged_sums(x: NDArray[np.float64], max_lag: int) -> NDArray[np.float64]:
-    """``sum_t x(t) . x(t - k)`` for lags 0..max_lag of a vector series (M, m)."""
-    return _lagged_sums(np.ascontiguousarray(x, dtype=np.float64), max_lag)
+def lagged_sums(x: NDArray[np.float64], max_lag: int, first: int = 0) -> NDArray[np.float64]:
+    """``sum_t x(t) . x(t - k)`` for lags 0..max_lag of a vector series (M, m), over t from ``first`` on."""
+    return _lagged_sums(np.ascontiguousarray(x, dtype=np.float64), max_lag, first)
 
 
 def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whiteness:
@@ -147,12 +147,12 @@ def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whitenes
 
 
 @compiled
-def _lagged_sums(x: NDArray[np.float64], max_lag: int) -> NDArray[np.float64]:
+def _lagged_sums(x: NDArray[np.float64], max_lag: int, first: int) -> NDArray[np.float64]:
     samples, width = x.shape
     sums, products = np.zeros(max_lag + 1), np.empty(width)
     for lag in range(max_lag + 1):
         products[:] = 0.0
-        for k in range(lag, samples):
+        for k in range(max(lag, first), samples):
             for c in range(width):
                 products[c] += x[k, c] * x[k - lag, c]
         for c in range(width):

@@ -16,7 +16,7 @@ TRANSITION = 0.5
 """Width of the transition band as a share of the decimated Nyquist frequency."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Decimation:
     """A linear-phase low-pass of finite length and the factor by which it thins out the samples.
 
@@ -26,6 +26,16 @@ class Decimation:
 
     factor: int
     taps: NDArray[np.float64]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Decimation) and (self.factor, self._bytes) == (other.factor, other._bytes)
+
+    def __hash__(self) -> int:
+        return hash((self.factor, self._bytes))
+
+    @property
+    def _bytes(self) -> bytes:
+        return self.taps.tobytes()
 
     @property
     def margin(self) -> int:

@@ -84,6 +84,7 @@ def torque_delay(
     signals: Sequence[Derivatives],
     decimation: Decimation,
     instruments: Sequence[Derivatives] | None = None,
+    regressors: tuple[Sequence[Array], Sequence[Array]] = ((), ()),
 ) -> TorqueDelay:
     """Delay between torque and position of every joint, in fractions of samples.
 
@@ -101,6 +102,8 @@ def torque_delay(
     instruments
         Motions without the disturbances of the recordings, for instance simulated; ``None``: the references, and
         where one is missing the measured motion, which makes it least squares.
+    regressors
+        Filtered regressors, (M, n, b) each, at the measured motions and at the instruments, where they are known.
 
     Returns
     -------
@@ -118,8 +121,12 @@ def torque_delay(
         instruments = [differentiate(q, experiments[0].dt) for q in references] if instrumented else signals
     n, b = model.n, len(model.base.names)
     joints = np.arange(n)
-    x = [_with_delays(filtered_regressor(model, s, decimation)) for s in signals]
-    z = [_with_delays(filtered_regressor(model, s, decimation)) for s in instruments] if instrumented else x
+
+    def augmented(motions: Sequence[Derivatives], known: Sequence[Array]) -> list[Array]:
+        return [_with_delays(value) for value in known or [filtered_regressor(model, s, decimation) for s in motions]]
+
+    x = augmented(signals, regressors[0])
+    z = augmented(instruments, regressors[1]) if instrumented else x
     y = [decimation(e.tau) for e in experiments]
     keep = [np.ones(value.shape, dtype=np.bool_) for value in y]
 
@@ -133,8 +140,8 @@ def torque_delay(
     theta, blocks = solve(*without, joint_variances(blocks, theta))
     noise: Sequence[ArModel] = joint_variances(blocks, theta)
     for _ in range(REWEIGHTINGS):
-        for regressors, motions in ((x, signals), (z, instruments)) if instrumented else ((x, signals),):
-            for value, motion in zip(regressors, motions, strict=True):
+        for values, motions in ((x, signals), (z, instruments)) if instrumented else ((x, signals),):
+            for value, motion in zip(values, motions, strict=True):
                 value[:, joints, b + joints] = _rate(model, motion, theta[:b], decimation)
         theta, blocks = solve(z, x, noise)
         noise = joint_variances(blocks, theta)

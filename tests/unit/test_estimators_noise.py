@@ -6,7 +6,15 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from identify.estimators.noise import ArModel, fit_ar, fit_spectrum, lagged_sums, whiteness
-from identify.estimators.regression import Block, inverse_gram, least_squares, noise_models, stacked
+from identify.estimators.regression import (
+    LONG_SERIES,
+    Block,
+    absorbed_sums,
+    inverse_gram,
+    least_squares,
+    noise_models,
+    stacked,
+)
 
 COEFFICIENTS = np.array([-1.5, 0.7])
 
@@ -88,6 +96,20 @@ def test_errors_of_parameters_are_as_large_as_said_although_the_noise_model_is_a
     # Over seeds 0 to 4 the difference to the known noise model is 0.006 +- 0.007; unwidened it is 0.064.
     assert abs(np.mean(said - known)) < 0.035
     assert np.mean(plain - known) > 0.035
+
+
+def test_stretches_of_a_long_series_say_what_the_parameters_absorbed() -> None:
+    # A motion that changes as it goes, as an excitation trajectory does, at the recorded rate.
+    samples, lags = 40_000, 60
+    t = np.arange(samples) / 5000.0
+    rng = np.random.default_rng(5)
+    waves = sum(np.sin(2 * np.pi * np.outer(t, rng.uniform(0.1, 8.0, 6)) + rng.uniform(0, 6.3, 6)) for _ in range(3))
+    x = np.asarray(waves) * (1 + 0.5 * np.sin(0.9 * t))[:, None]
+    factor = rng.standard_normal((6, 6))
+    whole = lagged_sums(x @ factor, lags)
+    np.testing.assert_allclose(absorbed_sums(x, factor, lags), whole, rtol=0.05)
+    short = x[: LONG_SERIES - 1]
+    np.testing.assert_array_equal(absorbed_sums(short, factor, lags), lagged_sums(short @ factor, lags))
 
 
 def weighted(blocks: list[Block], models: list[ArModel]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
