@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from identify.catalogue.effect import Effect, Place
 from identify.catalogue.motion import Motion
 from identify.catalogue.registry import catalogue
-from identify.discrepancy.regression import whitened
 from identify.discrepancy.study import Stretch, Study
+from identify.discrepancy.whitening import whitened
 from identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]

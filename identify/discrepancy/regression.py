@@ -1,7 +1,7 @@
 """The instrumental-variable regression behind a diagnosis, whitened joint by joint."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from identify.discrepancy.study import Stretch, Study
-from identify.estimators.noise import ArModel, fit_ar
+from identify.discrepancy.whitening import ar_models, log_likelihoods, summed_backwards, whitened
+from identify.estimators.noise import ArModel
 from identify.estimators.regression import require_excitation
 
 Array = NDArray[np.float64]
@@ -40,6 +41,81 @@ class Equations:
     train: tuple[Equation, ...]
     held: tuple[Equation, ...]
 
+    @cached_property
+    def blocks(self) -> tuple["Block", ...]:
+        """The training rows joint by joint, without the columns that are zero there."""
+        return tuple(Block.of(self.train, j) for j in range(self.train[0][2].shape[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rows of one joint, of which many columns are zero: a link hangs on the joints before it.
+
+    Parameters
+    ----------
+    x, z
+        Columns of regressor and instruments that are not zero.
+    parts
+        ``[X, Z, y]`` of these columns, one array (M, x + z + 1) per stretch.
+    """
+
+    x: NDArray[np.int64]
+    z: NDArray[np.int64]
+    parts: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, rows: Sequence[Equation], joint: int) -> "Block":
+        """Rows of a joint out of the equations of all."""
+        x, z = (
+            np.flatnonzero(np.any([np.any(row[k][:, joint] != 0, axis=0) for row in rows], axis=0)) for k in range(2)
+        )
+        parts = tuple(np.column_stack([r[0][:, joint, x], r[1][:, joint, z], r[2][:, joint]]) for r in rows)
+        return cls(x, z, parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Whitened rows of all joints, and their products.
+
+    Parameters
+    ----------
+    rows
+        ``[X, Z, y]`` of every joint's block, whitened.
+    zx, zz, zy
+        ``Z'X`` and ``Z'Z`` (b, b), ``Z'y`` (b,).
+    """
+
+    rows: tuple[Array, ...]
+    zx: Array
+    zz: Array
+    zy: Array
+
+    @classmethod
+    def of(cls, equations: Equations, noise: Sequence[ArModel]) -> "Products":
+        """Of the training rows under given noise models."""
+        b = equations.train[0][0].shape[2]
+        zx, zz, zy = np.zeros((b, b)), np.zeros((b, b)), np.zeros(b)
+        rows = []
+        for block, ar in zip(equations.blocks, noise, strict=True):
+            white = np.concatenate([ar.whiten(part) for part in block.parts])
+            through = white[:, block.x.size : -1].T @ white
+            zx[np.ix_(block.z, block.x)] += through[:, : block.x.size]
+            zz[np.ix_(block.z, block.z)] += through[:, block.x.size : -1]
+            zy[block.z] += through[:, -1]
+            rows.append(white)
+        return cls(tuple(rows), zx, zz, zy)
+
+    @cached_property
+    def scale(self) -> Array:
+        """Norms of the instruments, 1 for those that are zero, (b,)."""
+        scale = np.sqrt(np.diag(self.zz))
+        return np.where(scale == 0, 1.0, scale)
+
+    @cached_property
+    def solver(self) -> Any:
+        """Factors of ``Z'X``, scaled."""
+        return linalg.lu_factor(self.zx / np.outer(self.scale, self.scale))
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -51,10 +127,10 @@ class Fit:
         (b,), those of the terms at the end.
     noise
         AR model of each joint.
-    train, held
-        Whitened rows.
     equations
-        The same before they were whitened.
+        Rows before they were whitened.
+    products
+        Those of the whitened training rows.
     fixed
         Whether theta is given (a baseline), so that nothing of a candidate is absorbed by it.
     """
@@ -62,9 +138,8 @@ class Fit:
     study: Study
     theta: Array
     noise: tuple[ArModel, ...]
-    train: Rows
-    held: Rows
     equations: Equations
+    products: Products
     fixed: bool = False
 
     def renoised(self, noise: Sequence[ArModel]) -> "Fit":
@@ -77,51 +152,107 @@ class Fit:
         return [y - x @ theta for x, _, y in rows]
 
     @cached_property
+    def train(self) -> Rows:
+        """Whitened training rows."""
+        return self._rows(self.equations.train)
+
+    @cached_property
+    def held(self) -> Rows:
+        """Whitened held-out rows."""
+        return self._rows(self.equations.held)
+
+    def _rows(self, rows: tuple[Equation, ...]) -> Rows:
+        return Rows(*(whitened([row[k] for row in rows], self.noise) for k in range(3)))
+
+    @cached_property
     def residual(self) -> Array:
         """Of the training rows, (R,)."""
-        return self.train.y - self.train.x @ self.theta
+        return whitened(self.errors(self.theta, held=False), self.noise)
 
     @cached_property
     def held_residual(self) -> Array:
         """Of the held-out rows, (R,)."""
-        return self.held.y - self.held.x @ self.theta
+        return whitened(self.errors(self.theta, held=True), self.noise)
 
     @cached_property
-    def _solver(self) -> tuple[Array, Any]:
-        scale = np.linalg.norm(self.train.z, axis=0)
-        scale[scale == 0] = 1.0
-        return scale, linalg.lu_factor((self.train.z / scale).T @ (self.train.x / scale))
+    def likelihoods(self) -> tuple[Array, Array]:
+        """Log-likelihoods of the errors of the training and of the held-out rows, up to a constant, (n,) each."""
+        train, held = (
+            log_likelihoods(self.errors(self.theta, held=h), self.noise, MAX_AR_ORDER) for h in (False, True)
+        )
+        return train, held
+
+    def held_at_simulated(self, theta: Array) -> Array:
+        """``Z theta`` of the held-out rows, (R,)."""
+        return whitened([z @ theta for _, z, _ in self.equations.held], self.noise)
+
+    def _through(self, columns: Array) -> tuple[Array, Array]:
+        """``X' columns`` and ``Z' columns`` of the training rows, (b, k) each."""
+        x, z = np.zeros((2, self.theta.size, columns.shape[1]))
+        begin = 0
+        for block, rows in zip(self.equations.blocks, self.products.rows, strict=True):
+            own = columns[begin : begin + rows.shape[0]]
+            begin += rows.shape[0]
+            # Most candidates act on one joint.
+            if own.any():
+                through = rows[:, :-1].T @ own
+                x[block.x] += through[: block.x.size]
+                z[block.z] += through[block.x.size :]
+        return x, z
 
     def absorbed(self, columns: Array) -> Array:
         """Parameters (b, k) that the model would give to torques ``columns`` (R, k): ``(Z'X)^-1 Z' columns``."""
         if self.fixed:
             return np.zeros((self.theta.size, columns.shape[1]))
-        scale, factors = self._solver
-        found: Array = linalg.lu_solve(factors, (self.train.z / scale).T @ columns) / scale[:, None]
+        scale = self.products.scale[:, None]
+        found: Array = linalg.lu_solve(self.products.solver, self._through(columns)[1] / scale) / scale
         return found
+
+    def _inside(self, x: Array) -> Array:
+        """``(X'Z)^-1 x`` (b, k)."""
+        scale = self.products.scale[:, None]
+        inside: Array = linalg.lu_solve(self.products.solver, x / scale, trans=1) / scale
+        return inside
 
     def beside(self, instruments: Array) -> Array:
         """Instruments (R, k) less what the model's own explain: ``D - Z (X'Z)^-1 X'D``."""
         if self.fixed:
             return instruments
-        scale, factors = self._solver
-        inside = linalg.lu_solve(factors, (self.train.x / scale).T @ instruments, trans=1)
-        rest: Array = instruments - (self.train.z / scale) @ inside
+        inside = self._inside(self._through(instruments)[0])
+        rest = instruments.copy()
+        begin = 0
+        for block, rows in zip(self.equations.blocks, self.products.rows, strict=True):
+            rest[begin : begin + rows.shape[0]] -= rows[:, block.x.size : -1] @ inside[block.z]
+            begin += rows.shape[0]
         return rest
+
+    def products_beside(self, instruments: Array) -> tuple[Array, Array]:
+        """``B'B`` (k, k) and ``B' residual`` (k,) of ``B = beside(instruments)``, without making it."""
+        gram, score = instruments.T @ instruments, instruments.T @ self.residual
+        if self.fixed:
+            return gram, score
+        x, z = self._through(instruments)
+        inside = self._inside(x)
+        both = inside.T @ z
+        # The residual has nothing along the model's own instruments.
+        return gram - both - both.T + inside.T @ self.products.zz @ inside, score
 
     @cached_property
     def covariance(self) -> Array:
         """``(Z'X)^-1 Z'Z (X'Z)^-1`` (4.34), (b, b)."""
-        scale, factors = self._solver
-        half = linalg.lu_solve(factors, (self.train.z / scale).T) / scale[:, None]
-        covariance: Array = half @ half.T
+        scale = np.outer(self.products.scale, self.products.scale)
+        half = linalg.lu_solve(self.products.solver, self.products.zz / scale)
+        covariance: Array = linalg.lu_solve(self.products.solver, half.T) / scale
         return covariance
 
     def spread(self, direction: Array) -> float:
         """Variance of ``direction' X_held theta`` from the uncertainty of theta, ``direction`` (R,)."""
         if self.fixed:
             return 0.0
-        through = direction @ self.held.x
+        parts = summed_backwards(direction, self.noise, [y.shape[0] for _, _, y in self.equations.held])
+        through = np.zeros(self.theta.size)
+        for (x, _, _), weight in zip(self.equations.held, parts, strict=True):
+            through += weight.reshape(-1) @ x.reshape(-1, x.shape[2])
         return float(through @ self.covariance @ through)
 
 
@@ -154,15 +285,11 @@ def fit(study: Study, theta0: Array | None = None) -> Fit:
 
 def solved(study: Study, equations: Equations, noise: Sequence[ArModel], theta: Array | None = None) -> Fit:
     """Parameters by instrumental variables under given noise models; a given ``theta`` is kept as it is."""
-    train, held = (
-        Rows(*(whitened([row[k] for row in rows], noise) for k in range(3)))
-        for rows in (equations.train, equations.held)
-    )
-    blank = np.zeros(train.x.shape[1])
+    products = Products.of(equations, noise)
     if theta is not None:
-        return Fit(study, theta, tuple(noise), train, held, equations, fixed=True)
-    found = Fit(study, blank, tuple(noise), train, held, equations)
-    return replace(found, theta=found.absorbed(train.y[:, None])[:, 0])
+        return Fit(study, theta, tuple(noise), equations, products, fixed=True)
+    estimate = linalg.lu_solve(products.solver, products.zy / products.scale) / products.scale
+    return Fit(study, estimate, tuple(noise), equations, products)
 
 
 def relative_errors(fit: Fit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
@@ -186,10 +313,4 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
 def noise_models(errors: Sequence[Array], parameters: int, order: int) -> list[ArModel]:
     """AR model of each joint's residual (6.21 to 6.25), its variance corrected for the parameters estimated."""
     free = 1 - parameters / sum(e.size for e in errors)
-    models = [fit_ar([e[:, j] for e in errors], order) for j in range(errors[0].shape[1])]
-    return [ArModel(ar.coefficients, ar.variance / free, ar.aic) for ar in models]
-
-
-def whitened(values: Sequence[Array], noise: Sequence[ArModel]) -> Array:
-    """Stack (M, n) or (M, n, k) joint by joint, each joint whitened by its noise model."""
-    return np.concatenate([ar.whiten(value[:, j]) for j, ar in enumerate(noise) for value in values])
+    return [ArModel(ar.coefficients, ar.variance / free, ar.aic) for ar in ar_models(errors, order)]

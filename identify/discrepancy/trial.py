@@ -1,6 +1,5 @@
 """One candidate beside the model: fitted on the training data, judged by what it predicts on data it has not seen."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ from scipy import optimize, stats
 
 from identify.discrepancy.candidates import Candidate, Columns, Shapes, Workshop
 from identify.discrepancy.regression import MAX_AR_ORDER, Fit, noise_models
+from identify.discrepancy.whitening import log_likelihoods
 from identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
@@ -118,11 +118,16 @@ def screened(fit: Fit, candidate: Candidate, workshop: Workshop) -> tuple[float,
 
 def score_statistic(fit: Fit, instruments: Array) -> float | None:
     """Power of the training residual along instruments (R, k) beside the model's own; ``None`` if nothing is left."""
-    basis = directions_beside(fit, instruments)
-    if basis is None:
+    scale = np.linalg.norm(instruments, axis=0)
+    if np.any(scale == 0) or not np.isfinite(scale).all():
         return None
-    score = basis[0].T @ fit.residual
-    return float(score @ score)
+    gram, score = fit.products_beside(instruments / scale)
+    power, right = np.linalg.eigh(gram)
+    kept = power > RANK_TOLERANCE**2
+    if not kept.any():
+        return None
+    along = right[:, kept].T @ score
+    return float(np.sum(along**2 / power[kept]))
 
 
 def judge(
@@ -164,7 +169,7 @@ def _judged(
         return None
     statistic, values, std = solution
     away = fit.absorbed(columns.x @ values[:, None])[:, 0]
-    change = columns.held_z @ values - fit.held.z @ away
+    change = columns.held_z @ values - fit.held_at_simulated(away)
     before, after = fit.held_residual, fit.held_residual - change
     size = float(change @ change)
     if size == 0.0:
@@ -224,20 +229,9 @@ def _evidence(
         left[part] = [e - c @ values + r @ away for e, c, r in zip(errors, band, regressors, strict=True)]
     own = noise_models(left["train"], fit.theta.size + values.size, MAX_AR_ORDER)
     gain = 0.0
-    for part, errors in left.items():
-        before = alone.errors(alone.theta, held=part == "held")
-        gain += float(np.sum(log_likelihoods(errors, own) - log_likelihoods(before, alone.noise)))
+    for errors, before in zip(left.values(), alone.likelihoods, strict=True):
+        gain += float(np.sum(log_likelihoods(errors, own, MAX_AR_ORDER) - before))
     return gain
-
-
-def log_likelihoods(errors: Sequence[Array], noise: Sequence[ArModel]) -> Array:
-    """Of the errors (M, n) of all stretches under AR noise, up to a constant, (n,); the same rows at every order."""
-    found = np.zeros(len(noise))
-    for j, ar in enumerate(noise):
-        for stretch in errors:
-            e = ar.whiten(stretch[:, j])[MAX_AR_ORDER - ar.order :]
-            found[j] -= 0.5 * (float(e @ e) + e.size * math.log(ar.variance))
-    return found
 
 
 def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) -> tuple[Array, Array] | None:
