@@ -27,7 +27,8 @@ def test_slow_signals_pass_without_lag_and_fast_ones_do_not_pass() -> None:
 def test_columns_of_an_array_are_filtered_alike() -> None:
     x = np.random.default_rng(0).standard_normal((6000, 2, 3))
     low_pass = design(DT, 50.0)
-    np.testing.assert_array_equal(low_pass(x)[:, 1, 2], low_pass(x[:, 1, 2]))
+    # Up to the order in which about a thousand products are summed.
+    np.testing.assert_allclose(low_pass(x)[:, 1, 2], low_pass(x[:, 1, 2]), rtol=0, atol=1e-13)
 
 
 def test_too_short_a_record_is_refused() -> None:
