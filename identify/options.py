@@ -1,7 +1,7 @@
 """What a user may choose of an identification."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 from configs import ConfigError
 from identify.estimators.regression import MAX_AR_ORDER
@@ -89,7 +89,7 @@ def parse_nvr(text: str | None) -> float | NvrRule | None:
     try:
         return float(text)
     except ValueError:
-        return text  # type: ignore[return-value]
+        return cast(NvrRule, text)
 
 
 def parse_decimation(text: str | None) -> int | Literal["noise"] | None:
@@ -99,4 +99,4 @@ def parse_decimation(text: str | None) -> int | Literal["noise"] | None:
     try:
         return int(text)
     except ValueError:
-        return text  # type: ignore[return-value]
+        return cast(Literal["noise"], text)

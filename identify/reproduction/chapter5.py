@@ -10,6 +10,7 @@ from identify.reproduction.emps_protocol import evidence, inferred_rows
 from identify.reproduction.laboratory import Case, Method
 from identify.reproduction.tables import Column, Table
 from identify.reproduction.two_stages import TwoStages, structure_given, two_stages
+from identify.signals.differentiate import NvrRule
 
 GOOD = Case("bandpass")
 """The bandwidth is known: 50 Hz and 20 Hz (5.3.1)."""
@@ -47,13 +48,15 @@ def table_5_1(bench: Bench) -> Table:
     Rows = dict[str, list[float | None]]
     rows: Rows = {}
     measured: Rows | None = None if bench.measured is None else {}
-    for model, derivatives in (("IRWSM 1", "irwsm"), ("IRWSM 2", "irwsm2")):
-        for label, nvr in (
-            ("likelihood", "likelihood"),
-            ("tracking error", "tracking-error"),
-            ("automatic", "automatic"),
-        ):
-            case = Case(derivatives=derivatives, nvr=nvr)  # type: ignore[arg-type]
+    smoothers: tuple[tuple[str, Literal["irwsm", "irwsm2"]], ...] = (("IRWSM 1", "irwsm"), ("IRWSM 2", "irwsm2"))
+    rules: tuple[tuple[str, NvrRule], ...] = (
+        ("likelihood", "likelihood"),
+        ("tracking error", "tracking-error"),
+        ("automatic", "automatic"),
+    )
+    for model, derivatives in smoothers:
+        for label, nvr in rules:
+            case = Case(derivatives=derivatives, nvr=nvr)
             for lab, into in ((bench.virtual, rows), (bench.measured, measured)):
                 if lab is not None and into is not None and not (lab is bench.measured and nvr == "tracking-error"):
                     ratios = lab.derivatives(case).nvr

@@ -9,7 +9,7 @@ from scipy.io import loadmat
 from configs import load_robot
 from identify.experiment import Experiment
 from identify.model.arm import ArmModel
-from identify.options import Options
+from identify.options import ControllerName, Options
 from identify.preparation import published_equations
 from identify.result import Identification
 from identify.run import identify_experiment
@@ -61,8 +61,8 @@ def test_irwsm_without_any_knowledge_of_bandwidths_agrees_with_the_published_fit
 
 
 @pytest.mark.parametrize("controller", ["crc", "known"])
-def test_simulation_with_the_controller_follows_the_measurement(emps: Experiment, controller: str) -> None:
-    options = Options(method="idim-iv", controller=controller)  # type: ignore[arg-type]
+def test_simulation_with_the_controller_follows_the_measurement(emps: Experiment, controller: ControllerName) -> None:
+    options = Options(method="idim-iv", controller=controller)
     found = identify_experiment(emps, load_robot("emps"), options)
     # The published closed-loop simulation misses the measured velocity by 0.229 %.
     assert found.controller["kind"] == controller

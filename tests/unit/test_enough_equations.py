@@ -11,6 +11,7 @@ from configs import load_robot
 from identify.experiment import Experiment
 from identify.methods import decimation_of
 from identify.model.arm import ArmModel
+from identify.options import Method
 from identify.preparation import (
     EQUATIONS_PER_PARAMETER,
     LS_CUTOFF,
@@ -60,9 +61,9 @@ def test_enough_rows_are_left_and_not_many_more(dt: float, cutoff: float, second
 
 
 @pytest.mark.parametrize("method", ["idim-ls", "idim-piv"])
-def test_slow_motion_raises_the_cut_off_and_says_so(method: str) -> None:
+def test_slow_motion_raises_the_cut_off_and_says_so(method: Method) -> None:
     warnings: list[str] = []
-    found = decimation_of(method, DT, 0.1, None, samples=SAMPLES, rows=92, warnings=warnings)  # type: ignore[arg-type]
+    found = decimation_of(method, DT, 0.1, None, samples=SAMPLES, rows=92, warnings=warnings)
     assert decimated_rows(found, SAMPLES) >= 92
     (warning,) = warnings
     share = PIV_CUTOFF if method == "idim-piv" else LS_CUTOFF

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import RobotConfig, Trajectory, load_robot
-from configs.scenario import HiddenEffect, Scenario
+from configs import RobotConfig, Trajectory
+from configs.scenario import Scenario
 from configs.trajectory import Move
+from tests.unit.hidden import hide
 from virtual_robot.arm import Arm
 from virtual_robot.effects import EFFECTS, hidden_effects
 from virtual_robot.effects.signals import Signals
@@ -17,21 +18,6 @@ from virtual_robot.plant import Plant, pin
 
 PERIOD = 200e-6
 Q = np.array([0.3, 0.4, 1.1, -0.5, 0.7, 0.2])
-
-
-@pytest.fixture(scope="module")
-def tx40() -> RobotConfig:
-    return load_robot("tx40.yaml")
-
-
-@pytest.fixture(scope="module")
-def emps() -> RobotConfig:
-    return load_robot("emps.yaml")
-
-
-def hide(effect: str, joint: str, other: str | None = None, **parameters: float) -> Scenario:
-    hidden = HiddenEffect(effect=effect, joint=joint, other=other, parameters=parameters)
-    return Scenario(schema="armident/scenario/1", effects=(hidden,))
 
 
 def weight(plant: Plant, q: NDArray[np.float64]) -> NDArray[np.float64]:

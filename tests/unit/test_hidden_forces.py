@@ -7,29 +7,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from configs import RobotConfig, load_robot
-from configs.scenario import HiddenEffect, Scenario
+from configs import RobotConfig
+from configs.scenario import Scenario
+from tests.unit.hidden import hide
 from virtual_robot.inertias import rest_posture
 from virtual_robot.plant import Plant
 
 PERIOD = 200e-6
 FV2, FC2 = 5.50, 8.24
 """Friction of joint 2, table B.4."""
-
-
-@pytest.fixture(scope="module")
-def tx40() -> RobotConfig:
-    return load_robot("tx40.yaml")
-
-
-@pytest.fixture(scope="module")
-def emps() -> RobotConfig:
-    return load_robot("emps.yaml")
-
-
-def hide(effect: str, joint: str, other: str | None = None, **parameters: float) -> Scenario:
-    hidden = HiddenEffect(effect=effect, joint=joint, other=other, parameters=parameters)
-    return Scenario(schema="armident/scenario/1", effects=(hidden,))
 
 
 class Joint2:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from configs import ConfigError, RobotConfig, load_robot
+from configs import ConfigError, RobotConfig
 from configs.scenario import HiddenEffect, Scenario
 from virtual_robot.inertias import plant_parameters
 from virtual_robot.plant import Plant
@@ -21,16 +21,6 @@ MASS, FV, FC, OFF, SMOOTHING = 95.1089, 203.5034, 20.3935, -3.1648, 5000.0
 """The virtual EMPS: kg, N s/m, N, N, s/m."""
 Vector = NDArray[np.float64]
 Law = Callable[[Vector, float], list[float]]
-
-
-@pytest.fixture(scope="module")
-def emps() -> RobotConfig:
-    return load_robot("emps.yaml")
-
-
-@pytest.fixture(scope="module")
-def tx40() -> RobotConfig:
-    return load_robot("tx40.yaml")
 
 
 def entry(effect: str, joint: str = "joint_1", **parameters: float) -> HiddenEffect:

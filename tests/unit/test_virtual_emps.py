@@ -16,7 +16,7 @@ from daq.recording import Recording, read_recording
 from drivers.bus_load import check_fits
 from identify.experiment import Experiment
 from identify.from_recording import experiments_from_recording
-from identify.options import Options
+from identify.options import Method, Options
 from identify.run import identify_experiment
 from identify.signals.differentiate import differentiate
 from virtual_robot import noise, servo
@@ -146,8 +146,8 @@ def test_every_virtual_arm_has_a_noise_and_a_name() -> None:
 
 @pytest.mark.parametrize("method", ["idim-piv", "idim-iv", "didim"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_identification_recovers_the_published_parameters(method: str, seed: int) -> None:
-    result = identify_experiment([experiment(recorded(seed, 1.0))], emps(), Options(method=method))  # type: ignore[arg-type]
+def test_identification_recovers_the_published_parameters(method: Method, seed: int) -> None:
+    result = identify_experiment([experiment(recorded(seed, 1.0))], emps(), Options(method=method))
     assert result.converged
     assert result.names == NAMES
     assert (np.abs(result.theta - PUBLISHED) < 3 * result.std).all(), (result.theta - PUBLISHED) / result.std

@@ -11,7 +11,7 @@ from configs import RobotConfig, Trajectory, config_path, load_robot, load_traje
 from identify.experiment import Experiment
 from identify.from_recording import experiments_from_recording
 from identify.model.arm import ArmModel
-from identify.options import Options
+from identify.options import Method, Options
 from identify.result import Identification
 from identify.run import identify_experiment
 from virtual_robot.inertias import plant_parameters
@@ -61,8 +61,8 @@ def essential(result: Identification) -> list[int]:
 
 
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
-def test_without_noise_the_bias_is_far_below_what_noise_will_cost(method: str) -> None:
-    clean = identified(0, 0.0, Options(method=method))  # type: ignore[arg-type]
+def test_without_noise_the_bias_is_far_below_what_noise_will_cost(method: Method) -> None:
+    clean = identified(0, 0.0, Options(method=method))
     noisy = identified(0, 1.0, Options())
     chosen = essential(clean)
     bias = np.abs(clean.theta - truth())[chosen]
