@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 import configs
-from configs import DataError, RobotConfig
+from configs import ConfigError, DataError, RobotConfig
 from daq.recording import Recording
 
 if TYPE_CHECKING:
@@ -332,11 +332,15 @@ def load_document(path: Path, kind: type[T]) -> T:
 
     Raises
     ------
+    ConfigError
+        If there is no such file.
     DataError
         If the file cannot be read or is not such a document.
     """
     try:
         text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
     return from_json(text, kind, str(path))

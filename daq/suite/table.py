@@ -138,8 +138,8 @@ def _groups(scored: Iterable[Scored], failed: Iterable[Case]) -> dict[tuple[str,
         key = case.label, case.level or ""
         mine, count = groups.get(key, ([], 0))
         groups[key] = mine, count + 1
-    order = {level: k for k, level in enumerate(LEVELS)}
-    return dict(sorted(groups.items(), key=lambda g: (g[0][0], order.get(g[0][1], -1))))  # type: ignore[call-overload]
+    order: dict[str, int] = {level: k for k, level in enumerate(LEVELS)}
+    return dict(sorted(groups.items(), key=lambda g: (g[0][0], order.get(g[0][1], -1))))
 
 
 def _rows(scored: Sequence[Scored], failed: Sequence[Case]) -> tuple[Row, ...]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import configs
-from configs import DataError
+from configs import ConfigError, DataError
 from identify.document import (
     SCHEMA_FILES,
     BeforeAfter,
@@ -93,3 +93,8 @@ def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(OSError):  # noqa: PT011 - which one depends on the file system
         write_atomically(target, "{}")
     assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
+
+
+def test_a_document_that_is_not_there_is_a_mistake_of_the_call(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"gone\.json: no such file"):
+        load_document(tmp_path / "gone.json", IdentificationDocument)

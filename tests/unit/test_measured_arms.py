@@ -85,8 +85,11 @@ def panda(panda_files: tuple[Path, Path], tmp_path_factory: pytest.TempPathFacto
 
 def parts(experiment: Experiment) -> tuple[Experiment, Experiment]:
     cut = round(TRAINED_SHARE * len(experiment.q))
-    first, last = slice(None, cut), slice(cut, None)
-    return tuple(Experiment(experiment.q[s], experiment.tau[s], None, experiment.dt) for s in (first, last))  # type: ignore[return-value]
+
+    def part(samples: slice) -> Experiment:
+        return Experiment(experiment.q[samples], experiment.tau[samples], None, experiment.dt)
+
+    return part(slice(None, cut)), part(slice(cut, None))
 
 
 def least_squares(experiments: Sequence[Experiment], robot: RobotConfig) -> Identification:

@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -302,7 +303,7 @@ def test_response_from_the_velocity_makes_up_for_its_feedback(bench: Bench) -> N
 def test_didim_that_cannot_be_simulated_does_not_work(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = Laboratory(lambda: bench.virtual.recording(Case()))
     for method in ("idim-iv", "didim"):
-        lab.once((method, Case()), lambda m=method: bench.virtual.run(m, Case()))  # type: ignore[misc]
+        lab.once((method, Case()), partial(bench.virtual.run, method, Case()))
     lab.once(("idim-iv", IMPULSE_RESPONSES), lambda: bench.virtual.run("idim-iv", IMPULSE_RESPONSES))
 
     def diverges(*_: object) -> None:
