@@ -56,7 +56,7 @@ def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Exper
     ConfigError
         If a stanza does not say which signal, or which other joint.
     """
-    position, torque = permutations(robot)
+    position, torque = exchanges(robot)
     if np.array_equal(position, np.eye(robot.n)) and np.array_equal(torque, np.eye(robot.n)):
         return list(experiments)
     ratios = robot.transmission_matrix
@@ -74,9 +74,14 @@ def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Exper
     ]
 
 
-def permutations(robot: RobotConfig) -> tuple[Array, Array]:
-    """Signed permutations (n, n) of the motors' positions and torques that undo the mistakes a robot's effects name."""
+def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
+    """What undoes the mistakes that a robot's effects name in the motors' positions and torques, (n, n) each.
+
+    Raw numbers are exchanged, counts and shares of the rated signal; what they are worth goes with the name. So these
+    are signed permutations, scaled where two drives differ in resolution, gain or rating.
+    """
     names = [joint.name for joint in robot.joints]
+    worth = {"position": _per_count(robot), "torque": _per_share(robot)}
     found = {signal: np.eye(robot.n) for signal in SIGNALS}
     for k, stanza in enumerate(robot.effects):
         if stanza.effect not in NAMES:
@@ -94,5 +99,21 @@ def permutations(robot: RobotConfig) -> tuple[Array, Array]:
                     raise ConfigError(f"effects[{k}]: joint_order of {stanza.joint} needs the other joint")
                 second = names.index(stanza.other)
                 change[[first, second]] = change[[second, first]]
+                change = change * worth[signal][:, None] / worth[signal]
             found[signal] = change @ found[signal]
     return found["position"], found["torque"]
+
+
+def _per_count(robot: RobotConfig) -> Array:
+    """Position of each motor per count (n,), rad or m; ones where positions come in SI."""
+    if any(joint.drive.counts_per_unit is None for joint in robot.joints):
+        return np.ones(robot.n)
+    turn = np.array([2 * np.pi if joint.type == "revolute" else 1.0 for joint in robot.joints])
+    counts: Array = np.array([joint.drive.counts_per_unit for joint in robot.joints], dtype=np.float64)
+    return turn / counts
+
+
+def _per_share(robot: RobotConfig) -> Array:
+    """Torque of each motor at its rated signal (n,), N m or N."""
+    drives = [joint.drive for joint in robot.joints]
+    return np.array([d.rated * (d.gain if d.signal != "torque" and d.gain else 1.0) for d in drives])

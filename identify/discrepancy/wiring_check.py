@@ -16,7 +16,7 @@ from scipy import linalg, optimize, stats
 
 from configs import DataError, RobotConfig
 from configs.robot import Effect as Stanza
-from identify.catalogue.wiring import SIGNALS, permutations, rewired
+from identify.catalogue.wiring import SIGNALS, exchanges, rewired
 from identify.experiment import Experiment
 from identify.methods import decimation_of
 from identify.model.arm import ArmModel
@@ -84,7 +84,7 @@ class WiringFinding:
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """A mistake: signed permutations (n, n) of the motors' positions and torques that undo it."""
+    """A mistake: what undoes it in the motors' positions and torques, (n, n) each; see `exchanges`."""
 
     stanza: Stanza
     position: Array
@@ -151,8 +151,8 @@ class _Bench:
     made: dict[bytes, _Rows]
 
     def rows(self, position: Array) -> _Rows:
-        """Equations with the motors' positions assigned by a signed permutation (n, n)."""
-        key = np.round(position).astype(np.int8).tobytes()
+        """Equations with the motors' positions assigned by a signed and scaled permutation (n, n)."""
+        key = np.round(position, 9).tobytes()
         if key not in self.made:
             self.made[key] = self._make(position)
         return self.made[key]
@@ -283,7 +283,7 @@ def _singles(robot: RobotConfig) -> Iterator[_Hypothesis]:
     kinds = ((SIGNALS[0],), (SIGNALS[1],), SIGNALS)
     for (effect, joint, other), signals in product(places, kinds):
         stanza = Stanza(effect=effect, joint=joint, other=other, parameters={s: 1.0 for s in signals})
-        yield _Hypothesis(stanza, *permutations(robot.model_copy(update={"effects": (stanza,)})))
+        yield _Hypothesis(stanza, *exchanges(robot.model_copy(update={"effects": (stanza,)})))
 
 
 def _physical_least_squares(gram: Array, right: Array, physical: Array) -> Array:
