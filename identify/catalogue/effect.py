@@ -51,12 +51,15 @@ class Shape:
         Values worth trying on a motion of a joint, increasing, in the unit of the parameter.
     continuous
         Whether values between those of the grid make sense; a harmonic is a whole number.
+    default
+        What a robot configuration means that does not give it; ``None``: it must.
     """
 
     name: str
     unit: tuple[str, str]
     grid: Callable[[Motion, int], Sequence[float]]
     continuous: bool = True
+    default: float | None = None
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,8 @@ class Effect:
         recording, and there are no columns.
     predicts
         Whether the columns depend on the torques that the model predicts, and so on its parameters.
+    physical
+        Whether physics allows linear parameters (k,) at given nonlinear ones, where signs and bounds do not say it all.
     negligible
         Whether linear parameters (k,) are a convention of sampling instead of a fault, at the sampling period of the
         recording in s; ``None``: never.
@@ -116,7 +121,17 @@ class Effect:
     excitation: tuple[str, ...] = field(default=("reversals", "speeds"))
     rewires: bool = False
     predicts: bool = False
+    physical: Callable[[Array, Mapping[str, float]], bool] | None = None
     negligible: Callable[[Array, float], bool] | None = None
+
+    def allows(self, values: Array, shapes: Mapping[str, float]) -> bool:
+        """Whether linear parameters (k,) at given nonlinear ones have signs and sizes that physics allows."""
+        if self.physical is not None and not self.physical(values, shapes):
+            return False
+        return all(
+            p.sign * value >= 0 and p.bounds[0] <= value <= p.bounds[1]
+            for p, value in zip(self.linear, values, strict=True)
+        )
 
     def torque(self, motion: Motion, place: "Place", shapes: Mapping[str, float]) -> Array:
         """Columns of all joints, shape (N, n, k)."""

@@ -1,12 +1,13 @@
 """Friction that is more than ``fv qd + fc sign(qd)``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identify.catalogue.effect import Effect, Linear, Place, Shape
 from identify.catalogue.motion import Motion
+from identify.catalogue.rotor import ROTOR
 from identify.model.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -43,9 +44,14 @@ def _nonlinear_viscous(motion: Motion, place: Place, *, exponent: float) -> Arra
     return (share**exponent * motion.sign[:, j])[:, None]
 
 
-def _load_dependent(motion: Motion, place: Place) -> Array:
+def _rises_from_rest(values: Array, shapes: Mapping[str, float]) -> bool:
+    """Below one, a negative power of speed falls infinitely steeply from standstill: extra friction at low speed."""
+    return bool(shapes["exponent"] >= 1.0 or values[0] >= 0.0)
+
+
+def _load_dependent(motion: Motion, place: Place, *, rotor: float = 0.0) -> Array:
     j = place.joint
-    return (np.abs(motion.transmitted[:, j]) * motion.sign[:, j])[:, None]
+    return (np.abs(motion.handed_on(j, rotor)) * motion.sign[:, j])[:, None]
 
 
 def _presliding(motion: Motion, place: Place, *, displacement: float) -> Array:
@@ -148,6 +154,7 @@ EFFECTS = (
         linear=(Linear("fvn", TORQUE),),
         shapes=(Shape("exponent", ("", ""), lambda motion, joint: EXPONENTS, continuous=False),),
         columns=_nonlinear_viscous,
+        physical=_rises_from_rest,
         needs="slow and fast motion",
         excitation=("speeds",),
     ),
@@ -157,6 +164,7 @@ EFFECTS = (
         says="dry friction grows with the torque that the gear transmits",
         reference="Hamon, Gautier, Garrec 2010, IROS, Dynamic identification with load-dependent dry friction",
         linear=(Linear("fcl", ("", ""), sign=1),),
+        shapes=(ROTOR,),
         columns=_load_dependent,
         predicts=True,
         needs="motion in both directions under small and under large load",

@@ -107,6 +107,11 @@ class Motion:
         """Torques that the gears hand on to the links: without friction, offsets and rotors, (N, n)."""
         return self._predicted(self.links)
 
+    def handed_on(self, joint: int, rotor: float) -> Array:
+        """Torque (N,) that a gear hands on if ``rotor`` (kg m^2 or kg) of the link's inertia is the motor's."""
+        load: Array = self.transmitted[:, joint] - rotor * self.qdd[:, joint]
+        return load
+
     @cached_property
     def standard(self) -> Array:
         """Standard parameters that predict the same torques as ``theta``, (p,)."""
@@ -130,7 +135,9 @@ class Motion:
         joints: Array = (torque[:, None] * self.model.robot.transmission_matrix[motor])[:, :, None]
         return joints
 
-    def response(self, joint: int, shift: Array, rate: Array, acceleration: Array, *, links: bool = False) -> Array:
+    def response(
+        self, joint: int, shift: Array, rate: Array, acceleration: Array, *, links: bool = False, rotor: float = 0.0
+    ) -> Array:
         """Change (N, n) of the predicted torques when one joint moves otherwise, to first order.
 
         Parameters
@@ -139,9 +146,12 @@ class Motion:
             Changes of the joint's position, velocity and acceleration, (N,) each.
         links
             Of the links alone, without friction and rotors.
+        rotor
+            What of the link's inertia is the motor's, kg m^2 or kg.
         """
         position, velocity, inertia = self.slopes(joint, links=links)
         change: Array = position * shift[:, None] + velocity * rate[:, None] + inertia * acceleration[:, None]
+        change[:, joint] -= rotor * acceleration
         return change
 
     def slopes(self, joint: int, *, links: bool = False) -> tuple[Array, Array, Array]:

@@ -105,10 +105,11 @@ def stanza_of(effect: Effect, place: Place, robot: RobotConfig, parameters: dict
 def _shapes(stanza: Stanza, effect: Effect, where: str) -> dict[str, float]:
     shapes = [shape.name for shape in effect.shapes]
     linear = [parameter.name for parameter in effect.linear]
-    missing = [name for name in shapes if name not in stanza.parameters]
+    given = {shape.name: shape.default for shape in effect.shapes if shape.default is not None} | stanza.parameters
+    missing = [name for name in shapes if name not in given]
     if missing:
         raise ConfigError(f"{where} needs {', '.join(missing)}")
     unknown = [name for name in stanza.parameters if name not in (*shapes, *linear)]
     if unknown:
         raise ConfigError(f"{where}: parameters.{unknown[0]}: unknown (takes {', '.join((*shapes, *linear))})")
-    return {name: stanza.parameters[name] for name in shapes}
+    return {name: given[name] for name in shapes}

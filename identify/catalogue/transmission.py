@@ -8,6 +8,7 @@ from scipy import signal
 
 from identify.catalogue.effect import Effect, Linear, Place, Shape
 from identify.catalogue.motion import Motion
+from identify.catalogue.rotor import ROTOR
 from identify.model.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -37,9 +38,9 @@ def harmonics(motion: Motion, joint: int) -> Sequence[float]:
     return [float(resolution * k) for k in range(4, 161)]
 
 
-def _elasticity(motion: Motion, place: Place, *, frequency: float) -> Array:
+def _elasticity(motion: Motion, place: Place, *, frequency: float, rotor: float = 0.0) -> Array:
     """The link stands behind the motor by compliance times load, and swings there at its own frequency."""
-    j, behind = place.joint, -motion.transmitted[:, place.joint]
+    j, behind = place.joint, -motion.handed_on(place.joint, rotor)
     # Tustin's rule for w^2 s^k / (s^2 + 2 damping w s + w^2), k = 0, 1, 2: way, speed and acceleration of the link.
     w, tustin = 2 * np.pi * frequency, 2 / motion.dt
     swing = 2 * DAMPING * w * tustin
@@ -49,7 +50,7 @@ def _elasticity(motion: Motion, place: Place, *, frequency: float) -> Array:
         b = w**2 * np.array(numerator)
         start = signal.lfilter_zi(b / a[0], a / a[0]) * behind[0]
         moves.append(signal.lfilter(b / a[0], a / a[0], behind, zi=start)[0])
-    return motion.response(j, *moves, links=True)[:, :, None]
+    return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
 
 
 def frequencies(motion: Motion, joint: int) -> Sequence[float]:
@@ -57,19 +58,19 @@ def frequencies(motion: Motion, joint: int) -> Sequence[float]:
     return [float(f) for f in np.geomspace(4.0, min(100.0, 0.2 / motion.dt), 7)]
 
 
-def _backlash(motion: Motion, place: Place, *, gap: float) -> Array:
+def _backlash(motion: Motion, place: Place, *, gap: float, rotor: float = 0.0) -> Array:
     """Between the sides of the gap nothing drives the link: it coasts and falls on, until the teeth catch it."""
     j = place.joint
-    moves = crossing(falls(motion, j), gap, motion.dt)
-    return motion.response(j, *moves, links=True)[:, :, None]
+    moves = crossing(falls(motion, j, rotor), gap, motion.dt)
+    return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
 
 
-def falls(motion: Motion, joint: int) -> Array:
+def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
     """Acceleration (N,) of a link from its motor where no tooth touches, over position and time as they are."""
-    inertia = motion.slopes(joint, links=True)[2][:, joint]
+    inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
     if inertia.max() <= 0.0:
         return np.zeros(motion.samples)
-    away: Array = -motion.transmitted[:, joint] / np.maximum(inertia, LEAST_INERTIA * inertia.max())
+    away: Array = -motion.handed_on(joint, rotor) / np.maximum(inertia, LEAST_INERTIA * inertia.max())
     return away
 
 
@@ -120,7 +121,7 @@ EFFECTS = (
         says="the link swings behind its motor: an elastic gear, belt or coupling, or a bending link",
         reference="Spong 1987, J. Dyn. Sys. Meas. Control 109(4)",
         linear=(Linear("compliance", ("rad/(N m)", "m/N"), sign=1),),
-        shapes=(Shape("frequency", ("Hz", "Hz"), frequencies),),
+        shapes=(Shape("frequency", ("Hz", "Hz"), frequencies), ROTOR),
         columns=_elasticity,
         predicts=True,
         needs="quick accelerations near the resonance, under load",
@@ -132,7 +133,7 @@ EFFECTS = (
         says="the motor turns a little before the link follows when the load changes sides: worn teeth, a loose key",
         reference="Nordin, Gutman 2002, Automatica 38(10)",
         linear=(Linear("behind", ("", ""), sign=1),),
-        shapes=(Shape("gap", ("rad", "m"), gaps),),
+        shapes=(Shape("gap", ("rad", "m"), gaps), ROTOR),
         columns=_backlash,
         predicts=True,
         needs="many changes of the load's direction",

@@ -68,11 +68,7 @@ class Trial:
     @property
     def forbidden(self) -> bool:
         """Whether a linear parameter has a sign or a size that physics does not allow."""
-        linear = self.candidate.effect.linear
-        return any(
-            p.sign * value < 0 or not p.bounds[0] <= value <= p.bounds[1]
-            for p, value in zip(linear, self.values, strict=True)
-        )
+        return not self.candidate.effect.allows(self.values, dict(self.shapes))
 
     @property
     def p_value(self) -> float:

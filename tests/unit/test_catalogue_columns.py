@@ -1,5 +1,6 @@
 """Columns of every effect against its defining equation, computed another way on a motion that is known in full."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from configs import load_robot
 from identify.catalogue.effect import Place
 from identify.catalogue.motion import Motion
 from identify.catalogue.registry import catalogue
+from identify.catalogue.rotor import rotors
 from identify.catalogue.transmission import DAMPING, crossing
 from identify.model.arm import ArmModel
 from virtual_robot.inertias import plant_parameters
@@ -90,6 +92,23 @@ def test_curved_viscous_friction_is_the_parameter_at_top_speed(axis: Motion, exp
 def test_load_dependent_friction_goes_with_what_the_link_takes(axis: Motion) -> None:
     expected = MASS * np.abs(axis.qdd[:, 0]) * sign(axis)
     np.testing.assert_allclose(columns("load_dependent_friction", axis)[:, 0, 0], expected, rtol=1e-12)
+
+
+def test_a_rotor_that_passes_for_the_link_s_own_inertia_is_taken_out_of_the_load(arm: Motion) -> None:
+    plant = plant_parameters(arm.model.robot)
+    known = replace(arm, theta=np.array([plant[name] for name in arm.model.names]))
+    # The base parameters count rotor 1 to link 1; the standard ones of the plant do not.
+    np.testing.assert_allclose(arm.handed_on(0, plant["ia1"]), known.transmitted[:, 0], atol=1e-9)
+    assert np.abs(arm.transmitted[:, 0] - known.transmitted[:, 0]).max() > 0.5
+    found = columns("load_dependent_friction", arm, 0, rotor=plant["ia1"])[:, 0, 0]
+    np.testing.assert_allclose(found, np.abs(known.transmitted[:, 0]) * sign(arm, 0), atol=1e-9)
+
+
+def test_a_rotor_is_looked_for_where_only_the_load_can_tell_it(axis: Motion, arm: Motion) -> None:
+    assert len(rotors(arm, 0)) == 4
+    assert max(rotors(arm, 0)) < arm.slopes(0, links=True)[2][:, 0].min()
+    # Rotor 4 is a base parameter; a horizontal axis has no load but its acceleration.
+    assert rotors(arm, 3) == rotors(axis, 0) == (0.0,)
 
 
 def test_presliding_is_what_dahl_lacks_of_coulomb(axis: Motion) -> None:
