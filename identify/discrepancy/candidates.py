@@ -113,9 +113,10 @@ class Workshop:
         if columns.ndim == 3:
             return self.study.decimation(columns)
         own = self.study.decimation(columns)
-        whole = np.zeros((own.shape[0], motion.n, own.shape[1]))
-        whole[:, place.joint] = own
-        return whole
+        # Joint by joint in memory, as it is whitened.
+        whole = np.zeros((motion.n, own.shape[0], own.shape[1]))
+        whole[place.joint] = own
+        return whole.transpose(1, 0, 2)
 
 
 def _predicts(name: str) -> bool:

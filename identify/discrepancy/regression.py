@@ -11,6 +11,7 @@ from scipy import linalg
 
 from identify.discrepancy.study import Stretch, Study
 from identify.discrepancy.whitening import ar_models, log_likelihoods, summed_backwards, whitened
+from identify.estimators.filtering import filter_columns
 from identify.estimators.noise import ArModel
 from identify.estimators.regression import require_excitation
 
@@ -97,7 +98,8 @@ class Products:
         zx, zz, zy = np.zeros((b, b)), np.zeros((b, b)), np.zeros(b)
         rows = []
         for block, ar in zip(equations.blocks, noise, strict=True):
-            white = np.concatenate([ar.whiten(part) for part in block.parts])
+            taps = np.append(1.0, ar.coefficients) / np.sqrt(ar.variance)
+            white = np.concatenate([filter_columns(taps, part) for part in block.parts])
             through = white[:, block.x.size : -1].T @ white
             zx[np.ix_(block.z, block.x)] += through[:, : block.x.size]
             zz[np.ix_(block.z, block.z)] += through[:, block.x.size : -1]
@@ -149,7 +151,7 @@ class Fit:
     def errors(self, theta: Array, *, held: bool) -> list[Array]:
         """``y - X theta`` at measured signals in the band of the comparison, (M, n) of every stretch."""
         rows = self.equations.held if held else self.equations.train
-        return [y - x @ theta for x, _, y in rows]
+        return [y - applied(x, theta) for x, _, y in rows]
 
     @cached_property
     def train(self) -> Rows:
@@ -184,7 +186,7 @@ class Fit:
 
     def held_at_simulated(self, theta: Array) -> Array:
         """``Z theta`` of the held-out rows, (R,)."""
-        return whitened([z @ theta for _, z, _ in self.equations.held], self.noise)
+        return whitened([applied(z, theta) for _, z, _ in self.equations.held], self.noise)
 
     def _through(self, columns: Array) -> tuple[Array, Array]:
         """``X' columns`` and ``Z' columns`` of the training rows, (b, k) each."""
@@ -303,11 +305,25 @@ def relative_errors(fit: Fit, theta: Array | None = None, *, held: bool) -> tupl
 def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Array, Array]:
     """Regressor (M, n, b) at measured and at simulated signals, in the band of the comparison."""
     out = []
-    for signals in (stretch.measured, stretch.simulated):
-        rigid = study.model.rigid_regressor(signals.q, signals.qd, signals.qdd)
-        terms = study.model.term_regressor(study.motion(signals, theta))
-        out.append(study.decimation(np.concatenate([rigid, terms], axis=2)))
+    for kind in ("measured", "simulated"):
+        signals = getattr(stretch, kind)
+        key = (id(stretch), kind, study.model.base.names[: -study.model.e or None])
+        if key not in study.rigid:
+            made = study.decimation(study.model.rigid_regressor(signals.q, signals.qd, signals.qdd))
+            # With the stretch, whose identity is the key only as long as it lives.
+            study.rigid[key] = stretch, made
+        rigid = study.rigid[key][1]
+        if study.model.e:
+            terms = study.decimation(study.model.term_regressor(study.motion(signals, theta)))
+            rigid = np.concatenate([rigid, terms], axis=2)
+        out.append(rigid)
     return out[0], out[1]
+
+
+def applied(columns: Array, values: Array) -> Array:
+    """``columns @ values``: (M, n, k) and (k,) to (M, n), as one product."""
+    product: Array = (columns.reshape(-1, columns.shape[2]) @ values).reshape(columns.shape[:2])
+    return product
 
 
 def noise_models(errors: Sequence[Array], parameters: int, order: int) -> list[ArModel]:

@@ -1,7 +1,7 @@
 """What a diagnosis works on: training and held-out stretches of motion, with their torques in one band."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +89,8 @@ class Study:
         That loop, of the rigid arm.
     thinning
         From the recorded to the working rate.
+    rigid
+        Regressors that all models of the study share, made once (see `identify.discrepancy.regression.regressors`).
     """
 
     robot: RobotConfig
@@ -102,6 +104,9 @@ class Study:
     auxiliary: AuxiliaryModel
     thinning: Decimation
     warnings: tuple[str, ...] = ()
+    rigid: dict[tuple[int, str, tuple[str, ...]], tuple[Stretch, Array]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     @property
     def sample(self) -> float:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from identify.discrepancy.candidates import Candidate, Columns, Shapes, Workshop
-from identify.discrepancy.regression import MAX_AR_ORDER, Fit, noise_models
+from identify.discrepancy.regression import MAX_AR_ORDER, Fit, applied, noise_models
 from identify.discrepancy.whitening import log_likelihoods
 from identify.estimators.noise import ArModel
 
@@ -177,9 +177,7 @@ def _judged(
     share = gain / max(float(before[concerned] @ before[concerned]), 1e-300)
     fitted = 0.5 * (values.size + len(shapes))
     supported = 0.5 * (statistic + gain)
-    evidence = max(
-        _evidence(alone, fit, candidate, shapes, workshop, values, away, kind) for kind in ("simulated", "measured")
-    )
+    evidence = _evidence(alone, fit, candidate, shapes, workshop, values, away)
     return Trial(
         candidate,
         shapes,
@@ -210,24 +208,25 @@ def _evidence(
     workshop: Workshop,
     values: Array,
     away: Array,
-    kind: str,
 ) -> float:
-    """Gain in log-likelihood over both parts, each model with noise of its own.
+    """Gain in log-likelihood over both parts, each model with noise of its own; by the better kind of signals.
 
     A whitening that suits one candidate would weigh another's residual wrongly, so each has noise models of what it
     leaves itself; they are all held against the same model without any, with the noise models that it has itself.
     """
-    left: dict[str, list[Array]] = {}
+    left: dict[str, list[list[Array]]] = {"simulated": [], "measured": []}
     for part, rows in (("train", alone.equations.train), ("held", alone.equations.held)):
-        band = workshop.band(candidate.effect, candidate.place, shapes, part, kind)
-        errors = alone.errors(fit.theta, held=part == "held")
-        regressors = [z if kind == "simulated" else x for x, z, _ in rows]
-        left[part] = [e - c @ values + r @ away for e, c, r in zip(errors, band, regressors, strict=True)]
-    own = noise_models(left["train"], fit.theta.size + values.size, MAX_AR_ORDER)
-    gain = 0.0
-    for errors, before in zip(left.values(), alone.likelihoods, strict=True):
-        gain += float(np.sum(log_likelihoods(errors, own, MAX_AR_ORDER) - before))
-    return gain
+        base = alone.errors(fit.theta, held=part == "held")
+        for kind, errors in left.items():
+            band = workshop.band(candidate.effect, candidate.place, shapes, part, kind)
+            regressors = [z if kind == "simulated" else x for x, z, _ in rows]
+            errors.append([e - c @ values + applied(r, away) for e, c, r in zip(base, band, regressors, strict=True)])
+    gains = []
+    for errors in left.values():
+        own = noise_models(errors[0], fit.theta.size + values.size, MAX_AR_ORDER)
+        both = zip(errors, alone.likelihoods, strict=True)
+        gains.append(sum(float(np.sum(log_likelihoods(e, own, MAX_AR_ORDER) - before)) for e, before in both))
+    return max(gains)
 
 
 def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) -> tuple[Array, Array] | None:
