@@ -88,6 +88,36 @@ def export(
     print(out)
 
 
+def heal(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings that were not finished.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print what became of them as JSON.")] = False,
+) -> None:
+    """Give torn recordings their index and summary, so that every MCAP reader opens them, and say what they lack.
+
+    Complete ones are left alone. A file that is being written is refused.
+
+    Example: armident heal recordings/*.mcap
+    """
+    import json
+
+    from daq.recording import heal_recording
+
+    healed = [heal_recording(path) for path in recordings]
+    if as_json:
+        print(
+            json.dumps(
+                [
+                    {"path": str(h.path), "missing": h.missing, "original": h.original and str(h.original)}
+                    for h in healed
+                ]
+            )
+        )
+        return
+    for found in healed:
+        kept = "" if found.original is None else f"; as it was: {found.original}"
+        print(f"{found.path}: " + ("complete" if found.missing is None else f"healed: {found.missing}{kept}"))
+
+
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Directory of recordings, results and the report.")] = Path("demo"),
     keep_going: Annotated[

@@ -1,5 +1,6 @@
 """Recordings: what they are, how they are read and written."""
 
+from daq.recording.healing import Healed, heal_recording
 from daq.recording.layout import StreamLayout
 from daq.recording.model import Field, Gap, Mark, Recording, Stream
 from daq.recording.reader import read_recording
@@ -8,11 +9,13 @@ from daq.recording.writer import RecordingWriter, write_recording
 __all__ = [
     "Field",
     "Gap",
+    "Healed",
     "Mark",
     "Recording",
     "RecordingWriter",
     "Stream",
     "StreamLayout",
+    "heal_recording",
     "read_recording",
     "write_recording",
 ]

@@ -210,6 +210,11 @@ class StreamLayout:
             raw[field.name] = values
         return rows["sync"].astype(np.int64), rows["t_ns"].copy(), raw
 
+    def last_sync(self, data: bytes, at: int, count: int) -> int:
+        """SYNC number of the last of ``count`` records in ``data`` from ``at`` on."""
+        dtype = self.record[0]
+        return int(np.frombuffer(data, dtype, count=1, offset=at + (count - 1) * dtype.itemsize)["sync"][0])
+
     def run_length(self, data: bytes, at: int, channel_id: int) -> int:
         """How many records of this stream follow each other in ``data`` from ``at`` on."""
         dtype, template, _ = self.record

@@ -72,6 +72,11 @@ def metadata(name: str, entries: Mapping[str, str]) -> bytes:
     return record(METADATA, _string(name) + _mapping(entries))
 
 
+def index_entry(t_ns: int, offset: int) -> bytes:
+    """A message's entry in a message index."""
+    return struct.pack("<QQ", t_ns, offset)
+
+
 def message_index(channel_id: int, entries: bytes) -> bytes:
     """Where the messages of a channel stand in the chunk before; ``entries`` are pairs of u64 (time, offset)."""
     return record(MESSAGE_INDEX, struct.pack("<HI", channel_id, len(entries)) + entries)
@@ -220,6 +225,8 @@ def read_metadata(content: memoryview) -> tuple[str, dict[str, str]]:
 class ChunkRecord:
     """A chunk as read, its content still compressed."""
 
+    start_ns: int
+    end_ns: int
     size: int
     crc: int
     compression: str
@@ -230,14 +237,20 @@ def read_chunk(content: memoryview) -> ChunkRecord:
     """A chunk record's content, without copying its data."""
     if len(content) < _CHUNK_HEAD.size:
         raise MalformedRecord("a chunk without a head")
-    _, _, size, crc = _CHUNK_HEAD.unpack_from(content)
+    start_ns, end_ns, size, crc = _CHUNK_HEAD.unpack_from(content)
     cursor = Cursor(content[_CHUNK_HEAD.size :])
     compression = cursor.string()
     length = cursor.number(8)
     start = _CHUNK_HEAD.size + 4 + len(compression.encode()) + 8
     if start + length > len(content):
         raise MalformedRecord("a chunk shorter than it says")
-    return ChunkRecord(size, crc, compression, content[start : start + length])
+    return ChunkRecord(start_ns, end_ns, size, crc, compression, content[start : start + length])
+
+
+def read_message_index(content: memoryview) -> tuple[int, int]:
+    """Channel of a message index record's content, and how many messages it lists."""
+    cursor = Cursor(content)
+    return cursor.number(2), cursor.number(4) // 16
 
 
 def records(data: memoryview, start: int) -> Iterator[tuple[int, int, memoryview]]:

@@ -20,6 +20,8 @@ from daq.recording.writer import GAPS_TOPIC, MARKS_TOPIC, SCHEMA
 
 _Rows = tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[Any]]]
 _LARGEST_CHUNK = 1 << 30
+HEALED = "armident.healed"
+"""Metadata of a file that was torn and has been given its end: what it lacks."""
 
 
 @dataclass
@@ -94,9 +96,9 @@ def _take(content: _Content, opcode: int, at: int, body: memoryview) -> None:
         name, entries = mcap.read_metadata(body)
         content.metadata[name] = entries
     elif opcode == mcap.CHUNK:
-        raw = _uncompressed(mcap.read_chunk(body))
+        raw = uncompressed(mcap.read_chunk(body))
         if raw is None:
-            content.damaged.append(f"the chunk at byte {at} is damaged and left out")
+            content.damaged.append(damaged_text(at))
         else:
             _take_chunk(content, raw)
     elif opcode == mcap.DATA_END:
@@ -109,7 +111,7 @@ def _take_channel(content: _Content, channel: mcap.ChannelRecord) -> None:
         content.layouts[channel.channel_id] = StreamLayout.from_json(channel.metadata["armident.stream"])
 
 
-def _uncompressed(chunk: mcap.ChunkRecord) -> bytes | None:
+def uncompressed(chunk: mcap.ChunkRecord) -> bytes | None:
     """The chunk's records, or ``None`` if it is damaged."""
     if chunk.size > _LARGEST_CHUNK:
         return None
@@ -217,14 +219,26 @@ def _stream(layout: StreamLayout, parts: list[_Rows]) -> Stream:
 
 
 def _missing(content: _Content, samples: Stream, size: int) -> str | None:
-    words = list(content.damaged)
+    healed = content.metadata.get(HEALED)
+    words = [healed["missing"]] if healed and "missing" in healed else []
+    words += content.damaged
     if not content.finished:
-        last = f"after SYNC {samples.sync[-1]}" if samples.sync.size else "from the start"
-        words.append(
-            f"the file was not finished: whatever came {last} and the counters are missing"
-            f" ({size - content.end} bytes of a torn record left out)"
-        )
+        words.append(torn_text(int(samples.sync[-1]) if samples.sync.size else None, size - content.end))
     return "; ".join(words) or None
+
+
+def damaged_text(at: int) -> str:
+    """What is said of a chunk at byte ``at`` that cannot be read."""
+    return f"the chunk at byte {at} is damaged and left out"
+
+
+def torn_text(last_sync: int | None, left_out: int) -> str:
+    """What is said of a file that ends after a SYNC (``None``: before the first), with bytes that say nothing."""
+    last = "from the start" if last_sync is None else f"after SYNC {last_sync}"
+    return (
+        f"the file was not finished: whatever came {last} and the counters are missing"
+        f" ({left_out} bytes of a torn record left out)"
+    )
 
 
 def _one_line(error: Exception) -> str:

@@ -1,6 +1,7 @@
 """Writes recordings: MCAP, chunk by chunk, so that what is on the disk is always whole up to the last chunk."""
 
 import contextlib
+import fcntl
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,7 @@ from configs import ConfigError, RobotConfig, SessionConfig
 from daq.recording import mcap_format as mcap
 from daq.recording.layout import StreamLayout
 from daq.recording.model import Gap, Mark, Recording
+from daq.recording.summary import Summary
 
 SCHEMA = "armident/recording/1"
 GAPS_TOPIC, MARKS_TOPIC = "/events/gaps", "/events/marks"
@@ -80,28 +82,28 @@ class RecordingWriter:
         self._size = 0
         self._rows = 0
         self._span: tuple[int, int] | None = None
-        self._total_span: tuple[int, int] | None = None
-        self._chunks: list[mcap.ChunkPlace] = []
-        self._metadata: list[mcap.MetadataPlace] = []
-        self._messages: dict[int, int] = {}
-        self._schemas = [mcap.schema(k, la.message_name, "protobuf", la.descriptor) for k, la in self._layouts.values()]
-        self._channels = [
+        schemas = [mcap.schema(k, la.message_name, "protobuf", la.descriptor) for k, la in self._layouts.values()]
+        channels = [
             mcap.channel(k, k, la.topic, "protobuf", {"armident.stream": la.to_json()})
             for k, la in self._layouts.values()
         ]
         for topic, k in self._topics.items():
             properties = {name: {"type": kind} for name, kind in _EVENTS[topic].items()}
             document = json.dumps({"type": "object", "properties": properties}).encode()
-            self._schemas.append(mcap.schema(k, f"armident{topic.replace('/', '.')}", "jsonschema", document))
-            self._channels.append(mcap.channel(k, k, topic, "json", {}))
+            schemas.append(mcap.schema(k, f"armident{topic.replace('/', '.')}", "jsonschema", document))
+            channels.append(mcap.channel(k, k, topic, "json", {}))
+        self._summary = Summary(schemas, channels)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            # Whoever heals torn recordings sees that this one is being written.
+            with contextlib.suppress(OSError):
+                fcntl.flock(self._file, fcntl.LOCK_EX)
         except OSError as error:
             raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
         self._position = 0
         try:
-            self._append(mcap.MAGIC + mcap.header(f"armident {_version()}") + b"".join(self._schemas + self._channels))
+            self._append(mcap.MAGIC + mcap.header(f"armident {_version()}") + b"".join(schemas + channels))
             head = {"schema": SCHEMA, "sample_rate_hz": repr(sample_rate_hz)}
             self._add_metadata("armident.recording", head)
             self._add_metadata("armident.robot", {"json": robot.model_dump_json(by_alias=True)})
@@ -158,11 +160,7 @@ class RecordingWriter:
             self.lost_rows += self._rows
             self.problem = f"{self.path}: {error.strerror}"
         else:
-            self._chunks.append(place)
-            for channel, count in counts.items():
-                self._messages[channel] = self._messages.get(channel, 0) + count
-            low, high = self._total_span or self._span
-            self._total_span = min(low, self._span[0]), max(high, self._span[1])
+            self._summary.add_chunk(place, counts)
         self._parts, self._indexes, self._size, self._rows, self._span = [], {}, 0, 0, None
 
     def close(self, counters: Mapping[str, int]) -> None:
@@ -176,22 +174,7 @@ class RecordingWriter:
         try:
             self.flush()
             self._add_metadata("armident.counters", {key: str(value) for key, value in counters.items()})
-            statistics = mcap.statistics(
-                len(self._schemas),
-                len(self._channels),
-                len(self._metadata),
-                len(self._chunks),
-                self._total_span or (0, 0),
-                self._messages,
-            )
-            groups = [
-                (mcap.SCHEMA, b"".join(self._schemas)),
-                (mcap.CHANNEL, b"".join(self._channels)),
-                (mcap.STATISTICS, statistics),
-                (mcap.CHUNK_INDEX, b"".join(place.record() for place in self._chunks)),
-                (mcap.METADATA_INDEX, b"".join(place.record() for place in self._metadata)),
-            ]
-            self._append(mcap.ending(self._position, groups))
+            self._append(self._summary.ending(self._position))
             os.fsync(self._file)
         except OSError as error:
             raise ConfigError(f"{self.path}: could not be finished: {error.strerror}") from error
@@ -235,7 +218,7 @@ class RecordingWriter:
         data = mcap.metadata(name, entries)
         place = mcap.MetadataPlace(name, self._position, len(data))
         self._append(data)
-        self._metadata.append(place)
+        self._summary.metadata.append(place)
 
     def _append(self, data: bytes) -> None:
         """Write all of ``data``, or nothing."""
