@@ -26,8 +26,8 @@ def capture(
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(help="CSV, MAT or NPZ.")],
-    config: Annotated[str, typer.Option("--config", help="Robot configuration.")],
+    file: Annotated[Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, rosbag2's MCAP, or the log of a bus.")],
+    config: Annotated[str, typer.Option("--config", help="Robot configuration; of a bus log the session's.")],
     out: Annotated[Path, typer.Option("--out", help="The recording to write.")],
     effort: Annotated[Path | None, typer.Option("--effort", help="Second CSV with one effort per joint.")] = None,
     motor_side: Annotated[bool, typer.Option("--motor-side", help="Values are the motors', not the joints'.")] = False,
@@ -43,14 +43,28 @@ def import_(
 ) -> None:
     """Make a recording of measurements that other tools wrote.
 
-    CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the reference qr1..qrn; SI units. MAT and
-    NPZ: the same names, or positions, torques, times.
+    CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the reference qr1..qrn; SI units. MAT, NPZ
+    and Parquet: the same names, or positions, torques, times. ROS 2 bags (.mcap): sensor_msgs/msg/JointState. Logs of
+    a bus (candump -l, .asc, .blf, .trc): SYNC and TPDOs, as the session configuration maps them.
 
     Example: armident import DATA_EMPS.mat --config emps.yaml --out emps.mcap
     """
-    from configs import ConfigError, load_robot
+    from configs import ConfigError, load_robot, load_session
+    from daq.bus_log import SUFFIXES, recording_from_log
     from daq.importing import import_recording
     from daq.recording import write_recording
+
+    if file.suffix.lower() in SUFFIXES:
+        if effort is not None or motor_side or rate is not None or names or polled:
+            raise ConfigError(f"{file}: what is in the log of a bus is said by --config alone")
+        session = load_session(config)
+        logged = recording_from_log(file, session, load_robot(session.robot))
+        write_recording(logged, out)
+        rows, gaps = logged.counters["samples.rows"], logged.counters["samples.in_gaps"]
+        print(
+            f"{out}: {rows} samples at {logged.sample_rate_hz:g} Hz, {gaps} in gaps, {', '.join(logged.samples.fields)}"
+        )
+        return
 
     pairs = [pair.partition("=") for pair in names.split(",") if pair]
     for key, equals, value in pairs:
@@ -72,9 +86,14 @@ def import_(
 
 def export(
     recording: Annotated[Path, typer.Argument(help="The recording.")],
-    out: Annotated[Path, typer.Option("--out", help="File to write: .csv, .npz or .parquet.")],
+    out: Annotated[
+        Path, typer.Option("--out", help="File to write: .csv, .npz, .mat, .parquet, .mcap (ROS 2), .log, .asc, .blf.")
+    ],
 ) -> None:
     """Write a recording for other tools, in SI units at the joints.
+
+    .mcap is a rosbag2 file with sensor_msgs/msg/JointState; .log (candump -l), .asc, .blf and .trc hold the SYNCs and
+    TPDOs that it was recorded from.
 
     Example: armident export tx40.mcap --out tx40.csv
     """

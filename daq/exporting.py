@@ -1,12 +1,15 @@
-"""Recordings for other tools: CSV, NPZ and Parquet, in SI units at the joints."""
+"""Recordings for other tools: CSV, NPZ, MAT, Parquet and rosbag2 in SI units at the joints; logs of the bus."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from configs import ConfigError, DataError
+from daq.bus_log import SUFFIXES as LOG_SUFFIXES
+from daq.bus_log import write_log
 from daq.recording import Recording, Stream
 
 
@@ -49,24 +52,36 @@ def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
 
 
 def export_recording(recording: Recording, path: Path) -> None:
-    """Write the columns to ``path`` (.csv, .npz or .parquet); the file appears when it is complete.
+    """Write the columns to ``path`` (.csv, .npz, .mat, .parquet, .mcap of ROS 2), or the frames of the bus (`bus_log`).
+
+    The file appears when it is complete.
 
     Raises
     ------
     ConfigError
         If the kind of file is unknown, needs a package that is not installed, or cannot be written.
     DataError
-        If the recording has no samples.
+        If the recording has no samples, or frames are wanted of one that does not come from a bus.
     """
-    writers = {".csv": _write_csv, ".npz": _write_npz, ".parquet": _write_parquet}
+    if path.suffix.lower() in LOG_SUFFIXES:
+        write_log(recording, path)
+        return
+    writers: dict[str, Callable[[Recording, dict[str, NDArray[np.float64]], Path], None]] = {
+        ".csv": _write_csv,
+        ".npz": _write_npz,
+        ".mat": _write_mat,
+        ".parquet": _write_parquet,
+        ".mcap": _write_rosbag,
+    }
     write = writers.get(path.suffix.lower())
     if write is None:
-        raise ConfigError(f"{path}: cannot export {path.suffix or 'without suffix'}; expected {', '.join(writers)}")
+        known = ", ".join([*writers, *LOG_SUFFIXES])
+        raise ConfigError(f"{path}: cannot export {path.suffix or 'without suffix'}; expected {known}")
     table = columns(recording)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write(table, temporary)
+        write(recording, table, temporary)
         temporary.replace(path)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
@@ -86,20 +101,32 @@ def _numbered(base: str, values: NDArray[np.float64]) -> dict[str, NDArray[np.fl
     return {f"{base}{j + 1}": np.ascontiguousarray(values[:, j]) for j in range(values.shape[1])}
 
 
-def _write_csv(table: dict[str, NDArray[np.float64]], path: Path) -> None:
+def _write_csv(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
     values = np.stack(list(table.values()), axis=1)
     np.savetxt(path, values, fmt="%.17g", delimiter=",", header=",".join(table), comments="")
 
 
-def _write_npz(table: dict[str, NDArray[np.float64]], path: Path) -> None:
+def _write_npz(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
     with path.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **table)
 
 
-def _write_parquet(table: dict[str, NDArray[np.float64]], path: Path) -> None:
+def _write_parquet(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
         raise ConfigError(f"{path}: Parquet needs the package pyarrow (pip install pyarrow)") from error
     pyarrow.parquet.write_table(pyarrow.table(table), path)  # type: ignore[no-untyped-call]
+
+
+def _write_mat(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+    from scipy.io import savemat
+
+    savemat(path, dict(table), do_compression=True, oned_as="column")
+
+
+def _write_rosbag(recording: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+    from daq.rosbag import write_joint_states
+
+    write_joint_states(path, [joint.name for joint in recording.robot.joints], recording.samples.t_ns, table)

@@ -1,4 +1,4 @@
-"""Recordings from what other tools wrote: CSV, MAT, NPZ."""
+"""Recordings from what other tools wrote: CSV, MAT, NPZ, Parquet, rosbag2."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -70,7 +70,7 @@ def import_recording(
     Parameters
     ----------
     path
-        CSV with a header line, MAT (up to version 7) or NPZ; SI units.
+        CSV with a header line, MAT (up to version 7), NPZ, Parquet, or joint states in an MCAP of ROS 2; SI units.
     robot
         The robot that was measured.
     effort
@@ -101,7 +101,7 @@ def import_recording(
         raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
     if polled and rate_hz is None:
         raise ConfigError("--polled: say the rate of the controller's clock with --rate")
-    source = _pair(path, effort, robot) if effort is not None else _load(path)
+    source = _pair(path, effort, robot) if effort is not None else _load(path, robot)
     rate = rate_hz if rate_hz is not None else _rate(source, names)
     side: Side = "motor" if motor_side else "joint"
     fields: dict[str, Field] = {}
@@ -138,7 +138,7 @@ def import_recording(
     return Recording(None, robot, None, rate, {"samples": stream}, counters=counters, metadata=facts)
 
 
-def _load(path: Path) -> Source:
+def _load(path: Path, robot: RobotConfig) -> Source:
     if not path.is_file():
         raise ConfigError(f"{path}: no such file")
     kind = path.suffix.lower()
@@ -156,7 +156,29 @@ def _load(path: Path) -> Source:
         return Source(path, _numeric(arrays))
     if kind == ".mat":
         return Source(path, _numeric(_mat(path)))
-    raise ConfigError(f"{path}: cannot import {kind or 'a file without suffix'}; expected .csv, .mat or .npz")
+    if kind == ".parquet":
+        return Source(path, _numeric(_parquet(path)))
+    if kind == ".mcap":
+        from daq.rosbag import read_joint_states
+
+        return Source(path, read_joint_states(path, robot))
+    raise ConfigError(
+        f"{path}: cannot import {kind or 'a file without suffix'}; expected .csv, .mat, .npz, .parquet, "
+        "an .mcap of ROS 2, or the log of a bus (.log, .asc, .blf, .trc)"
+    )
+
+
+def _parquet(path: Path) -> dict[str, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise ConfigError(f"{path}: Parquet needs the package pyarrow (pip install pyarrow)") from error
+    try:
+        table = pyarrow.parquet.read_table(path)  # type: ignore[no-untyped-call]
+        return {name: table.column(name).to_numpy() for name in table.column_names}
+    except (OSError, pyarrow.ArrowException) as error:
+        raise DataError(f"{path}: not a readable Parquet file: {error}") from error
 
 
 def _mat(path: Path) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def test_a_csv_becomes_a_recording_with_its_numbers(tmp_path: Path) -> None:
     assert recording.samples.fields["torque"].side == "joint"
 
 
-@pytest.mark.parametrize("kind", ["csv", "npz"])
+@pytest.mark.parametrize("kind", ["csv", "npz", "mat", "parquet", "mcap"])
 def test_export_and_import_are_inverse(tmp_path: Path, kind: str) -> None:
     recording = import_recording(write_csv(tmp_path / "a.csv", table()), TX40)
     export_recording(recording, tmp_path / f"b.{kind}")

@@ -1,0 +1,240 @@
+"""Recordings from the logs of CAN tools, and such logs from recordings: candump, BLF, ASC and what python-can knows.
+
+A log holds frames; which of them are samples is what a session configuration says. They go the way of captured frames:
+matched to their SYNC, every SYNC accounted for.
+"""
+
+import hashlib
+import itertools
+import os
+import struct
+import sys
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn
+
+from configs import ConfigError, DataError, RobotConfig, SessionConfig
+from daq.assembler import Assembler, Batch
+from daq.recording import Gap, Recording, Stream
+from daq.streams import CapturedStream, captured_streams
+from drivers.frames import Frames, frames
+from drivers.objects import COB_SYNC
+
+SUFFIXES = (".log", ".asc", ".blf", ".trc")
+"""Kinds of logs: candump -l, Vector's text and binary, PEAK's."""
+
+_UNREADABLE = (ValueError, IndexError, KeyError, TypeError, EOFError, struct.error, zlib.error, can.CanError)
+"""What python-can's readers raise at a file that is not what its name says."""
+
+_BATCH = 4096
+_ANSWER_NS = 20_000
+"""Time between a SYNC and its answers in a log that is written from a recording, which keeps the time of SYNC alone."""
+
+
+def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -> Recording:
+    """Match the frames of a log by the mapping of a session.
+
+    Parameters
+    ----------
+    path
+        A log of one bus, or of several of which one has the name of the session's bus.
+    session, robot
+        What TPDOs hold, and the scales of their objects.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such file, or it holds several buses and none of them is the session's.
+    DataError
+        If it cannot be read as such a log, or holds no SYNC.
+    """
+    streams = captured_streams(session, robot)
+    log = _read(path)
+    read = log.of(path, session.bus.channel)
+    if not np.any(read["can_id"] == COB_SYNC):
+        raise DataError(f"{path}: no SYNC ({COB_SYNC:X}h) among its {read.size} frames: samples cannot be told apart")
+    assembler = Assembler(
+        [stream.bus for stream in streams],
+        [joint.name for joint in robot.joints],
+        session.sync.period_us * 1000,
+        session.sync.counter,
+        None,
+    )
+    parts = [assembler.push(read[first : first + _BATCH]) for first in range(0, read.size, _BATCH)]
+    parts.append(assembler.finish())
+    found = {stream.bus.name: _stream(stream, parts) for stream in streams}
+    if found["samples"].sync.size == 0:
+        wanted = ", ".join(f"{cob:X}h" for cob in streams[0].bus.cob_ids)
+        raise DataError(f"{path}: no SYNC was answered by all drives; the session expects TPDOs {wanted}")
+    gaps: list[Gap] = [gap for part in parts for gap in part.gaps]
+    return Recording(
+        None,
+        robot,
+        session,
+        1.0 / session.sync_period,
+        found,
+        tuple(gaps),
+        counters=assembler.counters | {"log.foreign": log.foreign},
+        metadata={"source": path.name, "source_sha256": _digest(path)},
+    )
+
+
+def write_log(recording: Recording, path: Path) -> None:
+    """Write the SYNCs and TPDOs of a recording as a log; the file appears when it is complete.
+
+    A recording keeps the time of every SYNC; its answers follow it by what a frame takes. SYNCs that were not received
+    or not answered by all drives are not in the log, and its SYNC counter shows it.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be written.
+    DataError
+        If the recording does not come from a bus.
+    """
+    session = recording.session
+    if session is None:
+        raise DataError(f"{recording.path}: was not captured from a bus; there are no frames to write")
+    streams = captured_streams(session, recording.robot)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with can.Logger(temporary) as logger:
+            for message in _messages(recording, session, streams):
+                logger.on_message_received(message)
+        temporary.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class _Log:
+    """Classic data frames with 11-bit identifiers, the bus of each by number, and how many other frames there are."""
+
+    frames: Frames
+    bus: NDArray[np.int64]
+    buses: tuple[str, ...]
+    foreign: int
+
+    def of(self, path: Path, bus: str) -> Frames:
+        """The frames of one bus."""
+        if len(self.buses) < 2:
+            return self.frames
+        if bus not in self.buses:
+            raise ConfigError(f"{path}: holds the buses {', '.join(self.buses)}; the session's is {bus}")
+        chosen: Frames = self.frames[self.bus == self.buses.index(bus)]
+        return chosen
+
+
+def _read(path: Path) -> _Log:
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file")
+    numbers: dict[str, int] = {}
+    parts: list[tuple[Frames, NDArray[np.int64]]] = []
+    foreign = done = 0
+    try:
+        with _progress(path) as advance:
+            for messages in _batches(path):
+                batch, bus = frames(len(messages)), np.zeros(len(messages), np.int64)
+                count = 0
+                for message in messages:
+                    done += 1
+                    if message.is_error_frame or message.is_remote_frame or message.is_extended_id or message.is_fd:
+                        foreign += 1
+                        continue
+                    row = batch[count]
+                    row["t_ns"] = round(message.timestamp * 1e9)
+                    row["can_id"], row["length"] = message.arbitration_id, message.dlc
+                    row["data"][: message.dlc] = np.frombuffer(bytes(message.data), np.uint8)
+                    bus[count] = numbers.setdefault(str(message.channel), len(numbers))
+                    count += 1
+                parts.append((batch[:count], bus[:count]))
+                advance(done)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except _UNREADABLE as error:
+        raise DataError(f"{path}: not a readable {path.suffix[1:]} log (after {done} frames): {error}") from error
+    if not parts:
+        raise DataError(f"{path}: no frames in it")
+    return _Log(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), tuple(numbers), foreign)
+
+
+def _batches(path: Path) -> Iterator[list[can.Message]]:
+    # Times in the file as they are: without, those of an ASC log would begin at zero.
+    options = {"relative_timestamp": False} if path.suffix.lower() == ".asc" else {}
+    with can.LogReader(path, **options) as reader:
+        messages = iter(reader)
+        while batch := list(itertools.islice(messages, _BATCH)):
+            yield batch
+
+
+@contextmanager
+def _progress(path: Path) -> Iterator[Callable[[int], None]]:
+    """Shows how many frames were read, on a terminal."""
+    columns = SpinnerColumn(), TextColumn("{task.description}: {task.completed:.0f} frames")
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
+        task = progress.add_task(path.name, total=None)
+        yield lambda done: progress.update(task, completed=done)
+
+
+def _stream(stream: CapturedStream, parts: Sequence[Batch]) -> Stream:
+    rows = [part.rows[stream.bus.name] for part in parts]
+    raw = [stream.decode(r) for r in rows]
+    layout = stream.layout
+    return Stream(
+        layout.name,
+        layout.every,
+        np.concatenate([r.sync for r in rows]),
+        np.concatenate([r.t_ns for r in rows]),
+        {f.name: f for f in layout.fields},
+        {f.name: np.concatenate([values[f.name] for values in raw]) for f in layout.fields},
+    )
+
+
+def _messages(recording: Recording, session: SessionConfig, streams: Sequence[CapturedStream]) -> Iterator[can.Message]:
+    """SYNCs in order, each followed by the TPDOs that answer it, stream by stream and joint by joint."""
+    overflow, channel = session.sync.counter, session.bus.channel
+    everything = sorted({int(n) for stream in recording.streams.values() for n in stream.sync})
+    rows = {stream.bus.name: _encoded(stream, recording.streams[stream.bus.name]) for stream in streams}
+    places = {
+        name: dict(zip(recording.streams[name].sync.tolist(), range(recording.streams[name].sync.size), strict=True))
+        for name in rows
+    }
+    for number in everything:
+        at = {name: place[number] for name, place in places.items() if number in place}
+        name = next(iter(at))
+        t_ns = int(recording.streams[name].t_ns[at[name]])
+        counter = bytes([number % overflow + 1])
+        yield can.Message(t_ns * 1e-9, COB_SYNC, False, data=counter, channel=channel)
+        for stream in streams:
+            if stream.bus.name not in at:
+                continue
+            for cob_id, octets in zip(stream.bus.cob_ids, rows[stream.bus.name][at[stream.bus.name]], strict=True):
+                t_ns += _ANSWER_NS
+                data = octets[: stream.bus.length].tobytes()
+                yield can.Message(t_ns * 1e-9, cob_id, False, data=data, channel=channel)
+
+
+def _encoded(stream: CapturedStream, recorded: Stream) -> NDArray[np.uint8]:
+    """Data bytes (N, n, 8) of the TPDOs that a stream was recorded from."""
+    dtype = stream.tpdo.dtype
+    joints = len(stream.bus.cob_ids)
+    records = np.zeros((recorded.sync.size, joints), dtype)
+    for name in dtype.names or ():
+        records[name] = recorded.raw[name]
+    return records.view(np.uint8).reshape(recorded.sync.size, joints, dtype.itemsize)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
