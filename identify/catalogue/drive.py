@@ -28,9 +28,12 @@ def _gain_numbers(motion: Motion, place: Place) -> Array:
 
 
 def _saturation(motion: Motion, place: Place) -> Array:
-    torque = motion.motor_torque[:, place.joint]
-    most = max(float(np.abs(torque).max()), 1e-12)
-    return motion.of_motor(place.joint, torque * (torque / most) ** 2)
+    """The first term of any odd curve beyond the straight line: the share lost grows with the square of the torque."""
+    j = place.joint
+    torque, ratios = motion.motor_torque[:, j], motion.model.robot.transmission_matrix[j]
+    # By the limit of the joint, so that the parameter is the same in every motion.
+    most = motion.model.robot.joints[j].limits.torque / float(np.abs(ratios).max())
+    return motion.of_motor(j, torque * (torque / most) ** 2)
 
 
 def _delay(motion: Motion, place: Place) -> Array:
@@ -81,7 +84,8 @@ EFFECTS = (
     Effect(
         name="drive_gain_saturation",
         title="a torque constant that falls with current",
-        says="the motor gives less torque per ampere at high current: its iron saturates",
+        says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost at the "
+        "joint's torque limit",
         reference="Leonhard 2001, Control of Electrical Drives, chapter 5",
         linear=(Linear("gain_loss", ("", ""), sign=1),),
         columns=_saturation,

@@ -243,9 +243,16 @@ def test_saturation_grows_with_the_cube_of_the_torque(axis: Motion) -> None:
     tau = axis.torque[:, 0]
     knee = 40.0 * np.abs(tau).max()
     current = tau / np.sqrt(1 - (tau / knee) ** 2)
-    loss = np.abs(tau).max() ** 2 / (2 * knee**2)
+    loss = axis.model.robot.joints[0].limits.torque ** 2 / (2 * knee**2)
     found = loss * columns("drive_gain_saturation", axis)[:, 0, 0]
     np.testing.assert_allclose(found, current - tau, rtol=2e-3, atol=1e-9)
+
+
+def test_the_loss_at_the_torque_limit_is_the_same_in_every_motion(arm: Motion) -> None:
+    half = replace(arm, q=arm.q[:700], qd=arm.qd[:700], qdd=arm.qdd[:700])
+    for joint in range(6):
+        whole, part = (columns("drive_gain_saturation", m, joint)[:700] for m in (arm, half))
+        np.testing.assert_allclose(part, whole, rtol=1e-9, atol=1e-12)
 
 
 def smooth(axis: Motion) -> Motion:
