@@ -84,8 +84,8 @@ EFFECTS = (
     Effect(
         name="drive_gain_saturation",
         title="a torque constant that falls with current",
-        says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost at the "
-        "joint's torque limit",
+        says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost "
+        "at the joint's torque limit",
         reference="Leonhard 2001, Control of Electrical Drives, chapter 5",
         linear=(Linear("gain_loss", ("", ""), sign=1),),
         columns=_saturation,
