@@ -164,14 +164,14 @@ class _Bench:
         parts, postures = [], []
         for s in self.signals:
             q, qd, qdd = s.q @ moved, s.qd @ moved, s.qdd @ moved
-            at_motors = np.einsum("mj,tjb->tmb", to_motors, self.model.rigid_regressor(q, qd, qdd))
+            at_motors = to_motors @ self.decimation(self.model.rigid_regressor(q, qd, qdd))
             # Springs on the joints: their torques in phase with the motion would pass for negative inertia.
-            springs = q[:, None, :] * to_motors
-            parts.append(self.decimation(np.concatenate([at_motors, springs], axis=2)))
+            springs = self.decimation(q)[:, None, :] * to_motors
+            parts.append(np.concatenate([at_motors, springs], axis=2))
             postures.append(q)
         x = np.concatenate(parts)
         grams = np.stack([x[:, m].T @ x[:, m] for m in range(self.model.n)])
-        products = np.einsum("tmb,tk->mkb", x, self.torque)
+        products = np.stack([self.torque.T @ x[:, m] for m in range(self.model.n)])
         return _Rows(x, grams, products, self._physical(np.concatenate(postures)))
 
     def _physical(self, q: Array) -> Array:
@@ -200,7 +200,7 @@ class _Bench:
         shares, theta = np.ones(self.model.n), np.zeros(right.shape[1])
         for _ in range(PASSES):
             theta = _physical_least_squares(np.tensordot(weights, rows.grams, 1), weights @ right, rows.physical)
-            left = power - 2 * right @ theta + np.einsum("b,mbc,c->m", theta, rows.grams, theta)
+            left = power - 2 * right @ theta + rows.grams @ theta @ theta
             shares = np.maximum(left / power, FLOOR)
             weights = 1.0 / (shares * power)
         return _Fit(shares[np.argsort(taken)], rows.x, y, theta, taken)
