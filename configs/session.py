@@ -55,11 +55,19 @@ class Setpoints(Frozen):
 
 
 class RecordingOptions(Frozen):
-    """Where and how recordings are written."""
+    """Where and how recordings are written, when a new file is begun, and how long files are kept.
+
+    Without ``rotate_mb`` and ``rotate_minutes`` a capture is one file; without ``keep_days`` and ``min_free_gb``
+    nothing is ever deleted.
+    """
 
     directory: Path = Path("recordings")
     chunk_ms: Annotated[int, Field(ge=10, le=1000)] = 100
     drain_ms: Annotated[int, Field(ge=1, le=100)] = 20
+    rotate_mb: Annotated[float, Field(ge=1)] | None = None
+    rotate_minutes: Annotated[float, Field(gt=0)] | None = None
+    keep_days: Annotated[float, Field(gt=0)] | None = None
+    min_free_gb: Annotated[float, Field(gt=0)] | None = None
 
 
 class ZenohOptions(Frozen):

@@ -27,8 +27,9 @@ from daq.assembler import LATE_S, Assembler
 from daq.facts import host_facts
 from daq.motion import Motion, plan_motion
 from daq.publisher import Publisher
-from daq.recording import Mark, RecordingWriter
+from daq.recording import Mark
 from daq.sink import Sink
+from daq.storage import kept_tidy, open_series
 from daq.streams import CapturedStream, captured_streams
 from daq.zenoh_keys import Keys
 from drivers.bus_load import check_fits
@@ -52,9 +53,9 @@ QUICK_STOP_S = 0.3
 
 @dataclass(frozen=True)
 class Captured:
-    """What a capture left: the finished recording, its counters and marks, and what ended it early."""
+    """What a capture left: the finished files in order, its counters and marks, and what ended it early."""
 
-    path: Path
+    paths: tuple[Path, ...]
     counters: dict[str, int]
     marks: tuple[Mark, ...]
     trouble: ArmidentError | None
@@ -127,17 +128,8 @@ def capture(order: Order, stop: threading.Event, say: Callable[[str], None]) -> 
     with ExitStack() as stack:
         metadata = host_facts(now) | {"capture": name, "cell": session.cell}
         rate = 1.0 / session.sync_period
-        writer = stack.enter_context(
-            RecordingWriter(
-                order.directory / f"{name}.mcap",
-                robot,
-                session,
-                rate,
-                [stream.layout for stream in order.streams],
-                metadata,
-                session.recording.chunk_ms * 1_000_000,
-            )
-        )
+        writer = stack.enter_context(open_series(session, robot, order.streams, order.directory, name, metadata))
+        stack.enter_context(kept_tidy(session.recording, order.directory, robot.name, say))
         try:
             bus = stack.enter_context(open_bus(session.bus, filters=_filters(order)))
             if session.bus.interface == "udp_multicast":
@@ -156,7 +148,7 @@ def capture(order: Order, stop: threading.Event, say: Callable[[str], None]) -> 
         run.sink.finish(counters)
         if writer.problem is not None:
             say(f"warning: {writer.lost_rows} rows not written: {writer.problem}")
-        return Captured(writer.path, counters, tuple(run.sink.marks), trouble)
+        return Captured(tuple(writer.paths), counters, tuple(run.sink.marks), trouble)
 
 
 def _filters(order: Order) -> list[tuple[int, int]]:
@@ -194,6 +186,8 @@ class _Run:
         self._span: tuple[int, int] | None = None
         self._frames_before = 0
         self._events = {"emcy": 0, "heartbeat_lost": 0}
+        self._lost_rows = 0
+        self._writing = True
 
     def start(self, stack: ExitStack) -> None:
         """Configure and enable the drives, and start SYNC; whatever was started is stopped when the stack unwinds."""
@@ -360,12 +354,25 @@ class _Run:
             why = str(trouble) if trouble is not None else "stopped"
             self.sink.move_mark("experiment_end", self.sink.last_sync, f"before its end: {why}")
 
+    def _tell_of_disk(self) -> None:
+        """Say it when the disk begins to refuse rows, and when it takes them again."""
+        lost, before = self.sink.lost_rows, self._lost_rows
+        self._lost_rows = lost
+        if lost > before and self._writing:
+            self._say(f"warning: rows are not being written, streaming goes on: {self.sink.problem}")
+        elif lost == before and not self._writing:
+            self._say(f"writing again; {lost} rows were not written")
+        self._writing = lost == before
+
     def _report_health(self, seconds: float) -> None:
         counters = self._assembler.counters
         rate = (counters["frames"] - self._frames_before) / seconds
         self._frames_before = counters["frames"]
+        self._tell_of_disk()
         self._publisher.health(
             {
+                "file": self.sink.path.name,
+                "rows_not_written": self.sink.lost_rows,
                 "sync": self._assembler.last_sync,
                 "frames_per_s": round(rate, 1),
                 "rows": counters["samples.rows"],
@@ -401,9 +408,10 @@ def run_capture(config: str, out: Path | None, duration: float | None, listen_on
     rows, gaps = done.counters["samples.rows"], done.counters["samples.in_gaps"]
     say(f"recorded {rows} samples, {gaps} in gaps, {done.counters['kernel_drops']} frames dropped by the kernel")
     if as_json:
-        print(json.dumps({"recording": str(done.path), "counters": done.counters}))
+        files = [str(path) for path in done.paths]
+        print(json.dumps({"recording": files[-1], "recordings": files, "counters": done.counters}))
     else:
-        print(done.path)
+        print(*done.paths, sep="\n")
     sys.stdout.flush()
     if done.trouble is not None:
         raise done.trouble

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from configs import RobotConfig, SessionConfig
 from daq.assembler import Batch, Rows
 from daq.publisher import Publisher
-from daq.recording import Gap, Mark, RecordingWriter
+from daq.recording import Gap, Mark, RecordingSeries
 from daq.recording.model import MarkKind
 from daq.streams import CapturedStream
 from daq.zenoh_keys import Block, encode_event
@@ -22,7 +23,7 @@ class Sink:
     Parameters
     ----------
     writer
-        The recording being written.
+        The files of the recording.
     publisher
         Where blocks are offered.
     streams
@@ -32,7 +33,7 @@ class Sink:
     """
 
     def __init__(
-        self, writer: RecordingWriter, publisher: Publisher, streams: Sequence[CapturedStream], capture: str
+        self, writer: RecordingSeries, publisher: Publisher, streams: Sequence[CapturedStream], capture: str
     ) -> None:
         self.gaps: list[Gap] = []
         self.marks: list[Mark] = []
@@ -43,6 +44,21 @@ class Sink:
         self._streams, self._capture = tuple(streams), capture
         self._blocks = 0
         self._planned: list[tuple[MarkKind, int, str]] = []
+
+    @property
+    def path(self) -> Path:
+        """The file being written."""
+        return self._writer.path
+
+    @property
+    def lost_rows(self) -> int:
+        """Rows that the disk did not take."""
+        return self._writer.lost_rows
+
+    @property
+    def problem(self) -> str | None:
+        """What went wrong with writing last, in words."""
+        return self._writer.problem
 
     def announce(
         self, robot: RobotConfig, session: SessionConfig, sample_rate_hz: float, metadata: dict[str, str]
@@ -64,6 +80,9 @@ class Sink:
 
     def take(self, batch: Batch) -> None:
         """Write and publish what became certain."""
+        samples = batch.rows["samples"]
+        if samples.sync.size:
+            self._writer.turn(int(samples.t_ns[0]))
         for stream in self._streams:
             rows = batch.rows[stream.bus.name]
             if rows.sync.size == 0:
@@ -88,6 +107,7 @@ class Sink:
         self._place_marks(True)
         self._writer.flush()
         counters["writer.rows_lost"] = self._writer.lost_rows
+        counters["writer.files"] = len(self._writer.paths)
         counters["zenoh.blocks"] = self._blocks
         counters["zenoh.blocks_dropped"] = self._publisher.dropped
         counters["gaps"] = len(self.gaps)

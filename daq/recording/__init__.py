@@ -4,6 +4,7 @@ from daq.recording.healing import Healed, heal_recording
 from daq.recording.layout import StreamLayout
 from daq.recording.model import Field, Gap, Mark, Recording, Stream
 from daq.recording.reader import read_recording
+from daq.recording.series import RecordingSeries
 from daq.recording.writer import RecordingWriter, write_recording
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "Healed",
     "Mark",
     "Recording",
+    "RecordingSeries",
     "RecordingWriter",
     "Stream",
     "StreamLayout",

@@ -114,6 +114,16 @@ class RecordingWriter:
             self.abort()
             raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
+    @property
+    def size(self) -> int:
+        """Bytes in the file so far."""
+        return self._position
+
+    @property
+    def rows(self) -> dict[str, int]:
+        """Rows of every stream that are in the file."""
+        return {name: self._summary.messages.get(channel, 0) for name, (channel, _) in self._layouts.items()}
+
     def append(
         self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> None:

@@ -72,12 +72,12 @@ def run_suite(options: Chosen, *, as_json: bool = False) -> Tables:
             Lanes(store, options.out, jobs).run(waiting, done, until)
     scored, failed, missing = judged(cases, store)
     result = tables(scored, failed)
-    document = summary(result, scored, failed, missing)
+    document = summary(result, scored, failed, len(cases))
     write(options.out, document, result)
     if as_json:
         sys.stdout.write(json.dumps(document) + "\n")
     else:
-        show(result, missing)
+        show(result, len(cases) - missing, len(cases))
         print(f"results: {options.out / RESULTS}\nsummary: {options.out / SUMMARY}\ntable:   {options.out / TABLE}")
     if failed:
         told = "; ".join(f"{c.name}: {(store.failure(c.key) or {}).get('error')}" for c in failed[:SHOWN_FAILURES])
@@ -102,11 +102,13 @@ def judged(cases: Sequence[Case], store: Store) -> tuple[list[Scored], list[Case
     return scored, failed, missing
 
 
-def summary(result: Tables, scored: Sequence[Scored], failed: Sequence[Case], missing: int) -> Record:
+def summary(result: Tables, scored: Sequence[Scored], failed: Sequence[Case], total: int) -> Record:
     """Everything for machines: the tables, and one line for each case."""
+    run = len(scored) + len(failed)
     return {
         "schema": SCHEMA,
-        "not_run": missing,
+        "run": run,
+        "not_run": total - run,
         **asdict(result),
         "cases": [{"key": c.key, "case": c.name, "level": c.level, **asdict(s)} for c, s in scored],
         "failed": [{"key": c.key, "case": c.name} for c in failed],

@@ -66,8 +66,8 @@ def progress(total: int) -> Iterator[Done]:
             bar.stop()
 
 
-def show(result: Tables, missing: int) -> None:
-    """Print the tables."""
+def show(result: Tables, run: int, total: int) -> None:
+    """Print the tables, and of how many cases they are."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=LEAST_WIDTH)
@@ -80,8 +80,9 @@ def show(result: Tables, missing: int) -> None:
     ):
         if rows:
             console.print(_table(title, columns, rows))
-    if missing:
-        console.print(f"{missing} cases have not been run; the same command goes on with them", highlight=False)
+    console.print(f"{run} of {total} cases have been run", highlight=False)
+    if run < total:
+        console.print("they are a sample of all kinds; the same command goes on with the others", highlight=False)
 
 
 def _table(title: str, columns: Sequence[tuple[str, Callable[[Any], str]]], rows: Sequence[Any]) -> Table:

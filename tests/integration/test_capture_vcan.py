@@ -106,6 +106,28 @@ def test_sixty_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_pat
 
 
 @pytest.mark.usefixtures("robot")
+def test_files_follow_each_other_without_losing_a_sample(vcan_bus: str, tmp_path: Path) -> None:
+    """Every SYNC of six seconds at 5 kHz is in exactly one file, old captures make room meanwhile."""
+    options = {"rotate_minutes": 0.02, "keep_days": 300}
+    session = session_file(tmp_path, vcan_bus, "rotated", setpoints=None, recording=options)
+    (tmp_path / "out").mkdir()
+    old = tmp_path / "out" / "tx40-20200101T000000-000Z.mcap"
+    old.write_bytes(b"old")
+    process = run("capture", "--config", session, "--duration", "6", "--out", tmp_path / "out", "--json")
+    out, err = process.communicate(timeout=200)
+    assert process.returncode == 0, err
+    document = json.loads(out)
+    parts = [read_recording(path) for path in document["recordings"]]
+    assert len(parts) >= 4
+    assert all(part.missing is None for part in parts)
+    sync = np.concatenate([part.samples.sync for part in parts])
+    lost = {n for part in parts for g in part.gaps if g.stream == "samples" for n in range(g.first, g.last + 1)}
+    assert np.array_equal(np.sort(np.concatenate([sync, sorted(lost)])), np.arange(document["counters"]["sync_sent"]))
+    assert not old.exists()
+    assert f"deleted {old} (retention)" in err
+
+
+@pytest.mark.usefixtures("robot")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_with_a_finished_file(vcan_bus: str, tmp_path: Path, number: signal.Signals) -> None:
     session = session_file(tmp_path, vcan_bus, "signal", sync={"period_us": 1000}, setpoints=None)

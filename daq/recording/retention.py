@@ -1,0 +1,119 @@
+"""How long recordings are kept: by age, and by the space that is left."""
+
+import datetime
+import fcntl
+import re
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+_NAME = re.compile(r"-(\d{8}T\d{6})-\d{3}Z(?:\.\d+)?\.mcap(?:\.damaged)?$")
+EVERY_S = 60.0
+"""How often it is looked, s."""
+
+
+def prune(
+    directory: Path,
+    robot: str,
+    now: datetime.datetime,
+    keep_days: float | None,
+    min_free_bytes: float | None,
+    free: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
+) -> list[Path]:
+    """Delete recordings that are too old, then the oldest ones until there is space enough.
+
+    Only finished captures of this robot are touched, by the name that ``capture`` gives them; a file that is being
+    written never is.
+
+    Parameters
+    ----------
+    directory
+        Where the recordings are; what is in folders below is left alone.
+    robot
+        Name of the robot, with which their names begin.
+    now
+        The time, with its zone.
+    keep_days
+        Age, by the time in the name, from which on a recording is deleted; ``None``: none for its age.
+    min_free_bytes
+        Free space to keep on the file system; ``None``: none for the space.
+    free
+        Tells the free space, bytes.
+
+    Returns
+    -------
+    list of Path
+        What was deleted, the oldest first.
+    """
+    deleted = []
+    for path, made in _recordings(directory, robot):
+        old = keep_days is not None and (now - made).total_seconds() > keep_days * 86_400
+        if not (old or (min_free_bytes is not None and free(directory) < min_free_bytes)):
+            break
+        if _is_being_written(path):
+            continue
+        path.unlink(missing_ok=True)
+        deleted.append(path)
+    return deleted
+
+
+def _recordings(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.datetime]]:
+    """Recordings of a robot with the time in their names, the oldest first."""
+    found = []
+    for path in directory.glob(f"{robot}-*.mcap*"):
+        match = _NAME.search(path.name)
+        if match is not None and path.name[: match.start()] == robot and path.is_file():
+            found.append((path, datetime.datetime.strptime(match[1] + "+0000", "%Y%m%dT%H%M%S%z")))
+    yield from sorted(found, key=lambda entry: entry[0].name)
+
+
+def _is_being_written(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+class Janitor:
+    """Prunes from time to time in a thread of its own: deleting gigabytes may take longer than a capture can wait.
+
+    Parameters
+    ----------
+    look
+        Deletes what is to be deleted and returns it.
+    say
+        Takes a line for everything that was deleted, and for what could not be.
+    """
+
+    def __init__(self, look: Callable[[], list[Path]], say: Callable[[str], None], every_s: float = EVERY_S) -> None:
+        self.deleted = 0
+        self._look, self._say, self._every_s = look, say, every_s
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="janitor", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop looking."""
+        self._over.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        told: str | None = None
+        while True:
+            try:
+                for path in self._look():
+                    self.deleted += 1
+                    self._say(f"deleted {path} (retention)")
+                told = None
+            except OSError as error:
+                problem = f"warning: retention: {error}"
+                if problem != told:
+                    self._say(problem)
+                told = problem
+            if self._over.wait(self._every_s):
+                return

@@ -1,0 +1,55 @@
+"""Where a capture's files go, when a new one is begun, and which old ones make room."""
+
+import datetime
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from configs import RobotConfig, SessionConfig
+from configs.session import RecordingOptions
+from daq.recording import RecordingSeries, RecordingWriter
+from daq.recording.retention import Janitor, prune
+from daq.streams import CapturedStream
+
+
+def open_series(
+    session: SessionConfig,
+    robot: RobotConfig,
+    streams: Sequence[CapturedStream],
+    directory: Path,
+    name: str,
+    metadata: dict[str, str],
+) -> RecordingSeries:
+    """Begin the files of a capture.
+
+    Raises
+    ------
+    ConfigError
+        If the first file cannot be created.
+    """
+    options = session.recording
+    layouts = [stream.layout for stream in streams]
+
+    def begin(path: Path, part: int) -> RecordingWriter:
+        facts = metadata | {"part": str(part)}
+        rate, chunk_ns = 1.0 / session.sync_period, options.chunk_ms * 1_000_000
+        return RecordingWriter(path, robot, session, rate, layouts, facts, chunk_ns)
+
+    max_bytes = None if options.rotate_mb is None else round(options.rotate_mb * 1e6)
+    max_ns = None if options.rotate_minutes is None else round(options.rotate_minutes * 60e9)
+    return RecordingSeries(begin, directory, name, max_bytes, max_ns)
+
+
+@contextmanager
+def kept_tidy(options: RecordingOptions, directory: Path, robot: str, say: Callable[[str], None]) -> Iterator[None]:
+    """Delete old recordings of a robot meanwhile, if the options say so."""
+    if options.keep_days is None and options.min_free_gb is None:
+        yield
+        return
+    least = None if options.min_free_gb is None else options.min_free_gb * 1e9
+
+    def look() -> list[Path]:
+        return prune(directory, robot, datetime.datetime.now(datetime.UTC), options.keep_days, least)
+
+    with closing(Janitor(look, say)):
+        yield
