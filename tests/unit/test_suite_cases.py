@@ -1,5 +1,6 @@
 """Which cases a suite has."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,20 @@ def test_every_hidden_effect_is_one_that_the_virtual_arm_takes() -> None:
 
 def test_no_two_cases_are_the_same() -> None:
     assert len({c.key for c in CASES}) == len(CASES)
+
+
+def test_any_beginning_has_its_share_of_every_row_of_the_tables() -> None:
+    first = SUITE.runs * len(SUITE.clean)
+    assert all(c.kind == "clean" for c in CASES[:first])
+    rest = CASES[first:]
+    whole = Counter((c.kind, c.label, c.level) for c in rest if c.kind != "clean")
+    for share in (0.1, 0.25, 0.5):
+        begun = Counter((c.kind, c.label, c.level) for c in rest[: round(share * len(rest))])
+        assert all(abs(begun[row] - share * size) < 2 for row, size in whole.items())
+
+
+def test_the_order_is_the_same_in_every_run() -> None:
+    assert [c.key for c in all_cases(SUITE)] == [c.key for c in CASES]
 
 
 def test_a_twin_is_the_healthy_arm_of_the_same_run_and_one_of_the_clean_cases() -> None:
