@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from identify.catalogue.motion import Motion
 from identify.discrepancy.candidates import Candidate, Shapes, Workshop
 from identify.discrepancy.regression import MAX_AR_ORDER, Fit, noise_models
+from identify.discrepancy.shaping import instrumented
 from identify.discrepancy.trial import refined, screened
 from identify.estimators.noise import ArModel
 
@@ -43,7 +44,10 @@ def shortlist(
         else:
             looks.append((look[0], candidate, look[1]))
     looks.sort(key=lambda look: len(look[1].effect.linear) - look[0])
-    best = [(candidate, refined(calm, candidate, workshop, (look, shapes))) for look, candidate, shapes in looks[:most]]
+    best = [
+        (candidate, instrumented(calm, candidate, workshop, refined(calm, candidate, workshop, (look, shapes))))
+        for look, candidate, shapes in looks[:most]
+    ]
     return best, frozenset(hidden), calm.noise
 
 

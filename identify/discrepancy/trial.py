@@ -294,7 +294,7 @@ def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[floa
         start = found[1]
 
         def loss(logarithm: float, start: Shapes = start, k: int = k) -> float:
-            shapes = _replaced(start, k, float(np.exp(logarithm)))
+            shapes = replaced(start, k, float(np.exp(logarithm)))
             statistic = score_statistic(
                 fit, workshop.instruments(candidate.effect, candidate.place, shapes, fit.noise, keep=False)
             )
@@ -304,11 +304,12 @@ def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[floa
             loss, bounds=(np.log(low), np.log(high)), method="bounded", options={"maxiter": REFINEMENTS}
         )
         if -result.fun > found[0]:
-            found = -float(result.fun), _replaced(start, k, float(np.exp(result.x)))
+            found = -float(result.fun), replaced(start, k, float(np.exp(result.x)))
     return found[1]
 
 
-def _replaced(shapes: Shapes, k: int, value: float) -> Shapes:
+def replaced(shapes: Shapes, k: int, value: float) -> Shapes:
+    """Shapes with another value of the k-th."""
     return (*shapes[:k], (shapes[k][0], value), *shapes[k + 1 :])
 
 
