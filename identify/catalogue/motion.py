@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-STEPS = (1e-6, 1e-6, 1.0)
-"""Of the finite differences, rad, rad/s and rad/s^2, or in metres; torques are linear in accelerations."""
+STEP = 1e-6
+"""Of the finite differences, rad and rad/s, or in metres."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ class Motion:
     _slopes: dict[tuple[int, bool], tuple[Array, Array, Array]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
+    _still: dict[bool, tuple[Array, Array]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def samples(self) -> int:
@@ -159,16 +160,26 @@ class Motion:
         key = (joint, links)
         if key not in self._slopes:
             theta = self.links if links else self._theta
-            # The sign is smoothed even where the motion has it sharp: a jump has no slope.
-            here = self.model.inverse_dynamics(theta, self.q, self.qd, self.qdd)
-            slopes = []
-            for k, step in enumerate(STEPS):
-                moved = [self.q, self.qd, self.qdd]
-                moved[k] = moved[k].copy()
-                moved[k][:, joint] += step
-                slopes.append((self.model.inverse_dynamics(theta, *moved) - here) / step)
-            self._slopes[key] = slopes[0], slopes[1], slopes[2]
+            here, inertia = self._smooth(links)
+            q, qd = self.q.copy(), self.qd.copy()
+            q[:, joint] += STEP
+            qd[:, joint] += STEP
+            position = (self.model.inverse_dynamics(theta, q, self.qd, self.qdd) - here) / STEP
+            velocity = (self.model.inverse_dynamics(theta, self.q, qd, self.qdd) - here) / STEP
+            self._slopes[key] = position, velocity, inertia[joint]
         return self._slopes[key]
+
+    def _smooth(self, links: bool) -> tuple[Array, Array]:
+        """Predicted torques (N, n), and their slopes over the accelerations, (n, N, n) with those of each joint first.
+
+        The sign is smoothed even where the motion has it sharp: a jump has no slope.
+        """
+        if links not in self._still:
+            theta = self.links if links else self._theta
+            masses = self.model.mass_matrix(theta, self.q)
+            here = self.model.inverse_dynamics(theta, self.q, self.qd, self.qdd)
+            self._still[links] = here, np.ascontiguousarray(masses.transpose(2, 0, 1))
+        return self._still[links]
 
     def rate(self, values: Array) -> Array:
         """Time derivative along the first axis, central differences."""
