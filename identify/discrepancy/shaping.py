@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from identify.discrepancy.candidates import Candidate, Shapes, Workshop
-from identify.discrepancy.regression import Fit, whitened
+from identify.discrepancy.regression import Fit
 from identify.discrepancy.trial import directions_beside, replaced
+from identify.discrepancy.whitening import whitened
 
 Array = NDArray[np.float64]
 
