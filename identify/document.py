@@ -167,7 +167,10 @@ class Gaps(Document):
 
 
 class DiagnosisDocument(Document):
-    """``diagnosis.json``: where model and data disagree, what is missing, and what stays unexplained."""
+    """``diagnosis.json``: where model and data disagree, what is missing, and what stays unexplained.
+
+    ``considered`` are effects that passed the tests and did not convince in the end; they are not in the model.
+    """
 
     schema_: Literal["armident/diagnosis/1"] = Field("armident/diagnosis/1", alias="schema")
     robot: str
@@ -184,6 +187,7 @@ class DiagnosisDocument(Document):
     warnings: list[str]
     not_visible: list[Invisible] = []
     simulated: dict[str, dict[str, float]] | None = None
+    considered: list[Finding] = []
 
 
 SCHEMA_FILES: dict[str, type[Document]] = {

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from configs import RobotConfig
+from identify.discrepancy.doubt import convincing
 from identify.discrepancy.findings import (
-    described,
     experiment_to_separate,
     gap_of,
     miswired,
@@ -22,7 +22,7 @@ from identify.discrepancy.numbers import stale_numbers
 from identify.discrepancy.search import Search, Settings, State, with_values
 from identify.discrepancy.simulated import SimulatedErrors, simulated_errors
 from identify.discrepancy.study import build_study
-from identify.discrepancy.where import Disagreement, survey, unexplained, where
+from identify.discrepancy.where import Disagreement, beyond_noise, survey, where
 from identify.discrepancy.wiring_check import find_wiring
 from identify.document import (
     BeforeAfter,
@@ -169,10 +169,11 @@ def _diagnose(
     steps("where")
     seen = survey(first.fit, first.workshop, settings.false_alarms)
     places = where(first.fit, first.workshop, seen=seen)
-    final = search.run()
+    outcome = convincing(search, first, search.run(), seen)
+    final = outcome.state
     steps("what is left")
-    left = unexplained(final.fit, final.workshop, settings.false_alarms, seen=seen if final is first else None)
-    findings = [*([] if wiring is None else miswired(wiring, robot)), *described(search, first, final, left)]
+    left = beyond_noise(final.fit, outcome.left, settings.false_alarms)
+    findings = [*([] if wiring is None else miswired(wiring, robot)), *outcome.findings]
     if baseline is not None:
         steps("numbers")
         findings += outdated(stale_numbers(final.fit, final.workshop, baseline, settings.false_alarms))
@@ -183,6 +184,7 @@ def _diagnose(
         recordings=list(recordings),
         verdict=_verdict(findings, left),
         findings=findings,
+        considered=list(outcome.considered),
         unexplained=[
             Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint) for d in left
         ],
@@ -216,6 +218,7 @@ def _diagnose(
 
 
 def _verdict(findings: Sequence[Finding], left: Sequence[Disagreement]) -> Verdict:
+    """``no_gap`` and ``explained`` say that what remains is noise (see `excess`) and varies with nothing."""
     if findings:
         return "partly_explained" if left else "explained"
     return "unexplained" if left else "no_gap"

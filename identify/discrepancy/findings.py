@@ -60,9 +60,12 @@ def _finding(
     rivals = [t for t in trials if t is not mine]
     # Only what could have been found in its place takes confidence from a finding.
     serious = [t for t in rest.passing(settings) if t is not mine]
-    share = 0.0 if mine is None else mine.share
+    # Rows of other joints, which a change goes along with, are no part of what it is a share of.
+    share = 0.0 if mine is None else min(mine.share, 1.0)
     scores = [] if mine is None else [mine.score, *(t.score for t in serious)]
     alone = 0.0 if mine is None else float(np.exp(mine.score - special.logsumexp(scores)))
+    close = [] if mine is None else [score for score in scores if abs(score - mine.score) < CLOSE]
+    among = float(np.exp(special.logsumexp(close) - special.logsumexp(scores))) if close else 0.0
     remaining = max((d.share for d in left if d.joint == stanza.joint), default=0.0)
     # What is left is a share of the smaller residual that the finding leaves.
     explained = share / max(share + (1 - share) * remaining, 1e-300) if share > 0 else 0.0
@@ -90,6 +93,7 @@ def _finding(
             "share_of_residual": share,
             "std": std,
             "units": _units(effect, study.robot.joints[joint].type == "prismatic"),
+            "confidence_with_equals": among * explained,
             "ambiguous_with": [t.candidate.effect.name for t in serious if mine and t.score > mine.score - CLOSE],
         },
     )
@@ -142,7 +146,9 @@ def noise_floor(final: State, left: Sequence[Disagreement]) -> Gap:
         if d.kind == "frequency":
             # Its share is one of the working rate, most of which lies beyond the band of the comparison.
             continue
-        known_shares[d.joint] = min(1.0, known_shares[d.joint] + d.share)
+        # What follows the motion contains what has a name.
+        own = known_shares[d.joint] + d.share if d.kind != "motion" else max(known_shares[d.joint], d.share)
+        known_shares[d.joint] = min(1.0, own)
     floor = np.array([e * np.sqrt(1 - known_shares[name]) for e, name in zip(each, study.joints, strict=True)])
     overall = float(np.sqrt((floor**2) @ power / power.sum()))
     return Gap(all=overall, by_joint=dict(zip(study.joints, (float(v) for v in floor), strict=True)))

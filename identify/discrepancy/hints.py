@@ -51,6 +51,11 @@ HINTS: dict[Kind, str] = {
         "the torque of {joint} has a line at {at} that does not move with the motion: look for ripple of the "
         "mains or of the supply, a fan, a pump, a neighbouring machine, or a badly tuned loop"
     ),
+    "motion": (
+        "the torque of {joint} misses more at the frequencies of the motion, most at {at}, than noise can, and nothing "
+        "tried explains it: record the same motion twice to see how much of it repeats, and look for what is not in "
+        "the model"
+    ),
 }
 """For each kind; the names of the joint and of another one, and where the shape is largest, are filled in."""
 
@@ -73,7 +78,7 @@ def unit_of(kind: Kind, joint: str) -> str:
             return f"{length}/s^2"
         case "time" | "time and direction":
             return "s"
-        case "frequency":
+        case "frequency" | "motion":
             return "Hz"
         case _:
             return "N m" if joint == "revolute" else "N"

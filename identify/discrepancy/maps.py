@@ -16,9 +16,10 @@ Array = NDArray[np.float64]
 Kind = Literal[
     "velocity", "position", "position and direction", "motor angle", "load", "load and direction", "torque",
     "acceleration", "time", "time and direction", "velocity of another joint", "torque of another joint",
-    "frequency",
+    "frequency", "motion",
 ]  # fmt: skip
-"""Variables; those with a direction count for the positive one, and with the other sign for the negative one."""
+"""Variables; those with a direction count for the positive one, and with the other sign for the negative one. The last
+are no maps: a frequency that does not move with the motion, and whatever moves with it in a way nobody can tell."""
 
 SIDE = (0.0, 0.05, 0.15, 0.35, 0.65, 1.0)
 """Speeds of the knots of either direction, over the top speed: close at low speeds, where friction is curved."""

@@ -111,13 +111,13 @@ class Search:
         """Add until nothing passes, then see whether another effect does better in each one's place."""
         state = self.start()
         own = len(self.study.robot.effects)
-        been = {_places(state)}
+        been = {places_of(state)}
         while len(state.study.robot.effects) - own < MOST:
             better = self._extended(state, own, been)
             if better is None:
                 break
             state = better
-            been.add(_places(state))
+            been.add(places_of(state))
         return self._exchanged(state, own)
 
     def state(self, robot: RobotConfig, before: State | None) -> State:
@@ -149,7 +149,7 @@ class Search:
                 continue
             if relative_errors(extended.fit, held=True)[0] < relative_errors(state.fit, held=True)[0]:
                 pruned = self._pruned(extended, own)
-                if _places(pruned) not in been:
+                if places_of(pruned) not in been:
                     return pruned
         return None
 
@@ -250,7 +250,7 @@ def with_values(state: State, shapes: Mapping[int, Mapping[str, float]] | None =
     return state.study.robot.model_copy(update={"effects": tuple(stanzas)})
 
 
-def _places(state: State) -> Places:
+def places_of(state: State) -> Places:
     """What the model of a state has beyond the rigid one, and where, whatever the values and the order."""
     return tuple(sorted((e.effect, e.joint, e.other or "") for e in state.study.robot.effects))
 

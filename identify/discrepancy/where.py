@@ -1,5 +1,6 @@
 """Where model and data disagree: what the residual of each joint depends on, and with which shape."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy import stats
 
 from identify.catalogue.effect import Place
 from identify.discrepancy.candidates import Candidate, Workshop
+from identify.discrepancy.excess import Excess, excesses
 from identify.discrepancy.hints import hint_of, unit_of
 from identify.discrepancy.lines import lowest_frequency, residuals, strongest_line
 from identify.discrepancy.maps import Kind, Map, maps
@@ -68,11 +70,12 @@ class Disagreement:
         Of the variable.
     share
         Share of the power of the joint's held-out residual, as whitened, that the dependence predicts as fitted on the
-        training data; of a frequency its share of the residual at the working rate.
+        training data; of a frequency its share of the residual at the working rate; of the motion what is not noise.
     p_value
         That a joint without the dependence shows it so clearly, of this one test.
     curve
-        Its shape; of a frequency the spectrum around it.
+        Its shape; of a frequency the spectrum around it; of the motion the root of the residual's density, per root of
+        a hertz, and the noise's for a band.
     """
 
     joint: str
@@ -95,7 +98,10 @@ class Disagreement:
     @property
     def hint(self) -> str:
         """What to look for, for whoever stands at the machine."""
-        at = self.curve.x[int(np.argmax(np.abs(self.curve.value)))]
+        height = np.abs(self.curve.value)
+        if self.kind == "motion":
+            height = height / self.curve.band
+        at = self.curve.x[int(np.argmax(height))]
         return hint_of(self.kind, self.joint, self.other, f"{at:.3g} {self.unit}")
 
 
@@ -164,6 +170,32 @@ def unexplained(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Surv
     return sorted(found, key=lambda d: -d.share)
 
 
+def beyond_noise(fit: Fit, left: Sequence[Disagreement], alpha: float = 0.01) -> list[Disagreement]:
+    """What is left, with the joints whose residual is more than noise although nothing named explains most of that.
+
+    Parameters
+    ----------
+    fit
+        Of the model as it stands.
+    left
+        What is left of it by name.
+    alpha
+        Chance of a false alarm over all joints.
+    """
+    found = list(left)
+    for excess in excesses(fit, alpha):
+        joint = fit.study.joints[excess.joint]
+        named = sum(d.share for d in left if d.joint == joint and d.kind != "frequency")
+        if named < 0.5 * excess.share:
+            found.append(_moving(joint, excess))
+    return sorted(found, key=lambda d: -d.share)
+
+
+def _moving(joint: str, excess: Excess) -> Disagreement:
+    curve = Curve(excess.f, excess.amplitude, excess.noise)
+    return Disagreement(joint, "motion", None, unit_of("motion", ""), excess.share, excess.p_value, curve)
+
+
 @dataclass(frozen=True, eq=False)
 class _Found:
     """A map and how it did."""
@@ -190,7 +222,7 @@ class _Found:
             m.kind,
             other,
             unit_of(m.kind, study.robot.joints[m.joint if m.other is None else m.other].type),
-            self.trial.share,
+            min(self.trial.share, 1.0),
             self.trial.p_value,
             Curve(x, value, band),
         )

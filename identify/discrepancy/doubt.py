@@ -1,0 +1,105 @@
+"""Findings that do not convince once all is said: their place goes to a likelier effect, or to what is unexplained."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from configs import DataError
+from identify.discrepancy.findings import CLOSE, described
+from identify.discrepancy.regression import relative_errors
+from identify.discrepancy.search import MOST, Search, State, added, places_of, without
+from identify.discrepancy.where import Disagreement, Survey, unexplained
+from identify.document import Finding
+
+CONVINCING = 0.5
+"""Confidence, with that of effects which do just as well, under which a name is more probably wrong than right."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What is left of a search when nothing of it is in doubt.
+
+    Parameters
+    ----------
+    state
+        The model with what convinces.
+    findings, considered
+        What was added to the model, and what was taken out again or never convinced.
+    left
+        Dependences of the residual of that model.
+    """
+
+    state: State
+    findings: tuple[Finding, ...]
+    considered: tuple[Finding, ...]
+    left: tuple[Disagreement, ...]
+
+
+def convincing(search: Search, first: State, final: State, seen: Survey) -> Outcome:
+    """Take out, one after the other, the findings that convince least.
+
+    Where a joint lacks something that the catalogue has no entry for, many an effect takes a part of it, and does so on
+    unseen data, too: the arm makes similar motions there, and what is wrong repeats with them. Noise cannot do that, so
+    no test against noise refuses them. A finding is right only if it leaves less unnamed than it explains, and if no
+    other effect in its place is twenty times likelier; such a rival takes its place.
+
+    Parameters
+    ----------
+    first, final
+        Model as configured, and at the end of the search.
+    seen
+        Survey of the first.
+    """
+    considered: list[Finding] = []
+    been = {places_of(final)}
+    for _ in range(2 * MOST):
+        left = unexplained(
+            final.fit, final.workshop, search.settings.false_alarms, seen=seen if final is first else None
+        )
+        findings = described(search, first, final, left)
+        worst = min(range(len(findings)), key=lambda k: _confidence(findings[k]), default=None)
+        if worst is None or _confidence(findings[worst]) >= CONVINCING:
+            break
+        considered.append(findings[worst])
+        search.progress(f"taking out {findings[worst].effect}")
+        final = _without(search, first, final, worst, been)
+        been.add(places_of(final))
+    return Outcome(final, tuple(findings), _unique(considered, findings), tuple(left))
+
+
+def _confidence(finding: Finding) -> float:
+    return float(finding.evidence["confidence_with_equals"])
+
+
+def _without(
+    search: Search, first: State, final: State, finding: int, been: set[tuple[tuple[str, str, str], ...]]
+) -> State:
+    """The model without a finding, or with the effect that beats it."""
+    number = len(first.study.robot.effects) + finding
+    stanza = final.study.robot.effects[number]
+    rest = search.state(without(final.study.robot, number), final)
+    mine = [
+        t.score
+        for t in rest.trials
+        if (t.candidate.effect.name, rest.study.joints[t.candidate.place.joint]) == (stanza.effect, stanza.joint)
+    ]
+    for best in rest.passing(search.settings)[:1]:
+        if mine and best.score < max(mine) + CLOSE:
+            continue
+        try:
+            other = search.state(added(rest.study.robot, best), rest)
+        except DataError:
+            continue
+        nearer = relative_errors(other.fit, held=True)[0] < relative_errors(rest.fit, held=True)[0]
+        if nearer and places_of(other) not in been:
+            return other
+    return rest
+
+
+def _unique(considered: Sequence[Finding], findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Each once, and none that came back."""
+    kept: dict[tuple[str, str, str | None], Finding] = {}
+    stated = {(f.effect, f.joint, f.other) for f in findings}
+    for f in considered:
+        if (f.effect, f.joint, f.other) not in stated:
+            kept.setdefault((f.effect, f.joint, f.other), f)
+    return tuple(kept.values())
