@@ -122,10 +122,15 @@ class Map:
         )
 
 
-def hats(x: Array, knots: Sequence[float]) -> Array:
+def hats(x: Array, knots: Sequence[float] | Array) -> Array:
     """Piecewise linear functions (N, k), one at each knot, constant beyond the outermost."""
-    unit = np.eye(len(knots))
-    return np.stack([np.interp(x, knots, row) for row in unit], axis=1)
+    at = np.asarray(knots, dtype=np.float64)
+    left = np.clip(np.searchsorted(at, x, side="right") - 1, 0, at.size - 2)
+    share = np.clip((x - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
+    out, rows = np.zeros((x.size, at.size)), np.arange(x.size)
+    out[rows, left] = 1.0 - share
+    out[rows, left + 1] = share
+    return out
 
 
 def maps(study: Study, motions: Sequence[Motion]) -> Iterator[Map]:

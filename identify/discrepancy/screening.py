@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from identify.catalogue.motion import Motion
 from identify.discrepancy.candidates import Candidate, Shapes, Workshop
+from identify.discrepancy.maps import hats
 from identify.discrepancy.regression import MAX_AR_ORDER, Fit, noise_models
 from identify.discrepancy.shaping import instrumented
 from identify.discrepancy.trial import refined, screened
@@ -90,4 +91,4 @@ def _hats(values: Array, knots: int) -> Array:
     places = np.unique(np.quantile(values, np.linspace(0, 1, knots)))
     if places.size < 2:
         return np.ones((values.size, 1))
-    return np.stack([np.interp(values, places, row) for row in np.eye(places.size)], axis=1)
+    return hats(values, places)
