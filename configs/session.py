@@ -54,11 +54,22 @@ class Setpoints(Frozen):
     settle_s: Annotated[float, Field(ge=0)] = 0.5
 
 
+TriggerName = Literal["emcy", "heartbeat_lost", "command"]
+
+
+class Trigger(Frozen):
+    """Write only around events: what happened up to ``before_s`` before one, and until ``after_s`` after it."""
+
+    before_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    after_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
+    events: Annotated[tuple[TriggerName, ...], Field(min_length=1)] = ("emcy", "heartbeat_lost", "command")
+
+
 class RecordingOptions(Frozen):
     """Where and how recordings are written, when a new file is begun, and how long files are kept.
 
-    Without ``rotate_mb`` and ``rotate_minutes`` a capture is one file; without ``keep_days`` and ``min_free_gb``
-    nothing is ever deleted.
+    With ``trigger`` only events are written. Without ``rotate_mb`` and ``rotate_minutes`` a capture is one file;
+    without ``keep_days`` and ``min_free_gb`` nothing is ever deleted.
     """
 
     directory: Path = Path("recordings")
@@ -68,6 +79,7 @@ class RecordingOptions(Frozen):
     rotate_minutes: Annotated[float, Field(gt=0)] | None = None
     keep_days: Annotated[float, Field(gt=0)] | None = None
     min_free_gb: Annotated[float, Field(gt=0)] | None = None
+    trigger: Trigger | None = None
 
 
 class ZenohOptions(Frozen):

@@ -28,8 +28,9 @@ from daq.facts import host_facts
 from daq.motion import Motion, plan_motion
 from daq.publisher import Publisher
 from daq.recording import Mark
+from daq.remote import Command
 from daq.sink import Sink
-from daq.storage import kept_tidy, open_series
+from daq.storage import capture_stamp, kept_tidy, open_series
 from daq.streams import CapturedStream, captured_streams
 from daq.zenoh_keys import Keys
 from drivers.bus_load import check_fits
@@ -100,7 +101,9 @@ def prepare(config: str | Path, out: Path | None, duration: float | None, listen
     return Order(session, robot, captured_streams(session, robot), trajectory, directory, duration, listen_only)
 
 
-def capture(order: Order, stop: threading.Event, say: Callable[[str], None]) -> Captured:
+def capture(
+    order: Order, stop: threading.Event, say: Callable[[str], None], save: threading.Event | None = None
+) -> Captured:
     """Run one capture from the first SDO to the finished file.
 
     Parameters
@@ -111,6 +114,8 @@ def capture(order: Order, stop: threading.Event, say: Callable[[str], None]) -> 
         Set it to end the capture; the file is finished all the same.
     say
         Takes lines that tell how it goes.
+    save
+        Set it to have the last seconds written, where only events are.
 
     Returns
     -------
@@ -124,11 +129,12 @@ def capture(order: Order, stop: threading.Event, say: Callable[[str], None]) -> 
     """
     session, robot = order.session, order.robot
     now = datetime.datetime.now(datetime.UTC)
-    name = f"{robot.name}-{now:%Y%m%dT%H%M%S}-{now.microsecond // 1000:03d}Z"
+    name = f"{robot.name}-{capture_stamp(now)}"
     with ExitStack() as stack:
         metadata = host_facts(now) | {"capture": name, "cell": session.cell}
         rate = 1.0 / session.sync_period
-        writer = stack.enter_context(open_series(session, robot, order.streams, order.directory, name, metadata))
+        writer = open_series(session, robot, order.streams, order.directory, name, metadata)
+        stack.callback(writer.__exit__, None, None, None)
         stack.enter_context(kept_tidy(session.recording, order.directory, robot.name, say))
         try:
             bus = stack.enter_context(open_bus(session.bus, filters=_filters(order)))
@@ -136,13 +142,25 @@ def capture(order: Order, stop: threading.Event, say: Callable[[str], None]) -> 
                 say(NOTE)
             publisher = Publisher(session, Keys(session.cell, robot.name))
             stack.callback(publisher.close)
-            run = _Run(order, bus, Sink(writer, publisher, order.streams, name), publisher, stop, say)
+            run = _Run(
+                order,
+                bus,
+                Sink(writer, publisher, order.streams, name),
+                publisher,
+                stop,
+                save or threading.Event(),
+                say,
+            )
             run.start(stack)
         except BaseException:
             writer.abort()
             raise
         run.sink.announce(robot, session, rate, metadata)
-        say(f"recording to {writer.path}")
+        trigger = session.recording.trigger
+        if trigger is None:
+            say(f"recording to {writer.path}")
+        else:
+            say(f"keeping the last {trigger.before_s:g} s; written on {', '.join(trigger.events)}")
         trouble = run.record()
         counters = run.counters()
         run.sink.finish(counters)
@@ -166,6 +184,7 @@ class _Run:
         sink: Sink,
         publisher: Publisher,
         stop: threading.Event,
+        save: threading.Event,
         say: Callable[[str], None],
     ) -> None:
         self.sink = sink
@@ -186,6 +205,8 @@ class _Run:
         self._span: tuple[int, int] | None = None
         self._frames_before = 0
         self._events = {"emcy": 0, "heartbeat_lost": 0}
+        self._triggers = () if session.recording.trigger is None else session.recording.trigger.events
+        self._save = save
         self._lost_rows = 0
         self._writing = True
 
@@ -291,6 +312,7 @@ class _Run:
         """Look after SYNC and drives; a drive that fails while we move the arm ends the capture."""
         if self._producer is not None:
             self._producer.check()
+        self._obey()
         for event in self._master.supervise() if self._master is not None else ():
             if event.kind in ("emcy", "heartbeat_lost"):
                 self._events[event.kind] += 1
@@ -298,9 +320,27 @@ class _Run:
             else:
                 self.sink.mark("note", max(self._assembler.last_sync, 0), event.text)
             self._say(event.text)
+            if event.kind in self._triggers:
+                self.sink.trigger()
             failed = event.kind == "heartbeat_lost" or (event.kind == "emcy" and event.code != 0)
             if failed and self._motion is not None:
                 raise ArmidentError(f"{event.text}; the arm was stopped")
+
+    def _obey(self) -> None:
+        """Do what was asked over Zenoh or by SIGUSR1."""
+        asked = self._publisher.commands.pending()
+        if self._save.is_set():
+            self._save.clear()
+            asked.append(Command("save", "SIGUSR1"))
+        for command in asked:
+            if command.name == "stop":
+                self._say("stopped by a command")
+                self._stop.set()
+                continue
+            text = command.text if command.name == "mark" else f"save: {command.text}".rstrip(": ")
+            self.sink.mark("note", max(self._assembler.last_sync, 0), text)
+            if command.name == "save" and "command" in self._triggers:
+                self.sink.trigger()
 
     def _mark_start(self) -> None:
         if self._span is None and self._motion is None and self.sink.first_sync is not None:
@@ -371,7 +411,7 @@ class _Run:
         self._tell_of_disk()
         self._publisher.health(
             {
-                "file": self.sink.path.name,
+                "file": None if self.sink.path is None else self.sink.path.name,
                 "rows_not_written": self.sink.lost_rows,
                 "sync": self._assembler.last_sync,
                 "frames_per_s": round(rate, 1),
@@ -397,14 +437,15 @@ def run_capture(config: str, out: Path | None, duration: float | None, listen_on
         If the bus or a drive failed on the way; the file is finished then too.
     """
     order = prepare(config, out, duration, listen_only)
-    stop = threading.Event()
+    stop, save = threading.Event(), threading.Event()
+    signal.signal(signal.SIGUSR1, lambda *_: save.set())
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
 
     def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
-    done = capture(order, stop, say)
+    done = capture(order, stop, say, save)
     rows, gaps = done.counters["samples.rows"], done.counters["samples.in_gaps"]
     say(f"recorded {rows} samples, {gaps} in gaps, {done.counters['kernel_drops']} frames dropped by the kernel")
     if as_json:

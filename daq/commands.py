@@ -25,6 +25,29 @@ def capture(
     run_capture(config, out, duration, listen_only, as_json)
 
 
+def command(
+    name: Annotated[str, typer.Argument(help="save, mark or stop.")],
+    text: Annotated[str, typer.Argument(help="What a mark says.")] = "",
+    config: Annotated[str, typer.Option("--config", help="Session configuration of the capture.")] = "tx40_cell.yaml",
+) -> None:
+    """Ask a running capture for something: save what was just recorded, set a mark, or stop.
+
+    The session of the capture has to allow it (zenoh.commands: true). `save` is for sessions with recording.trigger,
+    which keep only what happens around events; `systemctl kill -s USR1` asks for the same without Zenoh.
+
+    Example: armident command mark "gripper changed" --config cell.yaml
+    """
+    from configs import ConfigError, load_robot, load_session
+    from daq.remote import COMMANDS, Command, send_command
+
+    known = next((each for each in COMMANDS if each == name), None)
+    if known is None:
+        raise ConfigError(f"no command {name!r}; there are {', '.join(COMMANDS)}")
+    session = load_session(config)
+    send_command(session, load_robot(session.robot).name, Command(known, text))
+    print(f"{name}: accepted")
+
+
 def import_(
     file: Annotated[Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, rosbag2's MCAP, or the log of a bus.")],
     config: Annotated[str, typer.Option("--config", help="Robot configuration; of a bus log the session's.")],

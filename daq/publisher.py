@@ -10,6 +10,7 @@ import zenoh
 import zenoh.ext
 
 from configs import SessionConfig
+from daq.remote import Commands
 from daq.zenoh_keys import Block, Keys, encode_block, open_session
 
 _EVENTS_KEPT = 64
@@ -48,6 +49,7 @@ class Publisher:
         self._closing = False
         self._keys = keys
         self._session = open_session(session, "capture")
+        self.commands = Commands(self._session, keys, session.zenoh.commands)
         self._token = self._session.liveliness().declare_token(keys.alive("capture"))
         self._samples = self._advanced(keys.samples, session.zenoh.cache_blocks, zenoh.CongestionControl.DROP)
         self._events = self._advanced(keys.events, _EVENTS_KEPT, zenoh.CongestionControl.BLOCK)

@@ -10,7 +10,7 @@ import numpy as np
 from configs import RobotConfig, SessionConfig
 from daq.assembler import Batch, Rows
 from daq.publisher import Publisher
-from daq.recording import Gap, Mark, RecordingSeries
+from daq.recording import Gap, Mark, RecordingSeries, TriggeredSeries
 from daq.recording.model import MarkKind
 from daq.streams import CapturedStream
 from daq.zenoh_keys import Block, encode_event
@@ -33,7 +33,11 @@ class Sink:
     """
 
     def __init__(
-        self, writer: RecordingSeries, publisher: Publisher, streams: Sequence[CapturedStream], capture: str
+        self,
+        writer: RecordingSeries | TriggeredSeries,
+        publisher: Publisher,
+        streams: Sequence[CapturedStream],
+        capture: str,
     ) -> None:
         self.gaps: list[Gap] = []
         self.marks: list[Mark] = []
@@ -46,8 +50,8 @@ class Sink:
         self._planned: list[tuple[MarkKind, int, str]] = []
 
     @property
-    def path(self) -> Path:
-        """The file being written."""
+    def path(self) -> Path | None:
+        """The file being written, if one is."""
         return self._writer.path
 
     @property
@@ -72,6 +76,10 @@ class Sink:
         """Place a mark at a SYNC, now or when that SYNC has come."""
         self._planned.append((kind, sync, text))
         self._place_marks(False)
+
+    def trigger(self) -> None:
+        """Have what was just recorded, and what follows, written where only events are."""
+        self._writer.trigger(self.last_ns)
 
     def move_mark(self, kind: MarkKind, sync: int, text: str) -> None:
         """Bring a mark forward that was planned for later."""
@@ -112,8 +120,8 @@ class Sink:
         counters["zenoh.blocks_dropped"] = self._publisher.dropped
         counters["gaps"] = len(self.gaps)
         self._writer.close(counters)
-        path = self._writer.path.resolve()
-        content = end_content(self._capture, self._blocks, counters, self.gaps, self.marks, path)
+        paths = [path.resolve() for path in self._writer.paths]
+        content = end_content(self._capture, self._blocks, counters, self.gaps, self.marks, paths)
         self._publisher.event(encode_event("experiment_end", content))
 
     def _place_marks(self, final: bool, rows: Rows | None = None) -> None:

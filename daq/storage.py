@@ -7,7 +7,7 @@ from pathlib import Path
 
 from configs import RobotConfig, SessionConfig
 from configs.session import RecordingOptions
-from daq.recording import RecordingSeries, RecordingWriter
+from daq.recording import RecordingSeries, RecordingWriter, TriggeredSeries
 from daq.recording.retention import Janitor, prune
 from daq.streams import CapturedStream
 
@@ -19,8 +19,8 @@ def open_series(
     directory: Path,
     name: str,
     metadata: dict[str, str],
-) -> RecordingSeries:
-    """Begin the files of a capture.
+) -> RecordingSeries | TriggeredSeries:
+    """Begin the files of a capture, or what keeps its last seconds until there is something to write.
 
     Raises
     ------
@@ -37,7 +37,20 @@ def open_series(
 
     max_bytes = None if options.rotate_mb is None else round(options.rotate_mb * 1e6)
     max_ns = None if options.rotate_minutes is None else round(options.rotate_minutes * 60e9)
-    return RecordingSeries(begin, directory, name, max_bytes, max_ns)
+    if options.trigger is None:
+        return RecordingSeries(begin, directory, name, max_bytes, max_ns)
+
+    def event(_: int) -> RecordingSeries:
+        now = capture_stamp(datetime.datetime.now(datetime.UTC))
+        return RecordingSeries(begin, directory, f"{robot.name}-{now}", max_bytes, max_ns)
+
+    before, after = (round(seconds * 1e9) for seconds in (options.trigger.before_s, options.trigger.after_s))
+    return TriggeredSeries(event, before, after)
+
+
+def capture_stamp(now: datetime.datetime) -> str:
+    """The time in the names of recordings, to the millisecond, in UTC."""
+    return f"{now:%Y%m%dT%H%M%S}-{now.microsecond // 1000:03d}Z"
 
 
 @contextmanager

@@ -15,7 +15,7 @@ import zenoh
 import zenoh.ext
 
 from configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
-from daq.recording import Recording, read_recording
+from daq.recording import Recording, join_parts, read_recording
 from daq.zenoh_keys import Block, Keys, assemble, decode_block, decode_event, open_session
 from identify.document import to_json
 from identify.options import Options
@@ -58,10 +58,12 @@ class Assembly:
         recording = assemble(self.start, self.blocks.values(), self.end)
         if recording.missing is None:
             return recording
-        path = Path(self.end["path"])
-        if not path.is_file():
-            raise DataError(f"capture {self.capture}: {recording.missing}, and its file {path} is not here")
-        return read_recording(path)
+        paths = [Path(path) for path in self.end["paths"]]
+        absent = [str(path) for path in paths if not path.is_file()]
+        if absent or not paths:
+            where = f"its file {absent[0]} is not here" if absent else "it was not written to a file"
+            raise DataError(f"capture {self.capture}: {recording.missing}, and {where}")
+        return join_parts([read_recording(path) for path in paths])
 
 
 class Worker:

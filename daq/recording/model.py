@@ -1,14 +1,15 @@
 """What a recording is once it is read: raw numbers in arrays, and what they mean."""
 
 import hashlib
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig, SessionConfig
+from configs import DataError, RobotConfig, SessionConfig
 
 Quantity = Literal["position", "velocity", "current", "voltage", "torque", "demand", "status"]
 Side = Literal["motor", "joint"]
@@ -74,6 +75,31 @@ class Mark:
     sync: int
     t_ns: int
     text: str = ""
+
+
+def join_parts(parts: "Sequence[Recording]") -> "Recording":
+    """The recording whose files, in order, are the parts of one capture.
+
+    Raises
+    ------
+    DataError
+        If they are not: SYNC numbers that do not go on, or other streams.
+    """
+    last = parts[-1]
+    if len(parts) == 1:
+        return last
+    streams = {}
+    for name, stream in last.streams.items():
+        pieces = [part.streams[name] for part in parts if name in part.streams]
+        sync = np.concatenate([piece.sync for piece in pieces])
+        if len(pieces) != len(parts) or np.any(np.diff(sync) <= 0):
+            raise DataError(f"{last.path}: stream {name} does not go on from file to file; are they of one capture?")
+        raw = {field: np.concatenate([piece.raw[field] for piece in pieces]) for field in stream.fields}
+        streams[name] = replace(stream, sync=sync, t_ns=np.concatenate([piece.t_ns for piece in pieces]), raw=raw)
+    missing = "; ".join(part.missing for part in parts if part.missing is not None) or None
+    gaps = tuple(gap for part in parts for gap in part.gaps)
+    marks = tuple(mark for part in parts for mark in part.marks)
+    return replace(last, streams=streams, gaps=gaps, marks=marks, missing=missing)
 
 
 @dataclass(frozen=True)

@@ -115,6 +115,13 @@ class RecordingSeries:
         """
         self._writer.close(counters)
 
+    def finish(self) -> None:
+        """Finish the last file with what can be counted of it; one that cannot be is left as a torn one."""
+        self._finish(self._writer)
+
+    def trigger(self, t_ns: int) -> None:
+        """Everything is written anyway."""
+
     def abort(self) -> None:
         """Leave nothing behind of a capture that did not begin."""
         self._writer.abort()
@@ -139,7 +146,8 @@ class RecordingSeries:
     def _finish(self, writer: RecordingWriter) -> None:
         """Close a full file with what can be counted of it; one that cannot be finished is left as a torn one."""
         writer.flush()
-        self._lost_before += writer.lost_rows
+        if writer is not self._writer:
+            self._lost_before += writer.lost_rows
         self._problem = writer.problem or self._problem
         counters = {f"{name}.rows": count for name, count in writer.rows.items()}
         with contextlib.suppress(ConfigError):

@@ -8,7 +8,7 @@ endian, row by row.
 import json
 import struct
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -136,16 +136,21 @@ def start_content(
 
 
 def end_content(
-    capture: str, blocks: int, counters: Mapping[str, int], gaps: Iterable[Gap], marks: Iterable[Mark], path: Path
+    capture: str,
+    blocks: int,
+    counters: Mapping[str, int],
+    gaps: Iterable[Gap],
+    marks: Iterable[Mark],
+    paths: Sequence[Path],
 ) -> dict[str, Any]:
-    """What an ``experiment_end`` event says: what a complete assembly has to contain, and where the file is."""
+    """What an ``experiment_end`` event says: what a complete assembly has to contain, and where the files are."""
     return {
         "capture": capture,
         "blocks": blocks,
         "counters": dict(counters),
         "gaps": [asdict(gap) for gap in gaps],
         "marks": [asdict(mark) for mark in marks],
-        "path": str(path),
+        "paths": [str(path) for path in paths],
     }
 
 
@@ -180,7 +185,7 @@ def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str
         marks = tuple(Mark(**mark) for mark in end["marks"])
         counters = {str(key): int(value) for key, value in end["counters"].items()}
         metadata = {str(key): str(value) for key, value in start["metadata"].items()}
-        path = Path(end["path"])
+        path = Path(end["paths"][-1]) if end["paths"] else None
     except (KeyError, TypeError, ValueError, ValidationError) as error:
         raise DataError(f"an event that cannot be understood: {str(error).splitlines()[0]}") from error
     by_number = {block.sequence: block for block in blocks if 0 <= block.sequence < total}

@@ -45,6 +45,10 @@ class Keys:
         """The last diagnosis document (published, and answered to queries)."""
         return f"{self.base}/result/diagnosis"
 
+    def command(self, name: str) -> str:
+        """A command to the capture (``save``, ``mark``, ``stop``), answered like a query."""
+        return f"{self.base}/command/{name}"
+
     def alive(self, component: str) -> str:
         """Liveliness token of a component (``capture``, ``worker``)."""
         return f"{self.base}/alive/{component}"

@@ -128,6 +128,43 @@ def test_files_follow_each_other_without_losing_a_sample(vcan_bus: str, tmp_path
 
 
 @pytest.mark.usefixtures("robot")
+def test_only_events_are_written_where_the_session_says_so(vcan_bus: str, tmp_path: Path) -> None:
+    """Saved by SIGUSR1 with the seconds before; a mark and the end come over Zenoh."""
+    changes = {
+        "recording": {"trigger": {"before_s": 20.0, "after_s": 1.0}},
+        "zenoh": {"commands": True},
+        "sync": {"period_us": 1000},
+    }
+    session = session_file(tmp_path, vcan_bus, "events", setpoints=None, **changes)
+    process = run("capture", "--config", session, "--out", tmp_path / "out")
+    assert process.stderr is not None
+    while "keeping the last 20 s" not in (line := process.stderr.readline()):
+        assert line, "capture ended"
+    time.sleep(5.0)
+    for words in (["mark", "gripper changed"], ["save"]):
+        asked = run("command", *words, "--config", session)
+        out, err = asked.communicate(timeout=60)
+        assert asked.returncode == 0, err
+        assert out == f"{words[0]}: accepted\n"
+    path = wait_for_file(tmp_path / "out", 20_000, process)
+    time.sleep(3.0)
+    process.send_signal(signal.SIGUSR1)
+    time.sleep(1.0)
+    run("command", "stop", "--config", session).communicate(timeout=60)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    files = [Path(name) for name in out.split()]
+    assert files[0] == path
+    assert len(files) == 2
+    first, second = (read_recording(file) for file in files)
+    assert first.missing is second.missing is None
+    assert "gripper changed" in [mark.text for mark in first.marks]
+    assert second.samples.sync[0] > first.samples.sync[-1]
+    assert first.samples.sync.size / 1000 >= 4.0
+    assert np.array_equal(np.diff(second.samples.sync), np.ones(second.samples.sync.size - 1))
+
+
+@pytest.mark.usefixtures("robot")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_with_a_finished_file(vcan_bus: str, tmp_path: Path, number: signal.Signals) -> None:
     session = session_file(tmp_path, vcan_bus, "signal", sync={"period_us": 1000}, setpoints=None)

@@ -78,7 +78,9 @@ def publish(
         if block.sequence != leave_out:
             publisher.offer(block)
     assert path or recording.path
-    end = end_content("c1", len(made), recording.counters, recording.gaps, recording.marks, path or recording.path)  # type: ignore[arg-type]
+    file = path or recording.path
+    assert file is not None
+    end = end_content("c1", len(made), recording.counters, recording.gaps, recording.marks, [file])
     publisher.event(encode_event("experiment_end", end))
     publisher.close()
 

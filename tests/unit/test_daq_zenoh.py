@@ -64,7 +64,7 @@ def blocks(count: int, rows: int = 50) -> list[Block]:
 def events(session: SessionConfig, total: int) -> tuple[dict[str, Any], dict[str, Any]]:
     start = start_content("c1", ROBOT, session, 5000.0, [SAMPLES, DEMAND], {"host": "x"})
     gaps, marks = [Gap("samples", 3, 4)], [Mark("experiment_start", 5, 9)]
-    end = end_content("c1", total, {"samples.rows": 50}, gaps, marks, Path("x.mcap"))
+    end = end_content("c1", total, {"samples.rows": 50}, gaps, marks, [Path("x.mcap")])
     return decode_event(encode_event("experiment_start", start)), decode_event(encode_event("experiment_end", end))
 
 
