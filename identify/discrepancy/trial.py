@@ -48,7 +48,7 @@ class Trial:
     away
         Change of the model's own parameters that goes with it, (b,).
     share
-        Share of the whitened held-out residuals' power of the joints concerned that the change takes away.
+        Share of the whitened held-out residual's power that the change takes away, at the joint that it changes most.
     score
         Gain in log-likelihood over both parts, less what fitting alone gains on the training part.
     """
@@ -173,8 +173,7 @@ def _judged(
     inflation = max(1.0, _newey_west(change * after) / size)
     variance = size * inflation + fit.spread(change)
     gain = float(before @ before - after @ after)
-    concerned = np.abs(columns.held_z).any(axis=1)
-    share = gain / max(float(before[concerned] @ before[concerned]), 1e-300)
+    share = _share_of_joint(change, before, after, [s.y.shape[0] for s in fit.study.held], fit.noise)
     fitted = 0.5 * (values.size + len(shapes))
     supported = 0.5 * (statistic + gain)
     evidence = _evidence(alone, fit, candidate, shapes, workshop, values, away)
@@ -191,6 +190,17 @@ def _judged(
         share,
         min(SUPPORT * supported, evidence) - fitted,
     )
+
+
+def _share_of_joint(
+    change: Array, before: Array, after: Array, lengths: Sequence[int], noise: Sequence[ArModel]
+) -> float:
+    """See `Trial.share`; rows (R,) of joint after joint, from stretches of ``lengths`` rows each."""
+    ends = np.cumsum([sum(length - ar.order for length in lengths) for ar in noise])
+    joints = [slice(end - size, end) for end, size in zip(ends, np.diff(ends, prepend=0), strict=True)]
+    most = max(joints, key=lambda rows: float(change[rows] @ change[rows]))
+    power = float(before[most] @ before[most])
+    return (power - float(after[most] @ after[most])) / max(power, 1e-300)
 
 
 def _calmed(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, calm: Sequence[ArModel]) -> Fit:
