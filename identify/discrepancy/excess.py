@@ -78,7 +78,7 @@ def excesses(fit: Fit, alpha: float = 0.01) -> list[Excess]:
     alpha
         Chance of a false alarm over all joints.
     """
-    every = (excess_of(fit, j, pieces) for j, pieces in enumerate(_pieces(fit)))
+    every = (excess_of(fit, j, own) for j, own in enumerate(pieces(fit)))
     return [e for e in every if e is not None and e.p_value < alpha / fit.study.robot.n and e.share >= MATERIAL]
 
 
@@ -119,7 +119,7 @@ def excess_of(fit: Fit, joint: int, pieces: Pieces) -> Excess | None:
     return Excess(joint, share, together, differences is not None, f, amplitude, known)
 
 
-def _pieces(fit: Fit) -> list[Pieces]:
+def pieces(fit: Fit) -> list[Pieces]:
     """Of every joint: sums and differences of repetitions, or else the held-out residual."""
     held = fit.errors(fit.theta, held=True)
     both = [*fit.errors(fit.theta, held=False), *held]

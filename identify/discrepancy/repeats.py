@@ -51,7 +51,7 @@ class Repeat:
         there = np.arange(values[self.second].shape[0], dtype=np.float64)
         spline = interpolate.CubicSpline(there, values[self.second], axis=0)
         a = values[self.first][self.rows]
-        b = spline(np.clip(there[self.again] + self.shift, 0.0, there[-1]))
+        b = spline(there[self.again] + self.shift)
         return (a + b) / np.sqrt(2.0), (a - b) / np.sqrt(2.0)
 
 
@@ -112,7 +112,9 @@ def _longest(
     at = int(np.argmin(np.where(nearly, misses, np.inf)))
     lag, size, first = int(lags[at]), int(length[at]), int(begin[at])
     shift = _vertex(misses[at - 1 : at + 2]) if 0 < at < lags.size - 1 else 0.0
-    return slice(first, first + size), slice(first + lag, first + lag + size), shift
+    # A row less at either end, for the shift.
+    rows = slice(first + 1, first + size - 1)
+    return rows, slice(rows.start + lag, rows.stop + lag), shift
 
 
 def _vertex(values: Array) -> float:
