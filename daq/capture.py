@@ -2,12 +2,13 @@
 
 import datetime
 import json
+import math
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from daq.remote import Command
 from daq.sink import Sink
 from daq.storage import capture_stamp, kept_tidy, open_series
 from daq.streams import CapturedStream, captured_streams
+from daq.systemd import Notifier
 from daq.zenoh_keys import Keys
 from drivers.bus_load import check_fits
 from drivers.frames import FrameBus, frames
@@ -133,6 +135,7 @@ def capture(
     with ExitStack() as stack:
         metadata = host_facts(now) | {"capture": name, "cell": session.cell}
         rate = 1.0 / session.sync_period
+        notifier = stack.enter_context(closing(Notifier()))
         writer = open_series(session, robot, order.streams, order.directory, name, metadata)
         stack.callback(writer.__exit__, None, None, None)
         stack.enter_context(kept_tidy(session.recording, order.directory, robot.name, say))
@@ -147,6 +150,7 @@ def capture(
                 bus,
                 Sink(writer, publisher, order.streams, name),
                 publisher,
+                notifier,
                 stop,
                 save or threading.Event(),
                 say,
@@ -161,7 +165,9 @@ def capture(
             say(f"recording to {writer.path}")
         else:
             say(f"keeping the last {trigger.before_s:g} s; written on {', '.join(trigger.events)}")
+        notifier.ready(f"{session.cell}: recording")
         trouble = run.record()
+        notifier.stopping()
         counters = run.counters()
         run.sink.finish(counters)
         if writer.problem is not None:
@@ -183,12 +189,14 @@ class _Run:
         bus: FrameBus,
         sink: Sink,
         publisher: Publisher,
+        notifier: Notifier,
         stop: threading.Event,
         save: threading.Event,
         say: Callable[[str], None],
     ) -> None:
         self.sink = sink
         self._order, self._bus, self._publisher, self._stop, self._say = order, bus, publisher, stop, say
+        self._notifier = notifier
         session = order.session
         self._assembler = Assembler(
             [stream.bus for stream in order.streams],
@@ -207,6 +215,7 @@ class _Run:
         self._events = {"emcy": 0, "heartbeat_lost": 0}
         self._triggers = () if session.recording.trigger is None else session.recording.trigger.events
         self._save = save
+        self._fed = -math.inf
         self._lost_rows = 0
         self._writing = True
 
@@ -306,6 +315,10 @@ class _Run:
             total += got
             if got < BATCH:
                 break
+        # Our own SYNCs come back to us: without any, the bus is dead or we are. A foreign SYNC may rest.
+        if (total or self._producer is None) and time.monotonic() - self._fed >= HEALTH_S:
+            self._fed = time.monotonic()
+            self._notifier.progress(f"SYNC {self._assembler.last_sync}")
         return total
 
     def _watch(self) -> None:

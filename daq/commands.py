@@ -130,6 +130,21 @@ def export(
     print(out)
 
 
+def doctor(
+    config: Annotated[str, typer.Option("--config", help="Session configuration.")] = "tx40_cell.yaml",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
+) -> None:
+    """Check a session and this machine before a capture: configuration, bus, clock, disk, Zenoh.
+
+    Nothing is sent to the bus. Exit code 2 if a capture would not run; warnings alone are exit code 0.
+
+    Example: armident doctor --config cell.yaml
+    """
+    from daq.doctor import doctor as examine
+
+    examine(config, print, as_json)
+
+
 def heal(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings that were not finished.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print what became of them as JSON.")] = False,

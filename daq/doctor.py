@@ -1,0 +1,228 @@
+"""Checks a machine and a session before a capture is started: what would fail, and what to do about it."""
+
+import ctypes
+import json
+import os
+import shutil
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
+from daq.streams import captured_streams
+from daq.zenoh_keys.session import configuration, endpoints
+from drivers.bus_load import check_fits
+from drivers.socketcan import RECEIVE_BUFFER, RawSocket
+from drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
+
+Verdict = Literal["ok", "warning", "failed"]
+
+_LEAST_HOURS = 24.0
+"""Hours of recording that the disk should have room for."""
+_TIME_ERROR, _UNSYNCHRONISED = 5, 0x0040
+"""What adjtimex(2) returns, or sets in its status, while nothing disciplines the clock."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at: what, how it is, and in words what was found and what to do."""
+
+    what: str
+    verdict: Verdict
+    found: str
+
+
+def examine(config: str | Path) -> list[Check]:
+    """Look at everything that a capture of a session needs; nothing is sent, and nothing is written but a probe.
+
+    What depends on the configuration is left out where that cannot be read, which is a check of its own.
+    """
+    checks: list[Check] = []
+    try:
+        session = load_session(config)
+        robot = load_robot(session.robot)
+        captured_streams(session, robot)
+        if session.setpoints is not None:
+            trajectory = load_trajectory(session.setpoints.trajectory)
+            trajectory.check(robot, str(session.setpoints.trajectory))
+        checks.append(Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}"))
+    except ArmidentError as error:
+        return [Check("configuration", "failed", str(error)), _clock()]
+    checks += [_bus_load(session, config), *_interface(session), _clock()]
+    checks += [*_disk(session, robot), _zenoh(session)]
+    return checks
+
+
+def _bus_load(session: SessionConfig, config: str | Path) -> Check:
+    if session.bus.bitrate is None:
+        return Check("bus load", "ok", "a virtual bus has no bit rate to fill")
+    try:
+        check_fits(session, str(config))
+    except ConfigError as error:
+        return Check("bus load", "failed", str(error))
+    return Check("bus load", "ok", f"fits {session.bus.bitrate / 1e6:g} Mbit/s even in the worst case")
+
+
+def _interface(session: SessionConfig) -> Iterator[Check]:
+    """The interface of the bus, its state, and whether its bit rate is the configured one."""
+    name = session.bus.channel
+    if session.bus.interface == "udp_multicast":
+        yield Check(
+            "bus", "warning", "UDP multicast stands in for a bus: frames may be lost and times are not the kernel's"
+        )
+        return
+    if not have_socketcan():
+        yield Check("bus", "failed", "this kernel has no SocketCAN; try: sudo modprobe -a can_raw vcan")
+        return
+    if not (NETWORK / name).exists():
+        have = ", ".join(sorted(path.name for path in NETWORK.iterdir() if _is_can(path))) or "none"
+        yield Check("bus", "failed", f"no interface {name}; CAN interfaces here: {have}")
+        return
+    if not is_up(name):
+        yield Check("bus", "failed", f"{name} is down; try: sudo ip link set {name} up")
+        return
+    details = _link(name)
+    timing = details.get("bittiming")
+    actual = timing.get("bitrate") if isinstance(timing, dict) else None
+    wanted = session.bus.bitrate
+    if wanted is not None and actual is not None and actual != wanted:
+        yield Check("bus", "failed", f"{name} runs at {actual} bit/s, the configuration says {wanted}")
+        return
+    state = details.get("state")
+    if state not in (None, "ERROR-ACTIVE"):
+        yield Check("bus", "warning", f"{name} is {state}: look at its cabling and termination")
+        return
+    yield Check("bus", "ok", f"{name} is up" + (f" at {actual} bit/s" if actual else ""))
+    yield _receive_buffer(name)
+
+
+def _is_can(path: Path) -> bool:
+    try:
+        return (path / "type").read_text().strip() == "280"
+    except OSError:
+        return False
+
+
+def _link(name: str) -> dict[str, object]:
+    """What `ip` knows of a CAN interface: state and bit timing; nothing where it cannot be asked."""
+    try:
+        done = subprocess.run(
+            ["ip", "-json", "-details", "link", "show", "dev", name],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=5,
+        )
+        data = json.loads(done.stdout)[0].get("linkinfo", {}).get("info_data", {})
+    except (OSError, subprocess.SubprocessError, ValueError, LookupError):
+        return {}
+    return dict(data)
+
+
+def _receive_buffer(channel: str) -> Check:
+    """Whether the kernel keeps as many frames as the capture asks for, while it cannot look."""
+    try:
+        with RawSocket(channel) as bus:
+            given = bus.receive_buffer
+    except ArmidentError as error:
+        return Check("receive buffer", "failed", str(error))
+    if given >= RECEIVE_BUFFER:
+        return Check("receive buffer", "ok", f"{given / 1e6:.1f} MB")
+    return Check(
+        "receive buffer",
+        "warning",
+        f"the kernel gives {given / 1e6:.1f} of {RECEIVE_BUFFER / 1e6:.1f} MB: frames may be dropped while the machine "
+        f"is busy. Give the capture CAP_NET_ADMIN, or: sudo sysctl net.core.rmem_max={RECEIVE_BUFFER}",
+    )
+
+
+def _clock() -> Check:
+    """Whether something disciplines the clock, and which source it has."""
+    source = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    name = source.read_text().strip() if source.is_file() else "unknown"
+    buffer = ctypes.create_string_buffer(512)
+    state = ctypes.CDLL(None, use_errno=True).adjtimex(buffer)
+    # struct timex begins: unsigned modes, long offset, long freq, long maxerror, long esterror, int status.
+    status = ctypes.c_int.from_buffer(buffer, 40).value
+    if state < 0:
+        return Check("clock", "warning", f"source {name}; its state cannot be asked: {os.strerror(ctypes.get_errno())}")
+    if state == _TIME_ERROR or status & _UNSYNCHRONISED:
+        return Check(
+            "clock", "warning", f"source {name}, not synchronised: run chrony, or times of several machines drift apart"
+        )
+    return Check("clock", "ok", f"source {name}, synchronised")
+
+
+def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:
+    """Whether recordings can be written, and how long there is room."""
+    folder = session.recording.directory
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".armident-doctor.{os.getpid()}"
+        with probe.open("xb") as file:
+            file.write(b"\0" * 4096)
+            os.fsync(file.fileno())
+        probe.unlink()
+    except OSError as error:
+        yield Check("recordings", "failed", f"{folder}: cannot be written: {error.strerror}")
+        return
+    free = shutil.disk_usage(folder).free
+    rate = (
+        sum(s.layout.record[0].itemsize / s.layout.every for s in captured_streams(session, robot))
+        / session.sync_period
+    )
+    hours = free / rate / 3600
+    found = f"{folder}: {free / 1e9:.1f} GB free, at least {hours:.0f} h ({rate * 3.6e-6:.0f} MB/h before compression)"
+    options = session.recording
+    if hours < _LEAST_HOURS and options.keep_days is None and options.min_free_gb is None:
+        yield Check("recordings", "warning", f"{found}; recording.min_free_gb or keep_days would make room")
+    elif options.min_free_gb is not None and free < options.min_free_gb * 1e9:
+        yield Check(
+            "recordings",
+            "warning",
+            f"{found}, less than min_free_gb {options.min_free_gb:g}: old captures will be deleted",
+        )
+    else:
+        yield Check("recordings", "ok", found)
+
+
+def _zenoh(session: SessionConfig) -> Check:
+    """Whether Zenoh understands its configuration, and the capture's own port is free."""
+    try:
+        configuration(session, "capture")
+    except ConfigError as error:
+        return Check("zenoh", "failed", str(error))
+    if session.zenoh.config is not None or session.zenoh.listen:
+        return Check("zenoh", "ok", "configured by the session")
+    host, _, port = endpoints(session)["capture"].removeprefix("tcp/").rpartition(":")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, int(port)))
+        except OSError as error:
+            return Check(
+                "zenoh", "warning", f"{host}:{port}: {error.strerror}; does a capture of this cell run already?"
+            )
+    return Check("zenoh", "ok", f"peers on loopback, port {port}")
+
+
+def doctor(config: str, say: Callable[[str], None], as_json: bool) -> None:
+    """``armident doctor``.
+
+    Raises
+    ------
+    ConfigError
+        If something would keep a capture from running.
+    """
+    checks = examine(config)
+    if as_json:
+        say(json.dumps([{"what": c.what, "verdict": c.verdict, "found": c.found} for c in checks]))
+    else:
+        for check in checks:
+            say(f"{check.verdict:8} {check.what}: {check.found}")
+    failed = [check.what for check in checks if check.verdict == "failed"]
+    if failed:
+        raise ConfigError(f"{config}: a capture would not run: {', '.join(failed)}")
