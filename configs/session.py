@@ -93,6 +93,13 @@ class ZenohOptions(Frozen):
     cache_blocks: Annotated[int, Field(ge=0)] = 4096
 
 
+class MetricsOptions(Frozen):
+    """An endpoint for Prometheus; off unless it has a port, and on loopback unless it has another address."""
+
+    port: Annotated[int, Field(ge=0, le=65_535)] | None = None
+    address: str = "127.0.0.1"
+
+
 class IdentificationOptions(Frozen):
     """What the worker runs on an experiment; the same names as the options of ``armident identify``."""
 
@@ -119,6 +126,7 @@ class SessionConfig(Frozen):
     setpoints: Setpoints | None = None
     recording: RecordingOptions = RecordingOptions()
     zenoh: ZenohOptions = ZenohOptions()
+    metrics: MetricsOptions = MetricsOptions()
     identification: IdentificationOptions = IdentificationOptions()
 
     @model_validator(mode="after")

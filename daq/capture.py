@@ -26,12 +26,13 @@ from configs import (
 )
 from daq.assembler import LATE_S, Assembler
 from daq.facts import host_facts
+from daq.metrics import Metrics, Value
 from daq.motion import Motion, plan_motion
 from daq.publisher import Publisher
 from daq.recording import Mark
 from daq.remote import Command
 from daq.sink import Sink
-from daq.storage import capture_stamp, kept_tidy, open_series
+from daq.storage import capture_stamp, free_space, kept_tidy, open_series
 from daq.streams import CapturedStream, captured_streams
 from daq.systemd import Notifier
 from daq.zenoh_keys import Keys
@@ -210,6 +211,7 @@ class _Run:
         self._producer: SyncProducer | None = None
         self._master: DriveMaster | None = None
         self._motion: Motion | None = None
+        self._metrics: Metrics | None = None
         self._span: tuple[int, int] | None = None
         self._frames_before = 0
         self._events = {"emcy": 0, "heartbeat_lost": 0}
@@ -222,6 +224,11 @@ class _Run:
     def start(self, stack: ExitStack) -> None:
         """Configure and enable the drives, and start SYNC; whatever was started is stopped when the stack unwinds."""
         order, session = self._order, self._order.session
+        options = session.metrics
+        if options.port is not None:
+            labels = {"cell": session.cell, "robot": order.robot.name}
+            self._metrics = stack.enter_context(Metrics(options.address, options.port, labels))
+            self._say(f"metrics on http://{options.address}:{self._metrics.port}/metrics")
         if order.listen_only:
             return
         self._master = stack.enter_context(DriveMaster(session, order.robot))
@@ -422,20 +429,24 @@ class _Run:
         rate = (counters["frames"] - self._frames_before) / seconds
         self._frames_before = counters["frames"]
         self._tell_of_disk()
-        self._publisher.health(
-            {
-                "file": None if self.sink.path is None else self.sink.path.name,
-                "rows_not_written": self.sink.lost_rows,
-                "sync": self._assembler.last_sync,
-                "frames_per_s": round(rate, 1),
-                "rows": counters["samples.rows"],
-                "rows_in_gaps": counters["samples.in_gaps"],
-                "kernel_drops": self._bus.dropped,
-                "answers_owed": self._assembler.owed,
-                "queue_depth": self._publisher.depth,
-                "blocks_dropped": self._publisher.dropped,
-            }
-        )
+        health: dict[str, Value] = {
+            "file": None if self.sink.path is None else self.sink.path.name,
+            "rows_not_written": self.sink.lost_rows,
+            "sync": self._assembler.last_sync,
+            "frames": counters["frames"],
+            "frames_per_s": round(rate, 1),
+            "rows": counters["samples.rows"],
+            "rows_in_gaps": counters["samples.in_gaps"],
+            "kernel_drops": self._bus.dropped,
+            "answers_owed": self._assembler.owed,
+            "queue_depth": self._publisher.depth,
+            "disk_free_bytes": free_space(self._order.directory),
+            "blocks_dropped": self._publisher.dropped,
+            **self._events,
+        }
+        self._publisher.health(health)
+        if self._metrics is not None:
+            self._metrics.update(health)
         self._publisher.status({"state": "recording", "sync": self._assembler.last_sync})
 
 

@@ -1,6 +1,7 @@
 """Where a capture's files go, when a new one is begun, and which old ones make room."""
 
 import datetime
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -46,6 +47,15 @@ def open_series(
 
     before, after = (round(seconds * 1e9) for seconds in (options.trigger.before_s, options.trigger.after_s))
     return TriggeredSeries(event, before, after)
+
+
+def free_space(directory: Path) -> int | None:
+    """Bytes that are free where a directory is or will be; ``None`` if it cannot be told."""
+    try:
+        there = next(path for path in (directory.absolute(), *directory.absolute().parents) if path.exists())
+        return shutil.disk_usage(there).free
+    except (OSError, StopIteration):
+        return None
 
 
 def capture_stamp(now: datetime.datetime) -> str:

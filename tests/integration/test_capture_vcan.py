@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -132,15 +133,22 @@ def test_only_events_are_written_where_the_session_says_so(vcan_bus: str, tmp_pa
     """Saved by SIGUSR1 with the seconds before; a mark and the end come over Zenoh."""
     changes = {
         "recording": {"trigger": {"before_s": 20.0, "after_s": 1.0}},
+        "metrics": {"port": 0},
         "zenoh": {"commands": True},
         "sync": {"period_us": 1000},
     }
     session = session_file(tmp_path, vcan_bus, "events", setpoints=None, **changes)
     process = run("capture", "--config", session, "--out", tmp_path / "out")
     assert process.stderr is not None
-    while "keeping the last 20 s" not in (line := process.stderr.readline()):
+    said = ""
+    while "keeping the last 20 s" not in said:
+        line = process.stderr.readline()
         assert line, "capture ended"
+        said += line
     time.sleep(5.0)
+    (address,) = (word for word in said.split() if word.startswith("http://127.0.0.1:"))
+    with urllib.request.urlopen(address, timeout=10) as answer:
+        assert 'armident_frames_total{cell="events",robot="tx40"}' in answer.read().decode()
     for words in (["mark", "gripper changed"], ["save"]):
         asked = run("command", *words, "--config", session)
         out, err = asked.communicate(timeout=60)

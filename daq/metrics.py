@@ -1,0 +1,97 @@
+"""Metrics of a capture for Prometheus: off by default, on loopback."""
+
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Self
+
+from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from configs import ConfigError
+
+Value = int | float | str | None
+
+COUNTERS = {
+    "frames": "CAN frames received",
+    "rows": "Complete rows recorded",
+    "rows_in_gaps": "Rows that stand in the gap list",
+    "rows_not_written": "Rows that the disk did not take",
+    "kernel_drops": "Frames that the kernel dropped because the receive buffer was full",
+    "blocks_dropped": "Blocks that Zenoh listeners did not get because the queue was full",
+    "emcy": "Emergency messages of drives",
+    "heartbeat_lost": "Heartbeats of drives that stayed away",
+}
+"""What only grows while a capture runs; everything else that health says is a gauge."""
+
+
+class Metrics:
+    """Serves what the last health message said.
+
+    Parameters
+    ----------
+    address, port
+        Where; loopback unless the session says otherwise.
+    labels
+        Of every metric: cell and robot.
+
+    Raises
+    ------
+    ConfigError
+        If the port cannot be had.
+    """
+
+    def __init__(self, address: str, port: int, labels: dict[str, str]) -> None:
+        collected = _Collected(labels)
+        registry = CollectorRegistry()
+        registry.register(collected)
+        try:
+            self._server, self._thread = start_http_server(port, address, registry)
+        except OSError as error:
+            raise ConfigError(f"metrics: {address}:{port} cannot be listened on: {error.strerror}") from error
+        self._collected = collected
+
+    @property
+    def port(self) -> int:
+        """Where they are served."""
+        return int(self._server.server_port)
+
+    def update(self, health: dict[str, Value]) -> None:
+        """Take a health message."""
+        self._collected.health = dict(health)
+
+    def close(self) -> None:
+        """Serve no more."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+class _Collected(Collector):
+    def __init__(self, labels: dict[str, str]) -> None:
+        self.health: dict[str, Value] = {}
+        self._labels = labels
+
+    def collect(self) -> Iterator[Metric]:
+        """The metrics, made when they are asked for."""
+        names, values = list(self._labels), list(self._labels.values())
+        info = InfoMetricFamily("armident_capture", "Cell and robot that are recorded", labels=names)
+        info.add_metric(values, {})
+        yield info
+        for name, value in self.health.items():
+            if isinstance(value, str) or value is None:
+                continue
+            if name in COUNTERS:
+                counter = CounterMetricFamily(f"armident_{name}", COUNTERS[name], labels=names)
+                counter.add_metric(values, value)
+                yield counter
+            else:
+                gauge = GaugeMetricFamily(f"armident_{name}", name.replace("_", " "), labels=names)
+                gauge.add_metric(values, value)
+                yield gauge
