@@ -20,6 +20,12 @@ PADDING = 2
 HIGHEST = 0.35
 """Highest frequency of the search over the working rate: the first filter begins there."""
 
+PROMINENT = 100.0
+"""Power of a line of the references over that around it."""
+
+MODULATED = 0.1
+"""Width to either side of a line that the motion modulates, over the motion's bandwidth."""
+
 EQUIVALENT = BLOCK / 1.5 * np.log(2) ** 2
 """Shape of the gamma distribution with the spread of such a median; a Hann window makes 1.5 frequencies one."""
 
@@ -104,6 +110,21 @@ def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, low
         np.sqrt(2.0 * longest.to_power * longest.power[around]),
         np.sqrt(2.0 * longest.to_power * longest.background[around] * np.log(20.0)),
     )
+
+
+def of_references(study: Study, frequency: float) -> bool:
+    """Whether the references have that line, too: set points come at a rate of their own, and the arm follows them.
+
+    The motion modulates it, so that it is some of the motion's own frequencies wide.
+    """
+    wide = MODULATED * lowest_frequency(study)
+    for reference in study.auxiliary.references:
+        for joint in np.diff(reference, 2, axis=0).T:
+            spectrum = _Spectrum.of(joint, study.sample)
+            near = np.abs(spectrum.f - frequency) <= max(wide, 2 * PADDING * spectrum.f[1])
+            if np.any(spectrum.power[near] > PROMINENT * spectrum.background[near]):
+                return True
+    return False
 
 
 def lowest_frequency(study: Study) -> float:

@@ -11,7 +11,7 @@ from identify.catalogue.effect import Place
 from identify.discrepancy.candidates import Candidate, Workshop
 from identify.discrepancy.excess import Excess, excesses
 from identify.discrepancy.hints import hint_of, unit_of
-from identify.discrepancy.lines import lowest_frequency, residuals, strongest_line
+from identify.discrepancy.lines import lowest_frequency, of_references, residuals, strongest_line
 from identify.discrepancy.maps import Kind, Map, maps
 from identify.discrepancy.regression import Equation, Equations, Fit, solved
 from identify.discrepancy.screening import noise_beyond_shapes
@@ -301,6 +301,8 @@ def _lines(fit: Fit, level: float) -> list[Disagreement]:
     for j, joint in enumerate(study.joints):
         line = strongest_line([e[:, j] for e in train], [e[:, j] for e in held], study.dt, lowest_frequency(study))
         if line is None or not line.p_value < level or not line.p_held < HELD_OUT_LEVEL:
+            continue
+        if of_references(study, line.frequency):
             continue
         curve = Curve(line.f, line.amplitude, line.noise)
         found.append(Disagreement(joint, "frequency", None, "Hz", line.share, line.p_value, curve))
