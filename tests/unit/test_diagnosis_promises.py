@@ -1,0 +1,154 @@
+"""What a diagnosis promises: a model that is right, numbers told from structure, effects of other packages."""
+
+import json
+import os
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from configs import RobotConfig, Trajectory, load_robot, load_trajectory
+from configs.scenario import HiddenEffect, Scenario
+from daq.recording import Recording, write_recording
+from identify.discrepancy.diagnose import Diagnosis, diagnose
+from identify.document import Finding, IdentificationDocument
+from identify.from_recording import experiments_from_recording
+from identify.service import identify_recording
+from virtual_robot.offline import simulate_recording
+
+ARMIDENT = [sys.executable, "-m", "daq.cli"]
+PLUGIN = '''
+import numpy as np
+from identify.catalogue.effect import Effect, Linear, Shape
+
+
+def columns(motion, place, position):
+    """Torque (N, 1) per unit of height: a bell 10 mm wide around a position."""
+    return np.exp(-0.5 * ((motion.q[:, place.joint, None] - position) / 0.01) ** 2)
+
+
+TIGHT_SPOT = Effect(
+    name="tight_spot", title="a tight spot", says="something pushes back near one position",
+    reference="the machine's log book", linear=(Linear("height", ("N m", "N")),), columns=columns,
+    needs="motion across the spot",
+    shapes=(Shape("position", ("rad", "m"), lambda motion, joint: tuple(0.01 * k for k in range(1, 12))),),
+)
+'''
+
+
+def recorded(
+    robot: RobotConfig, seed: int, *effects: HiddenEffect, trajectory: str = "tx40_excitation", repeats: int = 2
+) -> Recording:
+    scenario = Scenario(schema="armident/scenario/1", effects=effects) if effects else None
+    once: Trajectory = load_trajectory(f"trajectories/{trajectory}.yaml")
+    moves = once.model_copy(update={"moves": once.moves * repeats})
+    return simulate_recording(robot, moves, seed, scenario=scenario, period=1e-3)
+
+
+def diagnosed(recording: Recording, robot: RobotConfig, baseline: IdentificationDocument | None = None) -> Diagnosis:
+    experiments, notes = experiments_from_recording(recording, robot)
+    return diagnose(experiments, [], robot, notes=notes, baseline=baseline)
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.1}),
+        HiddenEffect(effect="joint_spring", joint="joint_1", parameters={"stiffness": 60.0}),
+    ],
+    ids=lambda hidden: str(hidden.effect),
+)
+def test_the_resulting_model_has_no_gap_on_a_new_recording(hidden: HiddenEffect) -> None:
+    robot = load_robot("emps")
+    first = diagnosed(recorded(robot, 1, hidden, trajectory="emps_1", repeats=1), robot)
+    assert [f.effect for f in first.document.findings] == [hidden.effect]
+    again = diagnosed(recorded(robot, 2, hidden, trajectory="emps_1", repeats=1), first.robot)
+    assert again.document.verdict == "no_gap"
+
+
+@cache
+def baseline() -> IdentificationDocument:
+    robot = load_robot("tx40")
+    return identify_recording(recorded(robot, 100), robot).document
+
+
+def against_baseline(seed: int, *effects: HiddenEffect) -> list[Finding]:
+    robot = load_robot("tx40")
+    return diagnosed(recorded(robot, seed, *effects), robot, baseline()).document.findings
+
+
+@pytest.mark.slow
+def test_other_friction_of_one_joint_is_another_number_and_no_structure() -> None:
+    cold = HiddenEffect(effect="friction_scale", joint="joint_3", parameters={"factor": 1.3})
+    (finding,) = against_baseline(3, cold)
+    assert (finding.kind, finding.effect, finding.joint) == ("numbers", "friction_change", "joint_3")
+
+
+@pytest.mark.slow
+def test_a_structural_effect_is_no_other_number() -> None:
+    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
+    (finding,) = against_baseline(4, worn)
+    assert (finding.kind, finding.effect, finding.joint) == ("structure", "asymmetric_viscous_friction", "joint_2")
+
+
+@pytest.mark.slow
+def test_the_gain_of_one_drive_is_named() -> None:
+    gain = HiddenEffect(effect="drive_gain_error", joint="joint_2", parameters={"error": 0.1})
+    findings = [f for f in against_baseline(5, gain) if f.effect == "drive_gain_error"]
+    assert [f.joint for f in findings] == ["joint_2"]
+
+
+@pytest.mark.slow
+def test_a_base_that_was_tilted_is_named() -> None:
+    tilted = HiddenEffect(effect="gravity_direction", joint="joint_1", parameters={"tilt": 0.05, "azimuth": 0.7})
+    assert [f.effect for f in against_baseline(6, tilted)] == ["gravity_direction"]
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> dict[str, str]:
+    """Environment in which a distribution of somebody else's is installed, which brings one effect along."""
+    site = tmp_path / "site"
+    info = site / "tight_spots-1.0.dist-info"
+    info.mkdir(parents=True)
+    (site / "tight_spots.py").write_text(PLUGIN)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tight-spots\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[armident.effects]\ntight_spot = tight_spots:TIGHT_SPOT\n")
+    paths = [str(site), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+def test_an_effect_of_somebody_else_is_listed(elsewhere: dict[str, str]) -> None:
+    listed = subprocess.run(
+        [*ARMIDENT, "effects", "tight_spot"], env=elsewhere, capture_output=True, text=True, check=True
+    )
+    assert "something pushes back near one position" in listed.stdout
+    without = subprocess.run([*ARMIDENT, "effects", "tight_spot"], capture_output=True, text=True, check=False)
+    assert without.returncode == 2
+
+
+def test_an_effect_of_somebody_else_is_found_by_name(elsewhere: dict[str, str], tmp_path: Path) -> None:
+    robot = load_robot("emps")
+    bump = HiddenEffect(
+        effect="torque_bump", joint="joint_1", parameters={"torque": 3.0, "position": 0.06, "width": 0.01}
+    )
+    file = tmp_path / "bump.mcap"
+    write_recording(recorded(robot, 7, bump, trajectory="emps_1", repeats=1), file)
+
+    def run(environment: dict[str, str]) -> dict[str, object]:
+        done = subprocess.run(
+            [*ARMIDENT, "diagnose", str(file), "--out", str(tmp_path / "out"), "--json"],
+            env=environment, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 4, done.stderr
+        document: dict[str, object] = json.loads(done.stdout)
+        return document
+
+    findings = run(elsewhere)["findings"]
+    assert isinstance(findings, list)
+    assert [(f["effect"], f["joint"]) for f in findings] == [("tight_spot", "joint_1")]
+    parameters, std = findings[0]["parameters"], findings[0]["evidence"]["std"]
+    # The torque works against the joint.
+    assert abs(parameters["height"]) == pytest.approx(3.0, abs=4 * std["height"])
+    assert parameters["position"] == pytest.approx(0.06, abs=0.003)
