@@ -47,7 +47,7 @@ def test_a_spring_is_found_and_a_run_goes_on_where_it_was(small: Path, tmp_path:
     words = ("--suite", str(small), "--out", str(out), "--jobs", "2")
     stopped = diagnose_suite(*words, "--minutes", "0")
     assert stopped.returncode == 0, stopped.stderr
-    assert "2 cases have not been run" in stopped.stdout
+    assert "0 of 2 cases have been run" in stopped.stdout
     done = diagnose_suite(*words)
     assert done.returncode == 0, done.stderr
     result = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
@@ -55,6 +55,7 @@ def test_a_spring_is_found_and_a_run_goes_on_where_it_was(small: Path, tmp_path:
     assert (row["label"], row["n"], row["first"], row["failed"]) == ("joint_spring", 1, 1.0, 0)
     assert row["closed"] > 0.9
     assert row["within"] == 1.0
+    assert (result["run"], result["not_run"]) == (2, 0)
     assert result["healthy"][0]["alarms"] == 0
     assert "joint_spring,obvious,1" in (out / TABLE).read_text(encoding="utf-8")
     lines = (out / RESULTS).read_text(encoding="utf-8")
@@ -74,3 +75,28 @@ def test_a_case_that_fails_is_reported_and_not_swallowed(small: Path, tmp_path: 
     assert "1 of 1 cases failed" in done.stderr
     assert "torque_offset takes torque" in done.stderr
     assert json.loads((out / SUMMARY).read_text(encoding="utf-8"))["effects"][0]["failed"] == 1
+
+
+LEAST = {
+    "name and place right": 0.70,
+    "name and place right, or second": 0.70,
+    "healthy arms called healthy": 1.0,
+    "at least 90% of the injected gap closed, where named": 0.60,
+    "parameters within three standard deviations": 0.70,
+}
+"""Of the quick subset, one run of each effect: below what it comes to by two binomial deviations or more."""
+
+
+def test_most_of_the_quick_subset_is_named_and_no_healthy_arm_is_blamed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = diagnose_suite("--quick", "--out", str(tmp_path))
+    with capsys.disabled():
+        print(done.stdout, file=sys.__stderr__)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / SUMMARY).read_text(encoding="utf-8"))
+    assert result["not_run"] == 0
+    assert f"{result['run']} of {result['run']} cases have been run" in done.stdout
+    reached = {aim["what"]: aim["value"] for aim in result["aims"]}
+    assert {what: reached[what] for what, least in LEAST.items() if reached[what] < least} == {}
+    assert sum(row["n"] for row in result["healthy"] if row["label"].endswith(", all")) >= 12
