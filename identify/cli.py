@@ -130,6 +130,36 @@ def effects(
     effects_command(name, as_json=json)
 
 
+def history(
+    documents: Annotated[
+        list[Path] | None, typer.Argument(help="Results to add: identification.json. [default: none, only list]")
+    ] = None,
+    database: Annotated[
+        str, typer.Option(help="SQLAlchemy URL.", envvar="ARMIDENT_HISTORY")
+    ] = "sqlite:///history.sqlite",
+    robot: Annotated[
+        str | None, typer.Option(help="Whose runs. [default: that of the results, or the only one]")
+    ] = None,
+    parameter: Annotated[list[str] | None, typer.Option(help="Parameter to show; may be given more than once.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot parameters over time (.png, .svg, .pdf).")] = None,
+    false_alarms: Annotated[
+        float, typer.Option(min=1e-12, max=0.5, help="Chance of calling an unchanged arm changed, per run.")
+    ] = 1e-4,
+    json: Json = False,
+) -> None:
+    """Keep results in a database, list them, and say whether the arm has changed since the first of them.
+
+    Exit code 4 if the last run differs from the first by more than chance, in one parameter or in all together.
+
+    Example: armident history recordings/*.identification/identification.json --plot history.png
+    """
+    from identify.history_command import history_command
+
+    code = history_command(documents or [], database, robot, parameter or [], plot, false_alarms, as_json=json)
+    if code:
+        raise typer.Exit(code)
+
+
 def trajectory(
     config: Annotated[Path, typer.Option("--config", help="Robot configuration.")],
     out: Annotated[Path, typer.Option("--out", help="Trajectory file to write (.yaml).")],

@@ -1,0 +1,124 @@
+"""Has an arm changed since its baseline: two identifications beside each other, with their covariances."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from configs import DataError
+from identify.document import IdentificationDocument, Parameter
+
+Array = NDArray[np.float64]
+
+FALSE_ALARMS = 1e-4
+"""Chance of an alarm without a change, per comparison: one in 200 years of weekly runs."""
+
+RANK_TOLERANCE = 1e-9
+"""Eigenvalues of the correlation of the difference, relative to the greatest, that count as rounding."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Differences of the parameters of two identifications.
+
+    Parameters
+    ----------
+    parameters
+        The later ones, (k,) of them.
+    before, difference, std
+        Earlier values, later less earlier, and the standard deviation of that, (k,) each.
+    p_values
+        That an unchanged arm differs so much in this parameter, for all parameters together (Holm 1979), (k,).
+    chi_square, degrees, p_joint
+        ``d' C^-1 d`` with the covariance C of the difference, its degrees of freedom, and the chance of one so large.
+    false_alarms
+        What was allowed; half of it goes to the joint test and half to those of single parameters.
+    """
+
+    parameters: tuple[Parameter, ...]
+    before: Array
+    difference: Array
+    std: Array
+    p_values: Array
+    chi_square: float
+    degrees: int
+    p_joint: float
+    false_alarms: float
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """Parameters that changed by themselves, the clearest first."""
+        order = np.argsort(self.p_values, kind="stable")
+        return tuple(self.parameters[k].name for k in order if self.p_values[k] < self.false_alarms / 2)
+
+    @property
+    def drifted(self) -> bool:
+        """Whether the arm has changed: in single parameters, or in all together."""
+        return bool(self.changed) or self.p_joint < self.false_alarms / 2
+
+    @property
+    def words(self) -> str:
+        """The verdict in a sentence."""
+        if not self.drifted:
+            return f"no change (chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom)"
+        by_name = {p.name: k for k, p in enumerate(self.parameters)}
+        parts = [
+            f"{name} {self.before[by_name[name]]:.4g} -> {self.parameters[by_name[name]].value:.4g} "
+            f"{self.parameters[by_name[name]].unit}".rstrip()
+            for name in self.changed
+        ]
+        what = ", ".join(parts) or "no single parameter clearly"
+        return f"changed: {what} (chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom)"
+
+
+def compare(baseline: IdentificationDocument, now: IdentificationDocument, false_alarms: float = FALSE_ALARMS) -> Drift:
+    """Test whether two identifications can be of the same arm.
+
+    The runs are independent, so the covariance of the difference is the sum of both. All base parameters count: those
+    that are not essential weigh by their large deviations.
+
+    Parameters
+    ----------
+    baseline, now
+        Two identifications of one robot with the same model.
+    false_alarms
+        Chance of a verdict "changed" without a change.
+
+    Raises
+    ------
+    DataError
+        If they are of different robots or models.
+    """
+    if baseline.robot != now.robot:
+        raise DataError(f"the baseline is of robot {baseline.robot!r}, the identification of {now.robot!r}")
+    old = {p.name: k for k, p in enumerate(baseline.parameters)}
+    new = {p.name: k for k, p in enumerate(now.parameters)}
+    if old.keys() != new.keys():
+        odd = ", ".join(sorted(old.keys() ^ new.keys())[:5])
+        raise DataError(f"{now.robot}: baseline and identification have other base parameters: {odd}")
+    order = [old[p.name] for p in now.parameters]
+    before = np.array([baseline.parameters[k].value for k in order])
+    difference = np.array([p.value for p in now.parameters]) - before
+    covariance = np.array(now.covariance) + np.array(baseline.covariance)[np.ix_(order, order)]
+    std = np.sqrt(np.diag(covariance))
+    if not np.all(std > 0):
+        raise DataError(f"{now.robot}: a parameter without a standard deviation cannot be compared")
+    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
+    kept = values > RANK_TOLERANCE * values[-1]
+    chi_square = float(np.sum((vectors[:, kept].T @ (difference / std)) ** 2 / values[kept]))
+    degrees = int(kept.sum())
+    single = 2 * stats.norm.sf(np.abs(difference) / std)
+    joint = float(stats.chi2.sf(chi_square, degrees))
+    return Drift(
+        tuple(now.parameters), before, difference, std, _holm(single), chi_square, degrees, joint, false_alarms
+    )
+
+
+def _holm(p: Array) -> Array:
+    """P-values that hold for all tests together, by Holm's step-down."""
+    order = np.argsort(p, kind="stable")
+    stepped = np.maximum.accumulate(p[order] * (p.size - np.arange(p.size)))
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.minimum(stepped, 1.0)
+    return adjusted

@@ -1,0 +1,160 @@
+"""What was identified so far, in a database: SQLite in a file, or any other that SQLAlchemy reaches by URL."""
+
+import datetime
+import hashlib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import sqlalchemy as sa
+
+from configs import ConfigError
+from identify.document import IdentificationDocument, from_json, to_json
+
+DEFAULT = "sqlite:///history.sqlite"
+_STAMP = re.compile(r"(\d{8}T\d{6})-\d{3}Z")
+
+_tables = sa.MetaData()
+_runs = sa.Table(
+    "identifications",
+    _tables,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("digest", sa.String(64), unique=True, nullable=False),
+    sa.Column("robot", sa.String(128), index=True, nullable=False),
+    sa.Column("recorded", sa.DateTime, index=True, nullable=False),
+    sa.Column("recording", sa.Text),
+    sa.Column("sha256", sa.String(64), nullable=False),
+    sa.Column("samples", sa.Integer, nullable=False),
+    sa.Column("sample_rate_hz", sa.Float, nullable=False),
+    sa.Column("method", sa.String(32), nullable=False),
+    sa.Column("relative_error_pct", sa.Float, nullable=False),
+    sa.Column("converged", sa.Boolean, nullable=False),
+    sa.Column("document", sa.Text, nullable=False),
+)
+_parameters = sa.Table(
+    "parameters",
+    _tables,
+    sa.Column("identification", sa.ForeignKey(_runs.c.id), primary_key=True),
+    sa.Column("name", sa.String(64), primary_key=True),
+    sa.Column("value", sa.Float, nullable=False),
+    sa.Column("std", sa.Float, nullable=False),
+    sa.Column("unit", sa.String(32), nullable=False),
+    sa.Column("essential", sa.Boolean, nullable=False),
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """An identification in the history, and when its recording was made (UTC)."""
+
+    number: int
+    recorded: datetime.datetime
+    document: IdentificationDocument
+
+
+class History:
+    """Identifications in a database; its tables are made where they are missing.
+
+    Parameters
+    ----------
+    url
+        As SQLAlchemy understands it: ``sqlite:///history.sqlite``, ``postgresql+psycopg://...``.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such database, or its driver is not installed.
+    """
+
+    def __init__(self, url: str = DEFAULT) -> None:
+        try:
+            self._engine = sa.create_engine(url)
+            _tables.create_all(self._engine)
+        except (sa.exc.SQLAlchemyError, ImportError, OSError) as error:
+            raise ConfigError(f"{_shown(url)}: cannot be used as history: {_one_line(error)}") from error
+
+    def add(self, document: IdentificationDocument, recorded: datetime.datetime) -> bool:
+        """Keep an identification; whether it is new, since the same one is kept once.
+
+        Parameters
+        ----------
+        document
+            The result.
+        recorded
+            When its recording was made; see :func:`recorded_at`.
+        """
+        text = to_json(document)
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        source = document.recording
+        row = {
+            "digest": digest,
+            "robot": document.robot,
+            "recorded": recorded.astimezone(datetime.UTC).replace(tzinfo=None),
+            "recording": source.path,
+            "sha256": source.sha256,
+            "samples": source.samples,
+            "sample_rate_hz": source.sample_rate_hz,
+            "method": document.method,
+            "relative_error_pct": document.relative_error_pct,
+            "converged": document.converged,
+            "document": text,
+        }
+        try:
+            with self._engine.begin() as connection:
+                done = connection.execute(sa.insert(_runs).values(row))
+                (number,) = done.inserted_primary_key or (None,)
+                rows = [
+                    {
+                        "identification": number,
+                        "name": p.name,
+                        "value": p.value,
+                        "std": p.std,
+                        "unit": p.unit,
+                        "essential": p.essential,
+                    }
+                    for p in document.parameters
+                ]
+                connection.execute(sa.insert(_parameters), rows)
+        except sa.exc.IntegrityError:
+            return False
+        except sa.exc.SQLAlchemyError as error:
+            raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
+        return True
+
+    def runs(self, robot: str | None = None) -> list[Run]:
+        """Identifications in the order in which their recordings were made."""
+        query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document).order_by(_runs.c.recorded, _runs.c.id)
+        if robot is not None:
+            query = query.where(_runs.c.robot == robot)
+        try:
+            with self._engine.connect() as connection:
+                rows = connection.execute(query).all()
+        except sa.exc.SQLAlchemyError as error:
+            raise ConfigError(f"history: cannot be read: {_one_line(error)}") from error
+        return [
+            Run(number, recorded.replace(tzinfo=datetime.UTC), from_json(text, IdentificationDocument, f"run {number}"))
+            for number, recorded, text in rows
+        ]
+
+    def robots(self) -> Sequence[str]:
+        """Names of the robots that it knows."""
+        with self._engine.connect() as connection:
+            return connection.execute(sa.select(_runs.c.robot).distinct().order_by(_runs.c.robot)).scalars().all()
+
+
+def recorded_at(document: IdentificationDocument, file: Path) -> datetime.datetime:
+    """When a recording was made: by the time in its name, or else by that of the result's file."""
+    found = _STAMP.search(document.recording.path or "")
+    if found is not None:
+        return datetime.datetime.strptime(found[1] + "+0000", "%Y%m%dT%H%M%S%z")
+    return datetime.datetime.fromtimestamp(file.stat().st_mtime, datetime.UTC)
+
+
+def _shown(url: str) -> str:
+    """The URL without a password in it."""
+    return re.sub(r"(://[^:/@]*):[^@]*@", r"\1:***@", url)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
