@@ -155,6 +155,9 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
             rivals = f.evidence.get("ambiguous_with", [])
             unsure = f"; could also be {', '.join(rivals)}" if rivals else ""
             console.print(f"{f.joint}: {f.evidence['says']}{unsure}", highlight=False)
+    if document.considered:
+        named = ", ".join(f"{f.effect} of {f.joint}" for f in document.considered)
+        console.print(f"considered, and not convincing: {named}", highlight=False, soft_wrap=True)
     for u in document.unexplained:
         console.print(
             f"unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % of its residual varies with {u.varies_with}",
