@@ -16,6 +16,9 @@ Scope = Literal["joint", "motor", "pair", "arm"]
 """Where an effect sits: in one joint, in one motor (which a coupled transmission joins to several joints), between two
 joints, or in the arm as a whole (its stanza then names the first joint, a payload the last one)."""
 
+DOUBT = 2.0
+"""Standard deviations by which a parameter must have the wrong sign to be against physics."""
+
 
 @dataclass(frozen=True)
 class Linear:
@@ -124,13 +127,16 @@ class Effect:
     physical: Callable[[Array, Mapping[str, float]], bool] | None = None
     negligible: Callable[[Array, float], bool] | None = None
 
-    def allows(self, values: Array, shapes: Mapping[str, float]) -> bool:
-        """Whether linear parameters (k,) at given nonlinear ones have signs and sizes that physics allows."""
+    def allows(self, values: Array, std: Array, shapes: Mapping[str, float]) -> bool:
+        """Whether linear parameters (k,) at given nonlinear ones have signs and sizes that physics allows.
+
+        A sign is wrong if it is wrong beyond doubt: of several parameters some may be nothing but noise.
+        """
         if self.physical is not None and not self.physical(values, shapes):
             return False
         return all(
-            p.sign * value >= 0 and p.bounds[0] <= value <= p.bounds[1]
-            for p, value in zip(self.linear, values, strict=True)
+            p.sign * value >= -DOUBT * doubt and p.bounds[0] <= value <= p.bounds[1]
+            for p, value, doubt in zip(self.linear, values, std, strict=True)
         )
 
     def torque(self, motion: Motion, place: "Place", shapes: Mapping[str, float]) -> Array:

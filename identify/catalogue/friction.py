@@ -215,7 +215,11 @@ EFFECTS = (
         title="friction and inertia shared by two joints",
         says="two joints share a shaft or gear: what one does costs the other friction and inertia",
         reference="Brunot 2017, equation B.1",
-        linear=(Linear("iac", ("kg m^2", "kg")), Linear("fvc", VISCOUS), Linear("fcc", TORQUE)),
+        linear=(
+            Linear("iac", ("kg m^2", "kg"), sign=1),
+            Linear("fvc", VISCOUS, sign=1),
+            Linear("fcc", TORQUE, sign=1),
+        ),
         columns=_coupling,
         needs="motion of both joints, together and against each other",
         scope="pair",

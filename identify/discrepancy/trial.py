@@ -68,7 +68,7 @@ class Trial:
     @property
     def forbidden(self) -> bool:
         """Whether a linear parameter has a sign or a size that physics does not allow."""
-        return not self.candidate.effect.allows(self.values, dict(self.shapes))
+        return not self.candidate.effect.allows(self.values, self.std, dict(self.shapes))
 
     @property
     def p_value(self) -> float:
