@@ -12,7 +12,7 @@ from configs.robot import Effect as Stanza
 from identify.catalogue.registry import known
 from identify.catalogue.terms import Term, stanza_of
 from identify.discrepancy.candidates import Workshop, candidates
-from identify.discrepancy.regression import Fit, fit, relative_errors
+from identify.discrepancy.regression import Fit, applied, fit
 from identify.discrepancy.screening import shortlist
 from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial, judge
@@ -147,7 +147,7 @@ class Search:
                 extended = self.state(robot, state)
             except DataError:
                 continue
-            if relative_errors(extended.fit, held=True)[0] < relative_errors(state.fit, held=True)[0]:
+            if nearer(extended, state):
                 pruned = self._pruned(extended, own)
                 if places_of(pruned) not in been:
                     return pruned
@@ -180,10 +180,25 @@ class Search:
                 if (effect.name, state.study.joints[place.joint]) == (stanza.effect, stanza.joint):
                     continue
                 other = self.state(added(rest.study.robot, trial), rest)
-                if relative_errors(other.fit, held=True)[0] < relative_errors(state.fit, held=True)[0]:
+                if nearer(other, state):
                     self.progress(f"{effect.name} instead of {stanza.effect}")
                     state = other
         return state
+
+
+def nearer(one: State, other: State) -> bool:
+    """Whether a model comes closer to the held-out torques than another, at measured or at simulated signals.
+
+    Both count: measured positions, differentiated once more for a delay or twice for an elastic joint, may bring more
+    noise than the effect has torque, and simulated ones are only as good as the loop.
+    """
+    return any(_distance(one, kind) < _distance(other, kind) for kind in (0, 1))
+
+
+def _distance(state: State, kind: int) -> float:
+    """Norm of the held-out errors at measured (0) or simulated (1) signals."""
+    errors = [rows[2] - applied(rows[kind], state.fit.theta) for rows in state.fit.equations.held]
+    return float(np.linalg.norm(np.concatenate(errors)))
 
 
 def refit(study: Study, robot: RobotConfig, before: State | None) -> tuple[Study, Fit]:

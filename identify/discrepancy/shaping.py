@@ -27,12 +27,17 @@ REFINEMENTS = 8
 def instrumented(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Shapes) -> Shapes:
     """Continuous nonlinear parameters, one after the other, between the neighbours on the grid of where they are.
 
+    Of effects that depend on nothing but the motion they stay: that motion is simulated well, and measured velocities
+    are least sure around standstill, where friction changes most.
+
     Parameters
     ----------
     shapes
         Where to begin: the best at simulated signals.
     """
     found = shapes
+    if not candidate.effect.predicts:
+        return found
     for k, shape in enumerate(candidate.effect.shapes):
         values = np.array(sorted({grid[k][1] for grid in candidate.grid}))
         if not shape.continuous or values.size < 2:
