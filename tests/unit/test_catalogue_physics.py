@@ -1,0 +1,26 @@
+"""Which parameters physics forbids an effect."""
+
+import numpy as np
+import pytest
+
+from identify.catalogue.registry import known
+
+
+@pytest.mark.parametrize(
+    ("value", "exponent", "allowed"), [(-5.0, 2 / 3, False), (5.0, 2 / 3, True), (-5.0, 2.0, True)]
+)
+def test_friction_does_not_fall_from_standstill_as_a_power_of_speed(
+    value: float, exponent: float, allowed: bool
+) -> None:
+    effect = known("nonlinear_viscous_friction")
+    assert effect.allows(np.array([value]), np.array([0.1]), {"exponent": exponent}) is allowed
+
+
+@pytest.mark.parametrize(("inertia", "allowed"), [(-0.0028, True), (-0.055, False), (0.055, True)])
+def test_a_sign_is_wrong_beyond_doubt_only(inertia: float, allowed: bool) -> None:
+    values, std = np.array([inertia, 0.61, 1.84]), np.array([0.0035, 0.016, 0.064])
+    assert known("coupling_friction").allows(values, std, {}) is allowed
+
+
+def test_a_gain_beyond_its_bounds_is_another_fault() -> None:
+    assert not known("drive_gain_error").allows(np.array([-0.7]), np.array([1.0]), {})
