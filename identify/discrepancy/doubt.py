@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 from configs import DataError
 from identify.discrepancy.findings import CLOSE, described
-from identify.discrepancy.regression import relative_errors
-from identify.discrepancy.search import MOST, Search, State, added, places_of, without
+from identify.discrepancy.search import MOST, Search, State, added, nearer, places_of, without
 from identify.discrepancy.where import Disagreement, Survey, unexplained
 from identify.document import Finding
 
@@ -89,8 +88,7 @@ def _without(
             other = search.state(added(rest.study.robot, best), rest)
         except DataError:
             continue
-        nearer = relative_errors(other.fit, held=True)[0] < relative_errors(rest.fit, held=True)[0]
-        if nearer and places_of(other) not in been:
+        if nearer(other, rest, search.settings.material) and places_of(other) not in been:
             return other
     return rest
 

@@ -147,7 +147,7 @@ class Search:
                 extended = self.state(robot, state)
             except DataError:
                 continue
-            if nearer(extended, state):
+            if nearer(extended, state, self.settings.material):
                 pruned = self._pruned(extended, own)
                 if places_of(pruned) not in been:
                     return pruned
@@ -180,25 +180,34 @@ class Search:
                 if (effect.name, state.study.joints[place.joint]) == (stanza.effect, stanza.joint):
                     continue
                 other = self.state(added(rest.study.robot, trial), rest)
-                if nearer(other, state):
+                if nearer(other, state, self.settings.material):
                     self.progress(f"{effect.name} instead of {stanza.effect}")
                     state = other
         return state
 
 
-def nearer(one: State, other: State) -> bool:
+def nearer(one: State, other: State, material: float) -> bool:
     """Whether a model comes closer to the held-out torques than another, at measured or at simulated signals.
 
     Both count: measured positions, differentiated once more for a delay or twice for an elastic joint, may bring more
     noise than the effect has torque, and simulated ones are only as good as the loop.
+
+    Parameters
+    ----------
+    material
+        Share of the power of a joint's error by which it must be closer where only simulated signals show it.
     """
-    return any(_distance(one, kind) < _distance(other, kind) for kind in (0, 1))
+    if _power(one, 0).sum() < _power(other, 0).sum():
+        return True
+    now, before = _power(one, 1), _power(other, 1)
+    return bool(now.sum() < before.sum() and np.any(now < (1 - material) * before))
 
 
-def _distance(state: State, kind: int) -> float:
-    """Norm of the held-out errors at measured (0) or simulated (1) signals."""
+def _power(state: State, kind: int) -> Array:
+    """Squared norm of every joint's held-out errors at measured (0) or simulated (1) signals, (n,)."""
     errors = [rows[2] - applied(rows[kind], state.fit.theta) for rows in state.fit.equations.held]
-    return float(np.linalg.norm(np.concatenate(errors)))
+    total: Array = np.sum(np.concatenate(errors) ** 2, axis=0)
+    return total
 
 
 def refit(study: Study, robot: RobotConfig, before: State | None) -> tuple[Study, Fit]:

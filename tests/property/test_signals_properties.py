@@ -51,7 +51,7 @@ def test_decimated_instants_do_not_depend_on_how_much_follows(seed: int, samples
     x = series(seed, samples + more)
     low_pass = design(1e-3, 20.0)
     short, long = low_pass(x[:samples]), low_pass(x)
-    np.testing.assert_array_equal(short, long[: short.size])
+    np.testing.assert_allclose(short, long[: short.size], rtol=0, atol=1e-13)
     assert low_pass.instants(samples).size == short.size
     assert low_pass.instants(samples)[-1] + low_pass.margin < samples
 
