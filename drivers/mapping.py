@@ -1,10 +1,14 @@
 """Configures one drive over SDO: is it the drive we expect, and what does it send and receive."""
 
+import logging
+
 from configs.errors import ConfigError
 from configs.robot import Joint, RobotConfig
 from configs.session import SessionConfig
 from drivers import objects as od
 from drivers.sdo import DriveSdo
+
+log = logging.getLogger(__name__)
 
 
 def check_drive(sdo: DriveSdo, robot: RobotConfig) -> None:
@@ -83,6 +87,22 @@ def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
         value, exponent = interpolation_period(session.sync.period_us * every, sdo.who)
         sdo.write(od.INTERPOLATION_PERIOD, 1, value, "B")
         sdo.write(od.INTERPOLATION_PERIOD, 2, exponent, "b")
+        _map_stop(sdo, od.stop_rpdo(session.setpoints.rpdo))
+
+
+def _map_stop(sdo: DriveSdo, rpdo: int) -> None:
+    """Have the controlword (6040h) in an RPDO that acts when it arrives: what stops a drive faster than SDO can.
+
+    A drive that has no such RPDO, or does not map the controlword, is stopped by SDO alone.
+    """
+    communication, mapping = od.RPDO_COMMUNICATION + rpdo - 1, od.RPDO_MAPPING + rpdo - 1
+    if communication not in sdo.node.object_dictionary or mapping not in sdo.node.object_dictionary:
+        return
+    cob = od.rpdo_cob(rpdo, sdo.drive.node_id)
+    try:
+        _map_pdo(sdo, communication, mapping, cob, (od.CONTROL_ENTRY,), od.EVENT_DRIVEN)
+    except ConfigError as error:
+        log.warning("%s", error)
 
 
 def _map_pdo(sdo: DriveSdo, communication: int, mapping: int, cob: int, entries: tuple[int, ...], every: int) -> None:

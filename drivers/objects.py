@@ -95,6 +95,13 @@ SETPOINT = MappedObject("target", TARGET_POSITION, 0, "<i4")
 """What the RPDO of the set points carries: the target position in counts."""
 
 
+CONTROL_ENTRY = CONTROLWORD << 16 | 16
+"""Mapping entry of the controlword."""
+
+EVENT_DRIVEN = 255
+"""Transmission type of a PDO that acts when it arrives, without SYNC (CiA 301 section 7.5.2.35)."""
+
+
 @dataclass(frozen=True)
 class TpdoLayout:
     """The data bytes of one TPDO: its objects in mapping order, little endian, without gaps."""
@@ -157,6 +164,11 @@ def tpdo_cob(tpdo: int, node: int) -> int:
 def rpdo_cob(rpdo: int, node: int) -> int:
     """COB-ID of RPDO 1 to 4 in the predefined connection set (CiA 301 section 7.3.5)."""
     return 0x200 + 0x100 * (rpdo - 1) + node
+
+
+def stop_rpdo(setpoints: int) -> int:
+    """Which RPDO carries the controlword beside the one of the set points: 2, or 1 where those have 2."""
+    return 1 if setpoints == 2 else 2
 
 
 def rated_milliamperes(drive: Drive) -> int:
