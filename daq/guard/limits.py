@@ -1,0 +1,62 @@
+"""What a moving arm may do before its drives are stopped."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import RobotConfig
+
+FOLLOWING_S = 0.1
+"""A joint may lag behind its demand by what it covers in this time at its velocity limit, s."""
+
+VELOCITY_S = 0.002
+"""Velocity is a difference of positions over this time (s): a single one would show the encoder's steps."""
+
+TORQUE_S = 0.01
+"""Torque is a mean over this time (s): what chops in an amplifier for a millisecond loads no gear."""
+
+HEARTBEATS_MISSED = 3
+HEARTBEAT_MARGIN_S = 0.1
+"""A drive is lost after so many of its heartbeat periods, and what a host may be late on top."""
+
+SYNC_MISSED = 100
+SYNC_LOST_S = 0.5
+"""SYNC is lost after so many periods, or so long where that is more."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of the joints, (n,) each: rad or m, per second, N m or N.
+
+    ``following`` is the largest distance between demand and position.
+    """
+
+    low: Floats
+    high: Floats
+    velocity: Floats
+    torque: Floats
+    following: Floats
+
+
+def limits_of(robot: RobotConfig, following_s: float = FOLLOWING_S) -> Limits:
+    """Limits as the robot's configuration states them.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    following_s
+        See `FOLLOWING_S`.
+    """
+    limits = [joint.limits for joint in robot.joints]
+    velocity = np.array([limit.velocity for limit in limits])
+    return Limits(
+        low=np.array([limit.position[0] for limit in limits]),
+        high=np.array([limit.position[1] for limit in limits]),
+        velocity=velocity,
+        torque=np.array([limit.torque for limit in limits]),
+        following=velocity * following_s,
+    )

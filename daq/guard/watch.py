@@ -1,0 +1,300 @@
+"""Frame by frame through what is on the bus, compiled: the first thing that a moving arm must not do."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from configs import ConfigError, RobotConfig, SessionConfig
+from configs.session import ObjectName
+from daq.guard.limits import (
+    HEARTBEAT_MARGIN_S,
+    HEARTBEATS_MISSED,
+    SYNC_LOST_S,
+    SYNC_MISSED,
+    TORQUE_S,
+    VELOCITY_S,
+    Limits,
+)
+from daq.streams import counts_per_si, node_ids
+from drivers.frames import Frames
+from drivers.objects import (
+    COB_EMCY,
+    COB_HEARTBEAT,
+    COB_NMT,
+    COB_SYNC,
+    NmtState,
+    TpdoLayout,
+    emcy_text,
+    rpdo_cob,
+    tpdo_cob,
+)
+
+IDENTIFIERS = 2048
+SYNC, SAMPLE, DEMAND, SETPOINT, EMCY, HEARTBEAT, NMT = range(7)
+"""Kinds of frames."""
+
+QUIET, POSITION, VELOCITY, TORQUE, FOLLOWING, EMERGENCY, STATE, SILENT, NO_SYNC = range(9)
+"""What can be wrong."""
+
+ARMED, LAST_SYNC, SINCE_SETPOINT, ROWS, JOINT, FRAME = range(6)
+"""Places in the state: whether set points are played, when SYNC came (ns), how many since a set point, complete
+sets of samples so far; then joint and frame of an alarm."""
+
+ARMED_STATE = int(NmtState.OPERATIONAL)
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Why the drives have to be stopped; ``frame`` is the number of the frame in its batch, -1 for a silence."""
+
+    text: str
+    frame: int
+
+
+class Watch:
+    """What was on the bus so far; give it every batch of frames.
+
+    It is armed by the first set point and disarmed by the NMT command that ends the motion.
+
+    Parameters
+    ----------
+    session, robot
+        Nodes, streams and scales.
+    limits
+        What is allowed.
+
+    Raises
+    ------
+    ConfigError
+        If the session plays no set points, or its streams carry no position.
+    """
+
+    def __init__(self, session: SessionConfig, robot: RobotConfig, limits: Limits) -> None:
+        if session.setpoints is None:
+            raise ConfigError("setpoints: a session without them moves nothing, there is nothing to guard")
+        self._robot, self._limits, n = robot, limits, robot.n
+        self._kind = np.full(IDENTIFIERS, -1, np.int64)
+        self._joint = np.zeros(IDENTIFIERS, np.int64)
+        self._at = np.full(3, -1, np.int64)
+        self._identify(session, robot)
+        period = session.sync_period
+        self._per_count = np.linalg.inv(robot.transmission_matrix) / counts_per_si(robot)
+        torque = np.array([joint.drive.gain * joint.drive.rated / 1000.0 for joint in robot.joints])
+        self._per_mille = robot.transmission_matrix.T * torque
+        velocity, mean = (max(1, round(seconds / period)) for seconds in (VELOCITY_S, TORQUE_S))
+        self._positions, self._torques = np.zeros((velocity, n)), np.zeros((mean, n))
+        self._velocity_s = velocity * period
+        self._every = session.setpoints.every
+        self._raw, self._fresh = np.zeros((3, n), np.int64), np.zeros(n, np.bool_)
+        self._demanded = np.zeros(n, np.bool_)
+        self._beat = np.zeros(n, np.int64)
+        self._state = np.zeros(6, np.int64)
+        self._value = np.zeros(2)
+        heartbeat = HEARTBEATS_MISSED * session.heartbeat_ms * 1e-3 + HEARTBEAT_MARGIN_S
+        self._silence = np.array([heartbeat * 1e9, max(SYNC_LOST_S, SYNC_MISSED * period) * 1e9], np.int64)
+
+    def _identify(self, session: SessionConfig, robot: RobotConfig) -> None:
+        """Which identifier means what; the drives' own demand is taken where they send it, else the set points."""
+        nodes = node_ids(session, robot)
+        samples = session.streams["samples"]
+        at = _places(samples.objects)
+        if "position" not in at:
+            raise ConfigError("streams.samples.objects: the guard needs the position of every drive")
+        self._at[:] = at["position"], at.get("current", at.get("torque", -1)), 0
+        self._kind[[COB_SYNC, COB_NMT]] = SYNC, NMT
+        assert session.setpoints is not None
+        told = None
+        for stream in session.streams.values():
+            if "demand" in stream.objects and stream is not samples:
+                told = stream
+        for j, node in enumerate(nodes):
+            kinds = {
+                tpdo_cob(samples.tpdo, node): SAMPLE,
+                rpdo_cob(session.setpoints.rpdo, node): SETPOINT,
+                COB_EMCY + node: EMCY,
+                COB_HEARTBEAT + node: HEARTBEAT,
+            }
+            if told is not None:
+                kinds[tpdo_cob(told.tpdo, node)] = DEMAND
+            for identifier, kind in kinds.items():
+                self._kind[identifier], self._joint[identifier] = kind, j
+        self._own_demand = told is not None
+        if told is not None:
+            self._at[2] = _places(told.objects)["demand"]
+
+    @property
+    def identifiers(self) -> list[int]:
+        """COB-IDs that it wants to see."""
+        return [int(k) for k in np.flatnonzero(self._kind >= 0)]
+
+    @property
+    def armed(self) -> bool:
+        """Whether set points are being played."""
+        return bool(self._state[ARMED])
+
+    def look(self, frames: Frames, now_ns: int) -> Alarm | None:
+        """Take frames, in the order in which they were on the bus; the first reason to stop, if there is one.
+
+        Parameters
+        ----------
+        frames
+            What came since the last call, shape (N,), N from 0.
+        now_ns
+            Monotonic time of this call.
+        """
+        limits = self._limits
+        code = _look(
+            frames["can_id"], frames["length"], frames["data"], now_ns, self._kind, self._joint, self._at,
+            self._own_demand, self._every, self._raw, self._fresh, self._demanded, self._beat, self._silence,
+            self._per_count, self._per_mille, self._positions, self._torques, self._velocity_s,
+            limits.low, limits.high, limits.velocity, limits.torque, limits.following, self._state, self._value,
+        )  # fmt: skip
+        return None if code == QUIET else Alarm(self._text(code), int(self._state[FRAME]))
+
+    def _text(self, code: int) -> str:
+        joint = self._robot.joints[int(self._state[JOINT])]
+        found, allowed = (float(value) for value in self._value)
+        unit, force = ("rad", "N m") if joint.type == "revolute" else ("m", "N")
+        if code == POSITION:
+            low, high = joint.limits.position
+            return f"{joint.name}: position {found:.4f} {unit}, allowed is {low:g} to {high:g}"
+        if code == VELOCITY:
+            return f"{joint.name}: velocity {found:.3f} {unit}/s, allowed is {allowed:g}"
+        if code == TORQUE:
+            return f"{joint.name}: torque {found:.1f} {force}, allowed is {allowed:g}"
+        if code == FOLLOWING:
+            return f"{joint.name}: following error {found:.4f} {unit}, allowed is {allowed:g}"
+        if code == EMERGENCY:
+            return f"{joint.name}: EMCY {int(found):04X}h, {emcy_text(int(found))}"
+        if code == STATE:
+            return f"{joint.name}: its drive has left the NMT state operational (state {int(found)})"
+        if code == SILENT:
+            return f"{joint.name}: no heartbeat for {found:.2f} s"
+        return f"no SYNC for {found:.2f} s in the middle of the motion; has the capture died?"
+
+
+def _places(objects: Sequence[ObjectName]) -> dict[str, int]:
+    """First byte of each object in its TPDO."""
+    at, places = 0, {}
+    for mapped in TpdoLayout.of(objects).objects:
+        places[mapped.name] = at
+        at += mapped.bits // 8
+    return places
+
+
+@njit(cache=True)
+def _number(data, k, at, size):  # type: ignore[no-untyped-def]
+    """A signed little-endian number of ``size`` bytes."""
+    value = np.int64(0)
+    for b in range(size):
+        value |= np.int64(data[k, at + b]) << (8 * b)
+    top = np.int64(1) << (8 * size - 1)
+    return value - 2 * top if value & top else value
+
+
+@njit(cache=True)
+def _examine(  # type: ignore[no-untyped-def]
+    raw, demanded, per_count, per_mille, positions, torques, velocity_s,
+    low, high, velocity, torque, following, state, value,
+):  # fmt: skip
+    """One set of samples against the limits; what is wrong with it."""
+    n, row = low.size, state[ROWS]
+    old, mean = row % positions.shape[0], row % torques.shape[0]
+    full = row >= positions.shape[0]
+    state[ROWS] += 1
+    code = QUIET
+    every = True
+    for j in range(n):
+        every = every and demanded[j]
+    for j in range(n):
+        q, tau, lag = 0.0, 0.0, 0.0
+        for m in range(n):
+            q += per_count[j, m] * raw[0, m]
+            tau += per_mille[j, m] * raw[1, m]
+            lag += per_count[j, m] * (raw[2, m] - raw[0, m])
+        speed = (q - positions[old, j]) / velocity_s if full else 0.0
+        positions[old, j], torques[mean, j] = q, tau
+        load = torques[:, j].mean()
+        if code != QUIET:
+            continue
+        if q < low[j] or q > high[j]:
+            code, value[0], value[1] = POSITION, q, 0.0
+        elif abs(speed) > velocity[j]:
+            code, value[0], value[1] = VELOCITY, speed, velocity[j]
+        elif abs(load) > torque[j]:
+            code, value[0], value[1] = TORQUE, load, torque[j]
+        elif every and abs(lag) > following[j]:
+            code, value[0], value[1] = FOLLOWING, lag, following[j]
+        if code != QUIET:
+            state[JOINT] = j
+    return code
+
+
+@njit(cache=True)
+def _look(  # type: ignore[no-untyped-def]
+    ids, lengths, data, now, kinds, joints, at, own_demand, every, raw, fresh, demanded, beat, silence,
+    per_count, per_mille, positions, torques, velocity_s, low, high, velocity, torque, following, state, value,
+):  # fmt: skip
+    """All frames of a batch, then the silences."""
+    for k in range(ids.size):
+        if ids[k] >= IDENTIFIERS or kinds[ids[k]] < 0:
+            continue
+        kind, j = kinds[ids[k]], joints[ids[k]]
+        state[JOINT], state[FRAME] = j, k
+        complete = False
+        if kind == NMT:
+            state[ARMED] = 0
+        elif kind == SYNC:
+            state[LAST_SYNC] = now
+            state[SINCE_SETPOINT] += 1
+            # A drive that owes its sample keeps nobody from looking at those of the others.
+            complete = fresh.any()
+        elif kind == HEARTBEAT and lengths[k] >= 1:
+            beat[j] = now
+            if state[ARMED] and data[k, 0] != ARMED_STATE:
+                value[0] = data[k, 0]
+                return STATE
+        elif kind == EMCY and lengths[k] >= 2:
+            error = np.int64(data[k, 0]) | np.int64(data[k, 1]) << 8
+            if state[ARMED] and error:
+                value[0] = error
+                return EMERGENCY
+        elif kind == SETPOINT and lengths[k] >= 4:
+            if not state[ARMED]:
+                state[ARMED], state[LAST_SYNC] = 1, now
+                beat[:] = now
+                demanded[:] = False
+                state[ROWS] = 0
+            state[SINCE_SETPOINT] = 0
+            if not own_demand:
+                raw[2, j], demanded[j] = _number(data, k, 0, 4), True
+        elif kind == DEMAND and lengths[k] >= at[2] + 4:
+            raw[2, j], demanded[j] = _number(data, k, at[2], 4), True
+        elif kind == SAMPLE and lengths[k] >= at[0] + 4:
+            raw[0, j] = _number(data, k, at[0], 4)
+            if at[1] >= 0 and lengths[k] >= at[1] + 2:
+                raw[1, j] = _number(data, k, at[1], 2)
+            fresh[j] = True
+            complete = fresh.all()
+        if complete:
+            fresh[:] = False
+            if state[ARMED]:
+                code = _examine(
+                    raw, demanded, per_count, per_mille, positions, torques, velocity_s,
+                    low, high, velocity, torque, following, state, value,
+                )  # fmt: skip
+                if code != QUIET:
+                    return code
+    state[FRAME] = -1
+    if state[ARMED]:
+        for j in range(beat.size):
+            if now - beat[j] > silence[0]:
+                state[JOINT], value[0] = j, (now - beat[j]) * 1e-9
+                return SILENT
+        # Whoever ends a motion properly goes on with SYNC for a while after the last set point.
+        if state[SINCE_SETPOINT] <= every + 1 and now - state[LAST_SYNC] > silence[1]:
+            value[0] = (now - state[LAST_SYNC]) * 1e-9
+            return NO_SYNC
+    return QUIET

@@ -1,0 +1,308 @@
+"""The guard on a real bus: every reason to stop is followed by a quick stop within one cycle, and nothing else is."""
+
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from configs import ArmidentError, config_path, load_robot
+from daq.guard import guard
+from daq.streams import counts_per_si
+from drivers.frames import frame, frames
+from drivers.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC, rpdo_cob, tpdo_cob
+from drivers.socketcan import RawSocket
+
+pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
+
+PERIOD_S = 0.02
+"""Slow, so that a cycle is long beside what a busy machine takes to wake a process."""
+HEARTBEAT_MS = 100
+N = 6
+QUICK_STOP = b"\x02\x00"
+Change = Callable[["Cell"], None]
+
+
+@dataclass
+class Cell:
+    """What drives and master send in a cycle, in counts and per mille of rated current."""
+
+    position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(N))
+    current: NDArray[np.float64] = field(default_factory=lambda: np.zeros(N))
+    demand: NDArray[np.float64] = field(default_factory=lambda: np.zeros(N))
+    extra: tuple[tuple[int, bytes], ...] = ()
+    beating: tuple[int, ...] = tuple(range(1, N + 1))
+    setpoints: bool = True
+    sync: bool = True
+
+    def cycle(self, k: int) -> list[tuple[int, bytes]]:
+        """Frames of cycle ``k``, in their order on the bus."""
+        out = [(COB_SYNC, bytes([k % 240 + 1]))] if self.sync else []
+        for j in range(N):
+            sample = int(self.position[j]).to_bytes(4, "little", signed=True)
+            sample += int(self.current[j]).to_bytes(2, "little", signed=True) + b"\x37\x12"
+            out.append((tpdo_cob(1, j + 1), sample))
+            target = int(self.demand[j]).to_bytes(4, "little", signed=True)
+            out.append((tpdo_cob(2, j + 1), target))
+            if self.setpoints:
+                out.append((rpdo_cob(1, j + 1), target))
+        out += [(COB_HEARTBEAT + node, b"\x05") for node in self.beating]
+        return out + list(self.extra)
+
+
+def session_file(folder: Path, bus: str) -> Path:
+    shipped = config_path("tx40_cell.yaml")
+    data = yaml.safe_load(shipped.read_text())
+    data |= {"cell": "guarded", "robot": str(shipped.parent / data["robot"]), "bus": {"channel": bus}}
+    data |= {"sync": {"period_us": round(PERIOD_S * 1e6)}, "heartbeat_ms": HEARTBEAT_MS}
+    for drive in data["drives"]:
+        drive["eds"] = str(shipped.parent / drive["eds"])
+    data["setpoints"] |= {"trajectory": str(shipped.parent / data["setpoints"]["trajectory"]), "every": 1}
+    path = folder / "guarded.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def _guarded(config: Path, log: Path) -> None:
+    """Run the guard as the command does, with what it prints in a file."""
+    with log.open("w", buffering=1) as out:
+        sys.stdout = sys.stderr = out
+        try:
+            guard(str(config))
+        except ArmidentError as error:
+            print(error)
+            out.flush()
+            os._exit(error.exit_code)
+    os._exit(0)
+
+
+class Guarded:
+    """The guard in a process of its own; forked, so that every test need not import everything anew."""
+
+    def __init__(self, folder: Path, bus: str) -> None:
+        self._log = folder / "guard.log"
+        self._log.touch()
+        config = session_file(folder, bus)
+        self.process = multiprocessing.get_context("fork").Process(target=_guarded, args=(config, self._log))
+        self.process.start()
+        until = time.monotonic() + 60
+        while "ready" not in self.text and self.process.is_alive() and time.monotonic() < until:
+            time.sleep(0.02)
+        assert "ready" in self.text, self.text
+
+    @property
+    def text(self) -> str:
+        return self._log.read_text()
+
+    def end(self) -> tuple[int | None, str]:
+        """Its exit code and all that it printed."""
+        self.process.join(30)
+        return self.process.exitcode, self.text
+
+
+@pytest.fixture
+def guarded(vcan_bus: str, tmp_path: Path) -> Iterator[Guarded]:
+    running = Guarded(tmp_path, vcan_bus)
+    yield running
+    running.process.kill()
+    running.process.join()
+
+
+@dataclass
+class Dump:
+    """What was on the bus, as candump would show it: kernel time (ns), identifier, data."""
+
+    rows: list[tuple[int, int, bytes]]
+
+    def first(self, wanted: Callable[[int, bytes], bool]) -> int | None:
+        return next((k for k, (_, can_id, data) in enumerate(self.rows) if wanted(can_id, data)), None)
+
+    def orders(self) -> list[int]:
+        """Where nodes were told to stop, by RPDO and by SDO."""
+        words = {rpdo_cob(2, node): QUICK_STOP for node in range(1, N + 1)}
+        words |= {COB_SDO_REQUEST + node: b"\x2b\x40\x60\x00" + QUICK_STOP + b"\0\0" for node in range(1, N + 1)}
+        return [k for k, (_, can_id, data) in enumerate(self.rows) if words.get(can_id) == data]
+
+
+def play(bus: str, guarded: Guarded, cell: Cell, fault: Change, quiet: int = 15, after: int = 150) -> Dump:
+    """Cycles without and then with a fault, until some after the guard has ended; everything that was on the bus."""
+    with RawSocket(bus, filters=()) as sender, RawSocket(bus) as listener:
+        batch, rows, ended = frames(4096), [], None
+        k = 0
+        while k < quiet + after and (ended is None or k < ended + 3):
+            if k == quiet:
+                fault(cell)
+            for can_id, data in cell.cycle(k):
+                sender.send(frame(can_id, data))
+            time.sleep(PERIOD_S)
+            if ended is None and guarded.process.exitcode is not None:
+                ended = k
+            k += 1
+        while listener.poll(0.05):
+            got = listener.receive(batch)
+            rows += [
+                (int(row["t_ns"]), int(row["can_id"]), row["data"][: row["length"]].tobytes()) for row in batch[:got]
+            ]
+    return Dump(rows)
+
+
+def check(dump: Dump, offending: int | None, most_syncs: int = 1) -> float:
+    """All six drives were told to stop, both ways, within ``most_syncs`` SYNCs of a frame; how late, in ms."""
+    assert offending is not None
+    orders = dump.orders()
+    assert len(orders) == 2 * N, f"{len(orders)} orders"
+    assert orders[0] > offending
+    syncs = sum(1 for _, can_id, _ in dump.rows[offending + 1 : orders[-1]] if can_id == COB_SYNC)
+    late = (dump.rows[orders[-1]][0] - dump.rows[offending][0]) * 1e-6
+    print(f"last stop order {late:.2f} ms and {syncs} SYNC after the offending frame")
+    assert syncs <= most_syncs
+    return late
+
+
+ROBOT = load_robot("tx40.yaml")
+COUNTS = counts_per_si(ROBOT)
+
+
+def motor_counts(*joints: float) -> NDArray[np.float64]:
+    """Motor positions (counts) of joint positions (rad)."""
+    counts: NDArray[np.float64] = np.rint(ROBOT.transmission_matrix @ np.array(joints) * COUNTS)
+    return counts
+
+
+def jumping(cell: Cell) -> None:
+    cell.position[:] = cell.demand[:] = motor_counts(0, 1.5, 0, 0, 0, 0)
+
+
+def overloaded(cell: Cell) -> None:
+    cell.current[0] = 32000
+
+
+def off_its_demand(cell: Cell) -> None:
+    cell.demand[:] = motor_counts(0, 0, 1.0, 0, 0, 0)
+
+
+def sample_of(j: int, changed: bytes) -> Callable[[int, bytes], bool]:
+    return lambda can_id, data: can_id == tpdo_cob(1, j + 1) and data[: len(changed)] == changed
+
+
+@pytest.mark.parametrize(
+    ("fault", "says", "offending"),
+    [
+        (
+            jumping,
+            "joint_2: velocity",
+            sample_of(1, int(motor_counts(0, 1.5, 0, 0, 0, 0)[1]).to_bytes(4, "little", signed=True)),
+        ),
+        (overloaded, "joint_1: torque", sample_of(0, b"\0\0\0\0" + (32000).to_bytes(2, "little"))),
+        (
+            off_its_demand,
+            "joint_3: following error 1.0000 rad, allowed is 0.75",
+            lambda can_id, data: can_id == tpdo_cob(2, 3) and data != b"\0\0\0\0",
+        ),
+        (
+            lambda cell: setattr(cell, "extra", ((COB_EMCY + 4, b"\x10\x43\x08\0\0\0\0\0"),)),
+            "joint_4: EMCY 4310h, excess drive temperature",
+            lambda can_id, data: can_id == COB_EMCY + 4,
+        ),
+        (
+            lambda cell: setattr(cell, "extra", ((COB_HEARTBEAT + 5, b"\0"),)),
+            "joint_5: its drive has left the NMT state operational (state 0)",
+            lambda can_id, data: can_id == COB_HEARTBEAT + 5 and data == b"\0",
+        ),
+    ],
+    ids=["velocity", "torque", "following_error", "emcy", "reboot"],
+)
+def test_an_offending_frame_is_followed_by_a_stop_within_one_cycle(
+    vcan_bus: str, guarded: Guarded, fault: Change, says: str, offending: Callable[[int, bytes], bool]
+) -> None:
+    dump = play(vcan_bus, guarded, Cell(), fault)
+    code, err = guarded.end()
+    assert code == 1
+    assert says in err
+    check(dump, dump.first(offending))
+
+
+def test_a_position_beyond_its_limit_stops_the_arm(vcan_bus: str, guarded: Guarded) -> None:
+    """Reached slowly, so that it is the position that is wrong: 2.16 rad, then 2.19 rad in steps below the limit."""
+    cell = Cell()
+    cell.position[:] = cell.demand[:] = motor_counts(0, 2.16, 0, 0, 0, 0)
+
+    def fault(cell: Cell) -> None:
+        cell.position[:] = cell.demand[:] = motor_counts(0, 2.19, 0, 0, 0, 0)
+
+    dump = play(vcan_bus, guarded, cell, fault)
+    _, err = guarded.end()
+    assert "joint_2: position 2.1900 rad, allowed is -2.18 to 2.18" in err
+    wanted = int(motor_counts(0, 2.19, 0, 0, 0, 0)[1]).to_bytes(4, "little", signed=True)
+    check(dump, dump.first(sample_of(1, wanted)))
+
+
+def test_a_lost_heartbeat_stops_the_arm_within_a_cycle_of_its_time(vcan_bus: str, guarded: Guarded) -> None:
+    """Its time is three periods and a tenth of a second after the last one."""
+    dump = play(vcan_bus, guarded, Cell(), lambda cell: setattr(cell, "beating", (1, 2, 4, 5, 6)))
+    _, err = guarded.end()
+    assert "joint_3: no heartbeat for 0.4" in err
+    beats = [k for k, (_, can_id, _) in enumerate(dump.rows) if can_id == COB_HEARTBEAT + 3]
+    late = check(dump, beats[-1], most_syncs=1000)
+    allowed = (3 * HEARTBEAT_MS + 100) / 1000
+    begin = dump.rows[beats[-1]][0]
+    syncs = [t for t, can_id, _ in dump.rows if can_id == COB_SYNC and t > begin + allowed * 1e9]
+    # Of the SYNCs after the time was up, one may come before the last order.
+    assert late * 1e6 + begin <= syncs[1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_the_arm_at_once(vcan_bus: str, guarded: Guarded, number: signal.Signals) -> None:
+    sent = []
+
+    def interrupt(_: Cell) -> None:
+        sent.append(time.time_ns())
+        assert guarded.process.pid is not None
+        os.kill(guarded.process.pid, number)
+
+    dump = play(vcan_bus, guarded, Cell(), interrupt)
+    code, err = guarded.end()
+    assert code == 0, err
+    before = [k for k, (t, _, _) in enumerate(dump.rows) if t < sent[0]]
+    check(dump, before[-1])
+    print(f"last stop order {(dump.rows[dump.orders()[-1]][0] - sent[0]) * 1e-6:.2f} ms after the signal")
+
+
+def test_a_capture_that_dies_in_the_middle_of_the_motion_is_noticed(vcan_bus: str, guarded: Guarded) -> None:
+    def die(cell: Cell) -> None:
+        cell.sync = cell.setpoints = False
+
+    dump = play(vcan_bus, guarded, Cell(), die)
+    _, err = guarded.end()
+    assert "no SYNC for 2.0" in err
+    assert len(dump.orders()) == 2 * N
+
+
+def test_a_motion_that_ends_properly_is_left_alone(vcan_bus: str, guarded: Guarded) -> None:
+    """SYNC goes on after the last set point, NMT takes the drives out of operation, then all is silent."""
+    cell = Cell()
+    play(vcan_bus, guarded, cell, lambda cell: setattr(cell, "setpoints", False), quiet=20, after=20)
+
+    def over(cell: Cell) -> None:
+        cell.sync = False
+        cell.beating = ()
+        cell.extra = ((COB_NMT, b"\x80\x01"), (COB_HEARTBEAT + 1, b"\x7f"))
+
+    dump = play(vcan_bus, guarded, cell, over, quiet=0, after=40)
+    assert guarded.process.is_alive()
+    assert dump.orders() == []
+
+
+def test_nothing_is_stopped_before_the_arm_moves(vcan_bus: str, guarded: Guarded) -> None:
+    """Whatever the drives say: the capture has not begun, or somebody else moves the arm by hand."""
+    dump = play(vcan_bus, guarded, Cell(setpoints=False), jumping, quiet=10, after=20)
+    assert guarded.process.is_alive()
+    assert dump.orders() == []
