@@ -1,4 +1,4 @@
-"""The session: which bus, which drives, what is streamed, recorded, published and identified."""
+"""The session: which buses, which drives, what is streamed, recorded, published and identified."""
 
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -13,34 +13,58 @@ Every = Annotated[int, Field(ge=1, le=240)]
 
 
 class Bus(Frozen):
-    """A CAN bus. ``bitrate`` is ``None`` on a virtual bus, which has none."""
+    """A CAN bus. ``bitrate`` is ``None`` on a virtual bus, which has none.
+
+    With ``fd`` TPDOs are CAN FD frames of up to 64 bytes, whose data go at ``data_bitrate``; all else stays classic.
+    """
 
     interface: Literal["socketcan", "udp_multicast"] = "socketcan"
     channel: str = "vcan0"
     bitrate: Annotated[int, Field(gt=0)] | None = None
+    fd: bool = False
+    data_bitrate: Annotated[int, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.data_bitrate is not None and not self.fd:
+            raise ValueError(f"bus {self.channel}: data_bitrate: only a bus with fd: true has one")
+        if self.fd and (self.bitrate is None) != (self.data_bitrate is None):
+            raise ValueError(f"bus {self.channel}: bitrate and data_bitrate: a bus with fd: true has both or none")
+        if self.fd and self.interface != "socketcan":
+            raise ValueError(f"bus {self.channel}: fd: {self.interface} carries classic frames only")
+        return self
 
 
 class Sync(Frozen):
-    """SYNC (CiA 301 section 7.2.5): who sends it, how often, and the overflow of its counter (1019h)."""
+    """SYNC (CiA 301 section 7.2.5): who sends it, how often, and the overflow of its counter (1019h).
+
+    ``source``: who keeps the time where we send it, a loop of our own or the kernel (CAN_BCM).
+    """
 
     role: Literal["producer", "consumer"] = "producer"
     period_us: Annotated[int, Field(ge=100, le=1_000_000)] = 200
     counter: Annotated[int, Field(ge=2, le=240)] = 240
+    source: Literal["loop", "kernel"] = "loop"
 
 
 class DriveNode(Frozen):
-    """One CANopen node and the joint whose motor it drives."""
+    """One CANopen node and the joint whose motor it drives; ``bus`` is its channel, where there are several."""
 
     joint: Name
     node_id: Annotated[int, Field(ge=1, le=127)]
     eds: Path
+    bus: str | None = None
 
 
 class Stream(Frozen):
-    """One TPDO of every drive, sent on every ``every``-th SYNC, recorded as the topic of this name."""
+    """One TPDO of every drive, sent on every ``every``-th SYNC, recorded as the topic of this name.
+
+    With ``pack`` the drive takes a sample at every SYNC and sends the last ``pack`` of them in one TPDO.
+    """
 
     tpdo: Annotated[int, Field(ge=1, le=4)]
     every: Every = 1
+    pack: Annotated[int, Field(ge=1, le=64)] = 1
     objects: Annotated[tuple[ObjectName, ...], Field(min_length=1)]
 
 
@@ -118,6 +142,7 @@ class SessionConfig(Frozen):
     cell: Name
     robot: Path
     bus: Bus = Bus()
+    buses: tuple[Bus, ...] = ()
     sync: Sync = Sync()
     drives: Annotated[tuple[DriveNode, ...], Field(min_length=1)]
     heartbeat_ms: Annotated[int, Field(ge=10, le=60_000)] = 100
@@ -131,9 +156,7 @@ class SessionConfig(Frozen):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        nodes = [d.node_id for d in self.drives]
-        if len(set(nodes)) != len(nodes):
-            raise ValueError("drives: node_id must be unique")
+        self._check_buses()
         if len({d.joint for d in self.drives}) != len(self.drives):
             raise ValueError("drives: each joint has one drive")
         tpdos = [s.tpdo for s in self.streams.values()]
@@ -141,12 +164,60 @@ class SessionConfig(Frozen):
             raise ValueError("streams: each stream needs a tpdo of its own")
         if "samples" not in self.streams or self.streams["samples"].every != 1:
             raise ValueError("streams: a stream named 'samples' with every: 1 is required")
-        for label, every in [(f"streams.{k}", s.every) for k, s in self.streams.items()] + (
-            [("setpoints", self.setpoints.every)] if self.setpoints else []
-        ):
-            if self.sync.counter % every:
-                raise ValueError(f"{label}.every: {every} does not divide sync.counter {self.sync.counter}")
+        intervals = {f"streams.{k}.every": s.every for k, s in self.streams.items()}
+        intervals |= {f"streams.{k}.pack": s.pack for k, s in self.streams.items()}
+        if self.setpoints is not None:
+            intervals["setpoints.every"] = self.setpoints.every
+        for label, interval in intervals.items():
+            if self.sync.counter % interval:
+                raise ValueError(f"{label}: {interval} does not divide sync.counter {self.sync.counter}")
+        for name, stream in self.streams.items():
+            if stream.pack > 1 and stream.every > 1:
+                raise ValueError(f"streams.{name}: pack needs every: 1; a packed sample is taken at every SYNC")
+        if self.sync.source == "kernel":
+            self._check_kernel_sync()
         return self
+
+    def _check_buses(self) -> None:
+        channels = [bus.channel for bus in self.all_buses]
+        if len(set(channels)) != len(channels):
+            raise ValueError("buses: each needs a channel of its own")
+        for k, drive in enumerate(self.drives):
+            if drive.bus is None and len(channels) > 1:
+                raise ValueError(f"drives[{k}].bus: expected one of {', '.join(channels)}; there are several buses")
+            if drive.bus is not None and drive.bus not in channels:
+                raise ValueError(f"drives[{k}].bus: {drive.bus!r} is not among the buses ({', '.join(channels)})")
+        nodes = [(self.bus_of(drive).channel, drive.node_id) for drive in self.drives]
+        if len(set(nodes)) != len(nodes):
+            raise ValueError("drives: node_id must be unique on its bus")
+        idle = sorted(set(channels) - {channel for channel, _ in nodes})
+        if idle:
+            raise ValueError(f"buses: no drive is on {', '.join(idle)}")
+        if len(channels) > 1 and any(bus.interface != "socketcan" for bus in self.all_buses):
+            raise ValueError("buses: several buses need interface socketcan; times of others cannot be compared")
+
+    def _check_kernel_sync(self) -> None:
+        if self.sync.role != "producer":
+            raise ValueError("sync.source: only who sends SYNC (role producer) chooses its source")
+        if len(self.all_buses) > 1:
+            raise ValueError("sync.source: the kernel keeps a timer per bus, and they drift apart; expected loop")
+        if self.bus_of(self.drives[0]).interface != "socketcan":
+            raise ValueError("sync.source: kernel needs interface socketcan")
+        if self.setpoints is not None:
+            raise ValueError("sync.source: set points go out behind SYNC, which the kernel cannot do; expected loop")
+
+    @property
+    def all_buses(self) -> tuple[Bus, ...]:
+        """The buses of the session, one or several."""
+        return self.buses or (self.bus,)
+
+    def bus_of(self, drive: DriveNode) -> Bus:
+        """The bus that a drive is on."""
+        return next((bus for bus in self.all_buses if bus.channel == drive.bus), self.all_buses[0])
+
+    def drives_on(self, bus: Bus) -> tuple[DriveNode, ...]:
+        """The drives on a bus."""
+        return tuple(drive for drive in self.drives if self.bus_of(drive) == bus)
 
     @property
     def sync_period(self) -> float:

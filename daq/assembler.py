@@ -7,27 +7,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.matching import (
+from configs import DataError
+from daq.books import (
     AMBIGUOUS,
     COUNT_NAMES,
     COUNTER,
     LOST,
+    NO_SYNC,
     ORIGIN,
     RECEIVED,
     SYNC,
-    UNSEEN,
+    SYNC_MISALIGNED,
     WRONG_LENGTH,
     Decided,
-    count_sync,
-    finish,
-    match,
+    Shape,
     open_books,
     room_for,
 )
+from daq.matching import count_sync, finish, match
 from daq.recording import Gap
 
-REASONS = {LOST: "lost", WRONG_LENGTH: "wrong length", AMBIGUOUS: "ambiguous order"}
 SYNC_LOST = "SYNC not received"
+UNSENT = "pack not complete"
+"""SYNCs after the last packed TPDO: no drive was to send their samples any more."""
+REASONS = {NO_SYNC: SYNC_LOST, LOST: "lost", WRONG_LENGTH: "wrong length", AMBIGUOUS: "ambiguous order"}
 LATE_S = 4.0
 """A drive that owes an answer for longer than this while others have answered has lost it, s."""
 PATIENCE_S = 120.0
@@ -40,17 +43,27 @@ _LONGEST_OUTAGE_S = 60.0
 
 @dataclass(frozen=True)
 class TpdoStream:
-    """What the assembler has to know of a stream: the COB-ID of each joint's TPDO, how often, how many bytes."""
+    """What the assembler has to know of a stream: the COB-ID of each joint's TPDO, how often, how many bytes.
+
+    A frame of ``length`` bytes holds ``pack`` samples of ``size`` bytes (0: all of it), one of every SYNC.
+    """
 
     name: str
     every: int
     cob_ids: tuple[int, ...]
     length: int
+    pack: int = 1
+    size: int = 0
+
+    @property
+    def shape(self) -> Shape:
+        """How its frames come."""
+        return Shape(max(self.every, self.pack), self.pack, self.size or self.length, self.length)
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Complete rows: ``sync`` and ``t_ns`` (N,), ``data`` (N, n, 8) the bytes of each joint's TPDO."""
+    """Complete rows: ``sync`` and ``t_ns`` (N,), ``data`` (N, n, 8) or wider the bytes of each joint's sample."""
 
     sync: NDArray[np.int64]
     t_ns: NDArray[np.int64]
@@ -66,7 +79,7 @@ class Batch:
 
 
 class Assembler:
-    """Matches SYNC and TPDO frames; the result does not depend on how the frames are split into batches.
+    """Matches SYNC and TPDO frames; the result does not depend on how a bus's frames are split into batches.
 
     Parameters
     ----------
@@ -82,6 +95,8 @@ class Assembler:
         Counter of SYNC 0 where that is known (own producer); ``None``: the first SYNC seen is SYNC 0.
     sync_id
         COB-ID of SYNC.
+    bus_of
+        Number of the bus that each joint's drive is on; empty: all on one.
     """
 
     def __init__(
@@ -92,24 +107,29 @@ class Assembler:
         overflow: int = 240,
         first_counter: int | None = 1,
         sync_id: int = 0x80,
+        bus_of: Sequence[int] = (),
     ) -> None:
         self._streams, self._joints = tuple(streams), tuple(joints)
         self._timing = sync_id, period_ns, overflow
         self._longest = int(_LONGEST_OUTAGE_S * 1e9 / period_ns)
-        channel_of = np.full(0x800, -1, np.int64)
+        where = tuple(bus_of) or (0,) * len(joints)
+        channel_of = np.full((max(where) + 1, 0x800), -1, np.int64)
         for s, stream in enumerate(streams):
             for j, cob_id in enumerate(stream.cob_ids):
-                channel_of[cob_id] = s * len(joints) + j
-        every = [stream.every for stream in streams]
+                channel_of[where[j], cob_id] = s * len(joints) + j
+        self._shapes = [stream.shape for stream in streams]
         window, patience = (
-            [max(_FEWEST_LATE, int(seconds * 1e9 / period_ns) // e) for e in every] for seconds in (LATE_S, PATIENCE_S)
+            [max(_FEWEST_LATE, int(seconds * 1e9 / period_ns) // shape.every) for shape in self._shapes]
+            for seconds in (LATE_S, PATIENCE_S)
         )
-        self._books = open_books(every, window, patience, [s.length for s in streams], channel_of, len(joints))
+        self._books = open_books(self._shapes, window, patience, where, channel_of)
+        self._slack = int(self._books.slack[0])
         if first_counter is not None:
-            self._books.state[COUNTER] = (first_counter - 1) % overflow
-            self._books.state[ORIGIN] = first_counter
-        self._dropped = False
+            self._books.state[:, COUNTER] = (first_counter - 1) % overflow
+            self._books.state[:, ORIGIN] = first_counter
+        self._lossy = np.zeros(len(channel_of), bool)
         self._open: dict[tuple[str, str | None, str], tuple[int, int]] = {}
+        self._given = [0] * len(streams)
         self._totals = dict.fromkeys(
             [f"{s.name}.{what}" for s in streams for what in ("expected", "rows", "in_gaps", "discarded")], 0
         )
@@ -117,12 +137,21 @@ class Assembler:
     @property
     def last_sync(self) -> int:
         """Number of the last SYNC known of; -1 before the first."""
-        return int(self._books.state[SYNC])
+        return int(self._books.state[:, SYNC].max())
 
     @property
     def owed(self) -> int:
         """Most SYNCs that any drive has still to answer."""
-        return int((self._books.head[:, None] - self._books.settled - self._books.pending).max())
+        heads = self._books.head[self._books.bus_of].T
+        return int((heads - self._books.settled - self._books.pending).max())
+
+    @property
+    def wrong_lengths(self) -> dict[tuple[str, str], int]:
+        """How many TPDOs of another length than their mapping's have come, by stream and joint; those that did."""
+        return {
+            (self._streams[s].name, self._joints[j]): int(self._books.wrong[s, j])
+            for s, j in np.argwhere(self._books.wrong > 0)
+        }
 
     @property
     def counters(self) -> dict[str, int]:
@@ -134,30 +163,48 @@ class Assembler:
         counts = dict(zip(COUNT_NAMES, (int(c) for c in self._books.counts), strict=True))
         return counts | self._totals
 
-    def push(self, frames: NDArray[Any], sent: int | None = None, dropped: bool = False) -> Batch:
-        """Take frames in the order they came.
+    def push(self, frames: NDArray[Any], sent: int | None = None, dropped: bool = False, bus: int = 0) -> Batch:
+        """Take frames of one bus in the order they came.
 
         Parameters
         ----------
         frames
-            Structured array with ``t_ns``, ``can_id``, ``length`` and ``data`` (8 bytes), as the socket gives it.
+            Structured array with ``t_ns``, ``can_id``, ``length`` and ``data`` (8 or 64 bytes), as the socket gives it.
         sent
             How many SYNC were sent so far, where we send them: no gap is longer than that.
         dropped
-            Whether the kernel dropped frames between the last call and the end of these.
+            Whether frames of this bus were lost between the last call and the end of these, as the kernel knows.
+        bus
+            The bus they came from.
+
+        Raises
+        ------
+        DataError
+            If the SYNC counters of two buses do not agree.
         """
-        columns = _columns(frames)
-        self._dropped |= dropped
-        longest = self._longest if sent is None else min(self._longest, sent - self.last_sync)
-        if sent is not None and not self._dropped:
+        arguments = (*_columns(frames), *self._timing, bus)
+        self._lossy[bus] |= dropped
+        last = int(self._books.state[bus, SYNC])
+        longest = self._longest if sent is None else min(self._longest, sent - last)
+        if sent is not None and not self._lossy[bus]:
             # Our own SYNCs reach us unless the kernel drops them: time that passed is a producer held up, no loss.
             longest = 0
-        syncs = _count_sync(*columns, *self._timing, longest, self._books)
+        syncs = _count_sync(*arguments, longest, self._books)
         if dropped:
-            self._books.hole[:] = self._books.head + syncs + 1
+            self._books.hole[:] = self._books.top + syncs + 1
         out = room_for(self._books, syncs)
-        _match(*columns, *self._timing, longest, self._books, out)
+        _match(*arguments, longest, self._books, out)
+        if self._books.counts[SYNC_MISALIGNED]:
+            raise DataError(
+                f"bus {bus + 1}: its SYNC counter says another number than that of another bus at the same time; "
+                "buses of one session need SYNC from one master"
+            )
         return self._batch(out, False)
+
+    def silence(self, bus: int, silent: bool) -> None:
+        """Say that a bus is known to be down, or back: its drives owe nothing meanwhile, and the others go on."""
+        self._books.slack[bus] = 0 if silent else self._slack
+        self._lossy[bus] |= silent
 
     def finish(self, sent: int | None = None) -> Batch:
         """No more frames come; ``sent`` SYNC were sent in all, if we know."""
@@ -167,13 +214,13 @@ class Assembler:
         return self._batch(out, True)
 
     def warm_up(self, frames: NDArray[Any]) -> None:
-        """Compile the loops for frames like these (two or more), so that no SYNC waits for the compiler."""
-        every, few = self._books.every.tolist(), [_FEWEST_LATE] * self._books.every.size
-        nobody = np.full(1, -1, np.int64)
-        scratch = open_books(every, few, few, self._books.length.tolist(), nobody, self._books.settled.shape[1])
-        columns = _columns(frames)
-        out = room_for(scratch, _count_sync(*columns, *self._timing, self._longest, scratch))
-        _match(*columns, *self._timing, self._longest, scratch, out)
+        """Compile the loops for frames like these, so that no SYNC waits for the compiler."""
+        few = [_FEWEST_LATE] * len(self._shapes)
+        nobody = np.full((self._lossy.size, 1), -1, np.int64)
+        scratch = open_books(self._shapes, few, few, self._books.bus_of.tolist(), nobody)
+        arguments = (*_columns(frames), *self._timing, 0)
+        out = room_for(scratch, _count_sync(*arguments, self._longest, scratch))
+        _match(*arguments, self._longest, scratch, out)
         _finish(0, scratch, out)
 
     def _batch(self, out: Decided, final: bool) -> Batch:
@@ -181,28 +228,39 @@ class Assembler:
         for s, stream in enumerate(self._streams):
             part = slice(0, int(out.rows[s]))
             sync, t_ns, code = out.sync[s, part], out.t_ns[s, part], out.code[s, part]
-            whole = (t_ns != UNSEEN) & (code == RECEIVED).all(axis=1)
+            data = out.data[s, part, :, : -(-self._shapes[s].size // 8)]
+            whole = (code == RECEIVED).all(axis=1)
             self._totals[f"{stream.name}.expected"] += whole.size
             complete = int(np.count_nonzero(whole))
             self._totals[f"{stream.name}.rows"] += complete
             if complete < whole.size:
                 self._totals[f"{stream.name}.in_gaps"] += whole.size - complete
                 self._totals[f"{stream.name}.discarded"] += int(np.count_nonzero(code[~whole] == RECEIVED))
-                gaps += self._gaps(stream, sync[~whole], t_ns[~whole], code[~whole])
-                rows[stream.name] = Rows(sync[whole], t_ns[whole], _bytes(out.data[s, part][whole]))
+                gaps += self._gaps(stream, sync[~whole], code[~whole])
+                rows[stream.name] = Rows(sync[whole], t_ns[whole], _bytes(data[whole]))
             else:
-                rows[stream.name] = Rows(sync, t_ns, _bytes(out.data[s, part]))
+                rows[stream.name] = Rows(sync, t_ns, _bytes(data))
+            if sync.size:
+                self._given[s] = int(sync[-1]) + 1
+            if final and stream.pack > 1:
+                gaps += self._unsent(s)
             gaps += self._ended(stream, int(sync[-1]) if sync.size else None, final)
         return Batch(rows, tuple(sorted(gaps, key=lambda g: (g.first, g.stream, g.joint or ""))))
 
-    def _gaps(
-        self, stream: TpdoStream, sync: NDArray[np.int64], t_ns: NDArray[np.int64], code: NDArray[np.uint8]
-    ) -> list[Gap]:
+    def _unsent(self, s: int) -> list[Gap]:
+        """The SYNCs since the last packed TPDO, as a gap."""
+        stream, first, last = self._streams[s], self._given[s], self.last_sync
+        if first > last:
+            return []
+        self._totals[f"{stream.name}.expected"] += last - first + 1
+        self._totals[f"{stream.name}.in_gaps"] += last - first + 1
+        return [Gap(stream.name, first, last, None, UNSENT)]
+
+    def _gaps(self, stream: TpdoStream, sync: NDArray[np.int64], code: NDArray[np.uint8]) -> list[Gap]:
         """Gaps that are over, of the incomplete rows given; what may go on is kept open."""
-        unseen = t_ns == UNSEEN
-        found: list[tuple[str | None, str, NDArray[np.int64]]] = [(None, SYNC_LOST, sync[unseen])]
+        found: list[tuple[str | None, str, NDArray[np.int64]]] = []
         for value, reason in REASONS.items():
-            hit = (code == value) & ~unseen[:, None]
+            hit = code == value
             everyone = hit.all(axis=1)
             found.append((None, reason, sync[everyone]))
             found += [(name, reason, sync[hit[:, j] & ~everyone]) for j, name in enumerate(self._joints)]
@@ -239,11 +297,17 @@ _count_sync: Any = count_sync
 _finish: Any = finish
 
 
-def _columns(frames: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """Identifiers, lengths, times and data (as one number each) of frames."""
-    return frames["can_id"], frames["length"], frames["t_ns"], frames["data"].view("<u8")[:, 0]
+def _columns(frames: NDArray[Any]) -> tuple[Any, ...]:
+    """Count of frames, and their identifiers, lengths, times and data (as numbers of eight bytes)."""
+    count = frames.size
+    if count < 2:
+        # Columns of one frame or none count as contiguous, which would compile the loops anew.
+        room = np.zeros(2, frames.dtype)
+        room[:count] = frames
+        frames = room
+    return count, frames["can_id"], frames["length"], frames["t_ns"], frames["data"].view("<u8")
 
 
 def _bytes(data: NDArray[np.uint64]) -> NDArray[np.uint8]:
-    """Numbers (N, n) as the bytes (N, n, 8) they were read from."""
-    return data.view(np.uint8).reshape(*data.shape, 8)
+    """Numbers (N, n, words) as the bytes (N, n, 8 words) they were read from."""
+    return np.ascontiguousarray(data).view(np.uint8)

@@ -2,134 +2,52 @@
 
 A TPDO carries no number, only an order: each drive answers its SYNCs one after the other. So per drive and TPDO,
 SYNCs and answers are matched first to first. As long as a drive owes nothing when the books are closed (at the next
-SYNC) the match is certain, however late the answers came. A drive that owes while another has answered, for longer
-than a window of SYNCs, has lost something; then every answer is taken as prompt (the latest SYNC it can belong to),
-and where answers also came in bursts the matter is undecidable and the samples in question are given up as
-``AMBIGUOUS``, never guessed. While all drives owe at every SYNC and no frame is known to be missing, the bus is
+SYNC of its bus) the match is certain, however late the answers came. A drive that owes while another has answered, for
+longer than a window of SYNCs, has lost something; then every answer is taken as prompt (the latest SYNC it can belong
+to), and where answers also came in bursts the matter is undecidable and the samples in question are given up as
+``AMBIGUOUS``, never guessed. While all drives owe at every SYNC and no frame is known to be missing, the buses are
 behind and nothing is lost: then the window is ``patience`` SYNCs.
+
+Several buses carry the same SYNC numbers: a row is one SYNC of all axes. Where SYNC is not ours the buses are aligned
+by its counter and the time at which it came. A bus on which no SYNC comes while others go on is silent: its SYNCs are
+missing, and its drives owe nothing for them.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-LOST, RECEIVED, WRONG_LENGTH, AMBIGUOUS = 0, 1, 2, 3
-"""What is known of one joint's sample at one SYNC."""
-
-UNSEEN = int(np.iinfo(np.int64).min)
-"""The time of a SYNC that was not received."""
-
-# Positions in Books.state: number, counter and time of the last SYNC, counter of SYNC 0.
-SYNC, COUNTER, TIME, ORIGIN = 0, 1, 2, 3
-
-COUNT_NAMES = (
-    "sync_seen",
-    "sync_missing",
-    "sync_repeated",
-    "frames",
-    "frames_unknown",
-    "tpdo_early",
-    "tpdo_duplicate",
-    "tpdo_wrong_length",
+from daq.books import (
+    AMBIGUOUS,
+    COUNTER,
+    FRAMES,
+    FRAMES_UNKNOWN,
+    LOST,
+    NO_SYNC,
+    ORIGIN,
+    RECEIVED,
+    RECENT,
+    SYNC,
+    SYNC_MISALIGNED,
+    SYNC_MISSING,
+    SYNC_REPEATED,
+    SYNC_SEEN,
+    TIME,
+    TPDO_DUPLICATE,
+    TPDO_EARLY,
+    TPDO_LATE,
+    TPDO_WRONG_LENGTH,
+    UNSEEN,
+    WRONG_LENGTH,
+    Books,
+    Decided,
 )
-SYNC_SEEN, SYNC_MISSING, SYNC_REPEATED, FRAMES, FRAMES_UNKNOWN, TPDO_EARLY, TPDO_DUPLICATE, TPDO_WRONG_LENGTH = range(8)
 
 _DISORDER = 8
 """A SYNC counter that goes back by less than this is a repeated SYNC, not a long gap."""
-
-
-class Books(NamedTuple):
-    """What is owed and what has come; streams ``s``, joints ``j``, a stream's own SYNCs counted by ordinals ``u``.
-
-    Rows ``u`` of stream ``s`` stand in ring slots ``(u - base) % C`` until every joint has settled them; with nothing
-    open the ring begins anew, so that memory is only touched where answers are late. ``behind`` is the last ordinal
-    at which all joints owed, ``hole`` the last before which a frame is known to be missing.
-    """
-
-    state: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    every: NDArray[np.int64]
-    window: NDArray[np.int64]
-    patience: NDArray[np.int64]
-    length: NDArray[np.int64]
-    channel_of: NDArray[np.int64]
-    head: NDArray[np.int64]
-    base: NDArray[np.int64]
-    behind: NDArray[np.int64]
-    hole: NDArray[np.int64]
-    emitted: NDArray[np.int64]
-    settled: NDArray[np.int64]
-    pending: NDArray[np.int64]
-    fresh: NDArray[np.int64]
-    label: NDArray[np.int64]
-    answer: NDArray[np.uint64]
-    answer_code: NDArray[np.uint8]
-    row_sync: NDArray[np.int64]
-    row_t: NDArray[np.int64]
-    row_code: NDArray[np.uint8]
-    row_data: NDArray[np.uint64]
-
-
-class Decided(NamedTuple):
-    """Rows whose fate is decided, ``rows[s]`` of each stream."""
-
-    rows: NDArray[np.int64]
-    sync: NDArray[np.int64]
-    t_ns: NDArray[np.int64]
-    code: NDArray[np.uint8]
-    data: NDArray[np.uint64]
-
-
-def open_books(
-    every: list[int],
-    window: list[int],
-    patience: list[int],
-    length: list[int],
-    channel_of: NDArray[np.int64],
-    n: int,
-) -> Books:
-    """Empty books for streams of ``n`` joints; ``channel_of`` maps a COB-ID to ``s n + j``, or -1."""
-    streams, rows = len(every), 2 * max(patience) + 8
-    answers = rows + 64
-    return Books(
-        state=np.array([-1, -1, UNSEEN, 1]),
-        counts=np.zeros(len(COUNT_NAMES), np.int64),
-        every=np.array(every),
-        window=np.array(window),
-        patience=np.array(patience),
-        length=np.array(length),
-        channel_of=channel_of,
-        head=np.zeros(streams, np.int64),
-        base=np.zeros(streams, np.int64),
-        behind=np.zeros(streams, np.int64),
-        hole=np.zeros(streams, np.int64),
-        emitted=np.zeros(streams, np.int64),
-        settled=np.zeros((streams, n), np.int64),
-        pending=np.zeros((streams, n), np.int64),
-        fresh=np.zeros((streams, n), np.int64),
-        label=np.zeros((streams, n, answers), np.int64),
-        answer=np.zeros((streams, n, answers), np.uint64),
-        answer_code=np.zeros((streams, n, answers), np.uint8),
-        row_sync=np.zeros((streams, rows), np.int64),
-        row_t=np.zeros((streams, rows), np.int64),
-        row_code=np.zeros((streams, rows, n), np.uint8),
-        row_data=np.zeros((streams, rows, n), np.uint64),
-    )
-
-
-def room_for(books: Books, syncs: int) -> Decided:
-    """Room for what can be decided when ``syncs`` more SYNC are known of."""
-    streams, _, n = books.row_code.shape
-    rows = int((books.head - books.emitted).max()) + syncs
-    return Decided(
-        rows=np.zeros(streams, np.int64),
-        sync=np.empty((streams, rows), np.int64),
-        t_ns=np.empty((streams, rows), np.int64),
-        code=np.empty((streams, rows, n), np.uint8),
-        data=np.empty((streams, rows, n), np.uint64),
-    )
+_MISALIGNED = 2.0
+"""SYNCs of equal counters on two buses that are farther apart than so many periods are not the same SYNC."""
 
 
 @njit(cache=True, nogil=True)
@@ -148,6 +66,50 @@ def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longes
 
 
 @njit(cache=True, nogil=True)
+def _begin(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
+    """The first SYNC of a bus: number 0, or what those of another bus say; the step to it, 0 for one before number 0.
+
+    Less than 0 where counters of the buses do not agree.
+    """
+    for other in range(state.shape[0]):
+        if state[other, SYNC] < 0:
+            continue
+        elapsed = (t_ns - state[other, TIME]) / period_ns
+        ahead = int(np.rint(elapsed))
+        if counter >= 0 and state[other, COUNTER] >= 0:
+            step = (counter - state[other, COUNTER]) % overflow
+            ahead = int(step + overflow * np.rint((elapsed - step) / overflow))
+            if abs(elapsed - ahead) > _MISALIGNED:
+                return -1
+        state[bus, ORIGIN] = state[other, ORIGIN]
+        return int(max(0, state[other, SYNC] + ahead + 1))
+    if counter >= 0:
+        state[bus, ORIGIN] = counter
+    return 1
+
+
+@njit(cache=True, nogil=True)
+def _advance(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int) -> int:
+    """By how many SYNCs a bus advances with this one, after which ``state`` says so; nothing changes if it does not."""
+    elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != UNSEEN else 0.0
+    if state[bus, SYNC] < 0 and state[bus, COUNTER] < 0:
+        step = _begin(state, bus, counter, t_ns, period_ns, overflow)
+    elif counter >= 0 and state[bus, COUNTER] >= 0:
+        step = sync_step(counter, state[bus, COUNTER], elapsed, overflow, longest)
+    elif counter < 0 and state.shape[0] > 1:
+        # Without a counter, time alone keeps the buses together.
+        step = min(max(1, int(np.rint(elapsed))), max(1, longest))
+    else:
+        step = 1
+    if step > 0:
+        state[bus, SYNC] += step
+        state[bus, TIME] = t_ns
+        if counter >= 0:
+            state[bus, COUNTER] = counter
+    return int(step)
+
+
+@njit(cache=True, nogil=True)
 def _slot(b: Books, s: int, u: int) -> int:
     return int((u - b.base[s]) % b.row_sync.shape[1])
 
@@ -155,14 +117,18 @@ def _slot(b: Books, s: int, u: int) -> int:
 @njit(cache=True, nogil=True)
 def _place(b: Books, s: int, j: int, u: int, i: int) -> None:
     slot = _slot(b, s, u)
-    b.row_data[s, slot, j] = b.answer[s, j, i]
+    for w in range(b.answer.shape[3]):
+        b.row_data[s, slot, j, w] = b.answer[s, j, i, w]
     b.row_code[s, slot, j] = b.answer_code[s, j, i]
+    if b.label[s, j, i] > u and b.row_t[s, slot, b.pack[s] - 1, b.bus_of[j]] != UNSEEN:
+        b.counts[TPDO_LATE] += 1
 
 
 @njit(cache=True, nogil=True)
 def _settle(b: Books, s: int, j: int, final: bool) -> None:
     """Close the books of one TPDO of one drive: match what is certain, give up what is older than the window."""
-    owed = b.head[s] - b.settled[s, j]
+    head = b.head[b.bus_of[j], s]
+    owed = head - b.settled[s, j]
     count = b.pending[s, j]
     if count > owed:
         b.counts[TPDO_DUPLICATE] += count - owed
@@ -172,14 +138,14 @@ def _settle(b: Books, s: int, j: int, final: bool) -> None:
     if count == owed:
         for i in range(count):
             _place(b, s, j, b.settled[s, j] + i, i)
-        b.settled[s, j] = b.head[s]
+        b.settled[s, j] = head
         b.pending[s, j] = 0
         return
-    late = owed > b.window[s] and b.head[s] - b.behind[s] > b.window[s]
+    late = owed > b.window[s] and head - b.behind[s] > b.window[s]
     if not (late or owed > b.patience[s] or final):
         return
-    keep = b.head[s] if final else b.head[s] - b.window[s]
-    u = b.head[s]
+    keep = head if final else head - b.window[s]
+    u = head
     for i in range(count - 1, -1, -1):
         u = min(b.label[s, j, i], u - 1)
         keep = max(keep, u + 1)
@@ -198,134 +164,178 @@ def _settle(b: Books, s: int, j: int, final: bool) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _settle_all(b: Books, s: int, final: bool, out: Decided) -> None:
-    n, end = b.settled.shape[1], b.head[s]
-    oldest, all_owe = end, n > 1
-    for j in range(n):
-        oldest = min(oldest, b.settled[s, j])
-        all_owe = all_owe and b.settled[s, j] + b.pending[s, j] < b.head[s]
-    if all_owe and oldest >= b.hole[s]:
-        b.behind[s] = b.head[s]
-    for j in range(n):
-        _settle(b, s, j, final)
-        end = min(end, b.settled[s, j])
+def _sample(b: Books, s: int, slot: int, j: int, i: int, word: int) -> Any:
+    """Eight bytes of sample ``i`` of a packed answer."""
+    value = np.uint64(0)
+    for octet in range(8 * word, min(b.size[s], 8 * word + 8)):
+        at = i * b.size[s] + octet
+        taken = (b.row_data[s, slot, j, at >> 3] >> np.uint64(8 * (at & 7))) & np.uint64(0xFF)
+        value |= taken << np.uint64(8 * (octet & 7))
+    return value
+
+
+@njit(cache=True, nogil=True)
+def _emit(b: Books, s: int, end: int, out: Decided) -> None:
+    """Give out the rows before ``end``; a packed one is as many samples."""
+    pack, buses = b.pack[s], b.state.shape[0]
+    words = -(-b.size[s] // 8)
     while b.emitted[s] < end:
         slot = _slot(b, s, b.emitted[s])
-        o = out.rows[s]
-        out.sync[s, o] = b.row_sync[s, slot]
-        out.t_ns[s, o] = b.row_t[s, slot]
-        for j in range(b.settled.shape[1]):
-            out.code[s, o, j] = b.row_code[s, slot, j]
-            out.data[s, o, j] = b.row_data[s, slot, j]
-        out.rows[s] += 1
+        for i in range(pack):
+            k = b.row_sync[s, slot] - pack + 1 + i
+            if k < 0:
+                continue
+            o = out.rows[s]
+            out.sync[s, o] = k
+            out.t_ns[s, o] = UNSEEN
+            for bus in range(buses - 1, -1, -1):
+                if b.row_t[s, slot, i, bus] != UNSEEN:
+                    out.t_ns[s, o] = b.row_t[s, slot, i, bus]
+            for j in range(b.settled.shape[1]):
+                seen = b.row_t[s, slot, i, b.bus_of[j]] != UNSEEN
+                out.code[s, o, j] = b.row_code[s, slot, j] if seen else NO_SYNC
+                for w in range(words):
+                    out.data[s, o, j, w] = b.row_data[s, slot, j, w] if pack == 1 else _sample(b, s, slot, j, i, w)
+            out.rows[s] += 1
         b.emitted[s] += 1
-    if b.emitted[s] == b.head[s]:
-        b.base[s] = b.head[s]
+    if b.emitted[s] == b.top[s]:
+        b.base[s] = b.top[s]
 
 
 @njit(cache=True, nogil=True)
-def _owe(b: Books, s: int, k: int, t_ns: int) -> None:
-    """SYNC ``k`` asks for an answer, if the stream sends on it."""
-    if (b.state[ORIGIN] + k) % b.every[s] == 0:
-        slot = _slot(b, s, b.head[s])
+def _settle_all(b: Books, bus: int, s: int, final: bool, out: Decided) -> None:
+    """Close the books of the drives on one bus, and give out what all drives have settled."""
+    n = b.settled.shape[1]
+    oldest, all_owe = b.head[bus, s], n > 1
+    for j in range(n):
+        oldest = min(oldest, b.settled[s, j])
+        all_owe = all_owe and b.settled[s, j] + b.pending[s, j] < b.head[b.bus_of[j], s]
+    if all_owe and oldest >= b.hole[s]:
+        b.behind[s] = b.head[bus, s]
+    end = b.top[s]
+    for j in range(n):
+        if b.bus_of[j] == bus:
+            _settle(b, s, j, final)
+        end = min(end, b.settled[s, j])
+    _emit(b, s, end, out)
+
+
+@njit(cache=True, nogil=True)
+def _owe(b: Books, bus: int, k: int, s: int) -> None:
+    """SYNC ``k`` of a bus asks for an answer, if the stream sends on it."""
+    if (b.state[bus, ORIGIN] + k) % b.every[s]:
+        return
+    slot = _slot(b, s, b.head[bus, s])
+    if b.head[bus, s] == b.top[s]:
+        b.top[s] += 1
         b.row_sync[s, slot] = k
-        b.row_t[s, slot] = t_ns
-        for j in range(b.settled.shape[1]):
-            b.row_code[s, slot, j] = LOST
-        b.head[s] += 1
+        b.row_t[s, slot] = UNSEEN
+        b.row_code[s, slot] = LOST
+    for i in range(b.pack[s]):
+        b.row_t[s, slot, i, bus] = b.recent[bus, (k - b.pack[s] + 1 + i) % RECENT]
+    b.head[bus, s] += 1
 
 
 @njit(cache=True, nogil=True)
-def _miss(b: Books, s: int, until: int, out: Decided) -> None:
-    """The SYNCs after the last one and before ``until`` were sent, but not received."""
-    first = b.state[SYNC] + 1
-    if until > first:
-        b.hole[s] = b.head[s] + (until - first) // b.every[s] + 1
-    long = (until - first) // b.every[s] > b.window[s] // 2
-    if long:
-        _settle_all(b, s, False, out)
-    before = b.head[s]
+def _miss(b: Books, bus: int, first: int, until: int, out: Decided) -> None:
+    """SYNCs ``first`` to before ``until`` were sent on the bus, but not received."""
+    if until <= first:
+        return
+    streams = b.every.size
+    before = b.head[bus].copy()
+    for s in range(streams):
+        b.hole[s] = max(b.hole[s], b.head[bus, s] + (until - first) // b.every[s] + 1)
+        if (until - first) // b.every[s] > b.window[s] // 2:
+            _settle_all(b, bus, s, False, out)
     for k in range(first, until):
-        _owe(b, s, k, UNSEEN)
-        if long:
-            _settle_all(b, s, False, out)
-    if not long and b.head[s] > before:
+        b.recent[bus, k % RECENT] = UNSEEN
+        for s in range(streams):
+            _owe(b, bus, k, s)
+            if (until - first) // b.every[s] > b.window[s] // 2:
+                _settle_all(b, bus, s, False, out)
+    for s in range(streams):
+        if (until - first) // b.every[s] > b.window[s] // 2 or b.head[bus, s] == before[s]:
+            continue
         # What came since the last SYNC seen may answer the missed ones too.
         for j in range(b.settled.shape[1]):
-            for i in range(b.pending[s, j] - b.fresh[s, j], b.pending[s, j]):
-                b.label[s, j, i] = b.head[s] - 1
+            if b.bus_of[j] == bus:
+                for i in range(b.pending[s, j] - b.fresh[s, j], b.pending[s, j]):
+                    b.label[s, j, i] = b.head[bus, s] - 1
+
+
+@njit(cache=True, nogil=True)
+def _skip_silent(b: Books, bus: int, k: int, t_ns: int, period_ns: int, overflow: int, out: Decided) -> None:
+    """With SYNC ``k`` of a bus, those are missing that buses farther behind than their slack should have had."""
+    for other in range(b.state.shape[0]):
+        last = b.state[other, SYNC]
+        until = k + 1 - b.slack[other]
+        if other == bus or until <= last + 1:
+            continue
+        if last < 0:
+            b.state[other, ORIGIN] = b.state[bus, ORIGIN]
+        # What has come answers SYNCs that were seen, not those that are missing.
+        for s in range(b.every.size):
+            _settle_all(b, other, s, True, out)
+        _miss(b, other, last + 1, until, out)
+        b.counts[SYNC_MISSING] += until - last - 1
+        b.state[other, SYNC] = until - 1
+        b.state[other, TIME] = t_ns - (k + 1 - until) * period_ns
+        if b.state[bus, COUNTER] >= 0:
+            b.state[other, COUNTER] = (b.state[other, ORIGIN] + until - 1) % overflow
+        for s in range(b.every.size):
+            _settle_all(b, other, s, True, out)
 
 
 @njit(cache=True, nogil=True)
 def count_sync(
-    can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int, longest: int, b: Books
-) -> int:
+    count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
+    bus: int, longest: int, b: Books,
+) -> int:  # fmt: skip
     """How many SYNC numbers the frames may cover; changes nothing."""
-    total, counter, time = 0, b.state[COUNTER], b.state[TIME]
-    for i in range(can_id.size):
+    total, state = 0, b.state.copy()
+    for i in range(count):
         if can_id[i] == sync_id:
-            step = 1
-            if length[i] > 0:
-                if counter >= 0:
-                    elapsed = (t_ns[i] - time) / period_ns if time != UNSEEN else 0.0
-                    step = sync_step(int(np.int64(data[i] & np.uint64(0xFF))), counter, elapsed, overflow, longest)
-                if step > 0:
-                    counter = int(np.int64(data[i] & np.uint64(0xFF)))
-            if step > 0:
-                time = t_ns[i]
-                total += step
+            counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 else -1
+            total += max(0, _advance(state, bus, counter, t_ns[i], period_ns, overflow, longest))
     return int(total)
 
 
 @njit(cache=True, nogil=True)
 def match(
-    can_id: Any,
-    length: Any,
-    t_ns: Any,
-    data: Any,
-    sync_id: int,
-    period_ns: int,
-    overflow: int,
-    longest: int,
-    b: Books,
-    out: Decided,
-) -> None:
-    """Take frames in the order they came; rows whose fate is decided go to ``out``."""
+    count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
+    bus: int, longest: int, b: Books, out: Decided,
+) -> None:  # fmt: skip
+    """Take ``count`` frames of one bus in the order they came; samples whose fate is decided go to ``out``."""
     n = b.settled.shape[1]
-    for i in range(can_id.size):
+    words = min(data.shape[1], b.answer.shape[3])
+    for i in range(count):
         b.counts[FRAMES] += 1
         identifier = np.int64(can_id[i])
         if identifier == sync_id:
-            step = 1
-            if length[i] > 0:
-                counter = int(np.int64(data[i] & np.uint64(0xFF)))
-                if b.state[COUNTER] >= 0:
-                    elapsed = (t_ns[i] - b.state[TIME]) / period_ns if b.state[TIME] != UNSEEN else 0.0
-                    step = sync_step(counter, b.state[COUNTER], elapsed, overflow, longest)
-                else:
-                    b.state[ORIGIN] = counter
-                if step > 0:
-                    b.state[COUNTER] = counter
+            counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 else -1
+            last = b.state[bus, SYNC]
+            step = _advance(b.state, bus, counter, t_ns[i], period_ns, overflow, longest)
             if step <= 0:
-                b.counts[SYNC_REPEATED] += 1
+                unlike = last < 0 and step < 0
+                b.counts[SYNC_MISALIGNED if unlike else SYNC_REPEATED] += 1
                 continue
-            k = b.state[SYNC] + step
+            k = last + step
+            _miss(b, bus, last + 1, k, out)
+            b.recent[bus, k % RECENT] = t_ns[i]
             for s in range(b.every.size):
-                _miss(b, s, k, out)
-                _settle_all(b, s, False, out)
-                _owe(b, s, k, t_ns[i])
+                _settle_all(b, bus, s, False, out)
+                _owe(b, bus, k, s)
             b.counts[SYNC_SEEN] += 1
             b.counts[SYNC_MISSING] += step - 1
-            b.state[SYNC] = k
-            b.state[TIME] = t_ns[i]
+            _skip_silent(b, bus, k, t_ns[i], period_ns, overflow, out)
             continue
-        channel = b.channel_of[identifier] if identifier < b.channel_of.size else np.int64(-1)
+        channel = b.channel_of[bus, identifier] if identifier < b.channel_of.shape[1] else np.int64(-1)
         if channel < 0:
             b.counts[FRAMES_UNKNOWN] += 1
             continue
         s, j = channel // n, channel % n
         slot = b.pending[s, j]
-        if b.head[s] == 0:
+        if b.head[bus, s] == 0:
             b.counts[TPDO_EARLY] += 1
         elif slot >= b.label.shape[2]:
             b.counts[TPDO_DUPLICATE] += 1
@@ -333,9 +343,11 @@ def match(
             right = length[i] == b.length[s]
             if not right:
                 b.counts[TPDO_WRONG_LENGTH] += 1
-            b.answer[s, j, slot] = data[i]
+                b.wrong[s, j] += 1
+            for w in range(words):
+                b.answer[s, j, slot, w] = data[i, w]
             b.answer_code[s, j, slot] = RECEIVED if right else WRONG_LENGTH
-            b.label[s, j, slot] = b.head[s] - 1
+            b.label[s, j, slot] = b.head[bus, s] - 1
             b.pending[s, j] += 1
             b.fresh[s, j] += 1
 
@@ -343,10 +355,14 @@ def match(
 @njit(cache=True, nogil=True)
 def finish(total: int, b: Books, out: Decided) -> None:
     """No more frames come: SYNCs ``0 .. total - 1`` were sent, and what is still owed is lost."""
-    for s in range(b.every.size):
-        if total > b.state[SYNC] + 1:
-            _miss(b, s, total, out)
-        _settle_all(b, s, True, out)
-    if total > b.state[SYNC] + 1:
-        b.counts[SYNC_MISSING] += total - 1 - b.state[SYNC]
-        b.state[SYNC] = total - 1
+    for bus in range(b.state.shape[0]):
+        last = b.state[bus, SYNC]
+        for other in range(b.state.shape[0] if last < 0 else 0):
+            if b.state[other, COUNTER] >= 0:
+                b.state[bus, ORIGIN] = b.state[other, ORIGIN]
+        if total > last + 1:
+            _miss(b, bus, last + 1, total, out)
+            b.counts[SYNC_MISSING] += total - 1 - last
+            b.state[bus, SYNC] = total - 1
+        for s in range(b.every.size):
+            _settle_all(b, bus, s, True, out)

@@ -8,9 +8,21 @@ from numpy.typing import NDArray
 from configs.errors import ArmidentError
 
 FRAME = np.dtype(
-    [("t_ns", "<i8"), ("can_id", "<u4"), ("length", "u1"), ("reserved", "u1", (3,)), ("data", "u1", (8,))], align=True
-)
+    [
+        ("t_ns", "<i8"), ("can_id", "<u4"), ("length", "u1"),
+        ("flags", "u1"), ("reserved", "u1", (2,)), ("data", "u1", (8,)),
+    ], align=True,
+)  # fmt: skip
 """A received frame: kernel time (ns, UTC), then the 16 bytes of the kernel's ``struct can_frame`` as they are."""
+
+FD_FRAME = np.dtype([(name, FRAME[name]) for name in (FRAME.names or ())[:-1]] + [("data", "u1", (64,))], align=True)
+"""The same of a bus with CAN FD: kernel time, then the 72 bytes of ``struct canfd_frame``."""
+
+FD_FLAG, BIT_RATE_SWITCH = 0x04, 0x01
+"""Bits of ``flags``: a CAN FD frame, whose data go at the data bit rate (linux/can.h); a frame without is classic."""
+
+FD_LENGTHS: tuple[int, ...] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+"""How many data bytes a CAN FD frame can have (ISO 11898-1)."""
 
 ERROR_FLAG = 0x2000_0000
 """Bit of ``can_id`` that marks an error frame of the controller (linux/can.h)."""
@@ -19,7 +31,7 @@ Filter = tuple[int, int]
 """Identifier and mask: frames with ``can_id & mask == identifier & mask`` pass."""
 
 Frames = NDArray[Any]
-"""An array of ``FRAME`` of shape (N,)."""
+"""An array of ``FRAME`` or ``FD_FRAME`` of shape (N,)."""
 
 
 class BusDown(ArmidentError):
@@ -31,6 +43,22 @@ class FrameBus(Protocol):
 
     channel: str
     dropped: int
+    fd: bool
+
+    @property
+    def stamps(self) -> str:
+        """Whose clock stamps the frames: ``hardware`` or ``software``."""
+        ...
+
+    @property
+    def up(self) -> bool:
+        """Whether frames can come and go."""
+        ...
+
+    @property
+    def bound(self) -> bool:
+        """Whether the bus can still come back, when it is down."""
+        ...
 
     def receive(self, batch: Frames) -> int:
         """Fill the beginning of ``batch`` with what has arrived; the number of frames, 0 if none."""
@@ -57,13 +85,26 @@ class FrameBus(Protocol):
         ...
 
 
-def frames(n: int) -> Frames:
-    """An array of ``n`` empty frames."""
-    return np.zeros(n, dtype=FRAME)
+def frames(n: int, fd: bool = False) -> Frames:
+    """An array of ``n`` empty frames; with ``fd`` with room for those of CAN FD."""
+    return np.zeros(n, dtype=FD_FRAME if fd else FRAME)
+
+
+def fd_length(size: int) -> int:
+    """The length of the CAN FD frame that carries ``size`` bytes: the rest is padding.
+
+    Raises
+    ------
+    ValueError
+        If no frame carries as many.
+    """
+    if size > FD_LENGTHS[-1]:
+        raise ValueError(f"{size} bytes do not fit into the {FD_LENGTHS[-1]} of a CAN FD frame")
+    return next(length for length in FD_LENGTHS if length >= size)
 
 
 def frame(can_id: int, data: bytes = b"") -> Frames:
-    """An array with one frame to send."""
+    """An array with one classic frame to send."""
     one = frames(1)
     one["can_id"] = can_id
     one["length"] = len(data)

@@ -15,6 +15,16 @@ from configs.session import ObjectName
 PDO_BYTES = 8
 """Data bytes of a classic CAN frame, and so the most a PDO can carry."""
 
+FD_PDO_BYTES = 64
+"""The same of a CAN FD frame."""
+
+MAPPED_OBJECTS = 64
+"""Most objects that a PDO maps (CiA 301 section 7.5.2.36)."""
+
+TO_ARRAY = 0x4000
+"""From an object of CiA 402 (6064h) down to the manufacturer's array of its values (2064h): sub-index i holds the value
+at the i-th SYNC of the last pack, so that the last sub-index is the SYNC at which the TPDO is sent."""
+
 PDO_NOT_VALID = 1 << 31
 """Bit of a PDO's COB-ID entry (sub-index 1) that switches the PDO off (CiA 301 section 7.5.2.35)."""
 
@@ -77,6 +87,10 @@ class MappedObject:
         """The mapping entry: index, sub-index and length in bits (CiA 301 section 7.5.2.36)."""
         return self.index << 16 | self.subindex << 8 | self.bits
 
+    def packed(self, sample: int) -> "MappedObject":
+        """The element of the object's array that holds ``sample`` (1, the oldest, to ``pack``) of a packed TPDO."""
+        return MappedObject(self.name, self.index - TO_ARRAY, sample, self.format)
+
 
 OBJECTS: dict[str, MappedObject] = {
     o.name: o
@@ -104,55 +118,75 @@ EVENT_DRIVEN = 255
 
 @dataclass(frozen=True)
 class TpdoLayout:
-    """The data bytes of one TPDO: its objects in mapping order, little endian, without gaps."""
+    """The data bytes of one TPDO: its objects in mapping order, little endian, without gaps.
+
+    A packed TPDO holds ``pack`` samples of them, the oldest first, mapped from the objects' arrays (:data:`TO_ARRAY`).
+    """
 
     objects: tuple[MappedObject, ...]
+    pack: int = 1
 
     @classmethod
-    def of(cls, names: Sequence[ObjectName | str], where: str = "stream") -> "TpdoLayout":
-        """The layout of a stream's objects.
+    def of(
+        cls, names: Sequence[ObjectName | str], where: str = "stream", pack: int = 1, fd: bool = False
+    ) -> "TpdoLayout":
+        """The layout of a stream's objects, on a bus with CAN FD or without.
 
         Raises
         ------
         ConfigError
-            If an object is unknown or repeated, or the objects need more than eight bytes.
+            If an object is unknown or repeated, or the objects need more bytes than the frame has.
         """
         for name in names:
             if name not in OBJECTS:
                 raise ConfigError(f"{where}: no object named {name!r}; objects are {', '.join(OBJECTS)}")
         if len(set(names)) != len(names):
             raise ConfigError(f"{where}: an object is mapped twice: {', '.join(names)}")
-        layout = cls(tuple(OBJECTS[name] for name in names))
-        if layout.size > PDO_BYTES:
+        layout = cls(tuple(OBJECTS[name] for name in names), pack)
+        limit = FD_PDO_BYTES if fd else PDO_BYTES
+        if layout.frame_size > limit:
             sizes = ", ".join(f"{o.name} {o.bits // 8}" for o in layout.objects)
-            raise ConfigError(f"{where}: {layout.size} bytes ({sizes}) do not fit into the 8 bytes of a TPDO")
+            times = f"{pack} times " if pack > 1 else ""
+            raise ConfigError(
+                f"{where}: {times}{layout.size} bytes ({sizes}) do not fit into the {limit} bytes of a TPDO"
+                + ("" if fd else "; a bus with fd: true carries 64" if layout.frame_size <= FD_PDO_BYTES else "")
+            )
+        if len(names) * pack > MAPPED_OBJECTS:
+            raise ConfigError(f"{where}: {len(names) * pack} objects; a TPDO maps {MAPPED_OBJECTS}")
         return layout
 
     @property
     def size(self) -> int:
-        """Number of data bytes in the frame."""
+        """Number of data bytes of one sample."""
         return sum(o.bits for o in self.objects) // 8
 
     @property
+    def frame_size(self) -> int:
+        """Number of data bytes in the frame."""
+        return self.size * self.pack
+
+    @property
     def dtype(self) -> np.dtype[Any]:
-        """Structured type of eight bytes, one field per object; the bytes behind the last object are padding."""
+        """Structured type of a sample, one field per object, padded to whole numbers of eight bytes."""
         offsets = [sum(o.bits for o in self.objects[:k]) // 8 for k in range(len(self.objects))]
         return np.dtype(
             {
                 "names": [o.name for o in self.objects],
                 "formats": [o.format for o in self.objects],
                 "offsets": offsets,
-                "itemsize": PDO_BYTES,
+                "itemsize": -(-self.size // 8) * 8,
             }
         )
 
     @property
     def entries(self) -> tuple[int, ...]:
         """The mapping entries to write to 1A00h and following, in order."""
-        return tuple(o.entry for o in self.objects)
+        if self.pack == 1:
+            return tuple(o.entry for o in self.objects)
+        return tuple(o.packed(k).entry for k in range(1, self.pack + 1) for o in self.objects)
 
     def decode(self, data: NDArray[np.uint8]) -> NDArray[Any]:
-        """Frames' data bytes, shape (N, 8), as records of shape (N,); a view where ``data`` is contiguous."""
+        """Samples' data bytes, shape (N, 8) or wider, as records of shape (N,); a view where ``data`` is contiguous."""
         return np.ascontiguousarray(data).view(self.dtype)[:, 0]
 
 

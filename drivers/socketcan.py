@@ -12,14 +12,23 @@ import struct
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
-
-import numpy as np
+from typing import Self
 
 from configs.errors import ConfigError
 from drivers.frames import ERROR_FLAG, FRAME, BusDown, Filter, Frames, frame, frames
+from drivers.messages import DROP_CONTROL_BYTES, FD_MTU, Messages
+from drivers.stamps import (
+    RAW_HARDWARE,
+    RX_HARDWARE,
+    RX_SOFTWARE,
+    SO_TIMESTAMPING,
+    SO_TIMESTAMPNS,
+    SOFTWARE,
+    InterfaceClock,
+    has_hardware_stamps,
+)
 
-__all__ = ["ERROR_FLAG", "FRAME", "BusDown", "RawSocket", "frame", "frames"]
+__all__ = ["ERROR_FLAG", "FRAME", "BusDown", "Messages", "RawSocket", "frame", "frames"]
 
 RECEIVE_BUFFER = 64 << 20
 """Bytes of kernel buffer asked for: about two seconds of 36 000 frames/s at 900 bytes each."""
@@ -36,60 +45,17 @@ SEND_TIMEOUT = 0.5
 SO_RCVBUFFORCE = 33
 SO_RCVTIMEO = 20
 MSG_WAITFORONE = 0x10000
-SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 CAN_RAW_ERR_FILTER = 2
+CAN_RAW_FD_FRAMES = 5
 CAN_RAW_FILTER_MAX = 512
 SYSFS = Path("/sys/class/net")
-
-# struct mmsghdr, struct iovec and the control messages, as linux/socket.h and linux/can/raw.h lay them out on 64 bits.
-_MESSAGE = np.dtype(
-    {
-        "names": ["iov", "iovlen", "control", "controllen", "flags", "length"],
-        "formats": ["<u8", "<u8", "<u8", "<u8", "<i4", "<u4"],
-        "offsets": [16, 24, 32, 40, 48, 56],
-        "itemsize": 64,
-    }
-)
-_IOVEC = np.dtype([("base", "<u8"), ("length", "<u8")])
-# The kernel puts the time stamp first, and the drop counter behind it once anything was dropped.
-_CONTROL = np.dtype(
-    {
-        "names": ["seconds", "nanoseconds", "drop_header", "drop_type", "drops"],
-        "formats": ["<i8", "<i8", "<u8", "<i4", "<u4"],
-        "offsets": [16, 24, 32, 44, 48],
-        "itemsize": 56,
-    }
-)
-_STAMP_ONLY = 32
-_CAN_FRAME = 16
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _recvmmsg = _libc.recvmmsg
 _recvmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
 _sendmmsg = _libc.sendmmsg
 _sendmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int]
-
-
-class Messages:
-    """Preallocated ``struct mmsghdr`` for up to ``n`` frames, for the kernel to read from or write to.
-
-    ``body`` (n, 16) uint8 are the ``struct can_frame``; ``control`` (n,) the time stamps and drop counters.
-    """
-
-    def __init__(self, n: int, control: bool = True) -> None:
-        self.body = np.zeros((n, _CAN_FRAME), dtype=np.uint8)
-        self.iovec = np.zeros(n, dtype=_IOVEC)
-        self.iovec["base"] = self.body.ctypes.data + _CAN_FRAME * np.arange(n, dtype=np.uint64)
-        self.iovec["length"] = _CAN_FRAME
-        self.header = np.zeros(n, dtype=_MESSAGE)
-        self.header["iov"] = self.iovec.ctypes.data + _IOVEC.itemsize * np.arange(n, dtype=np.uint64)
-        self.header["iovlen"] = 1
-        self.control = np.zeros(n if control else 0, dtype=_CONTROL)
-        if control:
-            self.header["control"] = self.control.ctypes.data + _CONTROL.itemsize * np.arange(n, dtype=np.uint64)
-            self.header["controllen"] = _CONTROL.itemsize
-        self.address: int = self.header.ctypes.data
 
 
 class RawSocket:
@@ -109,11 +75,16 @@ class RawSocket:
         Whether other sockets of this machine see what is sent here.
     receive_buffer
         Bytes of kernel buffer to ask for; forced beyond the system's limit where we have the right.
+    fd
+        Whether frames of CAN FD are moved too; batches are then arrays of ``FD_FRAME``.
+    hardware
+        Whether frames get the interface's own time stamps where it has some, put into the machine's time.
 
     Raises
     ------
     ConfigError
-        If the kernel has no SocketCAN or no such interface; says which command an administrator has to run.
+        If the kernel has no SocketCAN or no such interface, or it carries no CAN FD; says which command an
+        administrator has to run.
     BusDown
         If the interface is there but down.
     """
@@ -127,8 +98,12 @@ class RawSocket:
         own: bool = False,
         loopback: bool = True,
         receive_buffer: int = RECEIVE_BUFFER,
+        fd: bool = False,
+        hardware: bool = False,
     ) -> None:
         self.channel = channel
+        self.fd = fd
+        self._clock = InterfaceClock() if hardware and has_hardware_stamps(channel) else None
         self.dropped = 0
         """Frames the kernel had to drop because the receive buffer was full, since the socket was opened."""
         try:
@@ -159,7 +134,13 @@ class RawSocket:
         self._socket.setsockopt(raw, CAN_RAW_ERR_FILTER, 0x1FFFFFFF if errors else 0)
         self._socket.setsockopt(raw, socket.CAN_RAW_LOOPBACK, int(loopback))
         self._socket.setsockopt(raw, socket.CAN_RAW_RECV_OWN_MSGS, int(own))
-        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        if self._clock is None:
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        else:
+            stamps = RX_HARDWARE | RX_SOFTWARE | SOFTWARE | RAW_HARDWARE
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPING, stamps)
+        if self.fd:
+            self._socket.setsockopt(raw, CAN_RAW_FD_FRAMES, 1)
         timeout = struct.pack("ll", 0, round(RECEIVE_TIMEOUT * 1e6))
         self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVTIMEO, timeout)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
@@ -177,6 +158,30 @@ class RawSocket:
             ) from error
         if not self.up:
             raise self._down("is down")
+        if self.fd and self._mtu() < FD_MTU:
+            command = f"sudo ip link set dev {self.channel} " + (
+                f"mtu {FD_MTU}" if self.channel.startswith("vcan") else "type can ... dbitrate ... fd on"
+            )
+            raise ConfigError(
+                f"bus {self.channel}: the interface carries no CAN FD; an administrator may run: "
+                f"sudo ip link set dev {self.channel} down && {command} && sudo ip link set dev {self.channel} up"
+            )
+
+    def _mtu(self) -> int:
+        try:
+            return int((SYSFS / self.channel / "mtu").read_text())
+        except (OSError, ValueError):
+            return 0
+
+    @property
+    def stamps(self) -> str:
+        """Whose clock stamps the frames: ``hardware`` (the interface's) or ``software`` (the kernel's)."""
+        return "software" if self._clock is None else "hardware"
+
+    @property
+    def bound(self) -> bool:
+        """Whether the socket still has its interface; it has lost it for good when that was removed."""
+        return bool(self._socket.getsockname()[0])
 
     @property
     def up(self) -> bool:
@@ -201,7 +206,7 @@ class RawSocket:
         Parameters
         ----------
         batch
-            Array of ``FRAME``, shape (N,), written in place.
+            Array of ``FRAME`` (``FD_FRAME`` with ``fd``), shape (N,), written in place.
         wait
             Wait up to ``RECEIVE_TIMEOUT`` for the first of them, without a system call more.
 
@@ -216,7 +221,7 @@ class RawSocket:
             If the interface went down or away.
         """
         if self._in is None:
-            self._in = Messages(BATCH)
+            self._in = Messages(BATCH, fd=self.fd, hardware=self._clock is not None)
         messages = self._in
         flags = MSG_WAITFORONE if wait else socket.MSG_DONTWAIT
         got = _recvmmsg(self._socket.fileno(), messages.address, min(batch.size, BATCH), flags, None)
@@ -226,13 +231,17 @@ class RawSocket:
             return 0
         control = messages.control[:got]
         filled = batch[:got]
-        filled["t_ns"] = control["seconds"] * 1_000_000_000 + control["nanoseconds"]
-        _frame_bytes(filled)[:, 8:] = messages.body[:got]
+        stamps = control["seconds"] * 1_000_000_000 + control["nanoseconds"]
+        if self._clock is not None:
+            own = control["hardware_seconds"] * 1_000_000_000 + control["hardware_nanoseconds"]
+            stamps = self._clock.to_utc(stamps, own)
+        filled["t_ns"] = stamps
+        messages.unload(filled)
         lengths = messages.header["controllen"][:got]
-        if lengths[-1] != _STAMP_ONLY:
+        if lengths[-1] > messages.control.itemsize - DROP_CONTROL_BYTES:
             # The counter is 32 bits wide, ours is not.
             self.dropped += (int(control["drops"][-1]) - self.dropped) & 0xFFFFFFFF
-        lengths[:] = _CONTROL.itemsize
+        lengths[:] = messages.control.itemsize
         return int(got)
 
     def poll(self, timeout: float) -> bool:
@@ -255,7 +264,7 @@ class RawSocket:
         Parameters
         ----------
         frames
-            Array of ``FRAME``, shape (N,); ``t_ns`` is not looked at.
+            Array of ``FRAME`` or ``FD_FRAME``, shape (N,); ``t_ns`` is not looked at.
 
         Returns
         -------
@@ -269,13 +278,13 @@ class RawSocket:
             (a physical bus without another node acknowledges nothing).
         """
         if self._out is None:
-            self._out = Messages(BATCH, control=False)
+            self._out = Messages(BATCH, control=False, fd=self.fd)
         messages, sent = self._out, 0
         # The clock is read only when the queue is full: where system calls are dear, that is half the cost.
         deadline: float | None = None
         while sent < frames.size:
             chunk = frames[sent : sent + BATCH]
-            messages.body[: chunk.size] = _frame_bytes(chunk)[:, 8:]
+            messages.load(chunk)
             done = _sendmmsg(self._socket.fileno(), messages.address, chunk.size, socket.MSG_DONTWAIT)
             if done > 0:
                 sent += done
@@ -311,10 +320,3 @@ class RawSocket:
     def __exit__(self, *_: object) -> None:
         """Close the socket."""
         self.close()
-
-
-def _frame_bytes(batch: Frames) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Bytes of a contiguous array of frames, shape (N, 24), as a view."""
-    if not batch.flags.c_contiguous:
-        raise ValueError("frames must lie contiguously in memory")
-    return batch.view(np.uint8).reshape(batch.size, FRAME.itemsize)

@@ -39,6 +39,10 @@ class UdpBus:
         If the address is no multicast address or the network has no route for it.
     """
 
+    fd = False
+    stamps = "software"
+    up = bound = True
+
     def __init__(self, channel: str, *, filters: Sequence[Filter] | None = None) -> None:
         self.channel = channel
         self.dropped = 0
@@ -139,7 +143,9 @@ class UdpBus:
         self.close()
 
 
-def open_bus(bus: Bus, *, filters: Sequence[Filter] | None = None) -> FrameBus:
+def open_bus(
+    bus: Bus, *, filters: Sequence[Filter] | None = None, errors: bool = False, hardware: bool = False
+) -> FrameBus:
     """Open the bus of a session for frames in batches.
 
     Parameters
@@ -148,6 +154,8 @@ def open_bus(bus: Bus, *, filters: Sequence[Filter] | None = None) -> FrameBus:
         The ``bus`` of the session.
     filters
         What is let through; ``None``: everything, empty: nothing.
+    errors, hardware
+        Whether to receive error frames, and to use hardware time stamps, where there are any.
 
     Raises
     ------
@@ -158,4 +166,4 @@ def open_bus(bus: Bus, *, filters: Sequence[Filter] | None = None) -> FrameBus:
     """
     if bus.interface == "udp_multicast":
         return UdpBus(bus.channel, filters=filters)
-    return RawSocket(bus.channel, filters=filters)
+    return RawSocket(bus.channel, filters=filters, errors=errors, fd=bus.fd, hardware=hardware)

@@ -1,0 +1,156 @@
+"""The books of the assembler: what every SYNC of every bus asked of every drive, and what has come."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+LOST, RECEIVED, WRONG_LENGTH, AMBIGUOUS, NO_SYNC = 0, 1, 2, 3, 4
+"""What is known of one joint's sample at one SYNC."""
+
+UNSEEN = int(np.iinfo(np.int64).min)
+"""The time of a SYNC that was not received."""
+
+# Positions in Books.state, per bus: number, counter and time of the last SYNC, counter of SYNC 0.
+SYNC, COUNTER, TIME, ORIGIN = 0, 1, 2, 3
+
+COUNT_NAMES = (
+    "sync_seen",
+    "sync_missing",
+    "sync_repeated",
+    "sync_misaligned",
+    "frames",
+    "frames_unknown",
+    "tpdo_early",
+    "tpdo_late",
+    "tpdo_duplicate",
+    "tpdo_wrong_length",
+)
+(
+    SYNC_SEEN, SYNC_MISSING, SYNC_REPEATED, SYNC_MISALIGNED, FRAMES, FRAMES_UNKNOWN,
+    TPDO_EARLY, TPDO_LATE, TPDO_DUPLICATE, TPDO_WRONG_LENGTH,
+) = range(10)  # fmt: skip
+
+RECENT = 256
+"""Times of so many SYNCs are kept for packed samples: a turn of the counter and more."""
+
+
+class Books(NamedTuple):
+    """What is owed and what has come; buses ``b``, streams ``s``, joints ``j``, a stream's own SYNCs as ordinals ``u``.
+
+    Rows ``u`` of stream ``s`` stand in ring slots ``(u - base) % C`` until every joint has settled them; with nothing
+    open the ring begins anew, so that memory is only touched where answers are late. ``head`` counts the rows that the
+    SYNCs of a bus have asked for, ``top`` those of the bus that is ahead. ``behind`` is the last ordinal
+    at which all joints owed, ``hole`` the last before which a frame is known to be missing. A bus may be ``slack``
+    SYNCs behind another one before it is taken for silent.
+    """
+
+    state: NDArray[np.int64]
+    slack: NDArray[np.int64]
+    recent: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    every: NDArray[np.int64]
+    pack: NDArray[np.int64]
+    size: NDArray[np.int64]
+    window: NDArray[np.int64]
+    patience: NDArray[np.int64]
+    length: NDArray[np.int64]
+    bus_of: NDArray[np.int64]
+    channel_of: NDArray[np.int64]
+    head: NDArray[np.int64]
+    top: NDArray[np.int64]
+    base: NDArray[np.int64]
+    behind: NDArray[np.int64]
+    hole: NDArray[np.int64]
+    emitted: NDArray[np.int64]
+    settled: NDArray[np.int64]
+    pending: NDArray[np.int64]
+    fresh: NDArray[np.int64]
+    wrong: NDArray[np.int64]
+    label: NDArray[np.int64]
+    answer: NDArray[np.uint64]
+    answer_code: NDArray[np.uint8]
+    row_sync: NDArray[np.int64]
+    row_t: NDArray[np.int64]
+    row_code: NDArray[np.uint8]
+    row_data: NDArray[np.uint64]
+
+
+class Decided(NamedTuple):
+    """Samples whose fate is decided, ``rows[s]`` of each stream; ``t_ns`` is that of the first bus with the SYNC."""
+
+    rows: NDArray[np.int64]
+    sync: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    code: NDArray[np.uint8]
+    data: NDArray[np.uint64]
+
+
+class Shape(NamedTuple):
+    """What a stream is made of: every how many SYNCs a frame is due, its samples, and the bytes of sample and frame."""
+
+    every: int
+    pack: int
+    size: int
+    length: int
+
+
+def open_books(
+    shapes: Sequence[Shape],
+    window: list[int],
+    patience: list[int],
+    bus_of: Sequence[int],
+    channel_of: NDArray[np.int64],
+) -> Books:
+    """Empty books; ``channel_of`` (buses, identifiers) maps a COB-ID on a bus to ``s n + j``, or -1."""
+    buses, streams, n = len(channel_of), len(shapes), len(bus_of)
+    rows = 2 * max(patience) + 8
+    answers = rows + 64
+    words = max(-(-shape.length // 8) for shape in shapes)
+    pack = max(shape.pack for shape in shapes)
+    return Books(
+        state=np.tile(np.array([-1, -1, UNSEEN, 1]), (buses, 1)),
+        slack=np.full(buses, max(w * s.every for w, s in zip(window, shapes, strict=True)), np.int64),
+        recent=np.full((buses, RECENT), UNSEEN, np.int64),
+        counts=np.zeros(len(COUNT_NAMES), np.int64),
+        every=np.array([s.every for s in shapes], np.int64),
+        pack=np.array([s.pack for s in shapes], np.int64),
+        size=np.array([s.size for s in shapes], np.int64),
+        window=np.array(window, np.int64),
+        patience=np.array(patience, np.int64),
+        length=np.array([s.length for s in shapes], np.int64),
+        bus_of=np.array(bus_of, np.int64),
+        channel_of=channel_of,
+        head=np.zeros((buses, streams), np.int64),
+        top=np.zeros(streams, np.int64),
+        base=np.zeros(streams, np.int64),
+        behind=np.zeros(streams, np.int64),
+        hole=np.zeros(streams, np.int64),
+        emitted=np.zeros(streams, np.int64),
+        settled=np.zeros((streams, n), np.int64),
+        pending=np.zeros((streams, n), np.int64),
+        fresh=np.zeros((streams, n), np.int64),
+        wrong=np.zeros((streams, n), np.int64),
+        label=np.zeros((streams, n, answers), np.int64),
+        answer=np.zeros((streams, n, answers, words), np.uint64),
+        answer_code=np.zeros((streams, n, answers), np.uint8),
+        row_sync=np.zeros((streams, rows), np.int64),
+        row_t=np.zeros((streams, rows, pack, buses), np.int64),
+        row_code=np.zeros((streams, rows, n), np.uint8),
+        row_data=np.zeros((streams, rows, n, words), np.uint64),
+    )
+
+
+def room_for(books: Books, syncs: int) -> Decided:
+    """Room for what can be decided when ``syncs`` more SYNC are known of."""
+    streams, _, n = books.row_code.shape
+    rows = int(((books.top - books.emitted + 1) * books.pack).max()) + syncs
+    words = int(-(-books.size // 8).max())
+    return Decided(
+        rows=np.zeros(streams, np.int64),
+        sync=np.empty((streams, rows), np.int64),
+        t_ns=np.empty((streams, rows), np.int64),
+        code=np.empty((streams, rows, n), np.uint8),
+        data=np.empty((streams, rows, n, words), np.uint64),
+    )

@@ -1,0 +1,69 @@
+"""Time stamps of CAN interfaces: which ones an interface has, and its clock's time in that of the machine."""
+
+import array
+import fcntl
+import socket
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+SO_TIMESTAMPNS = 35
+SO_TIMESTAMPING = 37
+RX_HARDWARE, RX_SOFTWARE, SOFTWARE, RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 4, 1 << 6
+"""Flags of SO_TIMESTAMPING (linux/net_tstamp.h)."""
+_SIOCETHTOOL, _ETHTOOL_GET_TS_INFO = 0x8946, 0x41
+_TS_INFO_BYTES = 44
+
+LARGEST_DRIFT = 1e-4
+"""Largest relative difference expected between the interface's clock and the machine's."""
+_CLOCK_STEP_NS = 50_000_000
+"""A frame that seems to have waited for longer than this says that one of the clocks was set."""
+
+
+def has_hardware_stamps(channel: str) -> bool:
+    """Whether the interface stamps received frames by a clock of its own; ``False`` where it cannot be asked."""
+    request = array.array("B", struct.pack("=I", _ETHTOOL_GET_TS_INFO).ljust(_TS_INFO_BYTES, b"\0"))
+    address, _ = request.buffer_info()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        try:
+            fcntl.ioctl(any_socket, _SIOCETHTOOL, struct.pack("=16sP", channel.encode(), address))
+        except OSError:
+            return False
+    (flags,) = struct.unpack_from("=I", request, 4)
+    return bool(flags & (RX_HARDWARE | RAW_HARDWARE) == RX_HARDWARE | RAW_HARDWARE)
+
+
+class InterfaceClock:
+    """The clock of one interface, read in the machine's time.
+
+    A frame's software stamp is its hardware stamp, plus the offset of the clocks, plus its wait for the interrupt.
+    The wait is never negative, so the offset is the smallest difference, which may grow as fast as clocks drift. So
+    frames keep the even spacing of the hardware stamps and the common time base of the software ones.
+    """
+
+    def __init__(self) -> None:
+        self._origin: int | None = None
+        self._least = 0
+
+    def to_utc(self, software_ns: NDArray[np.int64], hardware_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Times (N,) of frames in the machine's time, ns; one without hardware stamp (0) keeps its software one."""
+        times = software_ns.copy()
+        stamped = hardware_ns != 0
+        software, hardware = software_ns[stamped], hardware_ns[stamped]
+        if software.size == 0:
+            return times
+        if (
+            self._origin is None
+            or abs(int(software[0] - hardware[0]) - self._offset(int(hardware[0]))) > _CLOCK_STEP_NS
+        ):
+            self._origin, self._least = int(hardware[0]), int(software[0] - hardware[0])
+        drift = ((hardware - self._origin) * LARGEST_DRIFT).astype(np.int64)
+        least = np.minimum.accumulate(np.minimum(software - hardware - drift, self._least))
+        self._least = int(least[-1])
+        times[stamped] = hardware + least + drift
+        return times
+
+    def _offset(self, hardware_ns: int) -> int:
+        assert self._origin is not None
+        return self._least + int((hardware_ns - self._origin) * LARGEST_DRIFT)
