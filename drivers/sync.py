@@ -1,11 +1,12 @@
-"""The SYNC producer: SYNC with counter on an absolute time grid, and the position set points with it.
+"""The SYNC producer: SYNC with counter on an absolute time grid on all buses, and the position set points with it.
 
 A compiled loop without the interpreter's lock sleeps until each deadline (``clock_nanosleep``) and hands the
 SYNC and the set points that belong behind it to the kernel in one system call.
 
 What it does when it wakes up late: the SYNC goes out at once and the following ones return to the grid, never
 closer to each other than half a period. When it is late by more than ``MAX_LATE_PERIODS`` nothing is caught
-up: the grid moves by whole periods, and ``SyncStats.skipped`` counts them. No SYNC number is ever left out.
+up: the grid moves by whole periods, and ``SyncStats.skipped`` counts them. No SYNC number is ever left out: a bus that
+refuses one (it is down) lacks it, the others go on.
 """
 
 import ctypes
@@ -13,6 +14,8 @@ import errno
 import os
 import threading
 import time
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Self
 
@@ -22,7 +25,8 @@ from numpy.typing import NDArray
 from configs.session import Bus
 from drivers.frames import BusDown, FrameBus, frames
 from drivers.objects import COB_SYNC
-from drivers.socketcan import Messages, RawSocket
+from drivers.setpoints import SetpointPlan
+from drivers.socketcan import RawSocket
 from drivers.sync_loop import (
     BIN_NS,
     BINS,
@@ -41,33 +45,10 @@ from drivers.sync_loop import (
 )
 from drivers.udp import open_bus
 
+__all__ = ["SetpointPlan", "SyncProducer", "SyncStats"]
+
 REALTIME_PRIORITY = 10
 PR_SET_TIMERSLACK = 29
-
-
-@dataclass(frozen=True)
-class SetpointPlan:
-    """Position set points for all drives, one row per ``every`` SYNCs.
-
-    Parameters
-    ----------
-    rows
-        Targets in counts, shape (M, n) int32, one column per drive.
-    cob_ids
-        COB-ID of each drive's set point RPDO, in the order of the columns.
-    every
-        SYNCs between two rows.
-    """
-
-    rows: NDArray[np.int32]
-    cob_ids: tuple[int, ...]
-    every: int = 5
-
-    def __post_init__(self) -> None:
-        if self.rows.ndim != 2 or self.rows.shape[1] != len(self.cob_ids) or not self.rows.size:
-            raise ValueError(f"rows of shape {self.rows.shape} for {len(self.cob_ids)} drives")
-        if self.rows.dtype != np.int32:
-            raise ValueError(f"rows must be int32, not {self.rows.dtype}")
 
 
 @dataclass(frozen=True)
@@ -84,6 +65,8 @@ class SyncStats:
     """Periods by which the time grid had to move because the producer was held up for too long."""
     realtime: bool
     """Whether the loop ran with real-time priority."""
+    unsent: tuple[int, ...] = ()
+    """SYNCs that each bus refused."""
 
 
 class SyncProducer:
@@ -91,8 +74,8 @@ class SyncProducer:
 
     Parameters
     ----------
-    bus
-        The bus to send on; the producer opens a socket of its own, so that other sockets see the SYNC.
+    buses
+        The bus to send on, or several; the producer opens sockets of its own, so that other sockets see the SYNC.
     period_us
         Time between two SYNCs, us.
     counter
@@ -108,8 +91,10 @@ class SyncProducer:
     sent: the drives hold it.
     """
 
-    def __init__(self, bus: Bus, period_us: int, counter: int, setpoints: SetpointPlan | None = None) -> None:
-        self._bus_config = bus
+    def __init__(
+        self, buses: Bus | Sequence[Bus], period_us: int, counter: int, setpoints: SetpointPlan | None = None
+    ) -> None:
+        self._configured = (buses,) if isinstance(buses, Bus) else tuple(buses)
         self._period_ns = period_us * 1000
         self._counter = counter
         self._plan = setpoints
@@ -119,21 +104,30 @@ class SyncProducer:
         self._state[FIRST] = -1
         self._late = np.zeros(BINS, dtype=np.int64)
         self._realtime = False
+        self._errors = np.zeros(len(self._configured), dtype=np.int64)
+        self._unsent = np.zeros(len(self._configured), dtype=np.int64)
         self._thread: threading.Thread | None = None
-        self._bus: FrameBus | None = None
+        self._buses: list[FrameBus] = []
         self._loop: Loop | None = None
 
     def start(self) -> None:
-        """Open the bus and send the first SYNC one period from now.
+        """Open the buses and send the first SYNC one period from now.
 
         Raises
         ------
         ConfigError, BusDown
             As :class:`RawSocket` does.
         """
-        self._bus = open_bus(self._bus_config, filters=())
-        if isinstance(self._bus, RawSocket):
-            self._loop = Loop(self._bus.fileno(), self._period_ns, self._counter, self._state, self._late)
+        with ExitStack() as opened:
+            for bus in self._configured:
+                # SYNC and set points are classic frames on every bus.
+                classic = bus.model_copy(update={"fd": False, "data_bitrate": None})
+                self._buses.append(opened.enter_context(open_bus(classic, filters=())))
+            opened.pop_all()
+        sockets = [bus.fileno() for bus in self._buses if isinstance(bus, RawSocket)]
+        if len(sockets) == len(self._buses):
+            fixed = np.array(sockets, np.int64), self._period_ns, self._counter
+            self._loop = Loop(*fixed, self._state, self._late, self._errors, self._unsent)
         run = self._run_interpreted if self._loop is None else self._run_compiled
         self._thread = threading.Thread(target=run, name="sync", daemon=True)
         self._thread.start()
@@ -143,8 +137,8 @@ class SyncProducer:
         self._state[STOP] = 1
         if self._thread is not None:
             self._thread.join()
-        if self._bus is not None:
-            self._bus.close()
+        for bus in self._buses:
+            bus.close()
 
     def play(self, plan: SetpointPlan) -> int:
         """Play set points from the next possible knot on, in place of those played so far.
@@ -157,7 +151,7 @@ class SyncProducer:
         Raises
         ------
         BusDown
-            If the producer has ended because the bus went down.
+            If no bus takes SYNC.
         """
         self._taken.clear()
         self._pending = plan
@@ -165,20 +159,24 @@ class SyncProducer:
         while not self._taken.wait(0.05):
             self.check()
             if self._thread is None or not self._thread.is_alive():
-                raise BusDown(f"bus {self._bus_config.channel}: the SYNC producer is not running")
+                raise BusDown(f"bus {self._names}: the SYNC producer is not running")
         return int(self._state[FIRST])
 
     def check(self) -> None:
-        """Raise what ended the producer, if something did.
+        """Raise what keeps SYNC from being sent, if something does.
 
         Raises
         ------
         BusDown
-            If SYNC could not be sent any more.
+            If no bus takes SYNC any more.
         """
         code = int(self._state[ERROR])
         if code:
-            raise BusDown(f"bus {self._bus_config.channel}: SYNC cannot be sent: {os.strerror(code)}")
+            raise BusDown(f"bus {self._names}: SYNC cannot be sent: {os.strerror(code)}")
+
+    @property
+    def _names(self) -> str:
+        return ", ".join(bus.channel for bus in self._configured)
 
     @property
     def sent(self) -> int:
@@ -216,6 +214,7 @@ class SyncProducer:
             overruns=int(state[OVERRUNS]),
             skipped=int(state[SKIPPED]),
             realtime=self._realtime,
+            unsent=tuple(int(n) for n in self._unsent),
         )
 
     def __enter__(self) -> Self:
@@ -233,13 +232,13 @@ class SyncProducer:
         while not self._state[STOP]:
             self._take_plan()
             rows, cob_ids, every = self._rows()
-            self._loop(Messages(1 + len(cob_ids), control=False), rows, cob_ids, every)
-            if self._state[ERROR]:
-                return
+            plan = self._plan
+            bus_of = plan.bus_of if plan is not None and plan.bus_of else (0,) * cob_ids.size
+            self._loop(rows, cob_ids, np.array(bus_of, np.int64), every)
 
     def _run_interpreted(self) -> None:
         """Do the same on a bus that takes its frames from Python; for low rates."""
-        assert self._bus is not None
+        (bus,) = self._buses
         state, period = self._state, self._period_ns * 1e-9
         base = time.monotonic() + period
         while not state[STOP]:
@@ -263,7 +262,7 @@ class SyncProducer:
                 batch["data"][1:, :4] = rows[row].astype("<i4").view(np.uint8).reshape(-1, 4)
                 state[ROW] += 1
             try:
-                self._bus.send(batch)
+                bus.send(batch)
             except BusDown:
                 state[ERROR] = errno.ENETDOWN
                 return

@@ -1,6 +1,7 @@
 """The compiled loop of the SYNC producer: sleep until the deadline, send, account for the lateness."""
 
 import errno
+import socket
 from typing import Any
 
 import numpy as np
@@ -20,15 +21,19 @@ BINS = 10_000
 """Bins of the lateness histogram; the last one also holds everything later."""
 
 STOP, RETURN, SENT, ERROR, SKIPPED, OVERRUNS, ROW, FIRST, LATE_MAX, BASE_NS, LAST_NS = range(11)
-"""Places in the shared state. ``STOP``: end. ``RETURN``: leave the loop to take a new plan. ``ERROR``: errno."""
+"""Places in the shared state. ``STOP``: end. ``RETURN``: leave the loop to take a new plan. ``ERROR``: errno while all
+buses refuse SYNC."""
 
 STATE_SIZE = 11
 
 _SEND_ATTEMPTS = 5000
 _RETRY_NS = 100_000
+_FEW_ATTEMPTS = 3
+"""The same where other buses wait for their SYNC meanwhile."""
 _MONOTONIC = 1
 _ABSOLUTE = 1
 _EINTR, _EAGAIN, _ENOBUFS = errno.EINTR, errno.EAGAIN, errno.ENOBUFS
+_DONTWAIT = int(socket.MSG_DONTWAIT)
 
 _clock_nanosleep: Any = types.ExternalFunction(
     "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
@@ -44,39 +49,76 @@ def is_knot(k: int, every: int) -> bool:
 
 
 class Loop:
-    """The loop with the arrays it works on; called again, it goes on where it was."""
+    """The loop with the arrays it works on; called again, it goes on where it was.
+
+    Parameters
+    ----------
+    descriptors
+        One socket per bus.
+    period_ns, counter
+        Of SYNC.
+    state, late
+        Shared state and histogram of the lateness.
+    errors, unsent
+        Per bus the errno with which it refused the last SYNC (0: none), and how many SYNCs it refused.
+    """
 
     def __init__(
-        self, descriptor: int, period_ns: int, counter: int, state: NDArray[np.int64], late: NDArray[np.int64]
+        self,
+        descriptors: NDArray[np.int64],
+        period_ns: int,
+        counter: int,
+        state: NDArray[np.int64],
+        late: NDArray[np.int64],
+        errors: NDArray[np.int64],
+        unsent: NDArray[np.int64],
     ) -> None:
-        self._fixed = (descriptor, period_ns, counter, state, late)
+        self._fixed = (descriptors, period_ns, counter)
+        self._shared = (late, errors, unsent)
+        self._state = state
         self._spec = np.zeros(2, dtype=np.int64)
-        compiled = Messages(1, control=False)
         ended = np.ones(STATE_SIZE, dtype=np.int64)
+        none = np.zeros((0, 0), dtype=np.int32)
         # Compiled here, where nothing waits for the first SYNC yet.
-        _run(
-            *(descriptor, period_ns, counter, ended, late, compiled.address),
-            *(compiled.body.view(np.int32), np.zeros((0, 0), dtype=np.int32), 1, self._spec),
-        )
+        self._call(ended, none, np.zeros(0, np.uint32), np.zeros(0, np.int64), 1)
 
-    def __call__(self, messages: Messages, rows: NDArray[np.int32], cob_ids: NDArray[np.uint32], every: int) -> None:
-        """Send SYNCs, and ``rows`` from ``state[ROW]`` on, until ``state[STOP]``, ``state[RETURN]`` or an error.
+    def __call__(
+        self, rows: NDArray[np.int32], cob_ids: NDArray[np.uint32], bus_of: NDArray[np.int64], every: int
+    ) -> None:
+        """Send SYNCs, and ``rows`` from ``state[ROW]`` on, until ``state[STOP]`` or ``state[RETURN]``.
 
         Parameters
         ----------
-        messages
-            Room for the SYNC and one frame per drive.
         rows
             Set points, shape (M, n), counts.
-        cob_ids
-            Identifiers of the set point frames, shape (n,).
+        cob_ids, bus_of
+            Identifiers of the set point frames and the bus that each goes to, shape (n,).
         every
             SYNCs between two rows.
         """
+        self._call(self._state, rows, cob_ids, bus_of, every)
+
+    def _call(
+        self,
+        state: NDArray[np.int64],
+        rows: NDArray[np.int32],
+        cob_ids: NDArray[np.uint32],
+        bus_of: NDArray[np.int64],
+        every: int,
+    ) -> None:
+        buses = self._fixed[0].size
+        # Per bus the SYNC and behind it the set points of its drives.
+        first = np.searchsorted(np.sort(bus_of), np.arange(buses + 1)) + np.arange(buses + 1)
+        place = np.zeros(cob_ids.size, np.int64)
+        for bus in range(buses):
+            here = np.flatnonzero(bus_of == bus)
+            place[here] = first[bus] + 1 + np.arange(here.size)
+        messages = Messages(buses + cob_ids.size, control=False)
         body = messages.body.view(np.uint32)
-        body[0, 0], body[1:, 0] = COB_SYNC, cob_ids
-        messages.body[0, 4], messages.body[1:, 4] = 1, 4
-        _run(*self._fixed, messages.address, messages.body.view(np.int32), rows, every, self._spec)
+        body[first[:-1], 0], body[place, 0] = COB_SYNC, cob_ids
+        messages.body[first[:-1], 4], messages.body[place, 4] = 1, 4
+        shared = messages.address, messages.body.view(np.int32), first.astype(np.int64), place
+        _run(*self._fixed, state, *self._shared, *shared, rows, every, self._spec)
 
 
 @njit(nogil=True, cache=True)
@@ -95,11 +137,11 @@ def sleep_until(deadline, spec):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def send_messages(descriptor, address, count, spec):  # type: ignore[no-untyped-def]
+def send_messages(descriptor, address, count, attempts, spec):  # type: ignore[no-untyped-def]
     """Hand ``count`` messages to the kernel; 0, or errno if it will not take them."""
     sent, code = 0, 0
-    for _ in range(_SEND_ATTEMPTS):
-        done = _sendmmsg(descriptor, address + 64 * sent, count - sent, 0)
+    for _ in range(attempts):
+        done = _sendmmsg(descriptor, address + 64 * sent, count - sent, _DONTWAIT)
         if done > 0:
             sent += done
             if sent == count:
@@ -113,7 +155,10 @@ def send_messages(descriptor, address, count, spec):  # type: ignore[no-untyped-
 
 
 @njit(nogil=True, cache=True)
-def _run(descriptor, period, counter, state, late, address, body, rows, every, spec):  # type: ignore[no-untyped-def]
+def _run(  # type: ignore[no-untyped-def]
+    descriptors, period, counter, state, late, errors, unsent, address, body, first, place, rows, every, spec
+):
+    buses = descriptors.size
     if state[BASE_NS] == 0:
         state[BASE_NS] = monotonic_ns(spec) + period
     while state[STOP] == 0 and state[RETURN] == 0:
@@ -129,16 +174,21 @@ def _run(descriptor, period, counter, state, late, address, body, rows, every, s
         if lateness > MAX_LATE_PERIODS * period:
             state[SKIPPED] += lateness // period
             state[BASE_NS] += lateness // period * period
-        body[0, 2] = k % counter + 1
-        count = 1
-        if state[ROW] < rows.shape[0] and (k + 2) % every == 0:
+        due = state[ROW] < rows.shape[0] and (k + 2) % every == 0
+        if due:
             for j in range(rows.shape[1]):
-                body[1 + j, 2] = rows[state[ROW], j]
+                body[place[j], 2] = rows[state[ROW], j]
             state[ROW] += 1
-            count += rows.shape[1]
-        code = send_messages(descriptor, address, count, spec)
-        if code != 0:
-            state[ERROR] = code
-            return
+        refused, code = 0, 0
+        for b in range(buses):
+            body[first[b], 2] = k % counter + 1
+            count = first[b + 1] - first[b] if due else 1
+            attempts = _SEND_ATTEMPTS if buses == 1 else _FEW_ATTEMPTS
+            errors[b] = send_messages(descriptors[b], address + 64 * first[b], count, attempts, spec)
+            if errors[b] != 0:
+                unsent[b] += 1
+                refused += 1
+                code = errors[b]
+        state[ERROR] = code if refused == buses else 0
         state[LAST_NS] = now
         state[SENT] = k + 1

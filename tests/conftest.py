@@ -44,3 +44,14 @@ def vcan_bus() -> Iterator[str]:
     ensure_vcan(name)
     yield name
     remove_vcan(name)
+
+
+@pytest.fixture
+def vcan_buses() -> Iterator[list[str]]:
+    """Names of two vcan interfaces as :func:`vcan_bus` makes them."""
+    names = [f"vt{os.getpid() % 1_000_000}n{next(_bus_numbers)}" for _ in range(2)]
+    for name in names:
+        ensure_vcan(name)
+    yield names
+    for name in names:
+        remove_vcan(name)

@@ -3,11 +3,13 @@
 import subprocess
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import pytest
 
 from configs.session import Bus
+from drivers.bcm import KernelSync
 from drivers.frames import BusDown, Frames, frames
 from drivers.objects import COB_SYNC
 from drivers.socketcan import RawSocket
@@ -108,7 +110,7 @@ def test_after_the_last_row_the_drives_hear_no_more_set_points(vcan_bus: str) ->
     assert len(rows_of(got, COBS[0])) == 2
 
 
-def test_a_bus_that_goes_down_ends_the_producer_with_a_reason(vcan_bus: str) -> None:
+def test_a_bus_that_goes_down_is_a_reason_to_raise_until_it_is_back(vcan_bus: str) -> None:
     producer = producer_on(vcan_bus)
     with producer:
         while producer.sent < 10:
@@ -118,5 +120,66 @@ def test_a_bus_that_goes_down_ends_the_producer_with_a_reason(vcan_bus: str) -> 
         time.sleep(0.2)
         with pytest.raises(BusDown, match="SYNC cannot be sent"):
             producer.check()
-        with pytest.raises(BusDown):
-            producer.play(SetpointPlan(np.zeros((2, 2), dtype=np.int32), COBS))
+        subprocess.run(["ip", "link", "set", "dev", vcan_bus, "up"], check=True)
+        with RawSocket(vcan_bus) as socket:
+            assert socket.poll(2.0)
+            producer.check()
+    assert producer.stats().unsent[0] >= 100
+
+
+def test_several_buses_get_every_sync_and_each_its_own_set_points(vcan_buses: list[str]) -> None:
+    rows = np.arange(60, dtype=np.int32).reshape(20, 3)
+    plan = SetpointPlan(rows, (0x201, 0x201, 0x202), 5, bus_of=(0, 1, 0))
+    producer = SyncProducer([Bus(channel=name) for name in vcan_buses], PERIOD_US, 240, plan)
+    with RawSocket(vcan_buses[0]) as one, RawSocket(vcan_buses[1]) as other:
+        with producer:
+            while not producer.finished:
+                time.sleep(0.02)
+                producer.check()
+        got = []
+        for bus in (one, other):
+            batch = frames(4096)
+            got.append(batch[: bus.receive(batch)])
+    for log in got:
+        counters = log["data"][log["can_id"] == COB_SYNC, 0].tolist()
+        assert counters == [k % 240 + 1 for k in range(producer.sent)]
+    for log, cob, column in ((got[0], 0x201, 0), (got[1], 0x201, 1), (got[0], 0x202, 2)):
+        sent = log["data"][log["can_id"] == cob, :4].copy().view("<i4")[:, 0]
+        assert sent.tolist() == rows[:, column].tolist()
+    assert np.count_nonzero(got[1]["can_id"] == 0x202) == 0
+
+
+def test_one_bus_that_goes_down_keeps_none_from_the_others(vcan_buses: list[str]) -> None:
+    producer = SyncProducer([Bus(channel=name) for name in vcan_buses], PERIOD_US, 240)
+    with RawSocket(vcan_buses[0]) as one, RawSocket(vcan_buses[1]) as other:
+        with producer:
+            for state in ("down", "up"):
+                before = producer.sent
+                subprocess.run(["ip", "link", "set", vcan_buses[1], state], check=True)
+                while producer.sent < before + 200:
+                    time.sleep(0.02)
+                    producer.check()
+        unsent = producer.stats().unsent
+        counts = []
+        for bus in (one, other):
+            batch, n = frames(4096), 0
+            with suppress(BusDown):
+                n = bus.receive(batch)
+            n = n or bus.receive(batch)
+            counts.append(n)
+    assert unsent[0] == 0
+    assert unsent[1] >= 100
+    assert counts == [producer.sent, producer.sent - unsent[1]]
+
+
+def test_the_kernel_sends_every_sync_with_its_counter(vcan_bus: str) -> None:
+    with RawSocket(vcan_bus) as socket, KernelSync(Bus(channel=vcan_bus), PERIOD_US, 240):
+        log, batch = frames(0), frames(4096)
+        while log.size < 500:
+            socket.poll(0.1)
+            log = np.concatenate([log, batch[: socket.receive(batch)]])
+    assert (log["can_id"] == COB_SYNC).all()
+    assert (log["length"] == 1).all()
+    assert log["data"][:, 0].tolist() == [k % 240 + 1 for k in range(log.size)]
+    # The kernel's period is never shorter than asked for; on a guest it is longer by its timer's latency.
+    assert np.median(np.diff(log["t_ns"])) >= 0.9e3 * PERIOD_US
