@@ -3,14 +3,17 @@
 import datetime
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
 
 from configs import ConfigError
+from daq.recording import Recording
 from identify.document import IdentificationDocument, from_json, to_json
+from identify.drift import Drift
 
 DEFAULT = "sqlite:///history.sqlite"
 _STAMP = re.compile(r"(\d{8}T\d{6})-\d{3}Z")
@@ -41,6 +44,30 @@ _parameters = sa.Table(
     sa.Column("std", sa.Float, nullable=False),
     sa.Column("unit", sa.String(32), nullable=False),
     sa.Column("essential", sa.Boolean, nullable=False),
+)
+_recordings = sa.Table(
+    "recordings",
+    _tables,
+    sa.Column("sha256", sa.String(64), primary_key=True),
+    sa.Column("path", sa.Text),
+    sa.Column("cell", sa.String(128), index=True),
+    sa.Column("duration_s", sa.Float, nullable=False),
+    sa.Column("in_gaps", sa.Integer),
+    sa.Column("facts", sa.JSON, nullable=False),
+    sa.Column("counters", sa.JSON, nullable=False),
+)
+_comparisons = sa.Table(
+    "comparisons",
+    _tables,
+    sa.Column("identification", sa.ForeignKey(_runs.c.id), primary_key=True),
+    sa.Column("baseline", sa.String(64), primary_key=True),
+    sa.Column("drifted", sa.Boolean, nullable=False),
+    sa.Column("chi_square", sa.Float, nullable=False),
+    sa.Column("degrees", sa.Integer, nullable=False),
+    sa.Column("p_joint", sa.Float, nullable=False),
+    sa.Column("false_alarms", sa.Float, nullable=False),
+    sa.Column("changed", sa.JSON, nullable=False),
+    sa.Column("words", sa.Text, nullable=False),
 )
 
 
@@ -85,7 +112,7 @@ class History:
             When its recording was made; see :func:`recorded_at`.
         """
         text = to_json(document)
-        digest = hashlib.sha256(text.encode()).hexdigest()
+        digest = _digest(document)
         source = document.recording
         row = {
             "digest": digest,
@@ -122,11 +149,59 @@ class History:
             raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
         return True
 
+    def describe(self, recording: Recording) -> None:
+        """Keep what is known of a recording beside its samples: facts of the host, counters; once."""
+        rows = recording.samples.sync.size
+        row = {
+            "sha256": recording.sha256,
+            "path": None if recording.path is None else str(recording.path),
+            "cell": recording.metadata.get("cell"),
+            "duration_s": rows / recording.sample_rate_hz,
+            "in_gaps": recording.counters.get("samples.in_gaps"),
+            "facts": dict(recording.metadata),
+            "counters": dict(recording.counters),
+        }
+        self._insert_once(_recordings, row)
+
+    def judge(self, document: IdentificationDocument, baseline: IdentificationDocument, drift: Drift) -> None:
+        """Keep what came of the comparison of an identification, added before, with a baseline."""
+        number = sa.select(_runs.c.id).where(_runs.c.digest == _digest(document)).scalar_subquery()
+        row = {
+            "identification": number,
+            "baseline": _digest(baseline),
+            "drifted": drift.drifted,
+            "chi_square": drift.chi_square,
+            "degrees": drift.degrees,
+            "p_joint": drift.p_joint,
+            "false_alarms": drift.false_alarms,
+            "changed": list(drift.changed),
+            "words": drift.words,
+        }
+        self._insert_once(_comparisons, row)
+
+    def _insert_once(self, table: sa.Table, row: Mapping[str, Any]) -> None:
+        try:
+            with self._engine.begin() as connection:
+                connection.execute(sa.insert(table).values(row))
+        except sa.exc.IntegrityError:
+            return
+        except sa.exc.SQLAlchemyError as error:
+            raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
+
+    def first(self, robot: str) -> Run | None:
+        """The identification of a robot whose recording is the oldest."""
+        query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document).where(_runs.c.robot == robot)
+        found = self._read(query.order_by(_runs.c.recorded, _runs.c.id).limit(1))
+        return found[0] if found else None
+
     def runs(self, robot: str | None = None) -> list[Run]:
         """Identifications in the order in which their recordings were made."""
         query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document).order_by(_runs.c.recorded, _runs.c.id)
         if robot is not None:
             query = query.where(_runs.c.robot == robot)
+        return self._read(query)
+
+    def _read(self, query: sa.Select[Any]) -> list[Run]:
         try:
             with self._engine.connect() as connection:
                 rows = connection.execute(query).all()
@@ -141,6 +216,10 @@ class History:
         """Names of the robots that it knows."""
         with self._engine.connect() as connection:
             return connection.execute(sa.select(_runs.c.robot).distinct().order_by(_runs.c.robot)).scalars().all()
+
+
+def _digest(document: IdentificationDocument) -> str:
+    return hashlib.sha256(to_json(document).encode()).hexdigest()
 
 
 def recorded_at(document: IdentificationDocument, file: Path) -> datetime.datetime:

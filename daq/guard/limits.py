@@ -10,19 +10,15 @@ from configs import RobotConfig
 FOLLOWING_S = 0.1
 """A joint may lag behind its demand by what it covers in this time at its velocity limit, s."""
 
-VELOCITY_S = 0.002
-"""Velocity is a difference of positions over this time (s): a single one would show the encoder's steps."""
+VELOCITY_S = 0.01
+"""Velocity is a difference of positions over this time (s): a lost frame must not look like haste."""
 
 TORQUE_S = 0.01
 """Torque is a mean over this time (s): what chops in an amplifier for a millisecond loads no gear."""
 
 HEARTBEATS_MISSED = 3
 HEARTBEAT_MARGIN_S = 0.1
-"""A drive is lost after so many of its heartbeat periods, and what a host may be late on top."""
-
-SYNC_MISSED = 100
-SYNC_LOST_S = 0.5
-"""SYNC is lost after so many periods, or so long where that is more."""
+"""A drive is lost after so many of its heartbeat periods, and what a host may be late on top; so is SYNC."""
 
 Floats = NDArray[np.float64]
 

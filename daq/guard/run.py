@@ -61,25 +61,31 @@ class Guard:
     def __init__(self, bus: FrameBus, watch: Watch, orders: Frames) -> None:
         self._bus, self._watch, self._orders = bus, watch, orders
         self._batch = frames(BATCH)
-        self._asked = False
+        self._over = False
         watch.look(self._batch[:0], 0)
 
     def stop(self) -> None:
         """Order the quick stop now; may be called from a signal handler."""
         self._bus.send(self._orders)
-        self._asked = True
+        self._over = True
+
+    def leave(self) -> None:
+        """End without a word to the drives; for a signal handler, too."""
+        self._over = True
 
     def run(self) -> Alarm | None:
-        """Watch until something is wrong (the drives are stopped then), or ``stop`` was called.
+        """Watch until something is wrong (the drives are stopped then), or ``stop`` or ``leave`` was called.
 
         Raises
         ------
         BusDown
             If the bus went down.
         """
-        while not self._asked:
+        while not self._over:
+            # The time comes first: a guard that was kept waiting must not take that for a silence of the bus.
+            now = time.monotonic_ns()
             got = self._bus.receive(self._batch) if self._bus.poll(LOOK_S) else 0
-            alarm = self._watch.look(self._batch[:got], time.monotonic_ns())
+            alarm = self._watch.look(self._batch[:got], now)
             if alarm is not None:
                 self._bus.send(self._orders)
                 if alarm.frame < 0:
@@ -90,7 +96,9 @@ class Guard:
 
 
 def guard(config: str, following_s: float = FOLLOWING_S) -> None:
-    """Carry out ``armident guard`` until a signal or an alarm; both stop the drives.
+    """Carry out ``armident guard`` until a signal or an alarm.
+
+    An alarm, SIGINT and SIGTERM stop the drives. SIGUSR1 ends it quietly: the motion is over.
 
     Raises
     ------
@@ -110,15 +118,19 @@ def guard(config: str, following_s: float = FOLLOWING_S) -> None:
 
         def stop(_signal: int, _frame: FrameType | None) -> None:
             watcher.stop()
+            print("guard: quick stop ordered on a signal", file=sys.stderr, flush=True)
+
+        def leave(_signal: int, _frame: FrameType | None) -> None:
+            watcher.leave()
 
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, stop)
+        signal.signal(signal.SIGUSR1, leave)
         _come_first()
         print(f"guard: ready on {session.bus.channel}", flush=True)
         alarm = watcher.run()
     if alarm is not None:
         raise ArmidentError(f"guard: {alarm.text}; the drives were stopped")
-    print("guard: ended; quick stop was ordered", file=sys.stderr)
 
 
 def _come_first() -> None:

@@ -11,8 +11,6 @@ from configs.session import ObjectName
 from daq.guard.limits import (
     HEARTBEAT_MARGIN_S,
     HEARTBEATS_MISSED,
-    SYNC_LOST_S,
-    SYNC_MISSED,
     TORQUE_S,
     VELOCITY_S,
     Limits,
@@ -38,9 +36,9 @@ SYNC, SAMPLE, DEMAND, SETPOINT, EMCY, HEARTBEAT, NMT = range(7)
 QUIET, POSITION, VELOCITY, TORQUE, FOLLOWING, EMERGENCY, STATE, SILENT, NO_SYNC = range(9)
 """What can be wrong."""
 
-ARMED, LAST_SYNC, SINCE_SETPOINT, ROWS, JOINT, FRAME = range(6)
-"""Places in the state: whether set points are played, when SYNC came (ns), how many since a set point, complete
-sets of samples so far; then joint and frame of an alarm."""
+ARMED, LAST_SYNC, SINCE_SETPOINT, JOINT, FRAME = range(5)
+"""Places in the state: whether set points are played, when SYNC came (ns), how many since a set point; then joint and
+frame of an alarm."""
 
 ARMED_STATE = int(NmtState.OPERATIONAL)
 
@@ -84,16 +82,17 @@ class Watch:
         torque = np.array([joint.drive.gain * joint.drive.rated / 1000.0 for joint in robot.joints])
         self._per_mille = robot.transmission_matrix.T * torque
         velocity, mean = (max(1, round(seconds / period)) for seconds in (VELOCITY_S, TORQUE_S))
-        self._positions, self._torques = np.zeros((velocity, n)), np.zeros((mean, n))
+        self._positions, self._efforts = np.zeros((velocity + 1, n), np.int64), np.zeros((mean, n))
+        self._samples = np.zeros(n, np.int64)
         self._velocity_s = velocity * period
         self._every = session.setpoints.every
-        self._raw, self._fresh = np.zeros((3, n), np.int64), np.zeros(n, np.bool_)
+        self._raw, self._seen = np.zeros((3, n), np.int64), np.zeros(n, np.bool_)
         self._demanded = np.zeros(n, np.bool_)
         self._beat = np.zeros(n, np.int64)
-        self._state = np.zeros(6, np.int64)
+        self._state = np.zeros(5, np.int64)
         self._value = np.zeros(2)
         heartbeat = HEARTBEATS_MISSED * session.heartbeat_ms * 1e-3 + HEARTBEAT_MARGIN_S
-        self._silence = np.array([heartbeat * 1e9, max(SYNC_LOST_S, SYNC_MISSED * period) * 1e9], np.int64)
+        self._silence = round(heartbeat * 1e9)
 
     def _identify(self, session: SessionConfig, robot: RobotConfig) -> None:
         """Which identifier means what; the drives' own demand is taken where they send it, else the set points."""
@@ -147,8 +146,8 @@ class Watch:
         limits = self._limits
         code = _look(
             frames["can_id"], frames["length"], frames["data"], now_ns, self._kind, self._joint, self._at,
-            self._own_demand, self._every, self._raw, self._fresh, self._demanded, self._beat, self._silence,
-            self._per_count, self._per_mille, self._positions, self._torques, self._velocity_s,
+            self._own_demand, self._every, self._raw, self._seen, self._demanded, self._beat, self._silence,
+            self._per_count, self._per_mille, self._positions, self._efforts, self._samples, self._velocity_s,
             limits.low, limits.high, limits.velocity, limits.torque, limits.following, self._state, self._value,
         )  # fmt: skip
         return None if code == QUIET else Alarm(self._text(code), int(self._state[FRAME]))
@@ -196,46 +195,48 @@ def _number(data, k, at, size):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _examine(  # type: ignore[no-untyped-def]
-    raw, demanded, per_count, per_mille, positions, torques, velocity_s,
+    moved, raw, seen, demanded, per_count, per_mille, positions, efforts, samples, velocity_s,
     low, high, velocity, torque, following, state, value,
 ):  # fmt: skip
-    """One set of samples against the limits; what is wrong with it."""
-    n, row = low.size, state[ROWS]
-    old, mean = row % positions.shape[0], row % torques.shape[0]
-    full = row >= positions.shape[0]
-    state[ROWS] += 1
-    code = QUIET
-    every = True
+    """What is known of motor ``moved`` against the limits of the joints that it moves; what is wrong with it."""
+    n, ring = low.size, positions.shape[0]
     for j in range(n):
-        every = every and demanded[j]
-    for j in range(n):
-        q, tau, lag = 0.0, 0.0, 0.0
-        for m in range(n):
-            q += per_count[j, m] * raw[0, m]
-            tau += per_mille[j, m] * raw[1, m]
-            lag += per_count[j, m] * (raw[2, m] - raw[0, m])
-        speed = (q - positions[old, j]) / velocity_s if full else 0.0
-        positions[old, j], torques[mean, j] = q, tau
-        load = torques[:, j].mean()
-        if code != QUIET:
+        if per_count[j, moved] == 0.0 and per_mille[j, moved] == 0.0:
             continue
+        q, speed, tau, lag, known = 0.0, 0.0, 0.0, 0.0, True
+        for m in range(n):
+            if per_count[j, m] != 0.0:
+                known = known and seen[m]
+                q += per_count[j, m] * raw[0, m]
+                if samples[m] >= ring:
+                    # Behind the newest sample in the ring stands the oldest.
+                    speed += per_count[j, m] * (raw[0, m] - positions[(samples[m] + 1) % ring, m]) / velocity_s
+                if demanded[m]:
+                    lag += per_count[j, m] * (raw[2, m] - raw[0, m])
+            if per_mille[j, m] != 0.0:
+                tau += per_mille[j, m] * efforts[:, m].mean()
+        if not known:
+            continue
+        code = QUIET
         if q < low[j] or q > high[j]:
             code, value[0], value[1] = POSITION, q, 0.0
         elif abs(speed) > velocity[j]:
             code, value[0], value[1] = VELOCITY, speed, velocity[j]
-        elif abs(load) > torque[j]:
-            code, value[0], value[1] = TORQUE, load, torque[j]
-        elif every and abs(lag) > following[j]:
+        elif abs(tau) > torque[j]:
+            code, value[0], value[1] = TORQUE, tau, torque[j]
+        elif abs(lag) > following[j]:
             code, value[0], value[1] = FOLLOWING, lag, following[j]
         if code != QUIET:
             state[JOINT] = j
-    return code
+            return code
+    return QUIET
 
 
 @njit(cache=True)
 def _look(  # type: ignore[no-untyped-def]
-    ids, lengths, data, now, kinds, joints, at, own_demand, every, raw, fresh, demanded, beat, silence,
-    per_count, per_mille, positions, torques, velocity_s, low, high, velocity, torque, following, state, value,
+    ids, lengths, data, now, kinds, joints, at, own_demand, every, raw, seen, demanded, beat, silence,
+    per_count, per_mille, positions, efforts, samples, velocity_s,
+    low, high, velocity, torque, following, state, value,
 ):  # fmt: skip
     """All frames of a batch, then the silences."""
     for k in range(ids.size):
@@ -243,14 +244,12 @@ def _look(  # type: ignore[no-untyped-def]
             continue
         kind, j = kinds[ids[k]], joints[ids[k]]
         state[JOINT], state[FRAME] = j, k
-        complete = False
+        news = False
         if kind == NMT:
             state[ARMED] = 0
         elif kind == SYNC:
             state[LAST_SYNC] = now
             state[SINCE_SETPOINT] += 1
-            # A drive that owes its sample keeps nobody from looking at those of the others.
-            complete = fresh.any()
         elif kind == HEARTBEAT and lengths[k] >= 1:
             beat[j] = now
             if state[ARMED] and data[k, 0] != ARMED_STATE:
@@ -266,35 +265,39 @@ def _look(  # type: ignore[no-untyped-def]
                 state[ARMED], state[LAST_SYNC] = 1, now
                 beat[:] = now
                 demanded[:] = False
-                state[ROWS] = 0
+                samples[:] = 0
+                efforts[:] = 0.0
             state[SINCE_SETPOINT] = 0
             if not own_demand:
                 raw[2, j], demanded[j] = _number(data, k, 0, 4), True
         elif kind == DEMAND and lengths[k] >= at[2] + 4:
-            raw[2, j], demanded[j] = _number(data, k, at[2], 4), True
+            raw[2, j], demanded[j], news = _number(data, k, at[2], 4), True, True
         elif kind == SAMPLE and lengths[k] >= at[0] + 4:
             raw[0, j] = _number(data, k, at[0], 4)
             if at[1] >= 0 and lengths[k] >= at[1] + 2:
                 raw[1, j] = _number(data, k, at[1], 2)
-            fresh[j] = True
-            complete = fresh.all()
-        if complete:
-            fresh[:] = False
-            if state[ARMED]:
-                code = _examine(
-                    raw, demanded, per_count, per_mille, positions, torques, velocity_s,
-                    low, high, velocity, torque, following, state, value,
-                )  # fmt: skip
-                if code != QUIET:
-                    return code
+            seen[j] = True
+            if not state[ARMED]:
+                continue
+            efforts[samples[j] % efforts.shape[0], j] = raw[1, j]
+            samples[j] += 1
+            positions[samples[j] % positions.shape[0], j] = raw[0, j]
+            news = True
+        if news and state[ARMED]:
+            code = _examine(
+                j, raw, seen, demanded, per_count, per_mille, positions, efforts, samples, velocity_s,
+                low, high, velocity, torque, following, state, value,
+            )  # fmt: skip
+            if code != QUIET:
+                return code
     state[FRAME] = -1
     if state[ARMED]:
         for j in range(beat.size):
-            if now - beat[j] > silence[0]:
+            if now - beat[j] > silence:
                 state[JOINT], value[0] = j, (now - beat[j]) * 1e-9
                 return SILENT
         # Whoever ends a motion properly goes on with SYNC for a while after the last set point.
-        if state[SINCE_SETPOINT] <= every + 1 and now - state[LAST_SYNC] > silence[1]:
+        if state[SINCE_SETPOINT] <= every + 1 and now - state[LAST_SYNC] > silence:
             value[0] = (now - state[LAST_SYNC]) * 1e-9
             return NO_SYNC
     return QUIET

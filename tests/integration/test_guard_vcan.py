@@ -282,7 +282,7 @@ def test_a_capture_that_dies_in_the_middle_of_the_motion_is_noticed(vcan_bus: st
 
     dump = play(vcan_bus, guarded, Cell(), die)
     _, err = guarded.end()
-    assert "no SYNC for 2.0" in err
+    assert "no SYNC for 0.4" in err
     assert len(dump.orders()) == 2 * N
 
 

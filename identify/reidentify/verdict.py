@@ -1,0 +1,86 @@
+"""What a comparison and a diagnosis say in words: which joint, what, from what to what, how sure."""
+
+import re
+
+import numpy as np
+
+from configs import RobotConfig
+from identify.document import DiagnosisDocument
+from identify.drift import Drift
+
+_NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
+_SHARED = ("ia", "fv", "fc")
+"""Parameters that a coupling of two joints has."""
+
+_MEANINGS = {
+    "fv": "viscous friction",
+    "fc": "Coulomb friction",
+    "ia": "rotor inertia",
+    "off": "torque offset",
+    "mx": "mass moment",
+    "my": "mass moment",
+    "mz": "mass moment",
+}
+
+
+def told(drift: Drift, robot: RobotConfig) -> list[str]:
+    """One line per parameter that has changed, the clearest first; one that says so if only all together have.
+
+    Parameters
+    ----------
+    drift
+        The comparison.
+    robot
+        For the names of the joints.
+    """
+    lines = []
+    for name in drift.changed:
+        k = next(k for k, p in enumerate(drift.parameters) if p.name == name)
+        parameter, before = drift.parameters[k], float(drift.before[k])
+        share = f" ({100 * (parameter.value - before) / abs(before):+.1f} %)" if before else ""
+        lines.append(
+            f"{place_of(name, robot)}: {meaning_of(name)} {name} {before:.4g} -> {parameter.value:.4g} "
+            f"{parameter.unit}{share}, {abs(drift.difference[k]) / drift.std[k]:.1f} standard deviations, "
+            f"chance {_chance(float(drift.p_values[k]))}"
+        )
+    if not lines and drift.drifted:
+        z = np.abs(drift.difference) / drift.std
+        most = ", ".join(drift.parameters[k].name for k in np.argsort(-z)[:3])
+        lines.append(
+            f"no single parameter clearly, all together do (chance {_chance(drift.p_joint)}); farthest are {most}"
+        )
+    return lines
+
+
+def found(diagnosis: DiagnosisDocument) -> list[str]:
+    """One line per finding of a diagnosis, and one per joint that stays unexplained."""
+    lines = []
+    for finding in diagnosis.findings:
+        values = ", ".join(f"{name} {value:.4g}" for name, value in finding.parameters.items())
+        where = finding.joint if finding.other is None else f"{finding.joint} and {finding.other}"
+        words = finding.evidence.get("says")
+        said = words if isinstance(words, str) else f"{finding.effect.replace('_', ' ')} ({values})"
+        lines.append(
+            f"{where}: {said}; confidence {100 * finding.confidence:.0f} %, torque error "
+            f"{finding.gap_before:.2f} % -> {finding.gap_after:.2f} %"
+        )
+    return lines + [f"{each.joint}: {each.hint}" for each in diagnosis.unexplained]
+
+
+def place_of(name: str, robot: RobotConfig) -> str:
+    """The joint, or the coupling of two, that a base parameter belongs to."""
+    for coupling in robot.couplings:
+        if name in {kind + coupling.name for kind in _SHARED}:
+            return " and ".join(coupling.joints)
+    match = _NAME.match(name)
+    number = 0 if match is None else int(match[2])
+    return robot.joints[number - 1].name if 1 <= number <= robot.n else robot.name
+
+
+def meaning_of(name: str) -> str:
+    """What a parameter is, by the letters that its name begins with."""
+    return next((meaning for kind, meaning in _MEANINGS.items() if name.startswith(kind)), "inertia")
+
+
+def _chance(p: float) -> str:
+    return f"{p:.1g}" if p >= 1e-12 else "below 1e-12"
