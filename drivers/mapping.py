@@ -72,9 +72,9 @@ def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
         communication = od.TPDO_COMMUNICATION + tpdo - 1
         if tpdo in streams:
             name, stream = streams[tpdo]
-            entries = od.TpdoLayout.of(stream.objects, f"streams.{name}").entries
-            cob = od.tpdo_cob(tpdo, node)
-            _map_pdo(sdo, communication, od.TPDO_MAPPING + tpdo - 1, cob, entries, stream.every)
+            entries = od.TpdoLayout.of(stream.objects, f"streams.{name}", stream.pack, sdo.fd).entries
+            cob, interval = od.tpdo_cob(tpdo, node), max(stream.every, stream.pack)
+            _map_pdo(sdo, communication, od.TPDO_MAPPING + tpdo - 1, cob, entries, interval)
         elif communication in sdo.node.object_dictionary:
             cob = sdo.read(communication, 1, "I")
             if not cob & od.PDO_NOT_VALID:

@@ -1,6 +1,6 @@
 """CANopen by its names: objects, identifiers, states and error codes of CiA 301 and CiA 402."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Any
@@ -354,8 +354,10 @@ EMCY_TEXTS: dict[int, str] = {
 """Texts of emergency error codes (CiA 301 table of section 7.2.7.1, CiA 402 part 2 error codes)."""
 
 
-def emcy_text(code: int) -> str:
-    """The text of an emergency error code: its own, or that of the narrowest group that has one."""
+def emcy_text(code: int, vendor: Mapping[int, str] | None = None) -> str:
+    """The text of an emergency error code: the vendor's, its own, or that of the narrowest group that has one."""
+    if vendor and code in vendor:
+        return vendor[code]
     for mask in (0xFFFF, 0xFFF0, 0xFF00, 0xF000):
         if code & mask in EMCY_TEXTS:
             return EMCY_TEXTS[code & mask]

@@ -35,7 +35,10 @@ class DriveSdo:
         self.drive = drive
         self.who = f"node {drive.node_id} ({drive.joint})"
         """How messages name the drive."""
-        self._bus = session.bus
+        self.fd = session.bus_of(drive).fd
+        """Whether the drive's TPDOs are frames of CAN FD."""
+        self.emcy_texts = session.emcy_texts
+        self._bus = session.bus_of(drive)
         self._timeout = node.sdo.RESPONSE_TIMEOUT = session.sdo_timeout_s
 
     def read(self, index: int, sub: int, code: str) -> int:
