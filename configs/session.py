@@ -78,7 +78,7 @@ class Setpoints(Frozen):
     settle_s: Annotated[float, Field(ge=0)] = 0.5
 
 
-TriggerName = Literal["emcy", "heartbeat_lost", "command"]
+TriggerName = Literal["emcy", "heartbeat_lost", "bus", "command"]
 
 
 class Trigger(Frozen):
@@ -145,7 +145,7 @@ class SessionConfig(Frozen):
     buses: tuple[Bus, ...] = ()
     sync: Sync = Sync()
     drives: Annotated[tuple[DriveNode, ...], Field(min_length=1)]
-    emcy_texts: dict[Annotated[int, Field(ge=0, le=0xFFFF)], str] = {}
+    emcy_texts: dict[Annotated[int, Field(ge=0, le=0xFFFF)], str] = Field(default_factory=dict)
     heartbeat_ms: Annotated[int, Field(ge=10, le=60_000)] = 100
     sdo_timeout_s: Positive = 1.0
     streams: dict[Name, Stream]

@@ -10,25 +10,22 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from configs import (
-    ArmidentError,
-    ConfigError,
-    load_robot,
-    load_session,
-    load_trajectory,
-)
+from configs import ArmidentError
+from configs.session import Bus
 from daq.facts import host_facts
+from daq.order import Order, prepare
 from daq.publisher import Publisher
-from daq.recorder import Order, Recorder
+from daq.recorder import Recorder
 from daq.recording import Mark
 from daq.sink import Sink
 from daq.storage import capture_stamp, kept_tidy, open_series
-from daq.streams import captured_streams
 from daq.systemd import Notifier
 from daq.zenoh_keys import Keys
-from drivers.bus_load import check_fits
-from drivers.objects import COB_MASK, COB_SYNC
+from drivers.frames import FrameBus
+from drivers.receiver import Receiver
 from drivers.udp import NOTE, open_bus
+
+__all__ = ["Captured", "Order", "capture", "prepare", "run_capture"]
 
 
 @dataclass(frozen=True)
@@ -39,27 +36,6 @@ class Captured:
     counters: dict[str, int]
     marks: tuple[Mark, ...]
     trouble: ArmidentError | None
-
-
-def prepare(config: str | Path, out: Path | None, duration: float | None, listen_only: bool) -> Order:
-    """Load and check everything a capture needs.
-
-    Raises
-    ------
-    ConfigError
-        For whatever is wrong with the configuration, the trajectory's limits, or the load of the bus.
-    """
-    session = load_session(config)
-    robot = load_robot(session.robot)
-    check_fits(session, str(config))
-    trajectory = None
-    if session.setpoints is not None and not listen_only:
-        if session.sync.role != "producer":
-            raise ConfigError(f"{config}: setpoints need sync.role producer; only who sends SYNC can play them")
-        trajectory = load_trajectory(session.setpoints.trajectory)
-        trajectory.check(robot, str(session.setpoints.trajectory))
-    directory = out if out is not None else session.recording.directory
-    return Order(session, robot, captured_streams(session, robot), trajectory, directory, duration, listen_only)
 
 
 def capture(
@@ -92,21 +68,24 @@ def capture(
     now = datetime.datetime.now(datetime.UTC)
     name = f"{robot.name}-{capture_stamp(now)}"
     with ExitStack() as stack:
-        metadata = host_facts(now) | {"capture": name, "cell": session.cell}
+        receiver = stack.enter_context(Receiver([_opener(bus, k, order) for k, bus in enumerate(session.all_buses)]))
+        stamps = {
+            f"timestamps.{channel}": kind for channel, kind in zip(receiver.channels, receiver.stamps, strict=True)
+        }
+        metadata = host_facts(now) | {"capture": name, "cell": session.cell} | stamps
         rate = 1.0 / session.sync_period
         notifier = stack.enter_context(closing(Notifier()))
         writer = open_series(session, robot, order.streams, order.directory, name, metadata)
         stack.callback(writer.__exit__, None, None, None)
         stack.enter_context(kept_tidy(session.recording, order.directory, robot.name, say))
         try:
-            bus = stack.enter_context(open_bus(session.bus, filters=_filters(order)))
-            if session.bus.interface == "udp_multicast":
+            if session.all_buses[0].interface == "udp_multicast":
                 say(NOTE)
             publisher = Publisher(session, Keys(session.cell, robot.name))
             stack.callback(publisher.close)
             run = Recorder(
                 order,
-                bus,
+                receiver,
                 Sink(writer, publisher, order.streams, name),
                 publisher,
                 notifier,
@@ -134,9 +113,9 @@ def capture(
         return Captured(tuple(writer.paths), counters, tuple(run.sink.marks), trouble)
 
 
-def _filters(order: Order) -> list[tuple[int, int]]:
-    wanted = [COB_SYNC, *(cob_id for stream in order.streams for cob_id in stream.bus.cob_ids)]
-    return [(can_id, COB_MASK) for can_id in wanted]
+def _opener(bus: Bus, number: int, order: Order) -> Callable[[], FrameBus]:
+    """Opens one bus for what the capture wants of it, and for what its controller reports."""
+    return lambda: open_bus(bus, filters=order.filters(number), errors=True, hardware=True)
 
 
 def run_capture(config: str, out: Path | None, duration: float | None, listen_only: bool, as_json: bool) -> None:

@@ -21,6 +21,10 @@ COUNTERS = {
     "blocks_dropped": "Blocks that Zenoh listeners did not get because the queue was full",
     "emcy": "Emergency messages of drives",
     "heartbeat_lost": "Heartbeats of drives that stayed away",
+    "rebooted": "Drives that booted again",
+    "bus_down": "Buses that went down",
+    "bus_off": "Controllers that went off their bus",
+    "error_frames": "Error frames of the controllers",
 }
 """What only grows while a capture runs; everything else that health says is a gauge."""
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from configs import RobotConfig, SessionConfig, Trajectory
 from configs.trajectory import RAMP_SHARE, Move
-from daq.streams import counts_per_si, node_ids
+from daq.streams import bus_numbers, counts_per_si, node_ids
 from drivers.objects import rpdo_cob
 from drivers.sync import SetpointPlan
 
@@ -67,7 +67,7 @@ def plan_motion(
     parts.append(np.repeat(parts[-1][-1:], len(rest), axis=0))
     counts = np.rint(np.concatenate(parts) @ robot.transmission_matrix.T * scale).astype(np.int32)
     cob_ids = tuple(rpdo_cob(options.rpdo, node) for node in node_ids(session, robot))
-    return Motion(SetpointPlan(counts, cob_ids, options.every), first, last)
+    return Motion(SetpointPlan(counts, cob_ids, options.every, bus_numbers(session, robot)), first, last)
 
 
 def approach(

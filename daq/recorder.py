@@ -5,53 +5,35 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from configs import ArmidentError, RobotConfig, SessionConfig, Trajectory
+from configs import ArmidentError
 from daq.assembler import LATE_S, Assembler
-from daq.metrics import Metrics, Value
+from daq.happenings import Happenings
+from daq.health import Health
+from daq.jitter import SyncJitter, worst
 from daq.motion import Motion, plan_motion
+from daq.order import Order
 from daq.publisher import Publisher
 from daq.remote import Command
 from daq.sink import Sink
-from daq.storage import free_space
-from daq.streams import CapturedStream
 from daq.systemd import Notifier
-from drivers.frames import FrameBus, frames
+from drivers.bcm import KernelSync
+from drivers.frames import BusDown
 from drivers.master import DriveMaster
+from drivers.receiver import Receiver
 from drivers.sync import SyncProducer
 
-BATCH = 4096
-DRAINS = 16
-"""Batches taken in a row before anything else is looked at."""
 HEALTH_S = 1.0
 REST_S = 0.01
-"""Time between two looks at the bus when the capture comes to its end."""
+"""Time between two looks at the buses when the capture comes to its end."""
 TELL_BEHIND_S = 0.5
 """Drives that are farther behind than this at the end are worth a line."""
 QUICK_STOP_S = 0.3
 """How long a quick stop is given before the drives are disabled."""
-
-
-@dataclass(frozen=True)
-class Order:
-    """What is to be captured, checked before anything is touched."""
-
-    session: SessionConfig
-    robot: RobotConfig
-    streams: tuple[CapturedStream, ...]
-    trajectory: Trajectory | None
-    directory: Path
-    duration: float | None = None
-    listen_only: bool = False
-
-    @property
-    def producing(self) -> bool:
-        """Whether we send SYNC."""
-        return self.session.sync.role == "producer" and not self.listen_only
+OUTAGE_S = 5.0
+"""A capture ends when no bus has worked for this long."""
 
 
 class Recorder:
@@ -60,7 +42,7 @@ class Recorder:
     def __init__(
         self,
         order: Order,
-        bus: FrameBus,
+        receiver: Receiver,
         sink: Sink,
         publisher: Publisher,
         notifier: Notifier,
@@ -69,43 +51,38 @@ class Recorder:
         say: Callable[[str], None],
     ) -> None:
         self.sink = sink
-        self._order, self._bus, self._publisher, self._stop, self._say = order, bus, publisher, stop, say
+        self._order, self._receiver, self._publisher, self._stop, self._say = order, receiver, publisher, stop, say
         self._notifier = notifier
         session = order.session
+        period_ns, overflow = session.sync.period_us * 1000, session.sync.counter
         self._assembler = Assembler(
             [stream.bus for stream in order.streams],
             [joint.name for joint in order.robot.joints],
-            session.sync.period_us * 1000,
-            session.sync.counter,
+            period_ns,
+            overflow,
             1 if order.producing else None,
+            bus_of=order.bus_of,
         )
-        self._batch = frames(BATCH)
-        self._assembler.warm_up(self._batch[:2])
-        self._producer: SyncProducer | None = None
+        self._assembler.warm_up(receiver.warm_up())
+        self._jitters = [SyncJitter(period_ns, overflow) for _ in receiver.channels]
+        self._happenings = Happenings(order, self._assembler, sink, say)
+        self._health = Health(order, self._assembler, receiver, self._jitters, sink, publisher, say)
+        self._producer: SyncProducer | KernelSync | None = None
         self._master: DriveMaster | None = None
         self._motion: Motion | None = None
-        self._metrics: Metrics | None = None
         self._span: tuple[int, int] | None = None
-        self._frames_before = 0
-        self._events = {"emcy": 0, "heartbeat_lost": 0}
-        self._triggers = () if session.recording.trigger is None else session.recording.trigger.events
         self._save = save
         self._fed = -math.inf
-        self._lost_rows = 0
-        self._writing = True
+        self._refused: float | None = None
 
     def start(self, stack: ExitStack) -> None:
         """Configure and enable the drives, and start SYNC; whatever was started is stopped when the stack unwinds."""
         order, session = self._order, self._order.session
-        options = session.metrics
-        if options.port is not None:
-            labels = {"cell": session.cell, "robot": order.robot.name}
-            self._metrics = stack.enter_context(Metrics(options.address, options.port, labels))
-            self._say(f"metrics on http://{options.address}:{self._metrics.port}/metrics")
+        self._health.serve(stack)
         if order.listen_only:
             return
         self._master = stack.enter_context(DriveMaster(session, order.robot))
-        self._say(f"configuring {len(session.drives)} drives on {session.bus.channel}")
+        self._say(f"configuring {len(session.drives)} drives on {', '.join(self._receiver.channels)}")
         self._master.configure()
         # Whoever else produces SYNC also moves the arm.
         self._master.start(enable=order.producing)
@@ -113,8 +90,13 @@ class Recorder:
             by_joint = dict(zip((d.joint for d in session.drives), self._master.positions(), strict=True))
             actual = np.array([by_joint[joint.name] for joint in order.robot.joints], dtype=np.int64)
             self._motion = plan_motion(session, order.robot, order.trajectory, actual)
+            self._happenings.moving = True
         if order.producing:
-            self._producer = SyncProducer(session.bus, session.sync.period_us, session.sync.counter)
+            timing = session.sync.period_us, session.sync.counter
+            if session.sync.source == "kernel":
+                self._producer = KernelSync(session.all_buses[0], *timing)
+            else:
+                self._producer = SyncProducer(session.all_buses, *timing)
             self._producer.start()
             stack.callback(self._producer.stop)
 
@@ -132,12 +114,16 @@ class Recorder:
 
     def counters(self) -> dict[str, int]:
         """All counts of the capture."""
-        counters = self._assembler.counters | self._events
-        counters["kernel_drops"] = self._bus.dropped
-        if self._producer is not None:
+        counters = self._assembler.counters | self._happenings.counts
+        counters["kernel_drops"] = self._receiver.dropped
+        counters["error_frames"] = self._receiver.error_frames
+        for name, value in worst(self._jitters).items():
+            counters[f"sync_jitter_{name.replace('.', '_')}_us"] = round(value)
+        if isinstance(self._producer, SyncProducer):
             stats = self._producer.stats()
             counters |= {
                 "sync_sent": stats.sent,
+                "sync_not_sent": sum(stats.unsent),
                 "sync_late_p99_us": round(stats.late_p99_us),
                 "sync_late_max_us": round(stats.late_max_us),
                 "sync_overruns": stats.overruns,
@@ -146,7 +132,7 @@ class Recorder:
         return counters
 
     def _play(self) -> None:
-        if self._producer is not None and self._motion is not None:
+        if isinstance(self._producer, SyncProducer) and self._motion is not None:
             self._span = self._motion.span(self._producer.play(self._motion.plan))
             self.sink.mark("experiment_start", self._span[0])
             self.sink.mark("experiment_end", self._span[1])
@@ -177,24 +163,21 @@ class Recorder:
             self._watch()
             now = time.monotonic()
             if now - reported >= HEALTH_S:
-                self._report_health(now - reported)
+                self._happenings.look_for_other_mappings()
+                self._health.report(now - reported, self._happenings.counts)
                 reported = now
             if deadline is not None and now > deadline and self._assembler.last_sync < 0:
-                raise ArmidentError(f"bus {self._bus.channel}: no SYNC within {self._order.duration:g} s")
+                names = ", ".join(self._receiver.channels)
+                raise ArmidentError(f"bus {names}: no SYNC within {self._order.duration:g} s")
 
     def _drain(self) -> int:
         total = 0
-        # Bounded, so that a bus faster than we are cannot keep the capture from ending.
-        for _ in range(DRAINS):
-            before = self._bus.dropped
-            got = self._bus.receive(self._batch)
+        for bus, frames, dropped in self._receiver.drain():
             sent = self._producer.sent if self._producer is not None else None
-            if got:
-                self.sink.take(self._assembler.push(self._batch[:got], sent, self._bus.dropped > before))
-                self._mark_start()
-            total += got
-            if got < BATCH:
-                break
+            self._jitters[bus].take(frames)
+            self.sink.take(self._assembler.push(frames, sent, dropped, bus))
+            self._mark_start()
+            total += frames.size
         # Our own SYNCs come back to us: without any, the bus is dead or we are. A foreign SYNC may rest.
         if (total or self._producer is None) and time.monotonic() - self._fed >= HEALTH_S:
             self._fed = time.monotonic()
@@ -202,22 +185,23 @@ class Recorder:
         return total
 
     def _watch(self) -> None:
-        """Look after SYNC and drives; a drive that fails while we move the arm ends the capture."""
-        if self._producer is not None:
-            self._producer.check()
+        """Look after buses, SYNC and drives; what fails while we move the arm ends the capture."""
+        for happened in self._receiver.events():
+            self._happenings.of_bus(happened)
         self._obey()
-        for event in self._master.supervise() if self._master is not None else ():
-            if event.kind in ("emcy", "heartbeat_lost"):
-                self._events[event.kind] += 1
-                self.sink.mark(event.kind, max(self._assembler.last_sync, 0), event.text)
-            else:
-                self.sink.mark("note", max(self._assembler.last_sync, 0), event.text)
-            self._say(event.text)
-            if event.kind in self._triggers:
-                self.sink.trigger()
-            failed = event.kind == "heartbeat_lost" or (event.kind == "emcy" and event.code != 0)
-            if failed and self._motion is not None:
-                raise ArmidentError(f"{event.text}; the arm was stopped")
+        try:
+            if self._producer is not None:
+                self._producer.check()
+            for event in self._master.supervise() if self._master is not None else ():
+                self._happenings.of_drive(event)
+            if self._receiver.all_down_s:
+                raise BusDown(f"bus {', '.join(self._receiver.channels)}: the interface went down and stays down")
+            self._refused = None
+        except BusDown:
+            now = time.monotonic()
+            self._refused = now if self._refused is None else self._refused
+            if self._happenings.moving or now - self._refused > OUTAGE_S:
+                raise
 
     def _obey(self) -> None:
         """Do what was asked over Zenoh or by SIGUSR1."""
@@ -232,7 +216,7 @@ class Recorder:
                 continue
             text = command.text if command.name == "mark" else f"save: {command.text}".rstrip(": ")
             self.sink.mark("note", max(self._assembler.last_sync, 0), text)
-            if command.name == "save" and "command" in self._triggers:
+            if command.name == "save" and "command" in self._happenings.triggers:
                 self.sink.trigger()
 
     def _mark_start(self) -> None:
@@ -286,38 +270,3 @@ class Recorder:
         elif self._span[0] <= self.sink.last_sync < self._span[1]:
             why = str(trouble) if trouble is not None else "stopped"
             self.sink.move_mark("experiment_end", self.sink.last_sync, f"before its end: {why}")
-
-    def _tell_of_disk(self) -> None:
-        """Say it when the disk begins to refuse rows, and when it takes them again."""
-        lost, before = self.sink.lost_rows, self._lost_rows
-        self._lost_rows = lost
-        if lost > before and self._writing:
-            self._say(f"warning: rows are not being written, streaming goes on: {self.sink.problem}")
-        elif lost == before and not self._writing:
-            self._say(f"writing again; {lost} rows were not written")
-        self._writing = lost == before
-
-    def _report_health(self, seconds: float) -> None:
-        counters = self._assembler.counters
-        rate = (counters["frames"] - self._frames_before) / seconds
-        self._frames_before = counters["frames"]
-        self._tell_of_disk()
-        health: dict[str, Value] = {
-            "file": None if self.sink.path is None else self.sink.path.name,
-            "rows_not_written": self.sink.lost_rows,
-            "sync": self._assembler.last_sync,
-            "frames": counters["frames"],
-            "frames_per_s": round(rate, 1),
-            "rows": counters["samples.rows"],
-            "rows_in_gaps": counters["samples.in_gaps"],
-            "kernel_drops": self._bus.dropped,
-            "answers_owed": self._assembler.owed,
-            "queue_depth": self._publisher.depth,
-            "disk_free_bytes": free_space(self._order.directory),
-            "blocks_dropped": self._publisher.dropped,
-            **self._events,
-        }
-        self._publisher.health(health)
-        if self._metrics is not None:
-            self._metrics.update(health)
-        self._publisher.status({"state": "recording", "sync": self._assembler.last_sync})

@@ -12,6 +12,7 @@ from configs.session import ObjectName
 from daq.assembler import Rows, TpdoStream
 from daq.recording import Field, StreamLayout
 from daq.recording.model import Quantity
+from drivers.frames import fd_length
 from drivers.objects import OBJECTS, TpdoLayout, tpdo_cob
 
 
@@ -38,12 +39,14 @@ def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[Captur
         If a joint has no drive, a stream does not fit into its TPDO, or a position has no scale.
     """
     nodes = node_ids(session, robot)
+    fd = all(bus.fd for bus in session.all_buses)
     streams = []
     for name, stream in session.streams.items():
-        tpdo = TpdoLayout.of(stream.objects, f"streams.{name}")
+        tpdo = TpdoLayout.of(stream.objects, f"streams.{name}", stream.pack, fd)
         fields = tuple(field_of(object_name, robot) for object_name in stream.objects)
         dtypes = tuple(np.dtype(OBJECTS[o].format).name for o in stream.objects)
-        bus = TpdoStream(name, stream.every, tuple(tpdo_cob(stream.tpdo, node) for node in nodes), tpdo.size)
+        cob_ids = tuple(tpdo_cob(stream.tpdo, node) for node in nodes)
+        bus = TpdoStream(name, stream.every, cob_ids, fd_length(tpdo.frame_size), stream.pack, tpdo.size)
         layout = StreamLayout(name, stream.every, tuple(j.name for j in robot.joints), fields, dtypes)
         streams.append(CapturedStream(tpdo, bus, layout))
     return tuple(streams)
@@ -61,6 +64,13 @@ def node_ids(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
     for joint in robot.joints:
         if joint.name not in by_joint:
             raise ConfigError(f"drives: no drive for {joint.name} of {robot.name}; every joint needs one")
+    return tuple(by_joint[joint.name] for joint in robot.joints)
+
+
+def bus_numbers(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
+    """Number of the bus that each joint's drive is on, in the robot's order."""
+    buses = session.all_buses
+    by_joint = {drive.joint: buses.index(session.bus_of(drive)) for drive in session.drives}
     return tuple(by_joint[joint.name] for joint in robot.joints)
 
 

@@ -27,7 +27,7 @@ def has_hardware_stamps(channel: str) -> bool:
     address, _ = request.buffer_info()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         try:
-            fcntl.ioctl(any_socket, _SIOCETHTOOL, struct.pack("=16sP", channel.encode(), address))
+            fcntl.ioctl(any_socket, _SIOCETHTOOL, struct.pack("16sP16x", channel.encode(), address))
         except OSError:
             return False
     (flags,) = struct.unpack_from("=I", request, 4)

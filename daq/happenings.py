@@ -1,0 +1,90 @@
+"""What happens beside the samples: reports of drives and buses become counts, marks, lines and triggers."""
+
+from collections.abc import Callable
+
+from configs import ArmidentError
+from daq.assembler import Assembler
+from daq.order import Order
+from daq.sink import Sink
+from drivers.master import DriveEvent
+from drivers.receiver import BusEvent
+
+COUNTED = ("emcy", "heartbeat_lost", "rebooted", "bus_down", "bus_off")
+
+
+class Happenings:
+    """Takes events in the order they are noticed.
+
+    Parameters
+    ----------
+    order
+        Says which events write a recording, and which end a capture: those of drives and buses that move the arm.
+    assembler
+        Knows the SYNC at which something happened, and is told which bus is down.
+    sink
+        Gets the marks.
+    say
+        Gets the lines.
+    """
+
+    def __init__(self, order: Order, assembler: Assembler, sink: Sink, say: Callable[[str], None]) -> None:
+        self.counts = dict.fromkeys(COUNTED, 0)
+        self.moving = False
+        """Whether the arm is moved: what fails then ends the capture."""
+        trigger = order.session.recording.trigger
+        self.triggers: tuple[str, ...] = () if trigger is None else trigger.events
+        self._assembler, self._sink, self._say = assembler, sink, say
+        self._told: set[tuple[str, str]] = set()
+
+    def of_drive(self, event: DriveEvent) -> None:
+        """A drive reported something.
+
+        Raises
+        ------
+        ArmidentError
+            If the drive failed while it moves the arm.
+        """
+        kind = event.kind
+        if kind in self.counts:
+            self.counts[kind] += 1
+        self._sink.mark(kind if kind in ("emcy", "heartbeat_lost") else "note", self._sync, event.text)
+        self._say(event.text)
+        if kind in self.triggers:
+            self._sink.trigger()
+        if kind in ("heartbeat_lost", "rebooted") or (kind == "emcy" and event.code != 0):
+            self._stop_moving(event.text)
+
+    def of_bus(self, event: BusEvent) -> None:
+        """Something happened to a bus; its axes are gaps while it is down.
+
+        Raises
+        ------
+        ArmidentError
+            If the bus was lost while the arm is moved.
+        """
+        if event.kind in self.counts:
+            self.counts[event.kind] += 1
+        if event.kind in ("bus_down", "bus_up"):
+            self._assembler.silence(event.bus, event.kind == "bus_down")
+        self._sink.mark("note", self._sync, event.text)
+        self._say(event.text)
+        if "bus" in self.triggers:
+            self._sink.trigger()
+        if event.kind in ("bus_down", "bus_off"):
+            self._stop_moving(event.text)
+
+    def look_for_other_mappings(self) -> None:
+        """Tell once of every TPDO that has another length than its mapping says."""
+        for stream, joint in sorted(set(self._assembler.wrong_lengths) - self._told):
+            self._told.add((stream, joint))
+            text = f"{joint}: TPDO of {stream} has another length than mapped; was its mapping changed?"
+            self._sink.mark("note", self._sync, text)
+            self._say(f"warning: {text}")
+
+    @property
+    def _sync(self) -> int:
+        return max(self._assembler.last_sync, 0)
+
+    def _stop_moving(self, text: str) -> None:
+        if self.moving:
+            raise ArmidentError(f"{text}; the arm was stopped")

@@ -1,0 +1,91 @@
+"""How a capture does, once a second: on Zenoh, for Prometheus, and in words where the disk refuses."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+
+from daq.assembler import Assembler
+from daq.jitter import SyncJitter, worst
+from daq.metrics import Metrics, Value
+from daq.order import Order
+from daq.publisher import Publisher
+from daq.sink import Sink
+from daq.storage import free_space
+from drivers.receiver import Receiver
+
+
+class Health:
+    """Reports on one capture.
+
+    Parameters
+    ----------
+    order
+        What is captured.
+    assembler, receiver, jitters, sink, publisher
+        What is reported on, and where to.
+    say
+        Takes lines.
+    """
+
+    def __init__(
+        self,
+        order: Order,
+        assembler: Assembler,
+        receiver: Receiver,
+        jitters: list[SyncJitter],
+        sink: Sink,
+        publisher: Publisher,
+        say: Callable[[str], None],
+    ) -> None:
+        self._order, self._assembler, self._receiver, self._jitters = order, assembler, receiver, jitters
+        self._sink, self._publisher, self._say = sink, publisher, say
+        self._metrics: Metrics | None = None
+        self._frames_before = self._lost_rows = 0
+        self._writing = True
+
+    def serve(self, stack: ExitStack) -> None:
+        """Serve metrics where the session asks for it, until the stack unwinds."""
+        options, session = self._order.session.metrics, self._order.session
+        if options.port is not None:
+            labels = {"cell": session.cell, "robot": self._order.robot.name}
+            self._metrics = stack.enter_context(Metrics(options.address, options.port, labels))
+            self._say(f"metrics on http://{options.address}:{self._metrics.port}/metrics")
+
+    def report(self, seconds: float, events: dict[str, int]) -> None:
+        """Say how the last ``seconds`` were; ``events`` are counts since the start."""
+        counters = self._assembler.counters
+        rate = (counters["frames"] - self._frames_before) / seconds
+        self._frames_before = counters["frames"]
+        self._tell_of_disk()
+        health: dict[str, Value] = {
+            "file": None if self._sink.path is None else self._sink.path.name,
+            "rows_not_written": self._sink.lost_rows,
+            "sync": self._assembler.last_sync,
+            "frames": counters["frames"],
+            "frames_per_s": round(rate, 1),
+            "rows": counters["samples.rows"],
+            "rows_in_gaps": counters["samples.in_gaps"],
+            "kernel_drops": self._receiver.dropped,
+            "error_frames": self._receiver.error_frames,
+            "buses_down": sum(self._receiver.down),
+            "answers_owed": self._assembler.owed,
+            "queue_depth": self._publisher.depth,
+            "disk_free_bytes": free_space(self._order.directory),
+            "blocks_dropped": self._publisher.dropped,
+            **events,
+        }
+        for name, value in worst(self._jitters).items():
+            health[f"sync_jitter_{name.replace('.', '_')}_us"] = round(value, 1)
+        self._publisher.health(health)
+        if self._metrics is not None:
+            self._metrics.update(health)
+        self._publisher.status({"state": "recording", "sync": self._assembler.last_sync})
+
+    def _tell_of_disk(self) -> None:
+        """Say it when the disk begins to refuse rows, and when it takes them again."""
+        lost, before = self._sink.lost_rows, self._lost_rows
+        self._lost_rows = lost
+        if lost > before and self._writing:
+            self._say(f"warning: rows are not being written, streaming goes on: {self._sink.problem}")
+        elif lost == before and not self._writing:
+            self._say(f"writing again; {lost} rows were not written")
+        self._writing = lost == before

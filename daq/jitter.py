@@ -1,0 +1,76 @@
+"""How even the SYNCs of a bus come: the difference of their distances from the period, by the frames' time stamps."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+BIN_NS = 1_000
+"""Width of a bin of the histogram, ns."""
+BINS = 50_000
+"""Bins of the histogram; the last one also holds everything larger."""
+PERCENTILES = (50.0, 99.0, 99.9)
+
+
+class SyncJitter:
+    """Statistics over all SYNCs of one bus since the start.
+
+    Parameters
+    ----------
+    period_ns
+        SYNC period, ns.
+    overflow
+        Of the SYNC counter, by which SYNCs that are missing are told.
+    sync_id
+        COB-ID of SYNC.
+    """
+
+    def __init__(self, period_ns: int, overflow: int, sync_id: int = 0x80) -> None:
+        self._period, self._overflow, self._sync_id = period_ns, overflow, sync_id
+        self._last: tuple[int, int] | None = None
+        self._histogram = np.zeros(BINS, np.int64)
+        self._count, self._sum, self._squares = 0, 0.0, 0.0
+        self._max = 0
+
+    def take(self, frames: NDArray[Any]) -> None:
+        """Take the frames of a bus in the order they came."""
+        sync = frames[frames["can_id"] == self._sync_id]
+        if sync.size == 0:
+            return
+        t_ns = sync["t_ns"].astype(np.int64)
+        counter = np.where(sync["length"] > 0, sync["data"][:, 0].astype(np.int64), -1)
+        if self._last is not None:
+            t_ns, counter = np.r_[self._last[0], t_ns], np.r_[self._last[1], counter]
+        self._last = int(t_ns[-1]), int(counter[-1])
+        elapsed = np.diff(t_ns)
+        steps = np.where(counter[1:] >= 0, np.diff(counter) % self._overflow, 1)
+        # Where a SYNC is repeated, or a whole turn of the counter is missing, there is no distance to compare.
+        near = (steps > 0) & (elapsed < self._overflow * self._period)
+        error = (elapsed - steps * self._period)[near].astype(np.float64)
+        if error.size == 0:
+            return
+        self._count += error.size
+        self._sum += float(error.sum())
+        self._squares += float(np.square(error).sum())
+        size = np.abs(error).astype(np.int64)
+        self._max = max(self._max, int(size.max()))
+        self._histogram += np.bincount(np.minimum(size // BIN_NS, BINS - 1), minlength=BINS)
+
+    def statistics(self) -> dict[str, float]:
+        """Deviation from the period, us: ``std``, ``p50``, ``p99``, ``p99.9``, ``max``; nothing before two SYNCs."""
+        if self._count == 0:
+            return {}
+        mean = self._sum / self._count
+        found = {"std": max(0.0, self._squares / self._count - mean * mean) ** 0.5 / 1000}
+        total = np.cumsum(self._histogram)
+        for percent in PERCENTILES:
+            at = int(np.searchsorted(total, percent / 100 * self._count))
+            found[f"p{percent:g}"] = min((at + 0.5) * BIN_NS, self._max) / 1000
+        return found | {"max": self._max / 1000}
+
+
+def worst(jitters: "list[SyncJitter]") -> dict[str, float]:
+    """The largest of each statistic over several buses, us."""
+    all_of_them = [jitter.statistics() for jitter in jitters]
+    names = next((list(found) for found in all_of_them if found), [])
+    return {name: max(found[name] for found in all_of_them if found) for name in names}

@@ -1,0 +1,61 @@
+"""What a capture is to do, loaded and checked before anything is touched."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from configs import ConfigError, RobotConfig, SessionConfig, Trajectory, load_robot, load_session, load_trajectory
+from daq.streams import CapturedStream, bus_numbers, captured_streams
+from drivers.bus_load import check_fits
+from drivers.frames import Filter
+from drivers.objects import COB_MASK, COB_SYNC
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be captured."""
+
+    session: SessionConfig
+    robot: RobotConfig
+    streams: tuple[CapturedStream, ...]
+    trajectory: Trajectory | None
+    directory: Path
+    duration: float | None = None
+    listen_only: bool = False
+
+    @property
+    def producing(self) -> bool:
+        """Whether we send SYNC."""
+        return self.session.sync.role == "producer" and not self.listen_only
+
+    @property
+    def bus_of(self) -> tuple[int, ...]:
+        """Number of the bus of each joint, in the robot's order."""
+        return bus_numbers(self.session, self.robot)
+
+    def filters(self, bus: int) -> list[Filter]:
+        """What the capture wants to see of a bus: SYNC and the TPDOs of its drives."""
+        wanted = [COB_SYNC]
+        for stream in self.streams:
+            wanted += [cob for cob, b in zip(stream.bus.cob_ids, self.bus_of, strict=True) if b == bus]
+        return [(can_id, COB_MASK) for can_id in wanted]
+
+
+def prepare(config: str | Path, out: Path | None, duration: float | None, listen_only: bool) -> Order:
+    """Load and check everything a capture needs.
+
+    Raises
+    ------
+    ConfigError
+        For whatever is wrong with the configuration, the trajectory's limits, or the load of the buses.
+    """
+    session = load_session(config)
+    robot = load_robot(session.robot)
+    check_fits(session, str(config))
+    trajectory = None
+    if session.setpoints is not None and not listen_only:
+        if session.sync.role != "producer":
+            raise ConfigError(f"{config}: setpoints need sync.role producer; only who sends SYNC can play them")
+        trajectory = load_trajectory(session.setpoints.trajectory)
+        trajectory.check(robot, str(session.setpoints.trajectory))
+    directory = out if out is not None else session.recording.directory
+    return Order(session, robot, captured_streams(session, robot), trajectory, directory, duration, listen_only)
