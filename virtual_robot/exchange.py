@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drivers.frames import frames
+from drivers.frames import BIT_RATE_SWITCH, FD_FLAG, fd_length, frames
 from drivers.objects import (
     COB_SYNC,
     CONTROLWORD,
@@ -17,6 +17,7 @@ from drivers.objects import (
     RPDO_COMMUNICATION,
     STATUSWORD,
     TARGET_POSITION,
+    TO_ARRAY,
     TORQUE_ACTUAL,
     TPDO_COMMUNICATION,
     VELOCITY_ACTUAL,
@@ -39,19 +40,23 @@ LIVE = {
 TARGET, CONTROL, IGNORED = range(3)
 RECEIVED = {TARGET_POSITION: TARGET, CONTROLWORD: CONTROL}
 IDENTIFIERS = 2048
+HISTORY = 64
+"""Live values of so many SYNCs are kept for the arrays of packed samples."""
 
 
 @njit(cache=True, error_model="numpy")
 def _exchange(  # type: ignore[no-untyped-def]
-    ids, lengths, data, start, stop, sequence, period, position, before, current, demand, values,
-    tx_kinds, tx_first, tx_row, tx_drive, tx_offset, tx_size, tx_ids, tx_lengths, out_ids, out_lengths, out_data,
+    ids, lengths, data, start, stop, sequence, period, position, before, current, demand, values, history,
+    tx_kinds, tx_first, tx_row, tx_drive, tx_offset, tx_size, tx_back, tx_ids, tx_lengths,
+    out_ids, out_lengths, out_data,
     rx_kinds, rx_first, rx_what, rx_drive, rx_offset, rx_size, table, need, stored, fresh, short,
     targets, targets_fresh, control, result,
 ):  # fmt: skip
     """Take frames from ``start`` on up to the next SYNC and answer it; returns its place, or ``stop``.
 
-    ``sequence`` is the counter of a SYNC that carries none. ``result`` (2,) gets how many frames are to be sent,
-    and whether set points (1) and controlwords (2) act at this SYNC: ``targets`` and ``control`` hold them.
+    ``sequence`` is the counter of a SYNC that carries none. ``result`` (3,) gets how many frames are to be sent,
+    whether set points (1) and controlwords (2) act at this SYNC (``targets`` and ``control`` hold them), and counts
+    the SYNCs, whose live values ``history`` keeps: an entry may ask for those of ``tx_back`` SYNCs ago.
     """
     at = stop
     for k in range(start, stop):
@@ -79,6 +84,8 @@ def _exchange(  # type: ignore[no-untyped-def]
         values[VELOCITY, j] = np.int64((position[j] - before[j]) / period)
         values[ERROR, j] = np.int64(demand[j]) - position[j]
         before[j] = position[j]
+    result[2] += 1
+    history[result[2] % HISTORY] = values[:CONSTANT]
     count = 0
     for p in range(tx_kinds.size):
         if counter % tx_kinds[p]:
@@ -86,7 +93,10 @@ def _exchange(  # type: ignore[no-untyped-def]
         out_ids[count] = tx_ids[p]
         out_lengths[count] = tx_lengths[p]
         for e in range(tx_first[p], tx_first[p + 1]):
-            value = values[tx_row[e], tx_drive[e]]
+            if tx_back[e] > 0:
+                value = history[(result[2] - tx_back[e]) % HISTORY, tx_row[e], tx_drive[e]]
+            else:
+                value = values[tx_row[e], tx_drive[e]]
             for b in range(tx_size[e]):
                 out_data[count, tx_offset[e] + b] = np.uint8(value & 0xFF)
                 value >>= 8
@@ -130,9 +140,12 @@ class Exchange:
         self._before = motion.position.copy()
         self._targets, self._targets_fresh = np.zeros(n, np.int32), np.zeros(n, np.bool_)
         self._control = np.full(n, -1, np.int64)
-        self._result = np.zeros(2, np.int64)
+        self._result = np.zeros(3, np.int64)
+        self._history = np.zeros((HISTORY, CONSTANT, n), np.int64)
+        self.fd = any(drive.fd for drive in drives)
+        """Whether the TPDOs are frames of CAN FD."""
         self._follows = np.zeros(n, np.bool_)
-        self.out = frames(0)
+        self.out = frames(0, fd=self.fd)
         """Frames that answer the SYNC taken last."""
         self.rebuild()
 
@@ -140,8 +153,8 @@ class Exchange:
         """Read mapping, NMT state and status of every drive again."""
         n = self._motion.position.size
         constants: list[NDArray[np.int64]] = []
-        tx: list[tuple[int, int, list[tuple[int, int, int, int]]]] = []
-        rx: list[tuple[int, int, list[tuple[int, int, int, int]]]] = []
+        tx: list[Pdo] = []
+        rx: list[Pdo] = []
         for drive in self._drives:
             j = drive.index
             if not drive.nmt.operational:
@@ -149,14 +162,17 @@ class Exchange:
             for cob_id, kind, mapped in drive.pdos(TPDO_COMMUNICATION):
                 if not 1 <= kind <= 240:
                     continue
-                entries, offset = [], 0
+                entries: list[tuple[int, ...]] = []
+                offset = 0
                 for index, subindex, size in mapped:
-                    row = LIVE.get(index)
-                    if row is None:
+                    row, back = LIVE.get(index), 0
+                    if row is None and subindex and index + TO_ARRAY in LIVE:
+                        row, back = LIVE[index + TO_ARRAY], kind - subindex
+                    elif row is None:
                         row = CONSTANT + len(constants)
                         raw = drive.get_data(index, subindex)
                         constants.append(np.full(n, int.from_bytes(raw, "little"), np.int64))
-                    entries.append((row, j, offset, size))
+                    entries.append((row, j, offset, size, back))
                     offset += size
                 tx.append((cob_id, kind, entries))
             for cob_id, kind, mapped in drive.pdos(RPDO_COMMUNICATION):
@@ -165,12 +181,15 @@ class Exchange:
                     entries.append((RECEIVED.get(index, IGNORED), j, offset, size))
                     offset += size
                 rx.append((cob_id, kind, entries))
-        self._tx_kinds, self._tx_first, self._tx = _flat(tx)
+        self._tx_kinds, self._tx_first, self._tx = _flat(tx, 5)
         self._tx_ids = np.array([cob_id for cob_id, _, _ in tx], np.uint32)
-        self._tx_lengths = np.array([sum(e[3] for e in entries) for _, _, entries in tx], np.uint8)
+        sizes = [sum(e[3] for e in entries) for _, _, entries in tx]
+        self._tx_lengths = np.array([fd_length(size) if self.fd else size for size in sizes], np.uint8)
         # Arrays of one frame or none count as contiguous, which would compile the exchange anew for the others.
-        self._out = frames(max(len(tx), 2))
-        self._rx_kinds, self._rx_first, self._rx = _flat(rx)
+        self._out = frames(max(len(tx), 2), fd=self.fd)
+        if self.fd:
+            self._out["flags"] = FD_FLAG | BIT_RATE_SWITCH
+        self._rx_kinds, self._rx_first, self._rx = _flat(rx, 4)
         self._table = np.full(IDENTIFIERS, -1, np.int64)
         for p, (cob_id, _, _) in enumerate(rx):
             self._table[cob_id] = p
@@ -194,7 +213,7 @@ class Exchange:
         """Put the arguments of the compiled exchange together, once per mapping."""
         motion, out = self._motion, self._out
         self._arguments = (
-            self._period, motion.position, self._before, motion.current, motion.demand, self.values,
+            self._period, motion.position, self._before, motion.current, motion.demand, self.values, self._history,
             self._tx_kinds, self._tx_first, *self._tx, self._tx_ids, self._tx_lengths,
             out["can_id"], out["length"], out["data"],
             self._rx_kinds, self._rx_first, *self._rx, self._table, self._need, self._stored, self._fresh, self._short,
@@ -230,15 +249,15 @@ class Exchange:
                 self._control[drive.index] = -1
 
 
-Entries = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+Pdo = tuple[int, int, Sequence[tuple[int, ...]]]
+"""COB-ID, transmission type, and entries of one PDO."""
 
 
 def _flat(
-    pdos: Sequence[tuple[int, int, Sequence[tuple[int, int, int, int]]]],
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Entries]:
-    """Transmission types, first entry of each PDO (one more than PDOs), and columns of all entries."""
+    pdos: Sequence[Pdo], width: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], tuple[NDArray[np.int64], ...]]:
+    """Transmission types, first entry of each PDO (one more than PDOs), and the ``width`` columns of all entries."""
     kinds = np.array([kind for _, kind, _ in pdos], np.int64)
     first = np.concatenate([[0], np.cumsum([len(entries) for _, _, entries in pdos])]).astype(np.int64)
-    rows = np.array([e for _, _, entries in pdos for e in entries], np.int64).reshape(-1, 4)
-    a, b, c, d = (np.ascontiguousarray(column) for column in rows.T)
-    return kinds, first, (a, b, c, d)
+    rows = np.array([e for _, _, entries in pdos for e in entries], np.int64).reshape(-1, width)
+    return kinds, first, tuple(np.ascontiguousarray(column) for column in rows.T)

@@ -9,6 +9,7 @@ from typing import Any
 
 import canopen
 from canopen.nmt import NmtSlave
+from canopen.objectdictionary import ODArray
 from canopen.sdo.exceptions import SdoAbortedError
 from canopen.sdo.server import SdoServer
 
@@ -23,11 +24,14 @@ from drivers.objects import (
     CYCLIC_SYNCHRONOUS_POSITION,
     ENCODER_RESOLUTION,
     ERROR_REGISTER,
+    FD_PDO_BYTES,
     HEARTBEAT_PRODUCER,
     IDENTITY,
     INTERPOLATION_PERIOD,
+    MAPPED_OBJECTS,
     MODE_DISPLAY,
     MODE_OF_OPERATION,
+    PDO_BYTES,
     PDO_NOT_VALID,
     POSITION_ACTUAL,
     POSITION_DEMAND,
@@ -141,6 +145,8 @@ class Drive(canopen.LocalNode):
         Its address and object dictionary.
     index
         Number of its joint.
+    fd
+        Whether its TPDOs are frames of CAN FD.
     joint
         Encoder resolution (608Fh) and rated current (6075h) come from here.
     motion
@@ -165,7 +171,9 @@ class Drive(canopen.LocalNode):
         motion: Motion,
         changed: Callable[[], None],
         status_changed: Callable[[], None],
+        fd: bool = False,
     ) -> None:
+        self.fd = fd
         try:
             super().__init__(node_id, str(eds))
         except (OSError, ValueError, KeyError) as error:
@@ -309,12 +317,13 @@ class Drive(canopen.LocalNode):
         if not self._number(index - MAPPING, 1) & PDO_NOT_VALID:
             raise SdoAbortedError(ABORT_DEVICE_STATE)
         if subindex == 0:
-            if value > 8:
+            wide = self.fd and base == TPDO_COMMUNICATION
+            if value > (MAPPED_OBJECTS if wide else 8):
                 raise SdoAbortedError(ABORT_PDO_LENGTH)
             entries = [self._number(index, k) for k in range(1, value + 1)]
             for entry in entries:
                 self._check_entry(base, entry)
-            if sum(entry & 0xFF for entry in entries) > 64:
+            if sum(entry & 0xFF for entry in entries) > 8 * (FD_PDO_BYTES if wide else PDO_BYTES):
                 raise SdoAbortedError(ABORT_PDO_LENGTH)
         elif self._number(index, 0):
             raise SdoAbortedError(ABORT_UNSUPPORTED)
@@ -326,6 +335,12 @@ class Drive(canopen.LocalNode):
             mapped = self._find_object(entry >> 16, entry >> 8 & 0xFF)
         except SdoAbortedError:
             raise SdoAbortedError(ABORT_NOT_MAPPABLE) from None
+        listed = self.object_dictionary[entry >> 16]
+        if isinstance(listed, ODArray) and entry >> 8 & 0xFF:
+            # The elements of a compact array are all like its first; there are as many as sub-index 0 says.
+            if entry >> 8 & 0xFF > self._number(entry >> 16, 0):
+                raise SdoAbortedError(ABORT_NOT_MAPPABLE)
+            mapped = listed[1]
         allowed = mapped.readable if base == TPDO_COMMUNICATION else mapped.writable
         if not mapped.pdo_mappable or not allowed or len(mapped) != entry & 0xFF or len(mapped) % 8:
             raise SdoAbortedError(ABORT_NOT_MAPPABLE)

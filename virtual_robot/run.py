@@ -60,7 +60,8 @@ def run_robot(
     stop = _Stop()
     with Server(session, robot, motion) as server:
         nodes = ", ".join(str(drive.node_id) for drive in server.drives)
-        print(f"ready: {robot.name} on {session.bus.channel}, nodes {nodes}", flush=True)
+        buses = ", ".join(bus.channel for bus in session.all_buses)
+        print(f"ready: {robot.name} on {buses}, nodes {nodes}", flush=True)
         report = server.run(lambda: stop.asked, duration)
     print(report, file=sys.stderr, flush=True)
 

@@ -1,27 +1,24 @@
-"""The virtual drives on a bus: canopen serves SDO and NMT, a loop of its own answers every SYNC."""
+"""The virtual drives of a session: canopen serves SDO and NMT, a loop of its own answers every SYNC of every bus."""
 
+import select
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
-import can
-import canopen
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, RobotConfig, SessionConfig
-from drivers.frames import FrameBus, frames
-from drivers.objects import COB_MASK, COB_NMT, COB_SDO_REQUEST, COB_SYNC, DriveState
+from configs import RobotConfig, SessionConfig
+from drivers.frames import frames
+from drivers.objects import DriveState
 from drivers.socketcan import RECEIVE_TIMEOUT, RawSocket
-from drivers.udp import open_bus
 from virtual_robot.arm import Motion, counts_per_si
-from virtual_robot.exchange import Exchange
+from virtual_robot.line import BATCH, Line
 from virtual_robot.node import Drive
 
-PDO_FILTERS = ((0x180, 0x780), (0x200, 0x700), (0x300, 0x700), (0x400, 0x700), (0x500, 0x780))
-"""Identifiers 180h to 57Fh, which PDOs may have; a socket does not receive what it sends itself."""
-BATCH = 1024
+TOGETHER_S = 0.05
+"""How long a SYNC of one bus waits for that of another, before the arm moves on without it."""
 ANSWERED_SYNCS = 32
 """Most SYNCs whose answers wait for each other when the drives are behind."""
 SUPERVISION_SYNCS = 64
@@ -67,19 +64,19 @@ class ServerReport:
 
 
 class Server:
-    """All drives of a session on its bus.
+    """All drives of a session on its buses.
 
     Parameters
     ----------
     session, robot
-        Bus, nodes and SYNC; joints and drives.
+        Buses, nodes and SYNC; joints and drives.
     motion
         What moves behind the drives.
 
     Raises
     ------
     ConfigError
-        If the bus is missing or an EDS is unusable.
+        If a bus is missing or an EDS is unusable.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig, motion: Motion) -> None:
@@ -90,23 +87,23 @@ class Server:
         told = (self._changed, self._status_changed)
         for node in session.drives:
             j = names.index(node.joint)
-            self.drives.append(Drive(node.node_id, node.eds, j, robot.joints[j], motion, *told))
+            fd = session.bus_of(node).fd
+            self.drives.append(Drive(node.node_id, node.eds, j, robot.joints[j], motion, *told, fd))
         self._limit = _following_limit(robot)
         self._histogram = np.zeros(LATENESS_BINS + 1, np.int64)
         self._latest = 0.0
         self._backlog = self._syncs = 0
         self._seconds = self._cpu = 0.0
-        self._bus: FrameBus = open_bus(session.bus, filters=((COB_SYNC, COB_MASK), *PDO_FILTERS))
+        self._lines: list[Line] = []
         try:
-            self._network = open_network(session, self.drives)
+            for bus in session.all_buses:
+                both = zip(self.drives, session.drives, strict=True)
+                here = [drive for drive, node in both if session.bus_of(node) == bus]
+                self._lines.append(Line(bus, here, motion, session.sync_period))
         except BaseException:
-            self._bus.close()
+            for line in self._lines:
+                line.close()
             raise
-        self._exchange = Exchange(self.drives, motion, session.sync_period)
-        self._batch = frames(BATCH)
-        self._columns = self._batch["can_id"], self._batch["length"], self._batch["data"]
-        # Compile before anybody waits for an answer.
-        self._take(0, 0, 1)
 
     def _changed(self) -> None:
         self._dirty = True
@@ -117,24 +114,23 @@ class Server:
     def _catch_up(self) -> None:
         if self._dirty:
             self._dirty = self._status_dirty = False
-            self._exchange.rebuild()
+            for line in self._lines:
+                line.exchange.rebuild()
         elif self._status_dirty:
             self._status_dirty = False
-            self._exchange.refresh_status()
+            for line in self._lines:
+                line.exchange.refresh_status()
 
     def __enter__(self) -> Self:
         """Boot the drives: boot-up message, pre-operational, heartbeat."""
-        for drive in self.drives:
-            self._network.add_node(drive)
-            drive.nmt.boot()
+        for line in self._lines:
+            line.boot()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Take the drives off the bus."""
-        for drive in self.drives:
-            drive.nmt.halt()
-        self._network.disconnect()
-        self._bus.close()
+        """Take the drives off their buses."""
+        for line in self._lines:
+            line.close()
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> ServerReport:
         """Answer every SYNC until ``stopped()`` or for ``duration`` seconds.
@@ -142,21 +138,30 @@ class Server:
         Raises
         ------
         BusDown
-            If the bus goes down.
+            If the only bus goes down; of several the others go on, and one that is back is served again.
         """
-        stamps = self._batch["t_ns"]
-        outbox, queued = frames(BATCH), 0
         begin, cpu = time.monotonic(), time.process_time()
-        sequence = 0
-        exchange, bus = self._exchange, self._bus
-        while not stopped():
-            count = self._receive()
+
+        def over() -> bool:
+            return stopped() or (duration is not None and time.monotonic() - begin > duration)
+
+        if len(self._lines) == 1:
+            self._serve_one(self._lines[0], over)
+        else:
+            self._serve_several(over)
+        self._seconds += time.monotonic() - begin
+        self._cpu += time.process_time() - cpu
+        return self.report()
+
+    def _serve_one(self, line: Line, over: Callable[[], bool]) -> None:
+        stamps, exchange, bus = line.batch["t_ns"], line.exchange, line.bus
+        outbox, queued = frames(BATCH, fd=bus.fd), 0
+        while not over():
+            count = line.receive(wait=True)
             self._catch_up()
-            if duration is not None and time.monotonic() - begin > duration:
-                break
             at = backlog = 0
             while at < count:
-                at = self._take(at, count, sequence % self._session.sync.counter + 1)
+                at = line.take(at, count, self._counter)
                 if at >= count:
                     break
                 answers = exchange.out.size
@@ -169,32 +174,60 @@ class Server:
                 if at + 1 == count or (backlog + 1) % ANSWERED_SYNCS == 0:
                     bus.send(outbox[:queued])
                     queued = 0
-                if backlog or sequence % LATENESS_SYNCS == 0:
+                if backlog or self._syncs % LATENESS_SYNCS == 0:
                     self._note(time.time_ns() - int(stamps[at]))
                 exchange.act()
-                self._motion.advance()
-                sequence += 1
+                self._advance()
                 backlog += 1
                 at += 1
-                if sequence % SUPERVISION_SYNCS == 0:
-                    self._supervise()
             if queued:
                 bus.send(outbox[:queued])
                 queued = 0
             self._backlog = max(self._backlog, backlog)
-        self._syncs = sequence
-        self._seconds += time.monotonic() - begin
-        self._cpu += time.process_time() - cpu
-        return self.report()
 
-    def _take(self, start: int, stop: int, sequence: int) -> int:
-        return self._exchange.take(*self._columns, start, stop, sequence)
+    def _serve_several(self, over: Callable[[], bool]) -> None:
+        """Answer SYNC k on every bus before the arm moves on to k + 1."""
+        poll = select.poll()
+        for line in self._lines:
+            assert isinstance(line.bus, RawSocket)
+            poll.register(line.bus.fileno(), select.POLLIN)
+        overflow = self._session.sync.counter
+        expected: int | None = None
+        since: float | None = None
+        while not over():
+            due = {k: line.next_sync() for k, line in enumerate(self._lines)}
+            waiting = {k: counter for k, counter in due.items() if counter is not None}
+            missing = [line for k, line in enumerate(self._lines) if due[k] is None and not line.down]
+            if not waiting or (missing and (since is None or time.monotonic() - since < TOGETHER_S)):
+                since = time.monotonic() if waiting and since is None else since if waiting else None
+                poll.poll(1000 * (TOGETHER_S if waiting else RECEIVE_TIMEOUT))
+                self._catch_up()
+                continue
+            since = None
+            self._catch_up()
+            start = next(iter(waiting.values())) if expected is None else expected
+            # A bus that lacked a SYNC is ahead of the others: its next one waits for theirs.
+            counter = min(waiting.values(), key=lambda c: (c - start) % overflow)
+            expected = counter % overflow + 1
+            for line in [self._lines[k] for k, c in waiting.items() if c == counter]:
+                line.at = line.take(line.at, line.count, counter or self._counter)
+                if self._syncs % LATENESS_SYNCS == 0:
+                    self._note(time.time_ns() - int(line.batch["t_ns"][line.at]))
+                line.send()
+                line.exchange.act()
+                line.at += 1
+            self._advance()
 
-    def _receive(self) -> int:
-        """Wait for frames; in a guest kernel system calls are dear, so with one where the bus can."""
-        if isinstance(self._bus, RawSocket):
-            return self._bus.receive(self._batch, wait=True)
-        return self._bus.receive(self._batch) if self._bus.poll(RECEIVE_TIMEOUT) else 0
+    @property
+    def _counter(self) -> int:
+        """Counter of the next SYNC where that carries none."""
+        return self._syncs % self._session.sync.counter + 1
+
+    def _advance(self) -> None:
+        self._motion.advance()
+        self._syncs += 1
+        if self._syncs % SUPERVISION_SYNCS == 0:
+            self._supervise()
 
     def _note(self, late_ns: int) -> None:
         late = max(late_ns // 1000, 0)
@@ -206,7 +239,7 @@ class Server:
         for drive in self.drives:
             if drive.state is DriveState.ENABLED and error[drive.index] > self._limit[drive.index]:
                 drive.fault(EMCY_FOLLOWING_ERROR, MOTION_ERROR)
-        for index in self._exchange.take_short():
+        for index in [index for line in self._lines for index in line.exchange.take_short()]:
             next(d for d in self.drives if d.index == index).emcy.send(EMCY_PDO_LENGTH, COMMUNICATION_ERROR)
 
     def report(self) -> ServerReport:
@@ -215,27 +248,9 @@ class Server:
         p50, p99 = (float(np.searchsorted(counts, share * counts[-1])) for share in (0.5, 0.99))
         return ServerReport(
             self._syncs, p50, p99, self._latest, self._backlog, self._seconds,
-            self._cpu / self._seconds if self._seconds else 0.0, self._bus.dropped,
+            self._cpu / self._seconds if self._seconds else 0.0, sum(line.bus.dropped for line in self._lines),
         )  # fmt: skip
 
 
 def _following_limit(robot: RobotConfig) -> NDArray[np.float64]:
     return FOLLOWING_ERROR_LIMIT * np.abs(np.diag(robot.transmission_matrix)) * counts_per_si(robot)
-
-
-def open_network(session: SessionConfig, drives: Sequence[Drive]) -> Any:
-    """Open canopen's own bus, to which the kernel passes NMT commands and SDO requests only.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such bus.
-    """
-    wanted = [COB_NMT, *(COB_SDO_REQUEST + drive.node_id for drive in drives)]
-    filters = [{"can_id": can_id, "can_mask": COB_MASK, "extended": False} for can_id in wanted]
-    network = canopen.Network()
-    try:
-        network.connect(interface=session.bus.interface, channel=session.bus.channel, can_filters=filters)
-    except (OSError, can.CanError) as error:
-        raise ConfigError(f"bus {session.bus.channel}: cannot be opened: {error}") from error
-    return network

@@ -1,0 +1,195 @@
+"""Several buses, CAN FD and packed samples, from the virtual drives to the recording, on real (virtual) buses."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from configs import config_path
+from daq.recording import Recording, read_recording
+from drivers.vcan import ensure_vcan, remove_vcan
+
+pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
+
+ARMIDENT = [sys.executable, "-c", "from daq.cli import main; main()"]
+SLOW = {"role": "producer", "period_us": 1000, "counter": 240}
+
+
+@pytest.fixture
+def channels(request: pytest.FixtureRequest) -> Iterator[list[str]]:
+    """Names of six buses of this test alone."""
+    names = [f"w{time.monotonic_ns() % 10**9}n{k}" for k in range(6)]
+    for name in names:
+        ensure_vcan(name)
+    yield names
+    for name in names:
+        remove_vcan(name)
+
+
+def session_file(folder: Path, shipped: str, channels: list[str], **changes: Any) -> Path:
+    """A shipped session on other buses, under the name of the test's folder."""
+    source = config_path(shipped)
+    text = source.read_text()
+    for k in range(6):
+        text = text.replace(f"vcan{k}", channels[k])
+    data = yaml.safe_load(text) | changes
+    data |= {"cell": folder.name[:40].lower().rstrip("_"), "robot": str(source.parent / data["robot"])}
+    for drive in data["drives"]:
+        drive["eds"] = str(source.parent / drive["eds"])
+    if data.get("setpoints"):
+        data["setpoints"]["trajectory"] = str(source.parent / data["setpoints"]["trajectory"])
+    path = folder / f"{len(list(folder.glob('*.yaml')))}.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def start(*arguments: Any) -> subprocess.Popen[str]:
+    """An armident command as a process."""
+    command = ARMIDENT + [str(a) for a in arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@contextmanager
+def robot(session: Path, *options: Any) -> Iterator[subprocess.Popen[str]]:
+    """The virtual arm on the session's buses, ready."""
+    process = start("robot", "--config", session, *options)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    assert "ready" in line, process.communicate(timeout=10)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+        _, err = process.communicate(timeout=60)
+        print(err)
+
+
+def captured(session: Path, out: Path, *options: Any) -> tuple[Recording, str]:
+    """The recording of a whole capture, and what it said."""
+    process = start("capture", "--config", session, "--out", out, "--json", *options)
+    stdout, err = process.communicate(timeout=200)
+    assert process.returncode == 0, err
+    return read_recording(json.loads(stdout)["recording"]), err
+
+
+def wait_until_it_says(process: subprocess.Popen[str], text: str) -> str:
+    """What the process said on stderr up to the line with this text."""
+    assert process.stderr is not None
+    said = ""
+    while text not in said:
+        line = process.stderr.readline()
+        assert line, f"ended: {said}"
+        said += line
+    return said
+
+
+def every_sync_is_accounted_for(recording: Recording) -> set[int]:
+    """Rows and gaps make up all SYNCs; the SYNCs in gaps."""
+    gaps = {k for g in recording.gaps if g.stream == "samples" for k in range(g.first, g.last + 1)}
+    rows = set(recording.samples.sync.tolist())
+    assert not rows & gaps
+    assert rows | gaps == set(range(recording.counters["samples.expected"]))
+    assert recording.counters["samples.expected"] == recording.counters["sync_sent"]
+    return gaps
+
+
+@pytest.mark.parametrize(
+    ("shipped", "pack"), [("tx40_six_buses.yaml", 1), ("tx40_two_fd.yaml", 1), ("tx40_one_fd.yaml", 10)]
+)
+def test_three_seconds_at_5_khz_lose_nothing(shipped: str, pack: int, channels: list[str], tmp_path: Path) -> None:
+    session = session_file(tmp_path, shipped, channels)
+    with robot(session):
+        recording, err = captured(session, tmp_path / "out", "--duration", "3")
+    assert recording.missing is None
+    gaps = every_sync_is_accounted_for(recording)
+    sent = recording.counters["sync_sent"]
+    # The last SYNCs fill no packed TPDO.
+    assert gaps == set(range(sent - sent % pack, sent)), err
+    assert recording.counters["kernel_drops"] == 0
+    assert recording.counters["frames_unknown"] == 0
+    assert recording.counters["sync_jitter_max_us"] >= recording.counters["sync_jitter_p99_us"] >= 0
+    assert np.abs(recording.samples.si("current")).max() > 0
+    assert {recording.metadata[k] for k in recording.metadata if k.startswith("timestamps.")} == {"software"}
+
+
+@pytest.mark.parametrize("shipped", ["tx40_two_fd.yaml", "tx40_one_fd.yaml"])
+def test_what_is_played_arrives_sample_by_sample_whatever_the_buses(
+    shipped: str, channels: list[str], tmp_path: Path
+) -> None:
+    """A recording of the classic cell, played by drives on CAN FD."""
+    moved = {"repeat": 1, "settle_s": 0.1, "rpdo": 1, "every": 1, "trajectory": "trajectories/emps_excitation.yaml"}
+    del moved["trajectory"]
+    classic = session_file(tmp_path, "tx40_replay.yaml", channels, sync=SLOW)
+    with robot(classic):
+        first, _ = captured(classic, tmp_path / "first", "--duration", "2")
+    (path,) = (tmp_path / "first").glob("*.mcap")
+    session = session_file(tmp_path, shipped, channels, sync=SLOW)
+    with robot(session, "--replay", path):
+        second, _ = captured(session, tmp_path / "second", "--duration", "3")
+    played, got = first.samples.raw, second.samples.raw
+    # It begins when the last drive is enabled, which is before SYNC 0, and its last sample stands.
+    assert np.unique(played["current"], axis=0).shape[0] > 100
+    n = min(len(played["current"]), len(got["current"])) - 1
+    starts = [k for k in range(5) if np.array_equal(got["current"][: n - 5], played["current"][k : k + n - 5])]
+    assert len(starts) == 1
+    k = starts[0]
+    assert np.array_equal(got["position"][: n - 5], played["position"][k : k + n - 5])
+
+
+def test_one_bus_down_is_a_gap_of_its_axes_and_it_comes_back(channels: list[str], tmp_path: Path) -> None:
+    session = session_file(tmp_path, "tx40_two_fd.yaml", channels, sync=SLOW)
+    with robot(session):
+        process = start("capture", "--config", session, "--out", tmp_path / "out", "--json")
+        said = wait_until_it_says(process, "recording to")
+        time.sleep(2.0)
+        subprocess.run(["ip", "link", "set", channels[1], "down"], check=True)
+        said += wait_until_it_says(process, "went down")
+        time.sleep(1.0)
+        subprocess.run(["ip", "link", "set", channels[1], "up"], check=True)
+        said += wait_until_it_says(process, "is back")
+        time.sleep(2.0)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, said + err
+    recording = read_recording(json.loads(out)["recording"])
+    gaps = every_sync_is_accounted_for(recording)
+    assert 500 <= len(gaps) <= recording.counters["sync_sent"] - 2000
+    # None of them is of the axes of the other bus, and nothing is missing well before and well after.
+    assert {g.joint for g in recording.gaps} <= {"joint_4", "joint_5", "joint_6"}
+    assert recording.counters["bus_down"] == 1
+    assert recording.samples.sync[0] == 0
+    assert recording.samples.sync[-1] == recording.counters["sync_sent"] - 1
+    assert any("went down" in mark.text for mark in recording.marks)
+    assert any("is back" in mark.text for mark in recording.marks)
+
+
+def test_the_arm_moves_by_set_points_on_several_buses(channels: list[str], tmp_path: Path) -> None:
+    moved = {"rpdo": 1, "every": 5, "trajectory": "trajectories/tx40_1.yaml", "settle_s": 0.2}
+    session = session_file(tmp_path, "tx40_two_fd.yaml", channels, sync=SLOW, setpoints=moved)
+    with robot(session):
+        recording, err = captured(session, tmp_path / "out")
+    every_sync_is_accounted_for(recording)
+    ((first, last),) = recording.experiments()
+    inside = (recording.samples.sync >= first) & (recording.samples.sync <= last)
+    position = recording.samples.si("position")[inside]
+    assert np.all(np.ptp(position, axis=0) > 0.1), err
+
+
+def test_sync_from_the_kernel_records_every_sample(channels: list[str], tmp_path: Path) -> None:
+    session = session_file(tmp_path, "tx40_replay.yaml", channels, sync=SLOW | {"source": "kernel"}, heartbeat_ms=500)
+    with robot(session):
+        recording, _ = captured(session, tmp_path / "out", "--duration", "2")
+    assert recording.gaps == ()
+    assert recording.counters["samples.rows"] == recording.counters["sync_seen"] >= 1900
+    assert recording.counters["sync_repeated"] == recording.counters["sync_missing"] == 0
+    assert recording.counters["sync_jitter_std_us"] > 0

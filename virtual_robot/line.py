@@ -1,0 +1,146 @@
+"""The virtual drives on one bus: their frames, and canopen for their SDO, NMT and EMCY."""
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import can
+import canopen
+import numpy as np
+
+from configs import ArmidentError, ConfigError
+from configs.session import Bus
+from drivers.frames import BusDown, frames
+from drivers.objects import COB_MASK, COB_NMT, COB_SDO_REQUEST, COB_SYNC
+from drivers.socketcan import RECEIVE_TIMEOUT, RawSocket
+from drivers.udp import open_bus
+from virtual_robot.arm import Motion
+from virtual_robot.exchange import Exchange
+from virtual_robot.node import Drive
+
+PDO_FILTERS = ((0x180, 0x780), (0x200, 0x700), (0x300, 0x700), (0x400, 0x700), (0x500, 0x780))
+"""Identifiers 180h to 57Fh, which PDOs may have; a socket does not receive what it sends itself."""
+BATCH = 1024
+REOPEN_S = 0.1
+"""How often a bus that is down is tried again."""
+
+
+class Line:
+    """One bus and the drives on it.
+
+    Parameters
+    ----------
+    bus
+        The bus.
+    drives, motion, period
+        As for :class:`Exchange`.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such bus.
+    """
+
+    def __init__(self, bus: Bus, drives: Sequence[Drive], motion: Motion, period: float) -> None:
+        self.config, self.drives = bus, drives
+        self.bus = open_bus(bus, filters=((COB_SYNC, COB_MASK), *PDO_FILTERS))
+        try:
+            self._network = self._connected(canopen.Network())
+        except BaseException:
+            self.bus.close()
+            raise
+        self.exchange = Exchange(drives, motion, period)
+        self.batch = frames(BATCH, fd=self.bus.fd)
+        self._columns = self.batch["can_id"], self.batch["length"], self.batch["data"]
+        self.count = self.at = 0
+        self.down = False
+        self._tried = 0.0
+        # Compile before anybody waits for an answer.
+        self.take(0, 0, 1)
+
+    def _connected(self, network: Any) -> Any:
+        """Canopen's own bus, to which the kernel passes NMT commands and SDO requests only."""
+        wanted = [COB_NMT, *(COB_SDO_REQUEST + drive.node_id for drive in self.drives)]
+        filters = [{"can_id": can_id, "can_mask": COB_MASK, "extended": False} for can_id in wanted]
+        # A bus that goes down ends canopen's receive thread; it is connected anew when the bus is back.
+        network.listeners[0].on_error = lambda error: None
+        try:
+            network.connect(interface=self.config.interface, channel=self.config.channel, can_filters=filters)
+        except (OSError, can.CanError) as error:
+            raise ConfigError(f"bus {self.config.channel}: cannot be opened: {error}") from error
+        return network
+
+    def boot(self) -> None:
+        """Boot-up message, pre-operational, heartbeat."""
+        for drive in self.drives:
+            self._network.add_node(drive)
+            drive.nmt.boot()
+
+    def take(self, start: int, stop: int, sequence: int) -> int:
+        """As :meth:`Exchange.take`, of the frames in ``batch``."""
+        return self.exchange.take(*self._columns, start, stop, sequence)
+
+    def receive(self, wait: bool) -> int:
+        """Take what has arrived into ``batch``; the number of frames.
+
+        Raises
+        ------
+        BusDown
+            If the bus is down.
+        """
+        # In a guest kernel system calls are dear: with one where the bus can.
+        if isinstance(self.bus, RawSocket):
+            return self.bus.receive(self.batch, wait=wait)
+        return self.bus.receive(self.batch) if not wait or self.bus.poll(RECEIVE_TIMEOUT) else 0
+
+    def next_sync(self) -> int | None:
+        """Counter of the next SYNC (0: it carries none), read from the bus if there is none in ``batch``.
+
+        The bus is left alone while it is down, and used again once it is back.
+        """
+        for _ in range(2):
+            ids = self.batch["can_id"][self.at : self.count]
+            found = np.flatnonzero(ids == COB_SYNC)
+            if found.size:
+                first = self.at + int(found[0])
+                return int(self.batch["data"][first, 0]) if self.batch["length"][first] else 0
+            if self.at < self.count:
+                self.at = self.take(self.at, self.count, 1)
+            if self.down and not self._is_back():
+                return None
+            try:
+                self.at, self.count = 0, self.receive(wait=False)
+            except BusDown:
+                self.down, self.count = True, 0
+        return None
+
+    def send(self) -> None:
+        """Send what answers the SYNC taken last; nothing where the bus is down."""
+        try:
+            self.bus.send(self.exchange.out)
+        except BusDown:
+            self.down = True
+
+    def _is_back(self) -> bool:
+        if time.monotonic() - self._tried < REOPEN_S:
+            return False
+        self._tried = time.monotonic()
+        if not self.bus.up:
+            return False
+        with suppress(Exception):  # canopen raises here again what ended its receive thread
+            self._network.disconnect()
+        try:
+            self._connected(self._network)
+        except ArmidentError:
+            return False
+        self.down = False
+        return True
+
+    def close(self) -> None:
+        """Take the drives off the bus."""
+        for drive in self.drives:
+            drive.nmt.halt()
+        with suppress(can.CanError, OSError):
+            self._network.disconnect()
+        self.bus.close()
