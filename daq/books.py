@@ -12,8 +12,9 @@ LOST, RECEIVED, WRONG_LENGTH, AMBIGUOUS, NO_SYNC = 0, 1, 2, 3, 4
 UNSEEN = int(np.iinfo(np.int64).min)
 """The time of a SYNC that was not received."""
 
-# Positions in Books.state, per bus: number, counter and time of the last SYNC, counter of SYNC 0.
-SYNC, COUNTER, TIME, ORIGIN = 0, 1, 2, 3
+# Positions in Books.state, per bus: number, counter and time of the last SYNC, counter of SYNC 0, and whether the last
+# SYNC is one of other buses, which this one lacks.
+SYNC, COUNTER, TIME, ORIGIN, BORROWED = 0, 1, 2, 3, 4
 
 COUNT_NAMES = (
     "sync_seen",
@@ -110,7 +111,7 @@ def open_books(
     words = max(-(-shape.length // 8) for shape in shapes)
     pack = max(shape.pack for shape in shapes)
     return Books(
-        state=np.tile(np.array([-1, -1, UNSEEN, 1]), (buses, 1)),
+        state=np.tile(np.array([-1, -1, UNSEEN, 1, 0]), (buses, 1)),
         slack=np.full(buses, max(w * s.every for w, s in zip(window, shapes, strict=True)), np.int64),
         recent=np.full((buses, RECENT), UNSEEN, np.int64),
         counts=np.zeros(len(COUNT_NAMES), np.int64),

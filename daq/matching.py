@@ -20,6 +20,7 @@ from numba import njit
 
 from daq.books import (
     AMBIGUOUS,
+    BORROWED,
     COUNTER,
     FRAMES,
     FRAMES_UNKNOWN,
@@ -94,6 +95,10 @@ def _advance(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, over
     elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != UNSEEN else 0.0
     if state[bus, SYNC] < 0 and state[bus, COUNTER] < 0:
         step = _begin(state, bus, counter, t_ns, period_ns, overflow)
+    elif counter >= 0 and state[bus, COUNTER] >= 0 and state[bus, BORROWED]:
+        # What had waited on this bus may be older than what others had meanwhile.
+        step = (counter - state[bus, COUNTER]) % overflow
+        step += int(overflow * np.rint((elapsed - step) / overflow))
     elif counter >= 0 and state[bus, COUNTER] >= 0:
         step = sync_step(counter, state[bus, COUNTER], elapsed, overflow, longest)
     elif counter < 0 and state.shape[0] > 1:
@@ -104,6 +109,7 @@ def _advance(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, over
     if step > 0:
         state[bus, SYNC] += step
         state[bus, TIME] = t_ns
+        state[bus, BORROWED] = 0
         if counter >= 0:
             state[bus, COUNTER] = counter
     return int(step)
@@ -279,6 +285,7 @@ def _skip_silent(b: Books, bus: int, k: int, t_ns: int, period_ns: int, overflow
         _miss(b, other, last + 1, until, out)
         b.counts[SYNC_MISSING] += until - last - 1
         b.state[other, SYNC] = until - 1
+        b.state[other, BORROWED] = 1
         b.state[other, TIME] = t_ns - (k + 1 - until) * period_ns
         if b.state[bus, COUNTER] >= 0:
             b.state[other, COUNTER] = (b.state[other, ORIGIN] + until - 1) % overflow

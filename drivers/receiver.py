@@ -144,7 +144,10 @@ class Receiver:
 
     def _receive(self, k: int, line: _Line) -> int:
         try:
-            return line.bus.receive(line.batch)
+            got = line.bus.receive(line.batch)
+            if got and line.down_since is not None:
+                self._back(k, line)
+            return got
         except BusDown as error:
             if line.down_since is None:
                 line.down_since = line.looked = time.monotonic()
@@ -166,6 +169,9 @@ class Receiver:
             line.lost_before += line.bus.dropped
             line.bus.close()
             line.bus = fresh
+        self._back(k, line)
+
+    def _back(self, k: int, line: _Line) -> None:
         assert line.down_since is not None
         seconds = time.monotonic() - line.down_since
         line.down_since = None

@@ -128,12 +128,16 @@ class Line:
         self._tried = time.monotonic()
         if not self.bus.up:
             return False
+        for drive in self.drives:
+            drive.nmt.halt()
         with suppress(Exception):  # canopen raises here again what ended its receive thread
             self._network.disconnect()
         try:
             self._connected(self._network)
         except ArmidentError:
             return False
+        for drive in self.drives:
+            drive.nmt.resume()
         self.down = False
         return True
 

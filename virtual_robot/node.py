@@ -106,6 +106,10 @@ class Nmt(NmtSlave):
         self.stop_heartbeat()
         self.network.send_message(COB_HEARTBEAT + self.id, b"\0")
         self._state = int(NmtState.PRE_OPERATIONAL)
+        self.resume()
+
+    def resume(self) -> None:
+        """Start the heartbeat (1017h)."""
         self.start_heartbeat(int.from_bytes(self._local_node.get_data(HEARTBEAT_PRODUCER, 0), "little"))
 
     def halt(self) -> None:

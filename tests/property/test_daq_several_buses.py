@@ -219,3 +219,21 @@ def test_late_answers_are_counted() -> None:
     assembler.push(frames[order])
     assert assembler.finish(COUNT).gaps == ()
     assert assembler.counters["tpdo_late"] == 2
+
+
+def test_frames_that_waited_while_their_bus_was_taken_for_down_are_no_turn_of_the_counter() -> None:
+    """It is back before we know: what came meanwhile is older than the SYNCs of the others, and given up."""
+    assembler = Assembler((PLAIN,), JOINTS, PERIOD_NS, bus_of=BUS_OF)
+    per_bus = [bus_frames(b, (PLAIN,), Faults()) for b in range(3)]
+    batches: list[Batch] = []
+    number = [(frames["t_ns"] - T0) // PERIOD_NS for frames in per_bus]
+    for first, last in ((0, 50), (50, 180), (180, COUNT)):
+        if first == 50:
+            assembler.silence(1, True)
+        for b in (0, 2, 1):
+            batches.append(assembler.push(per_bus[b][(number[b] >= first) & (number[b] < last)], sent=last, bus=b))
+        assembler.silence(1, False)
+    batches.append(assembler.finish(COUNT))
+    gaps = [g for b in batches for g in b.gaps]
+    assert gaps == [Gap("samples", 50, 179, "joint_3", SYNC_LOST)]
+    assert assembler.counters["samples.expected"] == COUNT
