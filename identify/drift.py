@@ -1,6 +1,9 @@
 """Has an arm changed since its baseline: two identifications beside each other, with their covariances."""
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +21,38 @@ RANK_TOLERANCE = 1e-9
 """Eigenvalues of the correlation of the difference, relative to the greatest, that count as rounding."""
 
 
+FRICTION = ("fv", "fc", "off")
+"""Parameters that make up the friction of a joint, or of a shaft that two joints share; the rest is of its masses."""
+
+_NAME = re.compile(r"([a-z]+?)(m?\d+)r?(?:_\d+)?$")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Parameters of one place that change together, and that the data may tell apart badly.
+
+    Parameters
+    ----------
+    kind
+        ``friction`` or ``masses``.
+    place
+        What their names end in: the number of the joint, or the name of a coupling.
+    members
+        Their names.
+    chi_square, degrees
+        Of their differences, with all other parameters free.
+    p_value
+        That an unchanged arm differs so much in them, as in `Drift`.
+    """
+
+    kind: Literal["friction", "masses"]
+    place: str
+    members: tuple[str, ...]
+    chi_square: float
+    degrees: int
+    p_value: float
+
+
 @dataclass(frozen=True)
 class Drift:
     """Differences of the parameters of two identifications.
@@ -29,11 +64,15 @@ class Drift:
     before, difference, std
         Earlier values, later less earlier, and the standard deviation of that, (k,) each.
     p_values
-        That an unchanged arm differs so much in this parameter, for all parameters together (Holm 1979), (k,).
+        That an unchanged arm differs so much in this parameter, (k,), for all parameters and groups together (Holm
+        1979).
     chi_square, degrees, p_joint
         ``d' C^-1 d`` with the covariance C of the difference, its degrees of freedom, and the chance of one so large.
     false_alarms
-        What was allowed; half of it goes to the joint test and half to those of single parameters.
+        What was allowed; half of it goes to the joint test and half to those of single parameters and groups.
+    groups
+        The friction of each joint, and its masses: viscous and Coulomb friction are hard to tell apart, so that each
+        of them may have changed beyond doubt together and neither alone.
     """
 
     parameters: tuple[Parameter, ...]
@@ -45,6 +84,7 @@ class Drift:
     degrees: int
     p_joint: float
     false_alarms: float
+    groups: tuple[Group, ...] = ()
 
     @property
     def changed(self) -> tuple[str, ...]:
@@ -53,9 +93,15 @@ class Drift:
         return tuple(self.parameters[k].name for k in order if self.p_values[k] < self.false_alarms / 2)
 
     @property
+    def changed_groups(self) -> tuple[Group, ...]:
+        """Groups that changed, the clearest first."""
+        clear = [group for group in self.groups if group.p_value < self.false_alarms / 2]
+        return tuple(sorted(clear, key=lambda group: group.p_value))
+
+    @property
     def drifted(self) -> bool:
-        """Whether the arm has changed: in single parameters, or in all together."""
-        return bool(self.changed) or self.p_joint < self.false_alarms / 2
+        """Whether the arm has changed: in single parameters, in groups, or in all together."""
+        return bool(self.changed or self.changed_groups) or self.p_joint < self.false_alarms / 2
 
     @property
     def words(self) -> str:
@@ -68,6 +114,10 @@ class Drift:
             f"{self.parameters[by_name[name]].unit}".rstrip()
             for name in self.changed
         ]
+        known = set(self.changed)
+        for group in self.changed_groups:
+            if not known & set(group.members):
+                parts.append(f"{group.kind} {group.place} ({', '.join(group.members)} together)")
         what = ", ".join(parts) or "no single parameter clearly"
         return f"changed: {what} (chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom)"
 
@@ -104,15 +154,48 @@ def compare(baseline: IdentificationDocument, now: IdentificationDocument, false
     std = np.sqrt(np.diag(covariance))
     if not np.all(std > 0):
         raise DataError(f"{now.robot}: a parameter without a standard deviation cannot be compared")
-    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
-    kept = values > RANK_TOLERANCE * values[-1]
-    chi_square = float(np.sum((vectors[:, kept].T @ (difference / std)) ** 2 / values[kept]))
-    degrees = int(kept.sum())
+    chi_square, degrees = _chi_square(difference, covariance)
+    names = [p.name for p in now.parameters]
+    places = _places(names)
+    sums = [_chi_square(difference[rows], covariance[np.ix_(rows, rows)]) for rows in places.values()]
     single = 2 * stats.norm.sf(np.abs(difference) / std)
+    p = _holm(np.concatenate([single, [stats.chi2.sf(value, dof) for value, dof in sums]]))
+    groups = tuple(
+        Group(kind, place, tuple(names[k] for k in rows), *found, float(chance))
+        for ((kind, place), rows), found, chance in zip(places.items(), sums, p[len(names) :], strict=True)
+    )
     joint = float(stats.chi2.sf(chi_square, degrees))
     return Drift(
-        tuple(now.parameters), before, difference, std, _holm(single), chi_square, degrees, joint, false_alarms
+        tuple(now.parameters),
+        before,
+        difference,
+        std,
+        p[: len(names)],
+        chi_square,
+        degrees,
+        joint,
+        false_alarms,
+        groups,
     )
+
+
+def _chi_square(difference: Array, covariance: Array) -> tuple[float, int]:
+    """``d' C^-1 d`` and its degrees of freedom, rounding left out."""
+    std = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
+    kept = values > RANK_TOLERANCE * values[-1]
+    return float(np.sum((vectors[:, kept].T @ (difference / std)) ** 2 / values[kept])), int(kept.sum())
+
+
+def _places(names: Sequence[str]) -> dict[tuple[Literal["friction", "masses"], str], list[int]]:
+    """Which parameters make up a group of at least two."""
+    found: dict[tuple[Literal["friction", "masses"], str], list[int]] = {}
+    for k, name in enumerate(names):
+        match = _NAME.match(name)
+        if match is not None:
+            kind: Literal["friction", "masses"] = "friction" if match[1] in FRICTION else "masses"
+            found.setdefault((kind, match[2]), []).append(k)
+    return {key: rows for key, rows in found.items() if len(rows) > 1}
 
 
 def _holm(p: Array) -> Array:

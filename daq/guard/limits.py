@@ -13,8 +13,11 @@ FOLLOWING_S = 0.1
 VELOCITY_S = 0.01
 """Velocity is a difference of positions over this time (s): a lost frame must not look like haste."""
 
-TORQUE_S = 0.01
-"""Torque is a mean over this time (s): what chops in an amplifier for a millisecond loads no gear."""
+TORQUE_S, TORQUE_SAMPLES = 0.01, 20
+"""Torque is a mean over this time (s) and at least so many samples: measured currents chop, gears do not feel it."""
+
+TORQUE_PEAK = 2.0
+"""A single sample beyond this multiple of the limit is no chopping."""
 
 HEARTBEATS_MISSED = 3
 HEARTBEAT_MARGIN_S = 0.1

@@ -11,7 +11,9 @@ from configs.session import ObjectName
 from daq.guard.limits import (
     HEARTBEAT_MARGIN_S,
     HEARTBEATS_MISSED,
+    TORQUE_PEAK,
     TORQUE_S,
+    TORQUE_SAMPLES,
     VELOCITY_S,
     Limits,
 )
@@ -81,7 +83,7 @@ class Watch:
         self._per_count = np.linalg.inv(robot.transmission_matrix) / counts_per_si(robot)
         torque = np.array([joint.drive.gain * joint.drive.rated / 1000.0 for joint in robot.joints])
         self._per_mille = robot.transmission_matrix.T * torque
-        velocity, mean = (max(1, round(seconds / period)) for seconds in (VELOCITY_S, TORQUE_S))
+        velocity, mean = max(1, round(VELOCITY_S / period)), max(TORQUE_SAMPLES, round(TORQUE_S / period))
         self._positions, self._efforts = np.zeros((velocity + 1, n), np.int64), np.zeros((mean, n))
         self._samples = np.zeros(n, np.int64)
         self._velocity_s = velocity * period
@@ -203,7 +205,7 @@ def _examine(  # type: ignore[no-untyped-def]
     for j in range(n):
         if per_count[j, moved] == 0.0 and per_mille[j, moved] == 0.0:
             continue
-        q, speed, tau, lag, known = 0.0, 0.0, 0.0, 0.0, True
+        q, speed, tau, peak, lag, known = 0.0, 0.0, 0.0, 0.0, 0.0, True
         for m in range(n):
             if per_count[j, m] != 0.0:
                 known = known and seen[m]
@@ -215,6 +217,7 @@ def _examine(  # type: ignore[no-untyped-def]
                     lag += per_count[j, m] * (raw[2, m] - raw[0, m])
             if per_mille[j, m] != 0.0:
                 tau += per_mille[j, m] * efforts[:, m].mean()
+                peak += per_mille[j, m] * raw[1, m]
         if not known:
             continue
         code = QUIET
@@ -222,8 +225,8 @@ def _examine(  # type: ignore[no-untyped-def]
             code, value[0], value[1] = POSITION, q, 0.0
         elif abs(speed) > velocity[j]:
             code, value[0], value[1] = VELOCITY, speed, velocity[j]
-        elif abs(tau) > torque[j]:
-            code, value[0], value[1] = TORQUE, tau, torque[j]
+        elif abs(tau) > torque[j] or abs(peak) > TORQUE_PEAK * torque[j]:
+            code, value[0], value[1] = TORQUE, tau if abs(tau) > torque[j] else peak, torque[j]
         elif abs(lag) > following[j]:
             code, value[0], value[1] = FOLLOWING, lag, following[j]
         if code != QUIET:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import IO
+from typing import IO, Protocol
 
 from configs import ArmidentError, ConfigError, DataError
 from daq.recording import Recording, join_parts, read_recording
@@ -27,13 +27,46 @@ _ERRORS: dict[int, type[ArmidentError]] = {2: ConfigError, 3: DataError}
 Say = Callable[[str], None]
 
 
+class Process(Protocol):
+    """A command that was started, as `subprocess.Popen` has it."""
+
+    def poll(self) -> int | None:
+        """Its exit code, once it has ended."""
+        ...
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end; ``subprocess.TimeoutExpired`` if that takes longer."""
+        ...
+
+    def send_signal(self, sig: int) -> None:
+        """Send it a signal."""
+        ...
+
+    def kill(self) -> None:
+        """End it at once."""
+        ...
+
+
+Start = Callable[[Sequence[str], IO[bytes], IO[bytes]], Process]
+"""Starts an armident command, by its words, with its standard output and error in files."""
+
+
+def start_process(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Process:
+    """Start an armident command with an interpreter of its own.
+
+    Signals of the terminal reach us alone: the guard has to have its own before the capture has one.
+    """
+    command = [sys.executable, "-m", "daq.cli", *words]
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True)
+
+
 class Interrupted(ArmidentError):
     """SIGINT or SIGTERM came while the arm moved; the drives were stopped."""
 
     exit_code = 130
 
 
-def play(config: Path, out: Path, say: Say) -> Recording:
+def play(config: Path, out: Path, say: Say, start: Start = start_process) -> Recording:
     """Play the set points of a session once, watched by a guard; the recording of it.
 
     Parameters
@@ -44,6 +77,8 @@ def play(config: Path, out: Path, say: Say) -> Recording:
         Folder of the recording.
     say
         Takes lines that tell how it goes.
+    start
+        How guard and capture are started.
 
     Raises
     ------
@@ -55,11 +90,11 @@ def play(config: Path, out: Path, say: Say) -> Recording:
         On SIGINT and SIGTERM.
     """
     # The guard comes before the first motion, and leaves after the last.
-    with _interruptible(), _command(["guard", "--config", str(config)]) as guard:
+    with _interruptible(), _command(["guard", "--config", str(config)], start) as guard:
         _until_ready(guard)
         say("guard: ready")
         options = ["capture", "--config", str(config), "--out", str(out), "--json"]
-        with _command(options) as capture:
+        with _command(options, start) as capture:
             try:
                 while capture.running and guard.running:
                     time.sleep(LOOK_S)
@@ -110,17 +145,10 @@ def _until_ready(guard: "_Command") -> None:
 class _Command:
     """A command of ours, running."""
 
-    def __init__(self, arguments: Sequence[str], out: IO[bytes], err: IO[bytes]) -> None:
-        self.name = arguments[0]
+    def __init__(self, words: Sequence[str], start: Start, out: IO[bytes], err: IO[bytes]) -> None:
+        self.name = words[0]
         self._out, self._err = out, err
-        # Signals of the terminal reach us alone: the guard has to have its own before the capture has one.
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "daq.cli", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=out,
-            stderr=err,
-            start_new_session=True,
-        )
+        self._process = start(words, out, err)
 
     @property
     def running(self) -> bool:
@@ -161,9 +189,9 @@ class _Command:
 
 
 @contextmanager
-def _command(arguments: Sequence[str]) -> Iterator[_Command]:
+def _command(words: Sequence[str], start: Start) -> Iterator[_Command]:
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        command = _Command(arguments, out, err)
+        command = _Command(words, start, out, err)
         try:
             yield command
         finally:

@@ -29,7 +29,7 @@ from identify.moves import motion_of
 from identify.options import Options
 from identify.prior import prior_from
 from identify.reidentify.baseline import Baseline, baseline_of
-from identify.reidentify.play import play
+from identify.reidentify.play import Say, Start, play, start_process
 from identify.reidentify.publish import Announcer
 from identify.reidentify.verdict import found, told
 from identify.service import identify_recording, write_identification
@@ -156,12 +156,24 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
             )
 
 
-def carry_out(job: Job, announcer: Announcer, say: Any) -> Outcome:
-    """Do the job; everything that it leaves is kept in the history, and published."""
+def carry_out(job: Job, announcer: Announcer, say: Say, start: Start = start_process) -> Outcome:
+    """Do the job; everything that it leaves is kept in the history, and published.
+
+    Parameters
+    ----------
+    job
+        What `prepare` has checked.
+    announcer
+        For Zenoh.
+    say
+        Takes lines that tell how it goes.
+    start
+        How guard and capture are started.
+    """
     say(f"{job.robot.name} in cell {job.session.cell}; baseline: {job.baseline.name}")
     announcer.status("moving")
     job.out.mkdir(parents=True, exist_ok=True)
-    recording = play(job.config, job.out, say)
+    recording = play(job.config, job.out, say, start)
     say(f"recorded {recording.path}")
     announcer.status("identifying", recording=str(recording.path))
     options = Options(**job.session.identification.model_dump())
@@ -210,7 +222,7 @@ def started(recording: Recording, document: IdentificationDocument, path: Path) 
     return recorded_at(document, path) if said is None else datetime.datetime.fromisoformat(said)
 
 
-def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Any) -> Outcome:
+def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Outcome:
     """The outcome with what ``armident diagnose --baseline`` says; a diagnosis that fails does not undo the verdict."""
     assert job.baseline.document is not None
     folder = _beside(recording, job.out, "diagnosis")

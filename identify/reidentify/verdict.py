@@ -9,6 +9,9 @@ from identify.document import DiagnosisDocument
 from identify.drift import Drift
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
+CLEAR = 2.0
+"""Parameters of a group that changed are told if they are so many standard deviations off."""
+
 _SHARED = ("ia", "fv", "fc")
 """Parameters that a coupling of two joints has."""
 
@@ -24,7 +27,7 @@ _MEANINGS = {
 
 
 def told(drift: Drift, robot: RobotConfig) -> list[str]:
-    """One line per parameter that has changed, the clearest first; one that says so if only all together have.
+    """One line per parameter that has changed, the clearest first, and per group; one if only all together have.
 
     Parameters
     ----------
@@ -33,16 +36,14 @@ def told(drift: Drift, robot: RobotConfig) -> list[str]:
     robot
         For the names of the joints.
     """
-    lines = []
-    for name in drift.changed:
-        k = next(k for k, p in enumerate(drift.parameters) if p.name == name)
-        parameter, before = drift.parameters[k], float(drift.before[k])
-        share = f" ({100 * (parameter.value - before) / abs(before):+.1f} %)" if before else ""
-        lines.append(
-            f"{place_of(name, robot)}: {meaning_of(name)} {name} {before:.4g} -> {parameter.value:.4g} "
-            f"{parameter.unit}{share}, {abs(drift.difference[k]) / drift.std[k]:.1f} standard deviations, "
-            f"chance {_chance(float(drift.p_values[k]))}"
-        )
+    lines = [_line(drift, name, robot) + f", chance {_chance(_p_value(drift, name))}" for name in drift.changed]
+    for group in drift.changed_groups:
+        rest = [name for name in group.members if name not in drift.changed]
+        if len(rest) == len(group.members):
+            where = place_of(rest[0], robot)
+            clear = [name for name in rest if _deviations(drift, name) >= CLEAR] or rest
+            values = "; ".join(_line(drift, name, robot).removeprefix(f"{where}: ") for name in clear)
+            lines.append(f"{where}: {group.kind} ({values}), together with chance {_chance(group.p_value)}")
     if not lines and drift.drifted:
         z = np.abs(drift.difference) / drift.std
         most = ", ".join(drift.parameters[k].name for k in np.argsort(-z)[:3])
@@ -50,6 +51,26 @@ def told(drift: Drift, robot: RobotConfig) -> list[str]:
             f"no single parameter clearly, all together do (chance {_chance(drift.p_joint)}); farthest are {most}"
         )
     return lines
+
+
+def _deviations(drift: Drift, name: str) -> float:
+    k = next(k for k, p in enumerate(drift.parameters) if p.name == name)
+    return float(abs(drift.difference[k]) / drift.std[k])
+
+
+def _line(drift: Drift, name: str, robot: RobotConfig) -> str:
+    """Where, what, from what to what, and by how many standard deviations."""
+    k = next(k for k, p in enumerate(drift.parameters) if p.name == name)
+    parameter, before = drift.parameters[k], float(drift.before[k])
+    share = f" ({100 * (parameter.value - before) / abs(before):+.1f} %)" if before else ""
+    return (
+        f"{place_of(name, robot)}: {meaning_of(name)} {name} {before:.4g} -> {parameter.value:.4g} "
+        f"{parameter.unit}{share}, {_deviations(drift, name):.1f} standard deviations"
+    )
+
+
+def _p_value(drift: Drift, name: str) -> float:
+    return next(float(p) for each, p in zip(drift.parameters, drift.p_values, strict=True) if each.name == name)
 
 
 def found(diagnosis: DiagnosisDocument) -> list[str]:
