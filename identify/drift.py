@@ -104,6 +104,18 @@ class Drift:
         return bool(self.changed or self.changed_groups) or self.p_joint < self.false_alarms / 2
 
     @property
+    def entry(self) -> dict[str, object]:
+        """The verdict as a part of a document."""
+        return {
+            "drifted": self.drifted,
+            "changed": list(self.changed),
+            "changed_groups": [f"{group.kind} {group.place}" for group in self.changed_groups],
+            "chi_square": self.chi_square,
+            "degrees": self.degrees,
+            "p_joint": self.p_joint,
+        }
+
+    @property
     def words(self) -> str:
         """The verdict in a sentence."""
         if not self.drifted:

@@ -149,19 +149,28 @@ class History:
             raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
         return True
 
-    def describe(self, recording: Recording) -> None:
-        """Keep what is known of a recording beside its samples: facts of the host, counters; once."""
-        rows = recording.samples.sync.size
-        row = {
+    @staticmethod
+    def facts(recording: Recording) -> dict[str, Any]:
+        """What is known of a recording beside its samples, for `describe`."""
+        return {
             "sha256": recording.sha256,
             "path": None if recording.path is None else str(recording.path),
             "cell": recording.metadata.get("cell"),
-            "duration_s": rows / recording.sample_rate_hz,
+            "duration_s": recording.samples.sync.size / recording.sample_rate_hz,
             "in_gaps": recording.counters.get("samples.in_gaps"),
             "facts": dict(recording.metadata),
             "counters": dict(recording.counters),
         }
-        self._insert_once(_recordings, row)
+
+    @staticmethod
+    def began(facts: Mapping[str, Any], document: IdentificationDocument, file: Path) -> datetime.datetime:
+        """When a recording was begun: what it says itself, else by its name or the time of the result's file."""
+        said = facts["facts"].get("started_utc")
+        return recorded_at(document, file) if said is None else datetime.datetime.fromisoformat(said)
+
+    def describe(self, facts: Mapping[str, Any]) -> None:
+        """Keep what is known of a recording; once."""
+        self._insert_once(_recordings, facts)
 
     def judge(self, document: IdentificationDocument, baseline: IdentificationDocument, drift: Drift) -> None:
         """Keep what came of the comparison of an identification, added before, with a baseline."""

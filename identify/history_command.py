@@ -89,16 +89,7 @@ def _entry(run: Run, drift: Drift | None) -> dict[str, object]:
         "method": document.method,
         "relative_error_pct": document.relative_error_pct,
         "parameters": {p.name: {"value": p.value, "std": p.std, "unit": p.unit} for p in document.parameters},
-        "drift": None
-        if drift is None
-        else {
-            "drifted": drift.drifted,
-            "changed": list(drift.changed),
-            "chi_square": drift.chi_square,
-            "degrees": drift.degrees,
-            "p_joint": drift.p_joint,
-            "words": drift.words,
-        },
+        "drift": None if drift is None else drift.entry | {"words": drift.words},
     }
 
 

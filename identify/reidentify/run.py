@@ -1,6 +1,5 @@
 """``armident reidentify`` of one arm: check, move, identify, compare, keep, tell."""
 
-import datetime
 import json
 import subprocess
 import sys
@@ -23,7 +22,7 @@ from configs import (
 from daq.recording import Recording
 from identify.document import DiagnosisDocument, IdentificationDocument, from_json, to_json
 from identify.drift import Drift, compare
-from identify.history import History, recorded_at
+from identify.history import History
 from identify.model.arm import ArmModel
 from identify.moves import motion_of
 from identify.options import Options
@@ -210,16 +209,11 @@ def keep(
     drift: Drift | None,
 ) -> None:
     """Put a run, its recording's facts and its comparison into the history."""
-    history.describe(recording)
-    history.add(document, started(recording, document, path))
+    facts = History.facts(recording)
+    history.describe(facts)
+    history.add(document, History.began(facts, document, path))
     if drift is not None and baseline is not None:
         history.judge(document, baseline, drift)
-
-
-def started(recording: Recording, document: IdentificationDocument, path: Path) -> datetime.datetime:
-    """When a recording was begun: what it says itself, else by its name or the result's time."""
-    said = recording.metadata.get("started_utc")
-    return recorded_at(document, path) if said is None else datetime.datetime.fromisoformat(said)
 
 
 def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Outcome:
@@ -263,21 +257,10 @@ def entry(job: Job, outcome: Outcome) -> dict[str, Any]:
         "recording": outcome.document.recording.path,
         "identification": str(outcome.path),
         "baseline": job.baseline.name,
-        "drift": None if drift is None else as_entry(drift),
+        "drift": None if drift is None else drift.entry,
         "words": list(outcome.words),
         "diagnosis": None if outcome.diagnosis is None else str(outcome.diagnosis),
         "findings": list(outcome.findings),
-    }
-
-
-def as_entry(drift: Drift) -> dict[str, Any]:
-    """A comparison as a part of a document."""
-    return {
-        "drifted": drift.drifted,
-        "changed": list(drift.changed),
-        "chi_square": drift.chi_square,
-        "degrees": drift.degrees,
-        "p_joint": drift.p_joint,
     }
 
 

@@ -19,7 +19,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from multiprocessing import reduction
-from multiprocessing.context import BaseContext
+from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import IO, Any
 
@@ -100,7 +100,7 @@ def start_forked(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Forked
     return Forked(words, out.fileno(), err.fileno())
 
 
-def _server() -> BaseContext:
+def _server() -> ForkServerContext:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(PRELOADED))
     return context
