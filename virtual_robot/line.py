@@ -53,8 +53,11 @@ class Line:
         self.exchange = Exchange(drives, motion, period)
         self.batch = frames(BATCH, fd=self.bus.fd)
         self._columns = self.batch["can_id"], self.batch["length"], self.batch["data"]
-        self.count = self.at = 0
         self.down = False
+        self._count = self._at = 0
+        self._syncs: list[tuple[int, int]] = []
+        """Counter and time stamp of the SYNCs in ``batch`` that wait for an answer, the next one last."""
+        self._outbox, self._queued = frames(BATCH, fd=self.bus.fd), 0
         self._tried = 0.0
         # Compile before anybody waits for an answer.
         self.take(0, 0, 1)
@@ -94,33 +97,48 @@ class Line:
             return self.bus.receive(self.batch, wait=wait)
         return self.bus.receive(self.batch) if not wait or self.bus.poll(RECEIVE_TIMEOUT) else 0
 
-    def next_sync(self) -> int | None:
-        """Counter of the next SYNC (0: it carries none), read from the bus if there is none in ``batch``.
+    def next_sync(self) -> tuple[int, int] | None:
+        """Counter (0: it carries none) and time stamp of the next SYNC, read from the bus if none has been yet.
 
         The bus is left alone while it is down, and used again once it is back.
         """
-        for _ in range(2):
-            ids = self.batch["can_id"][self.at : self.count]
-            found = np.flatnonzero(ids == COB_SYNC)
-            if found.size:
-                first = self.at + int(found[0])
-                return int(self.batch["data"][first, 0]) if self.batch["length"][first] else 0
-            if self.at < self.count:
-                self.at = self.take(self.at, self.count, 1)
+        if not self._syncs:
+            self.flush()
+            if self._at < self._count:
+                # Set points behind the last SYNC.
+                self._at = self.take(self._at, self._count, 1)
             if self.down and not self._is_back():
                 return None
             try:
-                self.at, self.count = 0, self.receive(wait=False)
+                self._at, self._count = 0, self.receive(wait=False)
             except BusDown:
-                self.down, self.count = True, 0
-        return None
+                self.down, self._count = True, 0
+            at = np.flatnonzero(self.batch["can_id"][: self._count] == COB_SYNC)
+            counters = np.where(self.batch["length"][at] > 0, self.batch["data"][at, 0], 0)
+            stamps = self.batch["t_ns"][at]
+            self._syncs = list(zip(counters.tolist(), stamps.tolist(), strict=True))[::-1]
+        return self._syncs[-1] if self._syncs else None
 
-    def send(self) -> None:
-        """Send what answers the SYNC taken last; nothing where the bus is down."""
-        try:
-            self.bus.send(self.exchange.out)
-        except BusDown:
-            self.down = True
+    def answer(self, sequence: int) -> None:
+        """Answer the next SYNC and let set points act; ``sequence`` is its counter if it has none."""
+        self._syncs.pop()
+        at = self.take(self._at, self._count, sequence)
+        self._at = at + 1
+        out = self.exchange.out
+        if self._queued + out.size > self._outbox.size:
+            self.flush()
+        self._outbox[self._queued : self._queued + out.size] = out
+        self._queued += out.size
+        self.exchange.act()
+
+    def flush(self) -> None:
+        """Send the answers that are due, in one system call; nothing where the bus is down."""
+        if self._queued:
+            try:
+                self.bus.send(self._outbox[: self._queued])
+            except BusDown:
+                self.down = True
+            self._queued = 0
 
     def _is_back(self) -> bool:
         if time.monotonic() - self._tried < REOPEN_S:

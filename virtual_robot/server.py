@@ -191,31 +191,27 @@ class Server:
         for line in self._lines:
             assert isinstance(line.bus, RawSocket)
             poll.register(line.bus.fileno(), select.POLLIN)
-        overflow = self._session.sync.counter
-        expected: int | None = None
+        half_turn_ns = round(self._session.sync_period * 1e9 * self._session.sync.counter / 2)
         since: float | None = None
         while not over():
-            due = {k: line.next_sync() for k, line in enumerate(self._lines)}
-            waiting = {k: counter for k, counter in due.items() if counter is not None}
-            missing = [line for k, line in enumerate(self._lines) if due[k] is None and not line.down]
+            due = [(line, line.next_sync()) for line in self._lines]
+            waiting = [(line, *sync) for line, sync in due if sync is not None]
+            missing = any(sync is None and not line.down for line, sync in due)
+            self._catch_up()
             if not waiting or (missing and (since is None or time.monotonic() - since < TOGETHER_S)):
-                since = time.monotonic() if waiting and since is None else since if waiting else None
+                since = (since or time.monotonic()) if waiting else None
+                for line in self._lines:
+                    line.flush()
                 poll.poll(1000 * (TOGETHER_S if waiting else RECEIVE_TIMEOUT))
-                self._catch_up()
                 continue
             since = None
-            self._catch_up()
-            start = next(iter(waiting.values())) if expected is None else expected
-            # A bus that lacked a SYNC is ahead of the others: its next one waits for theirs.
-            counter = min(waiting.values(), key=lambda c: (c - start) % overflow)
-            expected = counter % overflow + 1
-            for line in [self._lines[k] for k, c in waiting.items() if c == counter]:
-                line.at = line.take(line.at, line.count, counter or self._counter)
-                if self._syncs % LATENESS_SYNCS == 0:
-                    self._note(time.time_ns() - int(line.batch["t_ns"][line.at]))
-                line.send()
-                line.exchange.act()
-                line.at += 1
+            _, counter, stamp = min(waiting, key=lambda one: one[2])
+            for line, other, at in waiting:
+                # A bus that lacked a SYNC is ahead of the others: its next one waits for theirs.
+                if other == counter and abs(at - stamp) < half_turn_ns:
+                    line.answer(counter or self._counter)
+            if self._syncs % LATENESS_SYNCS == 0:
+                self._note(time.time_ns() - stamp)
             self._advance()
 
     @property
