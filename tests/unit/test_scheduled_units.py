@@ -1,0 +1,107 @@
+"""Units and cron lines that come with armident: systemd takes them, and their commands are ours."""
+
+import re
+import shlex
+import shutil
+import subprocess
+from configparser import ConfigParser
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from configs.loading import HERE
+from daq.cli import application
+
+UNITS = sorted((HERE / "systemd").glob("*@.*"))
+CRON = HERE / "cron" / "armident-reidentify.cron"
+
+
+class Unit(ConfigParser):
+    """A unit file: keys may repeat, and are written as they are."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(interpolation=None, strict=False, delimiters=("=",), comment_prefixes=("#", ";"))
+        self.optionxform = str  # type: ignore[assignment, method-assign]
+        # Every value of a key that repeats counts.
+        seen: dict[str, int] = {}
+        lines = []
+        for line in path.read_text(encoding="utf-8").splitlines():
+            key = line.partition("=")[0]
+            if "=" in line and not line.startswith("#"):
+                seen[key] = seen.get(key, 0) + 1
+                line = line.replace(key, f"{key}#{seen[key]}" if seen[key] > 1 else key, 1)
+            lines.append(line)
+        self.read_string("\n".join(lines))
+
+
+def accepted(words: list[str]) -> None:
+    """Parse a command line as the program would, without running it."""
+    group = typer.main.get_command(application(words))
+    command = group.commands[words[0]]  # type: ignore[attr-defined]
+    command.make_context(words[0], words[1:])
+
+
+def commands(path: Path) -> list[list[str]]:
+    unit = Unit(path)
+    lines = [value for key, value in unit["Service"].items() if key.startswith("ExecStart")]
+    return [shlex.split(line.lstrip("+-!").replace("%i", "cell"))[1:] for line in lines]
+
+
+@pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
+def test_systemd_takes_every_unit(path: Path, tmp_path: Path) -> None:
+    """By systemd's own judgement where it is installed; its sections and keys are read in any case."""
+    unit = Unit(path)
+    wanted = {".service": ["Unit", "Service"], ".timer": ["Unit", "Timer", "Install"]}[path.suffix]
+    assert unit.sections()[: len(wanted)] == wanted
+    if shutil.which("systemd-analyze") is None:
+        return
+    for each in UNITS:
+        text = re.sub(r"/opt/armident/bin/armident", "/bin/true", each.read_text(encoding="utf-8"))
+        (tmp_path / each.name.replace("@.", "@cell.")).write_text(text)
+    name = tmp_path / path.name.replace("@.", "@cell.")
+    done = subprocess.run(["systemd-analyze", "verify", "--man=no", str(name)], capture_output=True, text=True)
+    complaints = [line for line in done.stderr.splitlines() if str(tmp_path) in line or "armident" in line]
+    assert done.returncode == 0, done.stderr
+    assert complaints == []
+
+
+@pytest.mark.parametrize("path", [p for p in UNITS if p.suffix == ".service"], ids=lambda path: path.name)
+def test_commands_of_units_are_ours(path: Path) -> None:
+    found = commands(path)
+    assert found
+    for words in found:
+        accepted(words)
+
+
+def test_the_timer_runs_weekly_the_service_of_its_name_and_never_late() -> None:
+    """An arm does not move because a machine was switched on."""
+    timer = Unit(HERE / "systemd" / "armident-reidentify@.timer")["Timer"]
+    assert timer["OnCalendar"].startswith("Sun ")
+    assert timer["Persistent"] == "false"
+    assert (HERE / "systemd" / "armident-reidentify@.service").is_file()
+
+
+def test_the_job_ends_a_capture_and_has_real_time() -> None:
+    service = Unit(HERE / "systemd" / "armident-reidentify@.service")
+    assert service["Unit"]["Conflicts"] == "armident-capture@%i.service"
+    assert service["Service"]["Type"] == "oneshot"
+    assert "RestrictRealtime" not in service["Service"]
+    assert "CAP_SYS_NICE" in service["Service"]["AmbientCapabilities"]
+
+
+def test_the_cron_line_runs_the_same_command_weekly() -> None:
+    (line,) = [line for line in CRON.read_text(encoding="utf-8").splitlines() if re.match(r"\d", line)]
+    *when, user, program = line.split()[:7]
+    assert when == ["0", "3", "*", "*", "0"]
+    assert user == "armident"
+    assert program == "/opt/armident/bin/armident"
+    words = line.split()[7:]
+    accepted(words)
+    (unit,) = [words for words in commands(HERE / "systemd" / "armident-reidentify@.service") if "reidentify" in words]
+    assert unit == [word.replace("CELL", "cell") for word in words]
+
+
+def test_a_wrong_option_would_be_noticed() -> None:
+    with pytest.raises(Exception, match="No such option"):
+        accepted(["reidentify", "--bassline", "x"])
