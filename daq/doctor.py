@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Literal
 
 from configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
+from configs.session import Bus
 from daq.streams import captured_streams
 from daq.zenoh_keys.session import configuration, endpoints
 from drivers.bus_load import check_fits
 from drivers.socketcan import RECEIVE_BUFFER, RawSocket
+from drivers.stamps import has_hardware_stamps
 from drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 
 Verdict = Literal["ok", "warning", "failed"]
@@ -51,25 +53,33 @@ def examine(config: str | Path) -> list[Check]:
         checks.append(Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}"))
     except ArmidentError as error:
         return [Check("configuration", "failed", str(error)), _clock()]
-    checks += [_bus_load(session, config), *_interface(session), _clock()]
+    checks.append(_bus_load(session, config))
+    for bus in session.all_buses:
+        checks += _interface(bus)
+    checks.append(_clock())
     checks += [*_disk(session, robot), _zenoh(session)]
     return checks
 
 
 def _bus_load(session: SessionConfig, config: str | Path) -> Check:
-    if session.bus.bitrate is None:
+    speeds = [
+        f"{bus.bitrate / 1e6:g}" + (f"/{bus.data_bitrate / 1e6:g}" if bus.data_bitrate else "")
+        for bus in session.all_buses
+        if bus.bitrate is not None
+    ]
+    if not speeds:
         return Check("bus load", "ok", "a virtual bus has no bit rate to fill")
     try:
         check_fits(session, str(config))
     except ConfigError as error:
         return Check("bus load", "failed", str(error))
-    return Check("bus load", "ok", f"fits {session.bus.bitrate / 1e6:g} Mbit/s even in the worst case")
+    return Check("bus load", "ok", f"fits {', '.join(speeds)} Mbit/s even in the worst case")
 
 
-def _interface(session: SessionConfig) -> Iterator[Check]:
-    """The interface of the bus, its state, and whether its bit rate is the configured one."""
-    name = session.bus.channel
-    if session.bus.interface == "udp_multicast":
+def _interface(bus: Bus) -> Iterator[Check]:
+    """The interface of a bus, its state, whose clock stamps its frames, and whether its bit rates are as configured."""
+    name = bus.channel
+    if bus.interface == "udp_multicast":
         yield Check(
             "bus", "warning", "UDP multicast stands in for a bus: frames may be lost and times are not the kernel's"
         )
@@ -85,18 +95,21 @@ def _interface(session: SessionConfig) -> Iterator[Check]:
         yield Check("bus", "failed", f"{name} is down; try: sudo ip link set {name} up")
         return
     details = _link(name)
-    timing = details.get("bittiming")
-    actual = timing.get("bitrate") if isinstance(timing, dict) else None
-    wanted = session.bus.bitrate
-    if wanted is not None and actual is not None and actual != wanted:
-        yield Check("bus", "failed", f"{name} runs at {actual} bit/s, the configuration says {wanted}")
-        return
+    for key, wanted in (("bittiming", bus.bitrate), ("data_bittiming", bus.data_bitrate)):
+        timing = details.get(key)
+        actual = timing.get("bitrate") if isinstance(timing, dict) else None
+        if wanted is not None and actual is not None and actual != wanted:
+            yield Check("bus", "failed", f"{name} runs at {actual} bit/s ({key}), the configuration says {wanted}")
+            return
     state = details.get("state")
     if state not in (None, "ERROR-ACTIVE"):
         yield Check("bus", "warning", f"{name} is {state}: look at its cabling and termination")
         return
-    yield Check("bus", "ok", f"{name} is up" + (f" at {actual} bit/s" if actual else ""))
-    yield _receive_buffer(name)
+    timing = details.get("bittiming")
+    rate = f" at {timing['bitrate']} bit/s" if isinstance(timing, dict) and "bitrate" in timing else ""
+    clock = "hardware" if has_hardware_stamps(name) else "software"
+    yield Check("bus", "ok", f"{name} is up{rate}, {clock} time stamps")
+    yield _receive_buffer(bus)
 
 
 def _is_can(path: Path) -> bool:
@@ -122,11 +135,11 @@ def _link(name: str) -> dict[str, object]:
     return dict(data)
 
 
-def _receive_buffer(channel: str) -> Check:
+def _receive_buffer(bus: Bus) -> Check:
     """Whether the kernel keeps as many frames as the capture asks for, while it cannot look."""
     try:
-        with RawSocket(channel) as bus:
-            given = bus.receive_buffer
+        with RawSocket(bus.channel, fd=bus.fd) as receiver:
+            given = receiver.receive_buffer
     except ArmidentError as error:
         return Check("receive buffer", "failed", str(error))
     if given >= RECEIVE_BUFFER:

@@ -1,14 +1,26 @@
-"""What a classic CAN bus can carry: the load of a session, and the nearest one that fits."""
+"""What CAN buses can carry: bits of classic and FD frames, the load of a session on each of its buses, what fits.
+
+Classic frames after Davis, Burns, Bril and Lukkien (2007); CAN FD after ISO 11898-1:2015: arbitration at the nominal
+bit rate, all between the bit rate switch and the CRC delimiter at the data bit rate, fixed stuff bits in the CRC field.
+"""
 
 from dataclasses import dataclass
 
 from configs import ConfigError, SessionConfig
+from configs.session import Bus
+from drivers.frames import fd_length
 from drivers.objects import COB_SYNC, SETPOINT, TpdoLayout
 
 CRC_15 = 0x4599
 TAIL_BITS = 13
 """CRC delimiter, acknowledgement, end of frame and interframe space: never stuffed."""
 HEARTBEAT_BYTES = 1
+FD_ARBITRATION_BITS = 17
+"""Start of frame to the bit rate switch, 11-bit identifier, at the nominal bit rate."""
+FD_TAIL_BITS = 13
+"""CRC delimiter, acknowledgement, end of frame and interframe space, at the nominal bit rate."""
+STUFF_EVERY = 4
+"""After its first bit, a stuffed field gets at most one stuff bit per so many bits."""
 STANDARD_PERIODS_US = (100, 125, 200, 250, 400, 500, 800, 1000, 2000, 4000, 5000, 10_000, 20_000, 50_000, 100_000)
 """SYNC periods that drives commonly offer."""
 
@@ -19,6 +31,20 @@ def frame_bits(data_bytes: int) -> tuple[int, int]:
     ``47 + 8 n`` without a stuff bit, ``55 + 10 n`` with the most there can be (Davis, Burns, Bril, Lukkien 2007).
     """
     return 47 + 8 * data_bytes, 55 + 10 * data_bytes
+
+
+def fd_frame_bits(data_bytes: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Bits of a CAN FD frame with 11-bit identifier at the nominal and at the data bit rate: fewest, then most.
+
+    Start of frame to the last data bit gets dynamic stuff bits (none to one in four); the stuff count and the CRC, of
+    17 bits up to 16 bytes and 21 above, have 6 and 7 fixed ones.
+    """
+    crc, fixed = (17, 6) if data_bytes <= 16 else (21, 7)
+    payload = 1 + 4 + 8 * data_bytes
+    fewest = FD_ARBITRATION_BITS + FD_TAIL_BITS, payload + 4 + crc + fixed
+    early = (FD_ARBITRATION_BITS - 1) // STUFF_EVERY
+    late = (FD_ARBITRATION_BITS + payload - 1) // STUFF_EVERY - early
+    return fewest, (fewest[0] + early, fewest[1] + late)
 
 
 def exact_bits(identifier: int, data: bytes) -> int:
@@ -41,32 +67,45 @@ def exact_bits(identifier: int, data: bytes) -> int:
 
 @dataclass(frozen=True)
 class Load:
-    """One kind of message: frames per second and its share of the bus, without and with all stuff bits."""
+    """One kind of message on one bus: frames per second and its share of the bus, without and with all stuff bits."""
 
     message: str
     frames_per_s: float
     typical: float
     worst: float
+    bus: str = ""
 
 
 def loads(session: SessionConfig, period_us: int | None = None) -> list[Load]:
-    """Bus load of a session by kind of message, for its own SYNC period or another one.
+    """Load of a session by bus and kind of message, for its own SYNC period or another one.
 
-    Shares are fractions of the bus's bit rate; ``nan`` on a bus without one.
+    Shares are fractions of the time; ``nan`` on a bus without bit rate.
     """
-    period = (session.sync.period_us if period_us is None else period_us) * 1e-6
-    bitrate = session.bus.bitrate or float("nan")
-    nodes = len(session.drives)
+    return [row for bus in session.all_buses for row in bus_loads(session, bus, period_us)]
 
-    def load(message: str, data_bytes: int, rate: float) -> Load:
-        low, high = frame_bits(data_bytes)
-        return Load(message, rate, low * rate / bitrate, high * rate / bitrate)
+
+def bus_loads(session: SessionConfig, bus: Bus, period_us: int | None = None) -> list[Load]:
+    """The same of one bus."""
+    period = (session.sync.period_us if period_us is None else period_us) * 1e-6
+    bitrate, data_bitrate = bus.bitrate or float("nan"), bus.data_bitrate or float("nan")
+    nodes = len(session.drives_on(bus))
+
+    def load(message: str, data_bytes: int, rate: float, fd: bool = False) -> Load:
+        if fd:
+            low, high = (
+                nominal / bitrate + data / data_bitrate for nominal, data in fd_frame_bits(fd_length(data_bytes))
+            )
+        else:
+            low, high = (bits / bitrate for bits in frame_bits(data_bytes))
+        return Load(message, rate, low * rate, high * rate, bus.channel)
 
     sync = [exact_bits(COB_SYNC, bytes([k])) for k in range(1, session.sync.counter + 1)]
-    rows = [Load("SYNC", 1 / period, sum(sync) / len(sync) / period / bitrate, max(sync) / period / bitrate)]
+    shares = sum(sync) / len(sync) / period / bitrate, max(sync) / period / bitrate
+    rows = [Load("SYNC", 1 / period, *shares, bus.channel)]
     for name, stream in session.streams.items():
-        size = TpdoLayout.of(stream.objects, f"streams.{name}").size
-        rows.append(load(f"TPDO{stream.tpdo} ({name})", size, nodes / (stream.every * period)))
+        size = TpdoLayout.of(stream.objects, f"streams.{name}", stream.pack, bus.fd).frame_size
+        rate = nodes / (max(stream.every, stream.pack) * period)
+        rows.append(load(f"TPDO{stream.tpdo} ({name})", size, rate, bus.fd))
     if session.setpoints is not None:
         rate = nodes / (session.setpoints.every * period)
         rows.append(load(f"RPDO{session.setpoints.rpdo} (set points)", SETPOINT.bits // 8, rate))
@@ -74,30 +113,42 @@ def loads(session: SessionConfig, period_us: int | None = None) -> list[Load]:
     return rows
 
 
+def worst_load(session: SessionConfig, bus: Bus, period_us: int | None = None) -> float:
+    """Worst-case load of one bus; ``nan`` without bit rate."""
+    return sum(row.worst for row in bus_loads(session, bus, period_us))
+
+
+def fits(session: SessionConfig, period_us: int | None = None) -> bool:
+    """Whether every bus that has a bit rate carries the session even in the worst case."""
+    return all(worst_load(session, bus, period_us) <= 1.0 for bus in session.all_buses if bus.bitrate is not None)
+
+
 def fitting_period(session: SessionConfig) -> int | None:
-    """The shortest usual SYNC period (us), not below the configured one, whose worst-case load fits the bus."""
+    """The shortest usual SYNC period (us), not below the configured one, whose worst-case load fits all buses."""
     for period in STANDARD_PERIODS_US:
-        if period >= session.sync.period_us and sum(row.worst for row in loads(session, period)) <= 1.0:
+        if period >= session.sync.period_us and fits(session, period):
             return period
     return None
 
 
 def check_fits(session: SessionConfig, where: str = "session") -> None:
-    """Refuse a session that its bus cannot carry even in the worst case; a virtual bus has no bit rate.
+    """Refuse a session that its buses cannot carry even in the worst case; a virtual bus has no bit rate.
 
     Raises
     ------
     ConfigError
-        With the load, and the nearest SYNC period or number of buses that would fit.
+        With the load, and the nearest configurations that would fit.
     """
-    if session.bus.bitrate is None:
-        return
-    worst = sum(row.worst for row in loads(session))
-    if worst <= 1.0:
-        return
-    period = fitting_period(session)
-    slower = f"sync.period_us {period} would fit" if period else "no usual SYNC period would fit"
-    raise ConfigError(
-        f"{where}: sync.period_us {session.sync.period_us} loads {session.bus.channel} at "
-        f"{session.bus.bitrate / 1e6:g} Mbit/s with {100 * worst:.0f} % in the worst case; {slower}"
-    )
+    for bus in session.all_buses:
+        if bus.bitrate is None or worst_load(session, bus) <= 1.0:
+            continue
+        # What would fit is worked out only where something does not.
+        from drivers.bus_plan import alternatives
+
+        speed = f"{bus.bitrate / 1e6:g}" + (f"/{bus.data_bitrate / 1e6:g}" if bus.data_bitrate else "")
+        found = "; ".join(f"{option.text} would fit" for option in alternatives(session))
+        raise ConfigError(
+            f"{where}: sync.period_us {session.sync.period_us} loads {bus.channel} at {speed} Mbit/s with "
+            f"{100 * worst_load(session, bus):.0f} % in the worst case; "
+            + (found or "no usual SYNC period, no number of buses and no packing would fit")
+        )

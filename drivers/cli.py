@@ -11,37 +11,51 @@ def bus_load(
     bitrate: Annotated[
         int | None, typer.Option("--bitrate", min=10_000, help="Bit rate in bit/s, instead of the configuration's.")
     ] = None,
+    data_bitrate: Annotated[
+        int | None, typer.Option("--data-bitrate", min=10_000, help="Data bit rate of CAN FD, with --bitrate.")
+    ] = None,
 ) -> None:
-    """Compute the load of the bus from a configuration, and refuse what cannot fit.
+    """Compute the load of every bus from a configuration, and refuse what cannot fit.
+
+    What does not fit is answered with the nearest configurations that would: the least change first.
 
     Example: armident bus-load --config tx40_cell.yaml --bitrate 1000000
     """
     from rich.console import Console
     from rich.table import Table
 
-    from configs import load_session
-    from drivers.bus_load import check_fits, loads
+    from configs import ConfigError, load_session
+    from drivers.bus_load import bus_loads, check_fits
 
     session = load_session(config)
+    if data_bitrate is not None and bitrate is None:
+        raise ConfigError("--data-bitrate: needs --bitrate")
     if bitrate is not None:
-        session = session.model_copy(update={"bus": session.bus.model_copy(update={"bitrate": bitrate})})
-    virtual = session.bus.bitrate is None
-    table = Table(title=f"{session.bus.channel}, SYNC every {session.sync.period_us} us")
-    table.add_column("message")
-    for heading in ("frames/s", "typical", "worst case"):
-        table.add_column(heading, justify="right")
-
-    def share(value: float) -> str:
-        return "-" if virtual else f"{100 * value:.1f} %"
-
-    rows = loads(session)
-    for row in rows:
-        table.add_row(row.message, f"{row.frames_per_s:.0f}", share(row.typical), share(row.worst))
-    table.add_section()
-    total = sum(row.frames_per_s for row in rows)
-    table.add_row("total", f"{total:.0f}", share(sum(r.typical for r in rows)), share(sum(r.worst for r in rows)))
+        buses = tuple(
+            bus.model_copy(update={"bitrate": bitrate, "data_bitrate": data_bitrate, "fd": data_bitrate is not None})
+            for bus in session.all_buses
+        )
+        session = session.model_copy(update={"buses": buses})
     console = Console()
-    console.print(table)
-    if virtual:
-        console.print("The bus is virtual: it has no bit rate to fill (--bitrate 1000000 shows a physical one).")
+    for bus in session.all_buses:
+        virtual = bus.bitrate is None
+        kind = "CAN FD" if bus.fd else "classic"
+        table = Table(title=f"{bus.channel} ({kind}), SYNC every {session.sync.period_us} us")
+        table.add_column("message")
+        for heading in ("frames/s", "typical", "worst case"):
+            table.add_column(heading, justify="right")
+
+        def share(value: float, hidden: bool = virtual) -> str:
+            return "-" if hidden else f"{100 * value:.1f} %"
+
+        rows = bus_loads(session, bus)
+        for row in rows:
+            table.add_row(row.message, f"{row.frames_per_s:.0f}", share(row.typical), share(row.worst))
+        table.add_section()
+        total = sum(row.frames_per_s for row in rows)
+        table.add_row("total", f"{total:.0f}", share(sum(r.typical for r in rows)), share(sum(r.worst for r in rows)))
+        console.print(table)
+    if all(bus.bitrate is None for bus in session.all_buses):
+        fd = " --data-bitrate 5000000" if session.all_buses[0].fd else ""
+        console.print(f"Virtual buses have no bit rate to fill (--bitrate 1000000{fd} shows physical ones).")
     check_fits(session, str(config))

@@ -5,7 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from configs import ConfigError, SessionConfig, load_session
-from drivers.bus_load import check_fits, exact_bits, fitting_period, frame_bits, loads
+from drivers.bus_load import check_fits, exact_bits, fd_frame_bits, fits, fitting_period, frame_bits, loads
+from drivers.bus_plan import alternatives
+from drivers.frames import FD_LENGTHS
 
 
 def on_a_physical_bus(period_us: int, drives: int = 6) -> SessionConfig:
@@ -51,3 +53,66 @@ def test_one_axis_at_five_kilohertz_fits_one_bus() -> None:
 
 def test_a_virtual_bus_has_no_bit_rate_to_exceed() -> None:
     check_fits(load_session("tx40_cell"))
+
+
+@pytest.mark.parametrize(("data_bitrate", "percent"), [(5_000_000, 45), (8_000_000, 32)])
+def test_six_axes_with_ten_samples_in_64_bytes_load_one_fd_bus_with_45_and_32_percent(
+    data_bitrate: int, percent: int
+) -> None:
+    """Six frames and one SYNC per ten samples at 5 kHz, without stuff bits in the data."""
+    nominal, data = fd_frame_bits(64)[0]
+    sync = sum(exact_bits(0x80, bytes([k])) for k in range(1, 241)) / 240
+    load = 500 * (6 * (nominal / 1e6 + data / data_bitrate) + sync / 1e6)
+    assert round(100 * load) == percent
+
+
+@given(st.sampled_from(FD_LENGTHS))
+def test_an_fd_frame_has_the_bits_of_iso_11898(n: int) -> None:
+    """Counted field by field: identifier, control, data, stuff count, CRC with fixed stuff bits, tail."""
+    (low_nominal, low_data), (high_nominal, high_data) = fd_frame_bits(n)
+    crc = 17 if n <= 16 else 21
+    fixed = 1 + (4 + crc) // 4
+    assert low_nominal + low_data == 1 + 11 + 5 + 1 + 4 + 8 * n + 4 + crc + fixed + 1 + 2 + 7 + 3
+    stuffed = 1 + 11 + 5 + 1 + 4 + 8 * n
+    assert high_nominal + high_data - low_nominal - low_data == (stuffed - 1) // 4
+
+
+def physical(name: str, data_bitrate: int | None = None) -> SessionConfig:
+    session = load_session(name)
+    changed = {"bitrate": 1_000_000, "data_bitrate": data_bitrate}
+    return session.model_copy(update={"buses": tuple(b.model_copy(update=changed) for b in session.all_buses)})
+
+
+def test_the_shipped_sessions_of_several_buses_fit_physical_ones_as_they_say() -> None:
+    check_fits(physical("tx40_six_buses"))
+    check_fits(physical("tx40_one_fd", 5_000_000))
+    two = physical("tx40_two_fd", 5_000_000)
+    with pytest.raises(ConfigError, match="pack: 2 for samples"):
+        check_fits(two)
+    packed = two.streams["samples"].model_copy(update={"pack": 2})
+    check_fits(two.model_copy(update={"streams": {"samples": packed}}))
+
+
+def test_what_does_not_fit_is_answered_with_the_nearest_that_does() -> None:
+    session = on_a_physical_bus(200)
+    options = alternatives(session)
+    assert all(fits(option.session) for option in options)
+    assert [option.kinds for option in options] == sorted(option.kinds for option in options)
+    texts = [option.text for option in options]
+    assert texts[0] == "sync.period_us 1000"
+    assert "buses 6 instead of 1" in texts
+    assert any("fd: true" in text and "pack:" in text for text in texts)
+    # The smallest packing of each: one sample less in a frame would not fit.
+    packed = next(o for o in options if "pack:" in o.text and "buses" not in o.text).session
+    pack = packed.streams["samples"].pack
+    fewer = max(k for k in range(1, pack) if 240 % k == 0)
+    less = packed.streams["samples"].model_copy(update={"pack": fewer})
+    assert not fits(packed.model_copy(update={"streams": {"samples": less}}))
+
+
+def test_each_bus_carries_its_own_drives_and_every_sync() -> None:
+    rows = loads(physical("tx40_six_buses"))
+    per_bus = {row.bus for row in rows}
+    assert len(per_bus) == 6
+    assert sum(row.frames_per_s for row in rows if row.message.startswith("TPDO1")) == pytest.approx(30_000)
+    assert sum(row.frames_per_s for row in rows if row.message == "SYNC") == pytest.approx(30_000)
