@@ -118,7 +118,14 @@ def _opener(bus: Bus, number: int, order: Order) -> Callable[[], FrameBus]:
     return lambda: open_bus(bus, filters=order.filters(number), errors=True, hardware=True)
 
 
-def run_capture(config: str, out: Path | None, duration: float | None, listen_only: bool, as_json: bool) -> None:
+def run_capture(
+    config: str,
+    out: Path | None,
+    duration: float | None,
+    listen_only: bool,
+    as_json: bool,
+    sniff_s: float | None = None,
+) -> None:
     """``armident capture``: runs until it is over, SIGINT or SIGTERM, and tells how it went.
 
     Raises
@@ -128,14 +135,15 @@ def run_capture(config: str, out: Path | None, duration: float | None, listen_on
     ArmidentError
         If the bus or a drive failed on the way; the file is finished then too.
     """
-    order = prepare(config, out, duration, listen_only)
+
+    def say(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    order = prepare(config, out, duration, listen_only, sniff_s, say)
     stop, save = threading.Event(), threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: save.set())
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-
-    def say(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
 
     done = capture(order, stop, say, save)
     rows, gaps = done.counters["samples.rows"], done.counters["samples.in_gaps"]

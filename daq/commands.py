@@ -11,18 +11,23 @@ def capture(
     out: Annotated[Path | None, typer.Option("--out", help="Directory of recordings; default: the session's.")] = None,
     duration: Annotated[float | None, typer.Option("--duration", help="Stop after so many seconds.", min=0.001)] = None,
     listen_only: Annotated[bool, typer.Option("--listen-only", help="Send nothing at all to the bus.")] = False,
+    sniff: Annotated[
+        float | None,
+        typer.Option("--sniff", min=0.1, help="With --listen-only: find out in so many seconds what drives send."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print path and counters as JSON.")] = False,
 ) -> None:
     """Record the drives of a session to an MCAP file and publish them on Zenoh.
 
     Starts and supervises the drives, plays the session's trajectory if it has one, and ends when that is over, after
-    --duration, or on Ctrl-C or SIGTERM; the file is finished in every case.
+    --duration, or on Ctrl-C or SIGTERM; the file is finished in every case. With --listen-only nothing is sent, not
+    even to configure the drives: what they send is what the session says, or with --sniff what is heard.
 
     Example: armident capture --config tx40_cell.yaml --out recordings
     """
     from daq.capture import run_capture
 
-    run_capture(config, out, duration, listen_only, as_json)
+    run_capture(config, out, duration, listen_only, as_json, sniff)
 
 
 def command(

@@ -1,9 +1,11 @@
 """What a capture is to do, loaded and checked before anything is touched."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from configs import ConfigError, RobotConfig, SessionConfig, Trajectory, load_robot, load_session, load_trajectory
+from daq.sniffing import sniff
 from daq.streams import CapturedStream, bus_numbers, captured_streams
 from drivers.bus_load import check_fits
 from drivers.frames import Filter
@@ -40,8 +42,15 @@ class Order:
         return [(can_id, COB_MASK) for can_id in wanted]
 
 
-def prepare(config: str | Path, out: Path | None, duration: float | None, listen_only: bool) -> Order:
-    """Load and check everything a capture needs.
+def prepare(
+    config: str | Path,
+    out: Path | None,
+    duration: float | None,
+    listen_only: bool,
+    sniff_s: float | None = None,
+    say: Callable[[str], None] = print,
+) -> Order:
+    """Load and check everything a capture needs; with ``sniff_s`` listen for so long for what the drives send.
 
     Raises
     ------
@@ -51,6 +60,10 @@ def prepare(config: str | Path, out: Path | None, duration: float | None, listen
     session = load_session(config)
     robot = load_robot(session.robot)
     check_fits(session, str(config))
+    if sniff_s is not None:
+        if not listen_only:
+            raise ConfigError("--sniff: only with --listen-only; otherwise drives are configured as the session says")
+        session = sniff(session, sniff_s, say)
     trajectory = None
     if session.setpoints is not None and not listen_only:
         if session.sync.role != "producer":

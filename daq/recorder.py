@@ -238,6 +238,7 @@ class Recorder:
             self._master.stop()
         sent = self._producer.sent if self._producer is not None else None
         self.sink.take(self._assembler.finish(sent))
+        self._happenings.look_for_other_mappings()
 
     def _rest(self, seconds: float) -> None:
         """Go on recording for so long."""

@@ -1,0 +1,125 @@
+"""Listening only: nothing of ours is on the bus, and what the drives send is found out or refused."""
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from configs import config_path
+from daq.recording import read_recording
+from drivers.frames import Frames, frames
+from drivers.socketcan import RawSocket
+from tests.integration.test_several_buses_vcan import session_file, start
+
+pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
+
+PERIOD_S = 0.005
+SYNC = {"role": "producer", "period_us": 5000, "counter": 240}
+
+
+class Strangers:
+    """Six drives and their master, of which we know nothing: SYNC, and a TPDO of each."""
+
+    def __init__(self, channel: str, length: int, every: int = 1) -> None:
+        self.heard: list[Frames] = []
+        self._length, self._every = length, every
+        self._bus = RawSocket(channel)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        k, batch, begin = 0, frames(256), time.monotonic()
+        while not self._stop.wait(max(0.0, begin + k * PERIOD_S - time.monotonic())):
+            counter = k % 240 + 1
+            due = counter % self._every == 0
+            out = frames(7 if due else 1)
+            out["can_id"][0], out["length"][0], out["data"][0, 0] = 0x80, 1, counter
+            if due:
+                out["can_id"][1:], out["length"][1:] = 0x180 + np.arange(1, 7), self._length
+                out["data"][1:, :4] = np.full((6, 1), k, "<i4").view(np.uint8)
+            self._bus.send(out)
+            # A socket does not hear itself: what comes here is somebody else's.
+            if got := self._bus.receive(batch):
+                self.heard.append(batch[:got].copy())
+            k += 1
+
+    def __enter__(self) -> "Strangers":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._bus.close()
+
+
+@contextmanager
+def nothing_of_ours(channel: str, length: int, every: int = 1) -> Iterator[None]:
+    """The strangers on the bus, who hear nothing but themselves."""
+    with Strangers(channel, length, every) as strangers:
+        yield
+    assert strangers.heard == []
+
+
+def listening(channel: str, folder: Path, *options: Any, **changes: Any) -> tuple[int, str, str]:
+    """Exit code, output and errors of a capture that listens for two seconds."""
+    session = session_file(folder, "tx40_replay.yaml", [channel] * 6, sync=SYNC, **changes)
+    process = start(
+        "capture", "--config", session, "--out", folder / "out", "--listen-only", "--duration", "2", "--json", *options
+    )
+    out, err = process.communicate(timeout=100)
+    return process.returncode, out, err
+
+
+def test_the_mapping_of_the_session_is_recorded_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
+    with nothing_of_ours(vcan_bus, 8):
+        code, out, err = listening(vcan_bus, tmp_path)
+    assert code == 0, err
+    recording = read_recording(json.loads(out)["recording"])
+    assert recording.counters["samples.rows"] >= 300
+    assert recording.gaps == ()
+    assert np.all(np.diff(recording.samples.raw["position"][:, 0]) == 1)
+
+
+def test_an_eds_that_fits_what_is_heard_is_recorded_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
+    """The session says eight bytes; six are heard, as the drives' EDS has them."""
+    text = config_path("eds/cia402_servo.eds").read_text()
+    begin, end = text.index("[1A00sub0]"), text.index("[1A00sub3]")
+    mapped = text[begin:end].replace("DefaultValue=1\n", "DefaultValue=2\n")
+    mapped = mapped.replace("0x60410010", "0x60640020").replace("DefaultValue=0\n", "DefaultValue=0x60780010\n")
+    eds = tmp_path / "drive.eds"
+    eds.write_text(text[:begin] + mapped + text[end:])
+    drives = [{"joint": f"joint_{k}", "node_id": k, "eds": str(eds)} for k in range(1, 7)]
+    with nothing_of_ours(vcan_bus, 6):
+        code, out, err = listening(vcan_bus, tmp_path, "--sniff", "1", drives=drives)
+    assert code == 0, err
+    assert "TPDO1 is samples: position, current on every 1. SYNC, as the EDS says" in err
+    recording = read_recording(json.loads(out)["recording"])
+    assert sorted(recording.samples.raw) == ["current", "position"]
+    assert recording.counters["samples.rows"] >= 300
+
+
+def test_what_nobody_can_tell_is_refused_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
+    with nothing_of_ours(vcan_bus, 5):
+        code, _, err = listening(vcan_bus, tmp_path, "--sniff", "1")
+    assert code == 2
+    assert "181h with 5 bytes, every 1 SYNC" in err
+    assert "say in streams what the TPDO holds" in err
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_a_tpdo_of_another_length_than_mapped_is_noticed(vcan_bus: str, tmp_path: Path) -> None:
+    with nothing_of_ours(vcan_bus, 6):
+        code, out, err = listening(vcan_bus, tmp_path)
+    assert code == 0, err
+    assert "joint_1: TPDO of samples has another length than mapped; was its mapping changed?" in err
+    recording = read_recording(json.loads(out)["recording"])
+    assert recording.counters["samples.rows"] == 0
+    assert recording.counters["tpdo_wrong_length"] > 1000
+    assert {gap.reason for gap in recording.gaps} == {"wrong length"}
