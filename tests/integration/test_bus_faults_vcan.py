@@ -1,0 +1,110 @@
+"""Faults of buses and drives while they are captured: told, counted, and over when they are over."""
+
+import json
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.recording import read_recording
+from drivers.frames import ERROR_FLAG, frame, frames
+from drivers.objects import NmtCommand
+from drivers.receiver import BusEvent, Receiver
+from drivers.socketcan import RawSocket
+from drivers.vcan import ensure_vcan, remove_vcan
+from tests.integration.test_several_buses_vcan import (
+    SLOW,
+    every_sync_is_accounted_for,
+    robot,
+    session_file,
+    start,
+    wait_until_it_says,
+)
+
+pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
+
+
+def events_until(receiver: Receiver, kind: str) -> list[BusEvent]:
+    """Events up to the first of a kind; frames are read meanwhile."""
+    found: list[BusEvent] = []
+    deadline = time.monotonic() + 10
+    while not any(event.kind == kind for event in found):
+        assert time.monotonic() < deadline, found
+        list(receiver.drain())
+        found += receiver.events()
+        time.sleep(0.01)
+    return found
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_a_bus_that_is_back_is_read_again(vcan_buses: list[str], removed: bool) -> None:
+    """Down and up again with the same socket; removed and made again with a new one. The other bus goes on."""
+    names = vcan_buses
+    with Receiver([lambda name=name: RawSocket(name) for name in names]) as receiver:  # type: ignore[misc]
+        socket = receiver._lines[1].bus
+        if removed:
+            remove_vcan(names[1])
+        else:
+            subprocess.run(["ip", "link", "set", names[1], "down"], check=True)
+        (down,) = events_until(receiver, "bus_down")
+        assert (down.bus, receiver.down, receiver.all_down_s) == (1, (False, True), 0.0)
+        with RawSocket(names[0], filters=()) as other:
+            other.send(frame(0x123))
+        assert [(k, batch["can_id"].tolist()) for k, batch, _ in receiver.drain()] == [(0, [0x123])]
+        ensure_vcan(names[1])
+        events_until(receiver, "bus_up")
+        assert receiver.down == (False, False)
+        assert (receiver._lines[1].bus is socket) is not removed
+        with RawSocket(names[1], filters=()) as other:
+            other.send(frame(0x124))
+        assert [(k, batch["can_id"].tolist()) for k, batch, _ in receiver.drain()] == [(1, [0x124])]
+
+
+def test_error_frames_are_taken_out_counted_and_told(vcan_bus: str) -> None:
+    with (
+        Receiver([lambda: RawSocket(vcan_bus, errors=True)]) as receiver,
+        RawSocket(vcan_bus, filters=()) as sender,
+    ):
+        sent = frames(4)
+        sent["can_id"], sent["length"] = [0x181, ERROR_FLAG | 0x40, 0x182, ERROR_FLAG | 0x100], 8
+        sender.send(sent)
+        batches = [batch for _, batch, _ in receiver.drain()]
+        assert np.concatenate(batches)["can_id"].tolist() == [0x181, 0x182]
+        assert receiver.error_frames == 2
+        assert [event.kind for event in receiver.events()] == ["bus_off", "bus_restarted"]
+
+
+def test_a_drive_that_boots_again_is_configured_and_its_errors_are_told(vcan_bus: str, tmp_path: Path) -> None:
+    texts = {0xFF01: "encoder battery low"}
+    session = session_file(tmp_path, "tx40_replay.yaml", [vcan_bus] * 6, sync=SLOW, emcy_texts=texts)
+    with robot(session):
+        process = start("capture", "--config", session, "--out", tmp_path / "out", "--json")
+        said = wait_until_it_says(process, "recording to")
+        time.sleep(1.5)
+        with RawSocket(vcan_bus, filters=()) as other:
+            other.send(frame(0x82, bytes([0x01, 0xFF, 0x81, 1, 2, 0, 0, 0])))
+            said += wait_until_it_says(process, "EMCY")
+            error = frame(0x0)
+            error["can_id"], error["length"] = ERROR_FLAG | 0x20, 8
+            other.send(error)
+            other.send(frame(0, bytes([NmtCommand.RESET_NODE, 2])))
+        said += wait_until_it_says(process, "configured again")
+        time.sleep(2.0)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, said + err
+    assert "node 2 (joint_2): EMCY FF01h, encoder battery low (error register 81h, manufacturer 01 02 00 00 00)" in said
+    assert "node 2 (joint_2): has booted again" in said
+    recording = read_recording(json.loads(out)["recording"])
+    gaps = every_sync_is_accounted_for(recording)
+    assert gaps
+    assert {gap.joint for gap in recording.gaps} == {"joint_2"}
+    assert recording.counters["rebooted"] == 1
+    assert recording.counters["emcy"] >= 1
+    assert recording.counters["error_frames"] == 1
+    # It answers again: what came last is complete.
+    assert recording.samples.sync[-1] == recording.counters["sync_sent"] - 1
+    assert any("configured again" in mark.text for mark in recording.marks)
