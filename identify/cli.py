@@ -162,7 +162,9 @@ def history(
 
 def trajectory(
     config: Annotated[Path, typer.Option("--config", help="Robot configuration.")],
-    out: Annotated[Path, typer.Option("--out", help="Trajectory file to write (.yaml).")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Trajectory file to write (.yaml). [needed without --look-at]")
+    ] = None,
     duration: Annotated[float, typer.Option(min=1.0, help="Length, s.")] = 7.5,
     seed: Annotated[int, typer.Option(help="Start of the random search.")] = 0,
     known: Annotated[
@@ -175,14 +177,31 @@ def trajectory(
     ] = None,
     joint: Annotated[str | None, typer.Option(help="Joint at which it is to show. [default: all]")] = None,
     against: Annotated[str | None, typer.Option(help="Another effect, from which it is to be told.")] = None,
+    shape: Annotated[
+        str, typer.Option(help="moves (point to point, trapezoidal velocities) or fourier (finite Fourier sums).")
+    ] = "moves",
+    harmonics: Annotated[
+        int | None, typer.Option(min=2, help="Of fourier. [default: up to 1.6 Hz, at least five]")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of it against the limits (.png, .svg, .pdf). [default: beside --out]")
+    ] = None,
+    look_at: Annotated[
+        Path | None, typer.Option(help="Design nothing: check this trajectory, draw it, say what it will tell.")
+    ] = None,
 ) -> None:
     """Design an exciting trajectory inside the limits of a robot, for the base parameters or for one effect.
 
+    Before anything moves it draws positions, velocities, accelerations and torques against their limits, and prints the
+    standard deviation to expect of every base parameter.
+
     Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
-    from identify.service import trajectory_command
+    from identify.trajectory_command import trajectory_command
 
-    trajectory_command(config, out, duration, seed, known, evaluations, wanted, joint, against)
+    trajectory_command(
+        config, out, duration, seed, known, evaluations, wanted, joint, against, shape, harmonics, picture, look_at
+    )
 
 
 def reproduce(

@@ -1,7 +1,8 @@
 """Excitation design: reference trajectories that condition the base regressor well (thesis section 2.3.5).
 
-The trajectory is a sequence of point-to-point moves within the limits. Waypoints and paces are improved by
-random search on the information in the base regressor, weighted by the torque noise of each joint:
+The trajectory is a sequence of point-to-point moves within the limits, or a finite Fourier sum per joint. Waypoints and
+paces, or coefficients, are improved by random search on the information in the base regressor, weighted by the torque
+noise of each joint:
 the smallest geometric mean of the standard deviations, with a condition number under `identify.moves.CONDITION`.
 The condition number alone would choose slow moves, whose gravity torques are as small as their inertial ones.
 
@@ -11,6 +12,7 @@ two effects beside each other, and keeps the base parameters in sight.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,10 +20,20 @@ from scipy.signal import butter, sosfiltfilt
 
 from configs import ConfigError, RobotConfig, Trajectory
 from identify.aim import Aim, aim_for
+from identify.fourier import FourierSearch
 from identify.model.arm import ArmModel
 from identify.model.chain import Floats
 from identify.moves import CUTOFF, SEARCH_RATE, Search, equations_of, motion_of, slow_share
 from identify.signals.decimate import design
+
+Shape = Literal["moves", "fourier"]
+C = TypeVar("C")
+
+PERIOD = 1e-3
+"""A designed trajectory is judged at this period, s."""
+
+ASSUMED_NOISE = 0.02
+"""Torque noise below the cut-off that is supposed where nothing is known, relative to the torque limit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +48,7 @@ class Design:
         Condition number of the filtered, weighted base regressor along it.
     std
         Predicted standard deviation of each base parameter, shape (b,), in its unit; ``None`` if the noise is
-        unknown.
+        neither known nor supposed.
     slow_share
         Share of the samples of each joint, shape (n,), slower than `identify.moves.SLOW` of its velocity limit: they
         say little about its friction.
@@ -46,6 +58,8 @@ class Design:
     condition: float
     std: Floats | None
     slow_share: Floats
+    torque: Floats | None = None
+    """Predicted torques along it, (N, n) at `PERIOD`; ``None`` where the robot's parameters are unknown."""
     wanted: dict[str, float] | None = None
     """Predicted standard deviations of the linear parameters of wanted effects; ``None`` as for ``std``."""
 
@@ -60,6 +74,8 @@ def design_trajectory(
     margin: float = 0.9,
     theta: ArrayLike | None = None,
     aim: Aim | None = None,
+    shape: Shape = "moves",
+    harmonics: int | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Design:
     """Design an exciting trajectory by random search.
@@ -82,6 +98,8 @@ def design_trajectory(
         their limits too.
     aim
         Effects that the trajectory is to show; those that depend on torques need ``theta``.
+    shape, harmonics
+        Point-to-point moves with trapezoidal velocities, or Fourier sums of so many harmonics.
     progress
         Called with the share done, 0 to 1.
 
@@ -96,19 +114,41 @@ def design_trajectory(
     if sigma.shape != (robot.n,) or not (sigma > 0.0).all():
         raise ConfigError(f"noise: expected {robot.n} positive numbers for {robot.name}")
     search = Search(robot, model, duration, sigma, margin, theta, aim, np.random.default_rng(seed))
-    best = search.random()
-    cost = search.cost(best)
+    if shape == "fourier":
+        trajectory = _search(FourierSearch(search, harmonics), evaluations, progress)
+    elif harmonics is not None:
+        raise ConfigError("harmonics: only Fourier sums have them; choose the shape fourier")
+    else:
+        trajectory = _search(search, evaluations, progress)
+    trajectory.check(robot, "designed trajectory")
+    return assess(model, trajectory, sigma, known_noise=noise is not None, theta=theta, aim=aim)
+
+
+class _Candidates(Protocol[C]):
+    """What is searched: candidates, their neighbours, their cost."""
+
+    def random(self) -> C: ...
+
+    def neighbour(self, candidate: C) -> C: ...
+
+    def cost(self, candidate: C) -> float: ...
+
+    def trajectory(self, candidate: C) -> Trajectory: ...
+
+
+def _search(among: _Candidates[C], evaluations: int, progress: Callable[[float], None] | None) -> Trajectory:
+    """The best trajectory found."""
+    best = among.random()
+    cost = among.cost(best)
     for count in range(evaluations):
         # The first fifth looks around, the rest improves the best so far.
-        candidate = search.random() if count < evaluations // 5 else search.neighbour(best)
-        candidate_cost = search.cost(candidate)
+        candidate = among.random() if count < evaluations // 5 else among.neighbour(best)
+        candidate_cost = among.cost(candidate)
         if candidate_cost < cost:
             best, cost = candidate, candidate_cost
         if progress is not None and count % 50 == 0:
             progress(count / evaluations)
-    trajectory = search.trajectory(best)
-    trajectory.check(robot, "designed trajectory")
-    return assess(model, trajectory, sigma, known_noise=noise is not None, theta=theta, aim=aim)
+    return among.trajectory(best)
 
 
 def aimed_at(
@@ -156,8 +196,9 @@ def assess(
     theta, aim
         As for `design_trajectory`.
     """
-    period = 1e-3
+    period = PERIOD
     q, qd, qdd = motion_of(trajectory, period)
+    torque = None if theta is None else model.inverse_dynamics(theta, q, qd, qdd)
     x = model.base_regressor(q, qd, qdd, dt=period)
     keep = max(1, round(0.5 / (cutoff_hz * period)))
     sections = butter(4, 2.0 * cutoff_hz * period, output="sos")
@@ -170,4 +211,4 @@ def assess(
         decimation = design(period, cutoff_hz, keep)
         motion = (model if theta is None else model.anchored(theta)).motion(q, qd, qdd, period)
         wanted = aim.std(motion, *equations_of(model, motion, decimation, np.asarray(noise, dtype=np.float64)))
-    return Design(trajectory, float(singular[0] / singular[-1]), std, slow_share(model.robot, qd), wanted)
+    return Design(trajectory, float(singular[0] / singular[-1]), std, slow_share(model.robot, qd), torque, wanted)

@@ -155,9 +155,13 @@ class Search:
         lengths = np.diff(np.vstack([self.home, candidate.points]), axis=0)
         if (durations < np.maximum(self._shortest(lengths), SHORTEST_MOVE)).any():
             return np.inf
+        return self.worth(self.trajectory(candidate))
+
+    def worth(self, trajectory: Trajectory) -> float:
+        """Cost of a trajectory that keeps the limits of motion; infinite where it exceeds those of torque."""
         factor = 1 if self.aim is None else AIM_FACTOR
         period = 1.0 / (factor * SEARCH_RATE)
-        q, qd, qdd = motion_of(self.trajectory(candidate), period)
+        q, qd, qdd = motion_of(trajectory, period)
         if self.theta is not None:
             torque = self.model.inverse_dynamics(self.theta, q, qd, qdd)
             if (np.abs(torque) > self.torque).any():

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from configs import ConfigError, DataError, RobotConfig, load_robot
+from configs import DataError, RobotConfig, load_robot
 from daq.recording import Recording, read_recording
 from identify.document import (
     IdentificationDocument,
@@ -154,50 +154,6 @@ def diagnose_command(
         if document.model is not None:
             print(f"model:  {document.model}")
     return 0 if document.verdict == "no_gap" else FOUND
-
-
-def trajectory_command(
-    config: Path,
-    out: Path,
-    duration: float,
-    seed: int,
-    known: Path | None,
-    evaluations: int,
-    wanted: str | None = None,
-    joint: str | None = None,
-    against: str | None = None,
-) -> None:
-    """Carry out ``armident trajectory``."""
-    from identify.excitation import aimed_at, design_trajectory
-    from identify.prior import prior_from
-    from identify.terminal import design_table, progress, wanted_table
-
-    robot = load_robot(config)
-    if out.suffix not in {".yaml", ".yml"}:
-        raise ConfigError(f"--out {out}: expected a file name that ends in .yaml")
-    prior = None
-    if known is not None:
-        prior = prior_from(load_document(known, IdentificationDocument), robot, str(known))
-    theta = None if prior is None else prior.theta
-    aim = aimed_at(robot, wanted, joint, against, theta)
-    with progress("trajectory") as report:
-        design = design_trajectory(
-            robot,
-            duration,
-            seed,
-            noise=None if prior is None else prior.noise,
-            evaluations=evaluations,
-            theta=theta,
-            aim=aim,
-            progress=lambda share: report("searching", share),
-        )
-    text = yaml.safe_dump(design.trajectory.model_dump(mode="json", by_alias=True), sort_keys=False)
-    write_atomically(out, text)
-    if prior is not None and design.std is not None:
-        design_table(robot, prior.theta, design.std)
-    if design.wanted is not None:
-        wanted_table(design.wanted)
-    print(f"{out}: {design.trajectory.duration:.2f} s, condition number {design.condition:.0f}")
 
 
 def robot_yaml(robot: RobotConfig) -> str:

@@ -76,12 +76,16 @@ def warn(lines: list[str]) -> None:
         print(f"armident: warning: {line}", file=sys.stderr)
 
 
-def design_table(robot: RobotConfig, theta: NDArray[np.float64], std: NDArray[np.float64]) -> None:
-    """What a designed trajectory will tell: base parameters (b,) and their predicted standard deviations."""
+def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:
+    """What a trajectory will tell: base parameters (b,), as far as known, and their predicted standard deviations."""
     table = Table(title=f"{robot.name}: predicted precision, base parameters", title_justify="left")
-    for column in ("parameter", "value", "std", "std %"):
+    names = ArmModel.from_config(robot).base.names
+    for column in ("parameter", "value", "std", "std %") if theta is not None else ("parameter", "std"):
         table.add_column(column, justify="left" if column == "parameter" else "right")
-    for name, value, deviation in zip(ArmModel.from_config(robot).base.names, theta, std, strict=True):
+    if theta is None:
+        for name, deviation in zip(names, std, strict=True):
+            table.add_row(name, f"{deviation:.4g}")
+    for name, value, deviation in () if theta is None else zip(names, theta, std, strict=True):
         relative = "" if value == 0 else f"{100 * deviation / abs(value):.1f}"
         table.add_row(name, f"{value:.4f}", f"{deviation:.4f}", relative)
     Console().print(table)
