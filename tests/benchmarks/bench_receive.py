@@ -30,6 +30,7 @@ DRAIN_S = 0.010
 MEMORY = Path("/dev/shm")
 """Where candump's log goes: the disk is no part of the comparison."""
 REPEATS = 3
+SEND_ATTEMPTS = 5000
 QUIET_S = 1.0
 """A receiver that has heard nothing for this long has seen the last frame."""
 
@@ -40,7 +41,7 @@ def _send_paced(descriptor, address, burst, bursts, period):  # type: ignore[no-
     begin = monotonic_ns(spec)
     for k in range(bursts):
         sleep_until(begin + k * period, spec)
-        if send_messages(descriptor, address, burst, spec):
+        if send_messages(descriptor, address, burst, SEND_ATTEMPTS, spec):
             return k * burst
     return bursts * burst
 
