@@ -1,13 +1,12 @@
 """Frame by frame through what is on the bus, compiled: the first thing that a moving arm must not do."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
 from configs import ConfigError, RobotConfig, SessionConfig
-from configs.session import ObjectName
+from configs.session import Stream
 from daq.guard.limits import (
     HEARTBEAT_MARGIN_S,
     HEARTBEATS_MISSED,
@@ -17,7 +16,7 @@ from daq.guard.limits import (
     VELOCITY_S,
     Limits,
 )
-from daq.streams import counts_per_si, node_ids
+from daq.streams import bus_numbers, counts_per_si, node_ids
 from drivers.frames import Frames
 from drivers.objects import (
     COB_EMCY,
@@ -38,9 +37,11 @@ SYNC, SAMPLE, DEMAND, SETPOINT, EMCY, HEARTBEAT, NMT = range(7)
 QUIET, POSITION, VELOCITY, TORQUE, FOLLOWING, EMERGENCY, STATE, SILENT, NO_SYNC = range(9)
 """What can be wrong."""
 
-ARMED, LAST_SYNC, SINCE_SETPOINT, JOINT, FRAME = range(5)
-"""Places in the state: whether set points are played, when SYNC came (ns), how many since a set point; then joint and
-frame of an alarm."""
+ARMED, JOINT, FRAME = range(3)
+"""Places in the state: whether set points are played; then joint and frame of an alarm."""
+
+LAST, SINCE = range(2)
+"""Rows of what is known of SYNC on every bus: when the last one came (ns), and how many since a set point."""
 
 ARMED_STATE = int(NmtState.OPERATIONAL)
 
@@ -54,7 +55,7 @@ class Alarm:
 
 
 class Watch:
-    """What was on the bus so far; give it every batch of frames.
+    """What was on the buses so far; give it every batch of frames.
 
     It is armed by the first set point and disarmed by the NMT command that ends the motion.
 
@@ -75,15 +76,17 @@ class Watch:
         if session.setpoints is None:
             raise ConfigError("setpoints: a session without them moves nothing, there is nothing to guard")
         self._robot, self._limits, n = robot, limits, robot.n
-        self._kind = np.full(IDENTIFIERS, -1, np.int64)
-        self._joint = np.zeros(IDENTIFIERS, np.int64)
+        shape = len(session.all_buses), IDENTIFIERS
+        self._kind, self._joint = np.full(shape, -1, np.int64), np.zeros(shape, np.int64)
         self._at = np.full(3, -1, np.int64)
         self._identify(session, robot)
-        period = session.sync_period
+        # Of a packed TPDO the newest sample is looked at.
+        pack = session.streams["samples"].pack
+        period = session.sync_period * pack
         self._per_count = np.linalg.inv(robot.transmission_matrix) / counts_per_si(robot)
         torque = np.array([joint.drive.gain * joint.drive.rated / 1000.0 for joint in robot.joints])
         self._per_mille = robot.transmission_matrix.T * torque
-        velocity, mean = max(1, round(VELOCITY_S / period)), max(TORQUE_SAMPLES, round(TORQUE_S / period))
+        velocity, mean = max(1, round(VELOCITY_S / period)), max(TORQUE_SAMPLES // pack, round(TORQUE_S / period), 1)
         self._positions, self._efforts = np.zeros((velocity + 1, n), np.int64), np.zeros((mean, n))
         self._samples = np.zeros(n, np.int64)
         self._velocity_s = velocity * period
@@ -91,7 +94,8 @@ class Watch:
         self._raw, self._seen = np.zeros((3, n), np.int64), np.zeros(n, np.bool_)
         self._demanded = np.zeros(n, np.bool_)
         self._beat = np.zeros(n, np.int64)
-        self._state = np.zeros(5, np.int64)
+        self._state, self._sync = np.zeros(3, np.int64), np.zeros((2, len(session.all_buses)), np.int64)
+        self._vendor = session.emcy_texts
         self._value = np.zeros(2)
         heartbeat = HEARTBEATS_MISSED * session.heartbeat_ms * 1e-3 + HEARTBEAT_MARGIN_S
         self._silence = round(heartbeat * 1e9)
@@ -100,17 +104,17 @@ class Watch:
         """Which identifier means what; the drives' own demand is taken where they send it, else the set points."""
         nodes = node_ids(session, robot)
         samples = session.streams["samples"]
-        at = _places(samples.objects)
+        at = _places(samples)
         if "position" not in at:
             raise ConfigError("streams.samples.objects: the guard needs the position of every drive")
         self._at[:] = at["position"], at.get("current", at.get("torque", -1)), 0
-        self._kind[[COB_SYNC, COB_NMT]] = SYNC, NMT
+        self._kind[:, [COB_SYNC, COB_NMT]] = SYNC, NMT
         assert session.setpoints is not None
         told = None
         for stream in session.streams.values():
             if "demand" in stream.objects and stream is not samples:
                 told = stream
-        for j, node in enumerate(nodes):
+        for j, (node, bus) in enumerate(zip(nodes, bus_numbers(session, robot), strict=True)):
             kinds = {
                 tpdo_cob(samples.tpdo, node): SAMPLE,
                 rpdo_cob(session.setpoints.rpdo, node): SETPOINT,
@@ -120,22 +124,21 @@ class Watch:
             if told is not None:
                 kinds[tpdo_cob(told.tpdo, node)] = DEMAND
             for identifier, kind in kinds.items():
-                self._kind[identifier], self._joint[identifier] = kind, j
+                self._kind[bus, identifier], self._joint[bus, identifier] = kind, j
         self._own_demand = told is not None
         if told is not None:
-            self._at[2] = _places(told.objects)["demand"]
+            self._at[2] = _places(told)["demand"]
 
-    @property
-    def identifiers(self) -> list[int]:
-        """COB-IDs that it wants to see."""
-        return [int(k) for k in np.flatnonzero(self._kind >= 0)]
+    def identifiers(self, bus: int) -> list[int]:
+        """COB-IDs that it wants to see of a bus."""
+        return [int(k) for k in np.flatnonzero(self._kind[bus] >= 0)]
 
     @property
     def armed(self) -> bool:
         """Whether set points are being played."""
         return bool(self._state[ARMED])
 
-    def look(self, frames: Frames, now_ns: int) -> Alarm | None:
+    def look(self, frames: Frames, now_ns: int, bus: int = 0) -> Alarm | None:
         """Take frames, in the order in which they were on the bus; the first reason to stop, if there is one.
 
         Parameters
@@ -143,14 +146,18 @@ class Watch:
         frames
             What came since the last call, shape (N,), N from 0.
         now_ns
-            Monotonic time of this call.
+            Monotonic time before they were taken.
+        bus
+            Number of the bus, in the order of the session.
         """
         limits = self._limits
         code = _look(
-            frames["can_id"], frames["length"], frames["data"], now_ns, self._kind, self._joint, self._at,
-            self._own_demand, self._every, self._raw, self._seen, self._demanded, self._beat, self._silence,
+            frames["can_id"], frames["length"], frames["data"], now_ns, bus,
+            self._kind[bus], self._joint[bus], self._at, self._own_demand, self._every,
+            self._raw, self._seen, self._demanded, self._beat, self._silence,
             self._per_count, self._per_mille, self._positions, self._efforts, self._samples, self._velocity_s,
-            limits.low, limits.high, limits.velocity, limits.torque, limits.following, self._state, self._value,
+            limits.low, limits.high, limits.velocity, limits.torque, limits.following,
+            self._state, self._sync, self._value,
         )  # fmt: skip
         return None if code == QUIET else Alarm(self._text(code), int(self._state[FRAME]))
 
@@ -168,7 +175,7 @@ class Watch:
         if code == FOLLOWING:
             return f"{joint.name}: following error {found:.4f} {unit}, allowed is {allowed:g}"
         if code == EMERGENCY:
-            return f"{joint.name}: EMCY {int(found):04X}h, {emcy_text(int(found))}"
+            return f"{joint.name}: EMCY {int(found):04X}h, {emcy_text(int(found), self._vendor)}"
         if code == STATE:
             return f"{joint.name}: its drive has left the NMT state operational (state {int(found)})"
         if code == SILENT:
@@ -176,10 +183,11 @@ class Watch:
         return f"no SYNC for {found:.2f} s in the middle of the motion; has the capture died?"
 
 
-def _places(objects: Sequence[ObjectName]) -> dict[str, int]:
-    """First byte of each object in its TPDO."""
-    at, places = 0, {}
-    for mapped in TpdoLayout.of(objects).objects:
+def _places(stream: Stream) -> dict[str, int]:
+    """First byte of each object in the TPDO of a stream, of the newest sample where it is packed."""
+    layout = TpdoLayout.of(stream.objects, "streams", stream.pack, fd=True)
+    at, places = layout.size * (stream.pack - 1), {}
+    for mapped in layout.objects:
         places[mapped.name] = at
         at += mapped.bits // 8
     return places
@@ -237,9 +245,9 @@ def _examine(  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _look(  # type: ignore[no-untyped-def]
-    ids, lengths, data, now, kinds, joints, at, own_demand, every, raw, seen, demanded, beat, silence,
+    ids, lengths, data, now, bus, kinds, joints, at, own_demand, every, raw, seen, demanded, beat, silence,
     per_count, per_mille, positions, efforts, samples, velocity_s,
-    low, high, velocity, torque, following, state, value,
+    low, high, velocity, torque, following, state, sync, value,
 ):  # fmt: skip
     """All frames of a batch, then the silences."""
     for k in range(ids.size):
@@ -251,8 +259,8 @@ def _look(  # type: ignore[no-untyped-def]
         if kind == NMT:
             state[ARMED] = 0
         elif kind == SYNC:
-            state[LAST_SYNC] = now
-            state[SINCE_SETPOINT] += 1
+            sync[LAST, bus] = now
+            sync[SINCE, bus] += 1
         elif kind == HEARTBEAT and lengths[k] >= 1:
             beat[j] = now
             if state[ARMED] and data[k, 0] != ARMED_STATE:
@@ -265,12 +273,15 @@ def _look(  # type: ignore[no-untyped-def]
                 return EMERGENCY
         elif kind == SETPOINT and lengths[k] >= 4:
             if not state[ARMED]:
-                state[ARMED], state[LAST_SYNC] = 1, now
+                state[ARMED] = 1
+                sync[LAST, :] = now
+                # A bus that has had no set point yet has not lost SYNC either.
+                sync[SINCE, :] = every + 2
                 beat[:] = now
                 demanded[:] = False
                 samples[:] = 0
                 efforts[:] = 0.0
-            state[SINCE_SETPOINT] = 0
+            sync[SINCE, bus] = 0
             if not own_demand:
                 raw[2, j], demanded[j] = _number(data, k, 0, 4), True
         elif kind == DEMAND and lengths[k] >= at[2] + 4:
@@ -300,7 +311,8 @@ def _look(  # type: ignore[no-untyped-def]
                 state[JOINT], value[0] = j, (now - beat[j]) * 1e-9
                 return SILENT
         # Whoever ends a motion properly goes on with SYNC for a while after the last set point.
-        if state[SINCE_SETPOINT] <= every + 1 and now - state[LAST_SYNC] > silence:
-            value[0] = (now - state[LAST_SYNC]) * 1e-9
-            return NO_SYNC
+        for b in range(sync.shape[1]):
+            if sync[SINCE, b] <= every + 1 and now - sync[LAST, b] > silence:
+                value[0] = (now - sync[LAST, b]) * 1e-9
+                return NO_SYNC
     return QUIET

@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 
 from configs import RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
 from daq.guard import Watch, limits_of
-from daq.streams import counts_per_si
+from daq.streams import bus_numbers, counts_per_si, node_ids
 from drivers.frames import Frames, frames
-from drivers.objects import COB_SYNC, rpdo_cob, tpdo_cob
+from drivers.objects import COB_SYNC, TpdoLayout, rpdo_cob, tpdo_cob
 
 NOW = 1_000_000_000
 
@@ -35,11 +35,7 @@ def on_the_bus(robot: RobotConfig, q: NDArray[np.float64], current: NDArray[np.i
             rows.append((tpdo_cob(1, j + 1), position + permille.to_bytes(2, "little", signed=True) + b"\x37\x12"))
             if k % 5 == 0:
                 rows += [(tpdo_cob(2, j + 1), position), (rpdo_cob(1, j + 1), position)]
-    out = frames(len(rows))
-    for k, (identifier, data) in enumerate(rows):
-        out["can_id"][k], out["length"][k] = identifier, len(data)
-        out["data"][k, : len(data)] = np.frombuffer(data, np.uint8)
-    return out
+    return _frames(rows)
 
 
 def watch(session: SessionConfig, robot: RobotConfig) -> Watch:
@@ -119,3 +115,63 @@ def test_silence_is_judged_by_the_time_before_the_frames(session: SessionConfig,
     assert late is not None
     assert late.frame == -1
     assert late.text == "joint_1: no heartbeat for 0.40 s"
+
+
+def test_axes_on_several_buses_are_watched_together(robot: RobotConfig) -> None:
+    """Joint 6 is turned by the motors 5 and 6, each on a bus of its own; the newest of packed samples counts."""
+    session = moving(load_session("tx40_six_buses.yaml"))
+    guard = watch(session, robot)
+    t = np.arange(400) * session.sync_period
+    q = np.zeros((t.size, robot.n))
+    # Half their limits each, but both turn motor 6; then joint 6 alone goes too fast.
+    q[:, 4], q[:, 5] = 4.0 * t, 5.0 * t
+    q[200:, 5] += 8.0 * (t[200:] - t[199])
+    counts = np.rint(q @ robot.transmission_matrix.T * counts_per_si(robot)).astype(np.int64)
+    alarm, at = None, -1
+    for k in range(t.size):
+        for j, bus in enumerate(bus_numbers(session, robot)):
+            node, position = node_ids(session, robot)[j], int(counts[k, j]).to_bytes(4, "little", signed=True)
+            rows = [(COB_SYNC, bytes([k % 240 + 1])), (tpdo_cob(1, node), position + b"\0\0\x37\x12")]
+            if k % 5 == 0:
+                rows += [(rpdo_cob(1, node), position), (tpdo_cob(2, node), position)]
+            alarm = guard.look(_frames(rows), NOW, bus)
+            if alarm is not None:
+                at = k
+                break
+        if alarm is not None:
+            break
+    assert alarm is not None
+    assert alarm.text.startswith("joint_6: velocity")
+    # 13 rad/s from sample 200 on: the mean over 50 samples passes 12 after 50 * 7 / 8 of them.
+    assert 200 + 42 <= at <= 200 + 46
+
+
+def test_the_newest_of_packed_samples_is_looked_at(robot: RobotConfig) -> None:
+    packed = moving(load_session("tx40_one_fd.yaml"))
+    pack = packed.streams["samples"].pack
+    assert pack > 1
+    guard = watch(packed, robot)
+    node = node_ids(packed, robot)[2]
+    far = int(np.rint(2.5 * robot.transmission_matrix[2, 2] * counts_per_si(robot)[2]))
+    size = TpdoLayout.of(packed.streams["samples"].objects, pack=pack, fd=True).size
+    old, new = (value.to_bytes(4, "little", signed=True) + bytes(size - 4) for value in (0, far))
+    start = _frames([(rpdo_cob(1, node), bytes(4))], fd=True)
+    assert guard.look(start, NOW) is None
+    assert guard.look(_frames([(tpdo_cob(1, node), old * pack)], fd=True), NOW) is None
+    alarm = guard.look(_frames([(tpdo_cob(1, node), old * (pack - 1) + new)], fd=True), NOW)
+    assert alarm is not None
+    assert alarm.text.startswith("joint_3: position 2.5")
+
+
+def moving(session: SessionConfig) -> SessionConfig:
+    """A session that plays set points, too."""
+    setpoints = load_session("tx40_cell.yaml").setpoints
+    return session.model_copy(update={"setpoints": setpoints})
+
+
+def _frames(rows: list[tuple[int, bytes]], fd: bool = False) -> Frames:
+    out = frames(len(rows), fd=fd)
+    for k, (identifier, data) in enumerate(rows):
+        out["can_id"][k], out["length"][k] = identifier, len(data)
+        out["data"][k, : len(data)] = np.frombuffer(data, np.uint8)
+    return out
