@@ -9,28 +9,27 @@ from numpy.typing import NDArray
 
 from configs import DataError
 from daq.books import (
-    AMBIGUOUS,
     COUNT_NAMES,
     COUNTER,
-    LOST,
-    NO_SYNC,
+    HOLE,
     ORIGIN,
     RECEIVED,
     SYNC,
     SYNC_MISALIGNED,
-    WRONG_LENGTH,
+    TOP,
     Decided,
     Shape,
     open_books,
     room_for,
 )
+from daq.gaps import SYNC_LOST, OpenGaps
 from daq.matching import count_sync, finish, match
 from daq.recording import Gap
 
-SYNC_LOST = "SYNC not received"
 UNSENT = "pack not complete"
 """SYNCs after the last packed TPDO: no drive was to send their samples any more."""
-REASONS = {NO_SYNC: SYNC_LOST, LOST: "lost", WRONG_LENGTH: "wrong length", AMBIGUOUS: "ambiguous order"}
+__all__ = ["LATE_S", "SYNC_LOST", "UNSENT", "Assembler", "Batch", "Rows", "TpdoStream"]
+
 LATE_S = 4.0
 """A drive that owes an answer for longer than this while others have answered has lost it, s."""
 PATIENCE_S = 120.0
@@ -128,7 +127,7 @@ class Assembler:
             self._books.state[:, COUNTER] = (first_counter - 1) % overflow
             self._books.state[:, ORIGIN] = first_counter
         self._lossy = np.zeros(len(channel_of), bool)
-        self._open: dict[tuple[str, str | None, str], tuple[int, int]] = {}
+        self._gaps = OpenGaps(self._joints)
         self._given = [0] * len(streams)
         self._totals = dict.fromkeys(
             [f"{s.name}.{what}" for s in streams for what in ("expected", "rows", "in_gaps", "discarded")], 0
@@ -191,7 +190,7 @@ class Assembler:
             longest = 0
         syncs = _count_sync(*arguments, longest, self._books)
         if dropped:
-            self._books.hole[:] = self._books.top + syncs + 1
+            self._books.mark[:, HOLE] = self._books.mark[:, TOP] + syncs + 1
         out = room_for(self._books, syncs)
         _match(*arguments, longest, self._books, out)
         if self._books.counts[SYNC_MISALIGNED]:
@@ -236,7 +235,7 @@ class Assembler:
             if complete < whole.size:
                 self._totals[f"{stream.name}.in_gaps"] += whole.size - complete
                 self._totals[f"{stream.name}.discarded"] += int(np.count_nonzero(code[~whole] == RECEIVED))
-                gaps += self._gaps(stream, sync[~whole], code[~whole])
+                gaps += self._gaps.add(stream.name, stream.every, sync[~whole], code[~whole])
                 rows[stream.name] = Rows(sync[whole], t_ns[whole], _bytes(data[whole]))
             else:
                 rows[stream.name] = Rows(sync, t_ns, _bytes(data))
@@ -244,7 +243,7 @@ class Assembler:
                 self._given[s] = int(sync[-1]) + 1
             if final and stream.pack > 1:
                 gaps += self._unsent(s)
-            gaps += self._ended(stream, int(sync[-1]) if sync.size else None, final)
+            gaps += self._gaps.over(stream.name, int(sync[-1]) if sync.size else None, final)
         return Batch(rows, tuple(sorted(gaps, key=lambda g: (g.first, g.stream, g.joint or ""))))
 
     def _unsent(self, s: int) -> list[Gap]:
@@ -255,40 +254,6 @@ class Assembler:
         self._totals[f"{stream.name}.expected"] += last - first + 1
         self._totals[f"{stream.name}.in_gaps"] += last - first + 1
         return [Gap(stream.name, first, last, None, UNSENT)]
-
-    def _gaps(self, stream: TpdoStream, sync: NDArray[np.int64], code: NDArray[np.uint8]) -> list[Gap]:
-        """Gaps that are over, of the incomplete rows given; what may go on is kept open."""
-        found: list[tuple[str | None, str, NDArray[np.int64]]] = []
-        for value, reason in REASONS.items():
-            hit = code == value
-            everyone = hit.all(axis=1)
-            found.append((None, reason, sync[everyone]))
-            found += [(name, reason, sync[hit[:, j] & ~everyone]) for j, name in enumerate(self._joints)]
-        gaps = []
-        for joint, reason, numbers in found:
-            if numbers.size == 0:
-                continue
-            key = stream.name, joint, reason
-            breaks = np.flatnonzero(np.diff(numbers) != stream.every) + 1
-            for run in np.split(numbers, breaks):
-                first, last = int(run[0]), int(run[-1])
-                if key in self._open:
-                    before = self._open.pop(key)
-                    if first - before[1] == stream.every:
-                        first = before[0]
-                    else:
-                        gaps.append(Gap(stream.name, *before, joint, reason))
-                self._open[key] = first, last
-        return gaps
-
-    def _ended(self, stream: TpdoStream, last: int | None, final: bool) -> list[Gap]:
-        """Open gaps of the stream that the rows up to ``last`` do not continue."""
-        gaps = []
-        for key, (begin, end) in list(self._open.items()):
-            if key[0] == stream.name and (final or (last is not None and last > end)):
-                del self._open[key]
-                gaps.append(Gap(stream.name, begin, end, key[1], key[2]))
-        return gaps
 
 
 # numba's dispatchers are typed by their Python signatures, which a tuple of columns cannot be checked against.

@@ -16,6 +16,14 @@ UNSEEN = int(np.iinfo(np.int64).min)
 # SYNC is one of other buses, which this one lacks.
 SYNC, COUNTER, TIME, ORIGIN, BORROWED = 0, 1, 2, 3, 4
 
+# Columns of Books.kind: every how many SYNCs a frame is due, its samples, their bytes, its bytes, and for how many rows
+# an answer may be late: where others are not, and where all are.
+EVERY, PACK, SIZE, LENGTH, WINDOW, PATIENCE = range(6)
+
+# Columns of Books.mark, ordinals of each stream: rows asked for, row in the first slot of the ring, last row at which
+# all joints owed, last before which a frame is known to be missing, rows given out.
+TOP, BASE, BEHIND, HOLE, EMITTED = range(5)
+
 COUNT_NAMES = (
     "sync_seen",
     "sync_missing",
@@ -42,29 +50,19 @@ class Books(NamedTuple):
 
     Rows ``u`` of stream ``s`` stand in ring slots ``(u - base) % C`` until every joint has settled them; with nothing
     open the ring begins anew, so that memory is only touched where answers are late. ``head`` counts the rows that the
-    SYNCs of a bus have asked for, ``top`` those of the bus that is ahead. ``behind`` is the last ordinal
-    at which all joints owed, ``hole`` the last before which a frame is known to be missing. A bus may be ``slack``
-    SYNCs behind another one before it is taken for silent.
+    SYNCs of a bus have asked for, ``TOP`` of ``mark`` those of the bus that is ahead. A bus may be ``slack`` SYNCs
+    behind another one before it is taken for silent.
     """
 
     state: NDArray[np.int64]
     slack: NDArray[np.int64]
     recent: NDArray[np.int64]
     counts: NDArray[np.int64]
-    every: NDArray[np.int64]
-    pack: NDArray[np.int64]
-    size: NDArray[np.int64]
-    window: NDArray[np.int64]
-    patience: NDArray[np.int64]
-    length: NDArray[np.int64]
+    kind: NDArray[np.int64]
+    mark: NDArray[np.int64]
     bus_of: NDArray[np.int64]
     channel_of: NDArray[np.int64]
     head: NDArray[np.int64]
-    top: NDArray[np.int64]
-    base: NDArray[np.int64]
-    behind: NDArray[np.int64]
-    hole: NDArray[np.int64]
-    emitted: NDArray[np.int64]
     settled: NDArray[np.int64]
     pending: NDArray[np.int64]
     fresh: NDArray[np.int64]
@@ -115,20 +113,14 @@ def open_books(
         slack=np.full(buses, max(w * s.every for w, s in zip(window, shapes, strict=True)), np.int64),
         recent=np.full((buses, RECENT), UNSEEN, np.int64),
         counts=np.zeros(len(COUNT_NAMES), np.int64),
-        every=np.array([s.every for s in shapes], np.int64),
-        pack=np.array([s.pack for s in shapes], np.int64),
-        size=np.array([s.size for s in shapes], np.int64),
-        window=np.array(window, np.int64),
-        patience=np.array(patience, np.int64),
-        length=np.array([s.length for s in shapes], np.int64),
+        kind=np.array(
+            [[s.every, s.pack, s.size, s.length, w, p] for s, w, p in zip(shapes, window, patience, strict=True)],
+            np.int64,
+        ),
+        mark=np.zeros((streams, 5), np.int64),
         bus_of=np.array(bus_of, np.int64),
         channel_of=channel_of,
         head=np.zeros((buses, streams), np.int64),
-        top=np.zeros(streams, np.int64),
-        base=np.zeros(streams, np.int64),
-        behind=np.zeros(streams, np.int64),
-        hole=np.zeros(streams, np.int64),
-        emitted=np.zeros(streams, np.int64),
         settled=np.zeros((streams, n), np.int64),
         pending=np.zeros((streams, n), np.int64),
         fresh=np.zeros((streams, n), np.int64),
@@ -146,8 +138,8 @@ def open_books(
 def room_for(books: Books, syncs: int) -> Decided:
     """Room for what can be decided when ``syncs`` more SYNC are known of."""
     streams, _, n = books.row_code.shape
-    rows = int(((books.top - books.emitted + 1) * books.pack).max()) + syncs
-    words = int(-(-books.size // 8).max())
+    rows = int(((books.mark[:, TOP] - books.mark[:, EMITTED] + 1) * books.kind[:, PACK]).max()) + syncs
+    words = int(-(-books.kind[:, SIZE] // 8).max())
     return Decided(
         rows=np.zeros(streams, np.int64),
         sync=np.empty((streams, rows), np.int64),

@@ -19,14 +19,16 @@ import numpy as np
 from numba import njit
 
 from daq.books import (
-    AMBIGUOUS,
     BORROWED,
     COUNTER,
+    EVERY,
     FRAMES,
     FRAMES_UNKNOWN,
+    HOLE,
+    LENGTH,
     LOST,
-    NO_SYNC,
     ORIGIN,
+    PACK,
     RECEIVED,
     RECENT,
     SYNC,
@@ -35,210 +37,37 @@ from daq.books import (
     SYNC_REPEATED,
     SYNC_SEEN,
     TIME,
+    TOP,
     TPDO_DUPLICATE,
     TPDO_EARLY,
-    TPDO_LATE,
     TPDO_WRONG_LENGTH,
     UNSEEN,
+    WINDOW,
     WRONG_LENGTH,
     Books,
     Decided,
 )
-
-_DISORDER = 8
-"""A SYNC counter that goes back by less than this is a repeated SYNC, not a long gap."""
-_MISALIGNED = 2.0
-"""SYNCs of equal counters on two buses that are farther apart than so many periods are not the same SYNC."""
-
-
-@njit(cache=True, nogil=True)
-def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longest: int) -> int:
-    """By how many SYNCs the counter advanced; zero or less for a repeated SYNC.
-
-    Known modulo ``overflow``; whole turns of the counter are told from ``elapsed`` periods, up to ``longest``.
-    """
-    step = (counter - previous) % overflow
-    turns = int(np.rint((elapsed - step) / overflow))
-    if turns > 0 and step + turns * overflow <= longest:
-        return int(step + turns * overflow)
-    if turns < 0 and step >= overflow - _DISORDER:
-        return int(step - overflow)
-    return int(step)
-
-
-@njit(cache=True, nogil=True)
-def _begin(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
-    """The first SYNC of a bus: number 0, or what those of another bus say; the step to it, 0 for one before number 0.
-
-    Less than 0 where counters of the buses do not agree.
-    """
-    for other in range(state.shape[0]):
-        if state[other, SYNC] < 0:
-            continue
-        elapsed = (t_ns - state[other, TIME]) / period_ns
-        ahead = int(np.rint(elapsed))
-        if counter >= 0 and state[other, COUNTER] >= 0:
-            step = (counter - state[other, COUNTER]) % overflow
-            ahead = int(step + overflow * np.rint((elapsed - step) / overflow))
-            if abs(elapsed - ahead) > _MISALIGNED:
-                return -1
-        state[bus, ORIGIN] = state[other, ORIGIN]
-        return int(max(0, state[other, SYNC] + ahead + 1))
-    if counter >= 0:
-        state[bus, ORIGIN] = counter
-    return 1
-
-
-@njit(cache=True, nogil=True)
-def _advance(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int) -> int:
-    """By how many SYNCs a bus advances with this one, after which ``state`` says so; nothing changes if it does not."""
-    elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != UNSEEN else 0.0
-    if state[bus, SYNC] < 0 and state[bus, COUNTER] < 0:
-        step = _begin(state, bus, counter, t_ns, period_ns, overflow)
-    elif counter >= 0 and state[bus, COUNTER] >= 0 and state[bus, BORROWED]:
-        # What had waited on this bus may be older than what others had meanwhile.
-        step = (counter - state[bus, COUNTER]) % overflow
-        step += int(overflow * np.rint((elapsed - step) / overflow))
-    elif counter >= 0 and state[bus, COUNTER] >= 0:
-        step = sync_step(counter, state[bus, COUNTER], elapsed, overflow, longest)
-    elif counter < 0 and state.shape[0] > 1:
-        # Without a counter, time alone keeps the buses together.
-        step = min(max(1, int(np.rint(elapsed))), max(1, longest))
-    else:
-        step = 1
-    if step > 0:
-        state[bus, SYNC] += step
-        state[bus, TIME] = t_ns
-        state[bus, BORROWED] = 0
-        if counter >= 0:
-            state[bus, COUNTER] = counter
-    return int(step)
-
-
-@njit(cache=True, nogil=True)
-def _slot(b: Books, s: int, u: int) -> int:
-    return int((u - b.base[s]) % b.row_sync.shape[1])
-
-
-@njit(cache=True, nogil=True)
-def _place(b: Books, s: int, j: int, u: int, i: int) -> None:
-    slot = _slot(b, s, u)
-    for w in range(b.answer.shape[3]):
-        b.row_data[s, slot, j, w] = b.answer[s, j, i, w]
-    b.row_code[s, slot, j] = b.answer_code[s, j, i]
-    if b.label[s, j, i] > u and b.row_t[s, slot, b.pack[s] - 1, b.bus_of[j]] != UNSEEN:
-        b.counts[TPDO_LATE] += 1
-
-
-@njit(cache=True, nogil=True)
-def _settle(b: Books, s: int, j: int, final: bool) -> None:
-    """Close the books of one TPDO of one drive: match what is certain, give up what is older than the window."""
-    head = b.head[b.bus_of[j], s]
-    owed = head - b.settled[s, j]
-    count = b.pending[s, j]
-    if count > owed:
-        b.counts[TPDO_DUPLICATE] += count - owed
-        count = owed
-        b.pending[s, j] = owed
-    b.fresh[s, j] = 0
-    if count == owed:
-        for i in range(count):
-            _place(b, s, j, b.settled[s, j] + i, i)
-        b.settled[s, j] = head
-        b.pending[s, j] = 0
-        return
-    late = owed > b.window[s] and head - b.behind[s] > b.window[s]
-    if not (late or owed > b.patience[s] or final):
-        return
-    keep = head if final else head - b.window[s]
-    u = head
-    for i in range(count - 1, -1, -1):
-        u = min(b.label[s, j, i], u - 1)
-        keep = max(keep, u + 1)
-        _place(b, s, j, u, i)
-    # Answers that came in a burst after a silence: with one of them lost, none can be told from the next.
-    previous = b.settled[s, j] - 1
-    for i in range(count):
-        label = b.label[s, j, i]
-        if i + 1 < count and b.label[s, j, i + 1] == label:
-            for v in range(previous + 1, label + 1):
-                b.row_code[s, _slot(b, s, v), j] = AMBIGUOUS
-        else:
-            previous = label
-    b.pending[s, j] = 0
-    b.settled[s, j] = keep
-
-
-@njit(cache=True, nogil=True)
-def _sample(b: Books, s: int, slot: int, j: int, i: int, word: int) -> Any:
-    """Eight bytes of sample ``i`` of a packed answer."""
-    value = np.uint64(0)
-    for octet in range(8 * word, min(b.size[s], 8 * word + 8)):
-        at = i * b.size[s] + octet
-        taken = (b.row_data[s, slot, j, at >> 3] >> np.uint64(8 * (at & 7))) & np.uint64(0xFF)
-        value |= taken << np.uint64(8 * (octet & 7))
-    return value
-
-
-@njit(cache=True, nogil=True)
-def _emit(b: Books, s: int, end: int, out: Decided) -> None:
-    """Give out the rows before ``end``; a packed one is as many samples."""
-    pack, buses = b.pack[s], b.state.shape[0]
-    words = -(-b.size[s] // 8)
-    while b.emitted[s] < end:
-        slot = _slot(b, s, b.emitted[s])
-        for i in range(pack):
-            k = b.row_sync[s, slot] - pack + 1 + i
-            if k < 0:
-                continue
-            o = out.rows[s]
-            out.sync[s, o] = k
-            out.t_ns[s, o] = UNSEEN
-            for bus in range(buses - 1, -1, -1):
-                if b.row_t[s, slot, i, bus] != UNSEEN:
-                    out.t_ns[s, o] = b.row_t[s, slot, i, bus]
-            for j in range(b.settled.shape[1]):
-                seen = b.row_t[s, slot, i, b.bus_of[j]] != UNSEEN
-                out.code[s, o, j] = b.row_code[s, slot, j] if seen else NO_SYNC
-                for w in range(words):
-                    out.data[s, o, j, w] = b.row_data[s, slot, j, w] if pack == 1 else _sample(b, s, slot, j, i, w)
-            out.rows[s] += 1
-        b.emitted[s] += 1
-    if b.emitted[s] == b.top[s]:
-        b.base[s] = b.top[s]
-
-
-@njit(cache=True, nogil=True)
-def _settle_all(b: Books, bus: int, s: int, final: bool, out: Decided) -> None:
-    """Close the books of the drives on one bus, and give out what all drives have settled."""
-    n = b.settled.shape[1]
-    oldest, all_owe = b.head[bus, s], n > 1
-    for j in range(n):
-        oldest = min(oldest, b.settled[s, j])
-        all_owe = all_owe and b.settled[s, j] + b.pending[s, j] < b.head[b.bus_of[j], s]
-    if all_owe and oldest >= b.hole[s]:
-        b.behind[s] = b.head[bus, s]
-    end = b.top[s]
-    for j in range(n):
-        if b.bus_of[j] == bus:
-            _settle(b, s, j, final)
-        end = min(end, b.settled[s, j])
-    _emit(b, s, end, out)
+from daq.numbering import advance
+from daq.settling import settle_all, slot_of
 
 
 @njit(cache=True, nogil=True)
 def _owe(b: Books, bus: int, k: int, s: int) -> None:
     """SYNC ``k`` of a bus asks for an answer, if the stream sends on it."""
-    if (b.state[bus, ORIGIN] + k) % b.every[s]:
+    if (b.state[bus, ORIGIN] + k) % b.kind[s, EVERY]:
         return
-    slot = _slot(b, s, b.head[bus, s])
-    if b.head[bus, s] == b.top[s]:
-        b.top[s] += 1
+    slot = slot_of(b, s, b.head[bus, s])
+    if b.head[bus, s] == b.mark[s, TOP]:
+        b.mark[s, TOP] += 1
         b.row_sync[s, slot] = k
-        b.row_t[s, slot] = UNSEEN
-        b.row_code[s, slot] = LOST
-    for i in range(b.pack[s]):
-        b.row_t[s, slot, i, bus] = b.recent[bus, (k - b.pack[s] + 1 + i) % RECENT]
+        # Loops, not slices: this runs once per SYNC.
+        for i in range(b.kind[s, PACK]):
+            for other in range(b.state.shape[0]):
+                b.row_t[s, slot, i, other] = UNSEEN
+        for j in range(b.settled.shape[1]):
+            b.row_code[s, slot, j] = LOST
+    for i in range(b.kind[s, PACK]):
+        b.row_t[s, slot, i, bus] = b.recent[bus, (k - b.kind[s, PACK] + 1 + i) % RECENT]
     b.head[bus, s] += 1
 
 
@@ -247,20 +76,20 @@ def _miss(b: Books, bus: int, first: int, until: int, out: Decided) -> None:
     """SYNCs ``first`` to before ``until`` were sent on the bus, but not received."""
     if until <= first:
         return
-    streams = b.every.size
+    streams = b.kind.shape[0]
     before = b.head[bus].copy()
     for s in range(streams):
-        b.hole[s] = max(b.hole[s], b.head[bus, s] + (until - first) // b.every[s] + 1)
-        if (until - first) // b.every[s] > b.window[s] // 2:
-            _settle_all(b, bus, s, False, out)
+        b.mark[s, HOLE] = max(b.mark[s, HOLE], b.head[bus, s] + (until - first) // b.kind[s, EVERY] + 1)
+        if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2:
+            settle_all(b, bus, s, False, out)
     for k in range(first, until):
         b.recent[bus, k % RECENT] = UNSEEN
         for s in range(streams):
             _owe(b, bus, k, s)
-            if (until - first) // b.every[s] > b.window[s] // 2:
-                _settle_all(b, bus, s, False, out)
+            if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2:
+                settle_all(b, bus, s, False, out)
     for s in range(streams):
-        if (until - first) // b.every[s] > b.window[s] // 2 or b.head[bus, s] == before[s]:
+        if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2 or b.head[bus, s] == before[s]:
             continue
         # What came since the last SYNC seen may answer the missed ones too.
         for j in range(b.settled.shape[1]):
@@ -280,8 +109,8 @@ def _skip_silent(b: Books, bus: int, k: int, t_ns: int, period_ns: int, overflow
         if last < 0:
             b.state[other, ORIGIN] = b.state[bus, ORIGIN]
         # What has come answers SYNCs that were seen, not those that are missing.
-        for s in range(b.every.size):
-            _settle_all(b, other, s, True, out)
+        for s in range(b.kind.shape[0]):
+            settle_all(b, other, s, True, out)
         _miss(b, other, last + 1, until, out)
         b.counts[SYNC_MISSING] += until - last - 1
         b.state[other, SYNC] = until - 1
@@ -289,8 +118,8 @@ def _skip_silent(b: Books, bus: int, k: int, t_ns: int, period_ns: int, overflow
         b.state[other, TIME] = t_ns - (k + 1 - until) * period_ns
         if b.state[bus, COUNTER] >= 0:
             b.state[other, COUNTER] = (b.state[other, ORIGIN] + until - 1) % overflow
-        for s in range(b.every.size):
-            _settle_all(b, other, s, True, out)
+        for s in range(b.kind.shape[0]):
+            settle_all(b, other, s, True, out)
 
 
 @njit(cache=True, nogil=True)
@@ -303,7 +132,7 @@ def count_sync(
     for i in range(count):
         if can_id[i] == sync_id:
             counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 else -1
-            total += max(0, _advance(state, bus, counter, t_ns[i], period_ns, overflow, longest))
+            total += max(0, advance(state, bus, counter, t_ns[i], period_ns, overflow, longest))
     return int(total)
 
 
@@ -321,20 +150,23 @@ def match(
         if identifier == sync_id:
             counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 else -1
             last = b.state[bus, SYNC]
-            step = _advance(b.state, bus, counter, t_ns[i], period_ns, overflow, longest)
+            step = advance(b.state, bus, counter, t_ns[i], period_ns, overflow, longest)
             if step <= 0:
                 unlike = last < 0 and step < 0
                 b.counts[SYNC_MISALIGNED if unlike else SYNC_REPEATED] += 1
                 continue
             k = last + step
-            _miss(b, bus, last + 1, k, out)
+            if step > 1:
+                _miss(b, bus, last + 1, k, out)
             b.recent[bus, k % RECENT] = t_ns[i]
-            for s in range(b.every.size):
-                _settle_all(b, bus, s, False, out)
+            for s in range(b.kind.shape[0]):
+                settle_all(b, bus, s, False, out)
                 _owe(b, bus, k, s)
             b.counts[SYNC_SEEN] += 1
             b.counts[SYNC_MISSING] += step - 1
-            _skip_silent(b, bus, k, t_ns[i], period_ns, overflow, out)
+            # A call hands all the books over, which costs more than most of what it does.
+            if b.state.shape[0] > 1:
+                _skip_silent(b, bus, k, t_ns[i], period_ns, overflow, out)
             continue
         channel = b.channel_of[bus, identifier] if identifier < b.channel_of.shape[1] else np.int64(-1)
         if channel < 0:
@@ -347,7 +179,7 @@ def match(
         elif slot >= b.label.shape[2]:
             b.counts[TPDO_DUPLICATE] += 1
         else:
-            right = length[i] == b.length[s]
+            right = length[i] == b.kind[s, LENGTH]
             if not right:
                 b.counts[TPDO_WRONG_LENGTH] += 1
                 b.wrong[s, j] += 1
@@ -371,5 +203,5 @@ def finish(total: int, b: Books, out: Decided) -> None:
             _miss(b, bus, last + 1, total, out)
             b.counts[SYNC_MISSING] += total - 1 - last
             b.state[bus, SYNC] = total - 1
-        for s in range(b.every.size):
-            _settle_all(b, bus, s, True, out)
+        for s in range(b.kind.shape[0]):
+            settle_all(b, bus, s, True, out)

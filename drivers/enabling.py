@@ -4,6 +4,7 @@ import time
 
 from configs.errors import ArmidentError, ConfigError
 from drivers import objects as od
+from drivers.emcy import emcy_text
 from drivers.objects import Control, DriveState
 from drivers.sdo import DriveSdo
 
@@ -72,4 +73,4 @@ def _fault_cause(sdo: DriveSdo) -> str:
         code = sdo.read(od.ERROR_CODE, 0, "H")
     except ConfigError:  # optional object
         return ""
-    return f" (error {code:04X}h, {od.emcy_text(code, sdo.emcy_texts)})" if code else ""
+    return f" (error {code:04X}h, {emcy_text(code, sdo.emcy_texts)})" if code else ""

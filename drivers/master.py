@@ -17,6 +17,7 @@ from configs.errors import ArmidentError, ConfigError
 from configs.robot import RobotConfig
 from configs.session import DriveNode, SessionConfig
 from drivers import objects as od
+from drivers.emcy import emcy_text
 from drivers.enabling import POLL_INTERVAL, enable_drive, stand_still, state_of
 from drivers.frames import BusDown
 from drivers.mapping import check_drive, map_drive
@@ -238,7 +239,7 @@ class DriveMaster:
         self._events.put(DriveEvent(kind, drive.joint, drive.node_id, t_ns, f"{sdo.who}: {text}", code))
 
     def _on_emcy(self, sdo: DriveSdo, emcy: EmcyError) -> None:
-        text = f"EMCY {emcy.code:04X}h, {od.emcy_text(emcy.code, sdo.emcy_texts)} (error register {emcy.register:02X}h"
+        text = f"EMCY {emcy.code:04X}h, {emcy_text(emcy.code, sdo.emcy_texts)} (error register {emcy.register:02X}h"
         text += f", manufacturer {emcy.data.hex(' ')})" if any(emcy.data) else ")"
         self._report("emcy", sdo, round(emcy.timestamp * 1e9), text, emcy.code)
 

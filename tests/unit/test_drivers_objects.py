@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from configs import ConfigError, config_path
 from drivers import objects as od
+from drivers.emcy import emcy_text
 from drivers.mapping import interpolation_period
-from drivers.objects import DriveState, TpdoLayout, drive_state, emcy_text
+from drivers.objects import DriveState, TpdoLayout, drive_state
 
 EDS = str(config_path("eds/cia402_servo.eds"))
 
@@ -121,3 +122,31 @@ def test_one_millisecond_is_stated_as_drives_expect_it() -> None:
 def test_a_period_without_a_short_mantissa_is_refused() -> None:
     with pytest.raises(ConfigError, match="60C2h"):
         interpolation_period(1001)
+
+
+def test_a_vendor_text_comes_before_that_of_the_standard() -> None:
+    assert emcy_text(0xFF01, {0xFF01: "encoder battery low"}) == "encoder battery low"
+    assert emcy_text(0x4310, {0xFF01: "encoder battery low"}) == "excess drive temperature"
+
+
+def test_a_packed_tpdo_maps_the_arrays_sample_by_sample() -> None:
+    layout = TpdoLayout.of(["position", "current"], pack=10, fd=True)
+    assert (layout.size, layout.frame_size) == (6, 60)
+    assert layout.entries[:4] == (0x20640120, 0x20780110, 0x20640220, 0x20780210)
+    assert len(layout.entries) == 20
+
+
+def test_what_does_not_fit_a_classic_frame_names_can_fd() -> None:
+    with pytest.raises(ConfigError, match=r"8 bytes of a TPDO; a bus with fd: true carries 64"):
+        TpdoLayout.of(["position", "velocity", "current"])
+    with pytest.raises(ConfigError, match=r"11 times 6 bytes .* do not fit into the 64 bytes"):
+        TpdoLayout.of(["position", "current"], pack=11, fd=True)
+
+
+def test_the_fd_eds_has_every_array_that_packed_samples_are_mapped_from() -> None:
+    known = canopen.import_od(str(config_path("eds/cia402_servo_fd.eds")), 1)
+    for entry in TpdoLayout.of(["position", "velocity", "current", "torque", "demand", "status"], fd=True).objects:
+        array = known[entry.packed(1).index]
+        assert array[1].pdo_mappable
+        assert len(array[1]) == entry.bits
+        assert array[0].default == 64

@@ -1,0 +1,77 @@
+"""The compiled part that numbers the SYNCs of every bus: by their counter, and where that is not enough by time."""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from daq.books import BORROWED, COUNTER, ORIGIN, SYNC, TIME, UNSEEN
+
+_DISORDER = 8
+"""A SYNC counter that goes back by less than this is a repeated SYNC, not a long gap."""
+_MISALIGNED = 2.0
+"""SYNCs of equal counters on two buses that are farther apart than so many periods are not the same SYNC."""
+
+
+@njit(cache=True, nogil=True)
+def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longest: int) -> int:
+    """By how many SYNCs the counter advanced; zero or less for a repeated SYNC.
+
+    Known modulo ``overflow``; whole turns of the counter are told from ``elapsed`` periods, up to ``longest``.
+    """
+    step = (counter - previous) % overflow
+    turns = int(np.rint((elapsed - step) / overflow))
+    if turns > 0 and step + turns * overflow <= longest:
+        return int(step + turns * overflow)
+    if turns < 0 and step >= overflow - _DISORDER:
+        return int(step - overflow)
+    return int(step)
+
+
+@njit(cache=True, nogil=True)
+def _begin(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
+    """The first SYNC of a bus: number 0, or what those of another bus say; the step to it, 0 for one before number 0.
+
+    Less than 0 where counters of the buses do not agree.
+    """
+    for other in range(state.shape[0]):
+        if state[other, SYNC] < 0:
+            continue
+        elapsed = (t_ns - state[other, TIME]) / period_ns
+        ahead = int(np.rint(elapsed))
+        if counter >= 0 and state[other, COUNTER] >= 0:
+            step = (counter - state[other, COUNTER]) % overflow
+            ahead = int(step + overflow * np.rint((elapsed - step) / overflow))
+            if abs(elapsed - ahead) > _MISALIGNED:
+                return -1
+        state[bus, ORIGIN] = state[other, ORIGIN]
+        return int(max(0, state[other, SYNC] + ahead + 1))
+    if counter >= 0:
+        state[bus, ORIGIN] = counter
+    return 1
+
+
+@njit(cache=True, nogil=True)
+def advance(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int) -> int:
+    """By how many SYNCs a bus advances with this one, after which ``state`` says so; nothing changes if it does not."""
+    elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != UNSEEN else 0.0
+    if state[bus, SYNC] < 0 and state[bus, COUNTER] < 0:
+        step = _begin(state, bus, counter, t_ns, period_ns, overflow)
+    elif counter >= 0 and state[bus, COUNTER] >= 0 and state[bus, BORROWED]:
+        # What had waited on this bus may be older than what others had meanwhile.
+        step = (counter - state[bus, COUNTER]) % overflow
+        step += int(overflow * np.rint((elapsed - step) / overflow))
+    elif counter >= 0 and state[bus, COUNTER] >= 0:
+        step = sync_step(counter, state[bus, COUNTER], elapsed, overflow, longest)
+    elif counter < 0 and state.shape[0] > 1:
+        # Without a counter, time alone keeps the buses together.
+        step = min(max(1, int(np.rint(elapsed))), max(1, longest))
+    else:
+        step = 1
+    if step > 0:
+        state[bus, SYNC] += step
+        state[bus, TIME] = t_ns
+        state[bus, BORROWED] = 0
+        if counter >= 0:
+            state[bus, COUNTER] = counter
+    return int(step)
