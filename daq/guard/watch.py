@@ -17,6 +17,7 @@ from daq.guard.limits import (
     Limits,
 )
 from daq.streams import bus_numbers, counts_per_si, node_ids
+from drivers.emcy import emcy_text
 from drivers.frames import Frames
 from drivers.objects import (
     COB_EMCY,
@@ -25,7 +26,6 @@ from drivers.objects import (
     COB_SYNC,
     NmtState,
     TpdoLayout,
-    emcy_text,
     rpdo_cob,
     tpdo_cob,
 )
