@@ -24,7 +24,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn
 from configs import ConfigError, DataError, RobotConfig, SessionConfig
 from daq.assembler import Assembler, Batch
 from daq.recording import Gap, Recording, Stream
-from daq.streams import CapturedStream, captured_streams
+from daq.streams import CapturedStream, bus_numbers, captured_streams
 from drivers.frames import Frames, frames
 from drivers.objects import COB_SYNC
 
@@ -35,6 +35,7 @@ _UNREADABLE = (ValueError, IndexError, KeyError, TypeError, EOFError, struct.err
 """What python-can's readers raise at a file that is not what its name says."""
 
 _BATCH = 4096
+_TURN_NS = 1_000_000_000
 _ANSWER_NS = 20_000
 """Time between a SYNC and its answers in a log that is written from a recording, which keeps the time of SYNC alone."""
 
@@ -45,30 +46,37 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
     Parameters
     ----------
     path
-        A log of one bus, or of several of which one has the name of the session's bus.
+        A log of one bus, or of several that have the names of the session's buses.
     session, robot
         What TPDOs hold, and the scales of their objects.
 
     Raises
     ------
     ConfigError
-        If there is no such file, or it holds several buses and none of them is the session's.
+        If there is no such file, it lacks a bus of the session, or the session's buses carry CAN FD.
     DataError
         If it cannot be read as such a log, or holds no SYNC.
     """
+    _check_classic(session, str(path))
     streams = captured_streams(session, robot)
     log = _read(path)
-    read = log.of(path, session.bus.channel)
-    if not np.any(read["can_id"] == COB_SYNC):
-        raise DataError(f"{path}: no SYNC ({COB_SYNC:X}h) among its {read.size} frames: samples cannot be told apart")
+    read = [log.of(path, bus.channel, len(session.all_buses) > 1) for bus in session.all_buses]
+    for bus, frames_of_it in zip(session.all_buses, read, strict=True):
+        if not np.any(frames_of_it["can_id"] == COB_SYNC):
+            where = f" of {bus.channel}" if len(read) > 1 else ""
+            raise DataError(
+                f"{path}: no SYNC ({COB_SYNC:X}h) among its {frames_of_it.size} frames{where}: "
+                "samples cannot be told apart"
+            )
     assembler = Assembler(
         [stream.bus for stream in streams],
         [joint.name for joint in robot.joints],
         session.sync.period_us * 1000,
         session.sync.counter,
         None,
+        bus_of=bus_numbers(session, robot),
     )
-    parts = [assembler.push(read[first : first + _BATCH]) for first in range(0, read.size, _BATCH)]
+    parts = [assembler.push(piece, bus=bus) for bus, piece in _in_turn(read)]
     parts.append(assembler.finish())
     found = {stream.bus.name: _stream(stream, parts) for stream in streams}
     if found["samples"].sync.size == 0:
@@ -87,6 +95,25 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
     )
 
 
+def _check_classic(session: SessionConfig, where: str) -> None:
+    if any(bus.fd for bus in session.all_buses):
+        raise ConfigError(f"{where}: the session's buses carry CAN FD; logs hold classic frames only")
+
+
+def _in_turn(read: Sequence[Frames]) -> Iterator[tuple[int, Frames]]:
+    """Frames of each bus in turn, a second at most of one before the other's."""
+    if len(read) == 1:
+        yield from ((0, read[0][first : first + _BATCH]) for first in range(0, read[0].size, _BATCH))
+        return
+    begin, end = min(int(f["t_ns"].min()) for f in read), max(int(f["t_ns"].max()) for f in read)
+    for t_ns in range(begin, end + 1, _TURN_NS):
+        for bus, frames_of_it in enumerate(read):
+            # Up to the first frame after this second: clocks that were set back keep frames in the order they came.
+            latest = np.maximum.accumulate(frames_of_it["t_ns"])
+            first, last = np.searchsorted(latest, [t_ns, t_ns + _TURN_NS])
+            yield bus, frames_of_it[first:last]
+
+
 def write_log(recording: Recording, path: Path) -> None:
     """Write the SYNCs and TPDOs of a recording as a log; the file appears when it is complete.
 
@@ -96,13 +123,14 @@ def write_log(recording: Recording, path: Path) -> None:
     Raises
     ------
     ConfigError
-        If the file cannot be written.
+        If the file cannot be written, or the session's buses carry CAN FD.
     DataError
         If the recording does not come from a bus.
     """
     session = recording.session
     if session is None:
         raise DataError(f"{recording.path}: was not captured from a bus; there are no frames to write")
+    _check_classic(session, str(path))
     streams = captured_streams(session, recording.robot)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
@@ -126,9 +154,9 @@ class _Log:
     buses: tuple[str, ...]
     foreign: int
 
-    def of(self, path: Path, bus: str) -> Frames:
-        """The frames of one bus."""
-        if len(self.buses) < 2:
+    def of(self, path: Path, bus: str, several: bool) -> Frames:
+        """The frames of one bus; those of the only one in the log, unless the session has ``several``."""
+        if len(self.buses) < 2 and not (self.buses and several):
             return self.frames
         if bus not in self.buses:
             raise ConfigError(f"{path}: holds the buses {', '.join(self.buses)}; the session's is {bus}")
@@ -203,7 +231,8 @@ def _stream(stream: CapturedStream, parts: Sequence[Batch]) -> Stream:
 
 def _messages(recording: Recording, session: SessionConfig, streams: Sequence[CapturedStream]) -> Iterator[can.Message]:
     """SYNCs in order, each followed by the TPDOs that answer it, stream by stream and joint by joint."""
-    overflow, channel = session.sync.counter, session.bus.channel
+    overflow, channels = session.sync.counter, [bus.channel for bus in session.all_buses]
+    joint_channel = [channels[bus] for bus in bus_numbers(session, recording.robot)]
     everything = sorted({int(n) for stream in recording.streams.values() for n in stream.sync})
     rows = {stream.bus.name: _encoded(stream, recording.streams[stream.bus.name]) for stream in streams}
     places = {
@@ -215,11 +244,13 @@ def _messages(recording: Recording, session: SessionConfig, streams: Sequence[Ca
         name = next(iter(at))
         t_ns = int(recording.streams[name].t_ns[at[name]])
         counter = bytes([number % overflow + 1])
-        yield can.Message(t_ns * 1e-9, COB_SYNC, False, data=counter, channel=channel)
+        for channel in channels:
+            yield can.Message(t_ns * 1e-9, COB_SYNC, False, data=counter, channel=channel)
         for stream in streams:
             if stream.bus.name not in at:
                 continue
-            for cob_id, octets in zip(stream.bus.cob_ids, rows[stream.bus.name][at[stream.bus.name]], strict=True):
+            answers = rows[stream.bus.name][at[stream.bus.name]]
+            for cob_id, octets, channel in zip(stream.bus.cob_ids, answers, joint_channel, strict=True):
                 t_ns += _ANSWER_NS
                 data = octets[: stream.bus.length].tobytes()
                 yield can.Message(t_ns * 1e-9, cob_id, False, data=data, channel=channel)

@@ -129,3 +129,34 @@ def test_import_and_export_know_the_logs(tmp_path: Path) -> None:
     assert "400 samples at 5000 Hz, 0 in gaps" in out.output
     assert read_recording(tmp_path / "a.mcap").sha256 == read_recording(tmp_path / "b.mcap").sha256
     assert run(application(["import"]), [*back, "--rate", "5"]).exit_code == 2
+
+
+def test_a_recording_of_several_buses_comes_back_from_a_log_of_all_of_them(tmp_path: Path) -> None:
+    session = load_session("tx40_six_buses.yaml")
+    one = captured()
+    samples = one.streams["samples"]
+    kept = {"position": samples.raw["position"], "current": samples.raw["current"]}
+    layout = captured_streams(session, ROBOT)[0].layout
+    stream = replace(samples, fields={f.name: f for f in layout.fields}, raw=kept)
+    recording = replace(one, session=session, streams={"samples": stream})
+    write_log(recording, tmp_path / "buses.log")
+
+    read = recording_from_log(tmp_path / "buses.log", session, ROBOT)
+
+    assert not read.gaps
+    np.testing.assert_array_equal(read.samples.sync, samples.sync)
+    for field, values in kept.items():
+        np.testing.assert_array_equal(read.samples.raw[field], values)
+    renamed = tuple(bus.model_copy(update={"channel": f"can{k}"}) for k, bus in enumerate(session.all_buses))
+    drives = tuple(d.model_copy(update={"bus": f"can{k}"}) for k, d in enumerate(session.drives))
+    with pytest.raises(ConfigError, match="the session's is can0"):
+        recording_from_log(
+            tmp_path / "buses.log", session.model_copy(update={"buses": renamed, "drives": drives}), ROBOT
+        )
+
+
+def test_a_session_on_can_fd_has_no_classic_log(tmp_path: Path) -> None:
+    session = load_session("tx40_two_fd.yaml")
+    with pytest.raises(ConfigError, match="CAN FD"):
+        write_log(replace(captured(), session=session), tmp_path / "bus.log")
+    assert not list(tmp_path.iterdir())

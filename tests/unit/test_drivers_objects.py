@@ -3,7 +3,7 @@
 import canopen
 import numpy as np
 import pytest
-from canopen.objectdictionary import ODVariable
+from canopen.objectdictionary import ODArray, ODVariable
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -147,6 +147,7 @@ def test_the_fd_eds_has_every_array_that_packed_samples_are_mapped_from() -> Non
     known = canopen.import_od(str(config_path("eds/cia402_servo_fd.eds")), 1)
     for entry in TpdoLayout.of(["position", "velocity", "current", "torque", "demand", "status"], fd=True).objects:
         array = known[entry.packed(1).index]
+        assert isinstance(array, ODArray)
         assert array[1].pdo_mappable
         assert len(array[1]) == entry.bits
         assert array[0].default == 64
