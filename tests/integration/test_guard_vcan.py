@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from configs import ArmidentError, config_path, load_robot
-from daq.guard import guard
+from daq.guard.run import guard
 from daq.streams import counts_per_si
 from drivers.frames import frame, frames
 from drivers.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC, rpdo_cob, tpdo_cob

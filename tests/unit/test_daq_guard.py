@@ -5,7 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from configs import RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
-from daq.guard import Watch, limits_of
+from daq.guard.limits import limits_of
+from daq.guard.watch import Watch
 from daq.streams import bus_numbers, counts_per_si, node_ids
 from drivers.frames import Frames, frames
 from drivers.objects import COB_SYNC, TpdoLayout, rpdo_cob, tpdo_cob
