@@ -11,12 +11,12 @@ import socket
 import struct
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Self
 
 from configs.errors import ConfigError
+from drivers import interface
 from drivers.frames import ERROR_FLAG, FRAME, BusDown, Filter, Frames, frame, frames
-from drivers.messages import DROP_CONTROL_BYTES, FD_MTU, Messages
+from drivers.messages import DROP_CONTROL_BYTES, Messages
 from drivers.stamps import (
     RAW_HARDWARE,
     RX_HARDWARE,
@@ -49,7 +49,6 @@ SO_RXQ_OVFL = 40
 CAN_RAW_ERR_FILTER = 2
 CAN_RAW_FD_FRAMES = 5
 CAN_RAW_FILTER_MAX = 512
-SYSFS = Path("/sys/class/net")
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _recvmmsg = _libc.recvmmsg
@@ -151,27 +150,11 @@ class RawSocket:
         try:
             self._socket.bind((self.channel,))
         except OSError as error:
-            hint = f"sudo ip link add dev {self.channel} type vcan && " if self.channel.startswith("vcan") else ""
-            raise ConfigError(
-                f"bus {self.channel}: no such CAN interface ({error.strerror}); "
-                f"an administrator may run: {hint}sudo ip link set dev {self.channel} up"
-            ) from error
+            raise interface.missing(self.channel, error.strerror) from error
         if not self.up:
-            raise self._down("is down")
-        if self.fd and self._mtu() < FD_MTU:
-            command = f"sudo ip link set dev {self.channel} " + (
-                f"mtu {FD_MTU}" if self.channel.startswith("vcan") else "type can ... dbitrate ... fd on"
-            )
-            raise ConfigError(
-                f"bus {self.channel}: the interface carries no CAN FD; an administrator may run: "
-                f"sudo ip link set dev {self.channel} down && {command} && sudo ip link set dev {self.channel} up"
-            )
-
-    def _mtu(self) -> int:
-        try:
-            return int((SYSFS / self.channel / "mtu").read_text())
-        except (OSError, ValueError):
-            return 0
+            raise interface.down(self.channel, "is down")
+        if self.fd:
+            interface.check_fd(self.channel)
 
     @property
     def stamps(self) -> str:
@@ -186,10 +169,7 @@ class RawSocket:
     @property
     def up(self) -> bool:
         """Whether the interface is administratively up."""
-        try:
-            return bool(int((SYSFS / self.channel / "flags").read_text(), 16) & 1)
-        except (OSError, ValueError):
-            return False
+        return interface.is_up(self.channel)
 
     @property
     def receive_buffer(self) -> int:
@@ -302,12 +282,8 @@ class RawSocket:
         if code in harmless:
             return
         if code in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
-            raise self._down("went down" if code == errno.ENETDOWN else "was removed")
+            raise interface.down(self.channel, "went down" if code == errno.ENETDOWN else "was removed")
         raise BusDown(f"bus {self.channel}: {OSError(code, errno.errorcode.get(code, str(code)))}")
-
-    def _down(self, what: str) -> BusDown:
-        command = f"sudo ip link set dev {self.channel} up"
-        return BusDown(f"bus {self.channel}: the interface {what}; an administrator may run: {command}")
 
     def close(self) -> None:
         """Release the socket; nothing happens the second time."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from configs import ConfigError
-from drivers.frames import BusDown, Frames, frame, frames
+from drivers.frames import BIT_RATE_SWITCH, FD_FLAG, BusDown, Frames, frame, frames
 from drivers.socketcan import BATCH, RawSocket
 
 pytestmark = pytest.mark.vcan
@@ -108,3 +108,33 @@ def test_an_interface_that_is_not_there_is_a_configuration_error() -> None:
 def test_an_interface_that_is_no_can_bus_is_a_configuration_error() -> None:
     with pytest.raises(ConfigError, match="bus lo: no such CAN interface"):
         RawSocket("lo")
+
+
+def test_frames_of_can_fd_arrive_beside_classic_ones(vcan_bus: str) -> None:
+    sent = frames(3, fd=True)
+    sent["can_id"], sent["length"] = [0x181, 0x182, 0x183], [64, 8, 12]
+    sent["flags"] = [FD_FLAG | BIT_RATE_SWITCH, 0, FD_FLAG]
+    sent["data"] = np.arange(3 * 64, dtype=np.uint8).reshape(3, 64)
+    with (
+        RawSocket(vcan_bus, filters=(), fd=True) as sender,
+        RawSocket(vcan_bus, fd=True) as receiver,
+        RawSocket(vcan_bus) as classic,
+    ):
+        assert sender.send(sent) == 3
+        batch = frames(16, fd=True)
+        assert receiver.receive(batch) == 3
+        for field in ("can_id", "length"):
+            assert batch[field][:3].tolist() == sent[field].tolist()
+        assert [bool(f & FD_FLAG) for f in batch["flags"][:3]] == [True, False, True]
+        for k, length in enumerate((64, 8, 12)):
+            assert batch["data"][k, :length].tolist() == sent["data"][k, :length].tolist()
+        narrow = frames(16)
+        assert classic.receive(narrow) == 1
+        assert narrow["can_id"][0] == 0x182
+
+
+def test_an_interface_without_can_fd_is_named_with_the_command_to_run(vcan_bus: str) -> None:
+    for step in (["down"], ["mtu", "16"], ["up"]):
+        subprocess.run(["ip", "link", "set", "dev", vcan_bus, *step], check=True)
+    with pytest.raises(ConfigError, match="carries no CAN FD"):
+        RawSocket(vcan_bus, fd=True)
