@@ -26,7 +26,7 @@ from drivers.udp import open_bus
 SYNC_WAIT_S = 10.0
 """How long a bus may be silent before we give up."""
 FEWEST_FRAMES = 3
-IN_STEP = 0.98
+IN_STEP = 0.95
 """Share of a TPDO's frames that must come at its interval; a busy machine may delay the others past the next SYNC."""
 PERIOD_TOLERANCE = 0.05
 """Relative difference allowed between the SYNC period heard and the session's."""
