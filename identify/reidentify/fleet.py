@@ -112,7 +112,7 @@ def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
     # What goes wrong with a recording is in its line; what goes wrong with the cluster is raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if scheduler is None:
-        local = LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0")
+        local = LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0")
         with local, Client(local) as client:
             yield client
         return
