@@ -188,7 +188,7 @@ def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:
         / session.sync_period
     )
     hours = free / rate / 3600
-    found = f"{folder}: {free / 1e9:.1f} GB free, at least {hours:.0f} h ({rate * 3.6e-6:.0f} MB/h before compression)"
+    found = f"{folder}: {free / 1e9:.1f} GB free, at least {hours:.0f} h ({rate * 3.6e-6:.1f} GB/h before compression)"
     options = session.recording
     if hours < _LEAST_HOURS and options.keep_days is None and options.min_free_gb is None:
         yield Check("recordings", "warning", f"{found}; recording.min_free_gb or keep_days would make room")
