@@ -150,8 +150,13 @@ def compare(baseline: IdentificationDocument, now: IdentificationDocument, false
     Raises
     ------
     DataError
-        If they are of different robots or models.
+        If they are of different robots or models, or one of them did not converge: its deviations say nothing then.
     """
+    for name, document in (("the baseline", baseline), ("the identification", now)):
+        if not document.converged:
+            raise DataError(
+                f"{now.robot}: {name} did not converge ({document.stop_reason}): whether the arm has changed is unknown"
+            )
     if baseline.robot != now.robot:
         raise DataError(f"the baseline is of robot {baseline.robot!r}, the identification of {now.robot!r}")
     old = {p.name: k for k, p in enumerate(baseline.parameters)}

@@ -198,8 +198,9 @@ class History:
             raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
 
     def first(self, robot: str) -> Run | None:
-        """The identification of a robot whose recording is the oldest."""
-        query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document).where(_runs.c.robot == robot)
+        """The identification of a robot whose recording is the oldest, of those that converged."""
+        query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document)
+        query = query.where(_runs.c.robot == robot, _runs.c.converged)
         found = self._read(query.order_by(_runs.c.recorded, _runs.c.id).limit(1))
         return found[0] if found else None
 

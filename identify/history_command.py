@@ -39,15 +39,20 @@ def history_command(
     for document, path in loaded:
         history.add(document, recorded_at(document, path))
     runs = history.runs(_robot(history, robot, [document.robot for document, _ in loaded]))
-    drifts = [compare(runs[0].document, run.document, false_alarms) for run in runs[1:]]
+    first = next((k for k, run in enumerate(runs) if run.document.converged), len(runs))
+    drifts = [
+        compare(runs[first].document, run.document, false_alarms) if k > first and run.document.converged else None
+        for k, run in enumerate(runs)
+    ]
     _check(parameters, runs)
     if plot is not None:
         _plot(plot, runs, parameters or _most_changed(drifts, runs))
     if as_json:
-        print(json.dumps([_entry(run, drift) for run, drift in zip(runs, [None, *drifts], strict=True)], indent=1))
+        print(json.dumps([_entry(run, drift) for run, drift in zip(runs, drifts, strict=True)], indent=1))
     else:
         _table(runs, drifts, parameters)
-    return DRIFTED if drifts and drifts[-1].drifted else 0
+    last = drifts[-1]
+    return DRIFTED if last is not None and last.drifted else 0
 
 
 def _robot(history: History, wanted: str | None, added: Sequence[str]) -> str:
@@ -68,13 +73,14 @@ def _check(parameters: Sequence[str], runs: Sequence[Run]) -> None:
             raise ConfigError(f"--parameter: no {name!r} of {runs[0].document.robot}; there are {', '.join(known)}")
 
 
-def _most_changed(drifts: Sequence[Drift], runs: Sequence[Run], most: int = 6) -> list[str]:
+def _most_changed(drifts: Sequence[Drift | None], runs: Sequence[Run], most: int = 6) -> list[str]:
     """Parameters that are farthest from the first run in any later one, in deviations."""
     names = [p.name for p in runs[0].document.parameters if p.essential]
-    if not drifts:
+    compared = [drift for drift in drifts if drift is not None]
+    if not compared:
         return names[:most]
     far: dict[str, float] = dict.fromkeys(names, 0.0)
-    for drift in drifts:
+    for drift in compared:
         for p, z in zip(drift.parameters, np.abs(drift.difference) / drift.std, strict=True):
             if p.name in far:
                 far[p.name] = max(far[p.name], float(z))
@@ -93,21 +99,21 @@ def _entry(run: Run, drift: Drift | None) -> dict[str, object]:
     }
 
 
-def _table(runs: Sequence[Run], drifts: Sequence[Drift], parameters: Sequence[str]) -> None:
+def _table(runs: Sequence[Run], drifts: Sequence[Drift | None], parameters: Sequence[str]) -> None:
     from rich.console import Console
     from rich.table import Table
 
     table = Table(title=runs[0].document.robot)
     for heading in ("recorded (UTC)", "recording", "error", *parameters, "beside the first"):
         table.add_column(heading, justify="left" if heading in ("recording", "beside the first") else "right")
-    for run, drift in zip(runs, [None, *drifts], strict=True):
+    for run, drift in zip(runs, drifts, strict=True):
         values = {p.name: f"{p.value:.4g} +- {p.std:.1g}" for p in run.document.parameters}
         table.add_row(
             f"{run.recorded:%Y-%m-%d %H:%M}",
             Path(run.document.recording.path or "-").name,
             f"{run.document.relative_error_pct:.2f} %",
             *(values[name] for name in parameters),
-            "baseline" if drift is None else drift.words,
+            drift.words if drift is not None else "baseline" if run.document.converged else "did not converge",
         )
     Console().print(table)
 

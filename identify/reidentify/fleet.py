@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from configs import ArmidentError, ConfigError, RobotConfig, load_robot
+from configs import ArmidentError, ConfigError, DataError, RobotConfig, load_robot
 from daq.recording import Recording, read_recording
 from identify.document import IdentificationDocument, from_json, load_document, to_json
 from identify.drift import Drift, compare
@@ -150,9 +150,11 @@ def _judged(
         found: Identified = future.result()
         document = from_json(found.text, IdentificationDocument, str(path))
         first = known if known is not None else _first(history, document.robot)
-        drift = None if first is None else compare(first, document, false_alarms)
         history.describe(found.facts)
         history.add(document, History.began(found.facts, document, Path(found.path)))
+        if not document.converged:
+            raise DataError(f"the identification did not converge ({document.stop_reason})")
+        drift = None if first is None else compare(first, document, false_alarms)
         if drift is None or first is None:
             return Row(str(path), words=(f"first run of {document.robot}: the baseline",), identification=found.path)
         history.judge(document, first, drift)

@@ -183,6 +183,12 @@ def carry_out(job: Job, announcer: Announcer, say: Say, start: Start = start_pro
     for warning in document.warnings:
         say(f"warning: {warning}")
     say(f"identified: relative torque error {document.relative_error_pct:.2f} %")
+    if not document.converged:
+        keep(job.history, recording, document, path, None, None)
+        raise DataError(
+            f"{recording.path}: the identification did not converge ({document.stop_reason}): "
+            f"whether the arm has changed is unknown (result: {path})"
+        )
     drift = None if job.baseline.document is None else compare(job.baseline.document, document, job.false_alarms)
     keep(job.history, recording, document, path, job.baseline.document, drift)
     announcer.result(to_json(document))

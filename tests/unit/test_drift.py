@@ -114,3 +114,29 @@ def test_another_robot_or_model_is_refused() -> None:
 def test_p_values_of_holm() -> None:
     np.testing.assert_allclose(_holm(np.array([0.01, 0.04, 0.03])), [0.03, 0.06, 0.06])
     np.testing.assert_allclose(_holm(np.array([0.5, 0.9])), [1.0, 1.0])
+
+
+def test_a_run_that_did_not_converge_is_not_called_unchanged() -> None:
+    """Its deviations are as wild as its values: everything would be within them."""
+    wild = identified(TRUTH * 3, C * 1e12).model_copy(update={"converged": False, "stop_reason": "stopped after 20"})
+    with pytest.raises(DataError, match=r"the identification did not converge \(stopped after 20\)"):
+        compare(identified(TRUTH), wild)
+    with pytest.raises(DataError, match="the baseline did not converge"):
+        compare(wild, identified(TRUTH))
+
+
+def test_friction_that_changed_as_a_whole_is_found_where_no_part_is_clear() -> None:
+    """Viscous and Coulomb friction, hard to tell apart: their common direction is known ten times better than each."""
+    names = [f"{kind}{joint}" for joint in range(1, 7) for kind in ("fv", "fc", "xx", "mx", "my")]
+    c = np.diag((0.02 * TRUTH) ** 2)
+    for k in (0, 5, 10, 15, 20, 25):
+        c[k, k + 1] = c[k + 1, k] = -0.98 * np.sqrt(c[k, k] * c[k + 1, k + 1])
+    later = TRUTH.copy()
+    later[[5, 6]] += 2.5 * 0.02 * TRUTH[[5, 6]]
+    drift = compare(identified(TRUTH, c, names=names), identified(later, c, names=names))
+    assert drift.changed == ()
+    assert [(group.kind, group.place, group.members) for group in drift.changed_groups] == [
+        ("friction", "2", ("fv2", "fc2"))
+    ]
+    assert drift.drifted
+    assert "friction 2 (fv2, fc2 together)" in drift.words
