@@ -21,6 +21,14 @@ RANK_TOLERANCE = 1e-9
 """Eigenvalues of the correlation of the difference, relative to the greatest, that count as rounding."""
 
 
+MUCH_WORSE = 10.0
+"""An identification whose deviations are so many times those of the other (median) can neither confirm nor deny."""
+
+
+class Inconclusive(DataError):
+    """An identification that can neither confirm nor deny a change."""
+
+
 FRICTION = ("fv", "fc", "off")
 """Parameters that make up the friction of a joint, or of a shaft that two joints share; the rest is of its masses."""
 
@@ -150,11 +158,13 @@ def compare(baseline: IdentificationDocument, now: IdentificationDocument, false
     Raises
     ------
     DataError
-        If they are of different robots or models, or one of them did not converge: its deviations say nothing then.
+        If they are of different robots or models.
+    Inconclusive
+        If one of them says nothing: it did not converge, or is far less precise than the other.
     """
     for name, document in (("the baseline", baseline), ("the identification", now)):
         if not document.converged:
-            raise DataError(
+            raise Inconclusive(
                 f"{now.robot}: {name} did not converge ({document.stop_reason}): whether the arm has changed is unknown"
             )
     if baseline.robot != now.robot:
@@ -167,10 +177,16 @@ def compare(baseline: IdentificationDocument, now: IdentificationDocument, false
     order = [old[p.name] for p in now.parameters]
     before = np.array([baseline.parameters[k].value for k in order])
     difference = np.array([p.value for p in now.parameters]) - before
+    if not all(p.std > 0 for p in (*now.parameters, *baseline.parameters)):
+        raise DataError(f"{now.robot}: a parameter without a standard deviation cannot be compared")
+    worse = float(np.median([p.std for p in now.parameters] / np.array([baseline.parameters[k].std for k in order])))
+    if not 1.0 / MUCH_WORSE < worse < MUCH_WORSE:
+        raise Inconclusive(
+            f"{now.robot}: standard deviations are {worse:.2g} times those of the baseline: "
+            "whether the arm has changed is unknown"
+        )
     covariance = np.array(now.covariance) + np.array(baseline.covariance)[np.ix_(order, order)]
     std = np.sqrt(np.diag(covariance))
-    if not np.all(std > 0):
-        raise DataError(f"{now.robot}: a parameter without a standard deviation cannot be compared")
     chi_square, degrees = _chi_square(difference, covariance)
     names = [p.name for p in now.parameters]
     places = _places(names)

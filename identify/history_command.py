@@ -8,7 +8,7 @@ import numpy as np
 
 from configs import ConfigError
 from identify.document import IdentificationDocument, load_document
-from identify.drift import Drift, compare
+from identify.drift import Drift, Inconclusive, compare
 from identify.history import History, Run, recorded_at
 
 DRIFTED = 4
@@ -40,10 +40,7 @@ def history_command(
         history.add(document, recorded_at(document, path))
     runs = history.runs(_robot(history, robot, [document.robot for document, _ in loaded]))
     first = next((k for k, run in enumerate(runs) if run.document.converged), len(runs))
-    drifts = [
-        compare(runs[first].document, run.document, false_alarms) if k > first and run.document.converged else None
-        for k, run in enumerate(runs)
-    ]
+    drifts = [_compared(runs[first], run, false_alarms) if k > first else None for k, run in enumerate(runs)]
     _check(parameters, runs)
     if plot is not None:
         _plot(plot, runs, parameters or _most_changed(drifts, runs))
@@ -53,6 +50,13 @@ def history_command(
         _table(runs, drifts, parameters)
     last = drifts[-1]
     return DRIFTED if last is not None and last.drifted else 0
+
+
+def _compared(first: Run, run: Run, false_alarms: float) -> Drift | None:
+    try:
+        return compare(first.document, run.document, false_alarms)
+    except Inconclusive:
+        return None
 
 
 def _robot(history: History, wanted: str | None, added: Sequence[str]) -> str:
@@ -106,6 +110,7 @@ def _table(runs: Sequence[Run], drifts: Sequence[Drift | None], parameters: Sequ
     table = Table(title=runs[0].document.robot)
     for heading in ("recorded (UTC)", "recording", "error", *parameters, "beside the first"):
         table.add_column(heading, justify="left" if heading in ("recording", "beside the first") else "right")
+    first = next((run for run in runs if run.document.converged), None)
     for run, drift in zip(runs, drifts, strict=True):
         values = {p.name: f"{p.value:.4g} +- {p.std:.1g}" for p in run.document.parameters}
         table.add_row(
@@ -113,7 +118,7 @@ def _table(runs: Sequence[Run], drifts: Sequence[Drift | None], parameters: Sequ
             Path(run.document.recording.path or "-").name,
             f"{run.document.relative_error_pct:.2f} %",
             *(values[name] for name in parameters),
-            drift.words if drift is not None else "baseline" if run.document.converged else "did not converge",
+            drift.words if drift is not None else "baseline" if run is first else "says nothing",
         )
     Console().print(table)
 

@@ -21,7 +21,7 @@ from configs import (
 )
 from daq.recording import Recording
 from identify.document import DiagnosisDocument, IdentificationDocument, from_json, to_json
-from identify.drift import Drift, compare
+from identify.drift import Drift, Inconclusive, compare
 from identify.history import History
 from identify.model.arm import ArmModel
 from identify.moves import motion_of
@@ -189,7 +189,11 @@ def carry_out(job: Job, announcer: Announcer, say: Say, start: Start = start_pro
             f"{recording.path}: the identification did not converge ({document.stop_reason}): "
             f"whether the arm has changed is unknown (result: {path})"
         )
-    drift = None if job.baseline.document is None else compare(job.baseline.document, document, job.false_alarms)
+    try:
+        drift = None if job.baseline.document is None else compare(job.baseline.document, document, job.false_alarms)
+    except Inconclusive as error:
+        keep(job.history, recording, document, path, None, None)
+        raise DataError(f"{recording.path}: {error} (result: {path})") from error
     keep(job.history, recording, document, path, job.baseline.document, drift)
     announcer.result(to_json(document))
     if drift is None:

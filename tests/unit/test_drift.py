@@ -5,7 +5,7 @@ import pytest
 
 from configs import DataError
 from identify.document import IdentificationDocument, Parameter, RecordingReference
-from identify.drift import FALSE_ALARMS, _holm, compare
+from identify.drift import FALSE_ALARMS, Inconclusive, _holm, compare
 
 NAMES = [f"p{k}" for k in range(30)]
 TRUTH = np.linspace(0.5, 20.0, 30)
@@ -119,7 +119,7 @@ def test_p_values_of_holm() -> None:
 def test_a_run_that_did_not_converge_is_not_called_unchanged() -> None:
     """Its deviations are as wild as its values: everything would be within them."""
     wild = identified(TRUTH * 3, C * 1e12).model_copy(update={"converged": False, "stop_reason": "stopped after 20"})
-    with pytest.raises(DataError, match=r"the identification did not converge \(stopped after 20\)"):
+    with pytest.raises(Inconclusive, match=r"the identification did not converge \(stopped after 20\)"):
         compare(identified(TRUTH), wild)
     with pytest.raises(DataError, match="the baseline did not converge"):
         compare(wild, identified(TRUTH))
@@ -140,3 +140,12 @@ def test_friction_that_changed_as_a_whole_is_found_where_no_part_is_clear() -> N
     ]
     assert drift.drifted
     assert "friction 2 (fv2, fc2 together)" in drift.words
+
+
+def test_a_run_that_knows_far_less_is_not_called_unchanged() -> None:
+    """A hundred times the deviations: a friction that doubled would be within them."""
+    with pytest.raises(Inconclusive, match="standard deviations are 1e\\+02 times those of the baseline"):
+        compare(identified(TRUTH), identified(2 * TRUTH, C * 1e4))
+    with pytest.raises(DataError, match=r"standard deviations are 0\.01 times those of the baseline"):
+        compare(identified(TRUTH, C * 1e4), identified(2 * TRUTH))
+    assert compare(identified(TRUTH), identified(2 * TRUTH, C * 16)).drifted
