@@ -77,10 +77,12 @@ def fleet_command(
     known = None if baseline is None else load_document(baseline, IdentificationDocument)
     history = History(store)
     rows: list[Row] = []
+    # Of each robot one baseline for all: an older recording that comes later must not take its place.
+    baselines: dict[str, IdentificationDocument] = {}
     with cluster(scheduler, workers) as client:
         futures = [client.submit(identify_one, str(path), robot, _folder(path, out), pure=False) for path in paths]
         for path, future in zip(paths, futures, strict=True):
-            row = _judged(path, future, history, known, false_alarms)
+            row = _judged(path, future, history, known, baselines, false_alarms)
             future.release()
             rows.append(row)
             # One line as soon as it is known: a fleet takes hours.
@@ -144,16 +146,22 @@ def _options(recording: Recording) -> Options:
 
 
 def _judged(
-    path: Path, future: Any, history: History, known: IdentificationDocument | None, false_alarms: float
+    path: Path,
+    future: Any,
+    history: History,
+    known: IdentificationDocument | None,
+    baselines: dict[str, IdentificationDocument],
+    false_alarms: float,
 ) -> Row:
     try:
         found: Identified = future.result()
         document = from_json(found.text, IdentificationDocument, str(path))
-        first = known if known is not None else _first(history, document.robot)
+        first = known or baselines.get(document.robot) or _first(history, document.robot)
         history.describe(found.facts)
         history.add(document, History.began(found.facts, document, Path(found.path)))
         if not document.converged:
             raise DataError(f"the identification did not converge ({document.stop_reason})")
+        baselines.setdefault(document.robot, first or document)
         drift = None if first is None else compare(first, document, false_alarms)
         if drift is None or first is None:
             return Row(str(path), words=(f"first run of {document.robot}: the baseline",), identification=found.path)
