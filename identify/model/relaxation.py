@@ -2,11 +2,12 @@
 
 The compiled loop knows the rigid arm with friction. What a term adds is computed along the whole simulated motion,
 taken for a load on the next simulation, and so on until the motion stays (Lelarasmee, Ruehli, Sangiovanni-Vincentelli
-1982): a controller that tracks its reference makes the motion depend so little on the load that a few rounds are
-enough. Any effect of the catalogue, also one with a memory of its own, so has a place in the simulation by its columns
-alone.
+1982). Each load is guessed from how the last ones answered (Anderson 1965, J. ACM 12(4)), so that terms that depend on
+accelerations and torques settle, too. Any effect of the catalogue, also one with a memory of its own, so has a place in
+the simulation by its columns alone.
 """
 
+from collections import deque
 from dataclasses import replace
 from typing import Any
 
@@ -17,12 +18,19 @@ from identify.model.arm import ArmModel
 from identify.model.chain import Floats
 from identify.model.controller import DiscreteController
 from identify.model.simulation import Simulation, simulate
+from identify.signals.bandpass import butterworth
 
-ROUNDS = 8
+ROUNDS = 16
 """Most simulations."""
 
 SETTLED = 1e-3
-"""Change of the terms' torque from one round to the next, over its size, that ends the rounds."""
+"""Torque of the terms beside the load that they were simulated with, over its size, that ends the rounds."""
+
+MEMORY = 6
+"""Rounds from which the next load is guessed."""
+
+STEP = 0.5
+"""Share of what is still missing from the load that goes into the next one, beyond the guess."""
 
 
 def simulate_with_terms(
@@ -34,6 +42,7 @@ def simulate_with_terms(
     *,
     start: float = 0.0,
     disturbance: ArrayLike | None = None,
+    band_hz: float = np.inf,
     **initial: Any,
 ) -> Simulation:
     """Simulate like :func:`identify.model.simulation.simulate`, the terms of the model included.
@@ -44,6 +53,9 @@ def simulate_with_terms(
         Base (b,) or standard (p,) parameters; the last e are those of the terms.
     start
         Time of the first sample since the recordings began, s.
+    band_hz
+        The arm feels no more of the terms than what is slower than this: differentiated twice or thrice, the steps in
+        which references arrive would keep the rounds from settling.
 
     Returns
     -------
@@ -59,22 +71,49 @@ def simulate_with_terms(
     reference = np.ascontiguousarray(q_ref, dtype=np.float64)
     pushed = np.zeros_like(reference) if disturbance is None else np.asarray(disturbance, dtype=np.float64)
     load: Floats = np.zeros_like(reference)
-    run, change = None, np.inf
+    best: tuple[float, Simulation, Floats] | None = None
+    past = _Past()
     for _ in range(ROUNDS):
-        again = simulate(model, theta, controller, reference, dt, disturbance=pushed - load @ to_motors, **initial)
-        if again.diverged_at is not None:
-            return again if run is None else run
-        torque = known.term_regressor(known.motion(again.q, again.qd, again.qdd, dt, start)) @ values
+        run = simulate(model, theta, controller, reference, dt, disturbance=pushed - load @ to_motors, **initial)
+        if run.diverged_at is not None:
+            if best is None:
+                return run
+            load = 0.5 * (load + best[2])
+            continue
+        torque = known.term_regressor(known.motion(run.q, run.qd, run.qdd, dt, start)) @ values
         # A torque held over a period acts like its mean between two samples.
         held = torque.copy()
         held[:-1] = 0.5 * (torque[1:] + torque[:-1])
-        step = float(np.linalg.norm(held - load)) / max(float(np.linalg.norm(held)), 1e-300)
-        settled = replace(again, tau=again.tau + load)
-        if step > change:
-            # Too stiff for relaxation: the best round so far stays.
-            return run if run is not None else settled
-        run, load, change = settled, held, step
-        if step < SETTLED:
+        if band_hz < 0.45 / dt:
+            held = butterworth(held, dt, band_hz)
+        missing = held - load
+        apart = float(np.linalg.norm(missing)) / max(float(np.linalg.norm(held)), 1e-300)
+        if best is None or apart < best[0]:
+            best = apart, replace(run, tau=run.tau + load), load
+        if apart < SETTLED:
             break
-    assert run is not None
-    return run
+        load = past.next(load, missing)
+    assert best is not None
+    return best[1]
+
+
+class _Past:
+    """Loads of the last rounds, and what was missing from them."""
+
+    def __init__(self) -> None:
+        self._loads: deque[Floats] = deque(maxlen=MEMORY)
+        self._missing: deque[Floats] = deque(maxlen=MEMORY)
+
+    def next(self, load: Floats, missing: Floats) -> Floats:
+        """The load at which the least would be missing if it answered linearly, and a step from there."""
+        self._loads.append(load)
+        self._missing.append(missing)
+        if len(self._loads) == 1:
+            return load + STEP * missing
+        loads, answers = (
+            np.stack([b.ravel() - a.ravel() for a, b in zip(x, list(x)[1:], strict=False)], axis=1)
+            for x in (self._loads, self._missing)
+        )
+        weights = np.linalg.lstsq(answers, missing.ravel(), rcond=1e-10)[0]
+        guess: Floats = load + STEP * missing - ((loads + STEP * answers) @ weights).reshape(load.shape)
+        return guess

@@ -17,6 +17,7 @@ from identify.model.relaxation import simulate_with_terms
 from identify.model.simulation import simulate
 from identify.options import Method, Options
 from identify.service import identify_recording
+from identify.signals.bandpass import butterworth
 from virtual_robot.inertias import plant_parameters
 from virtual_robot.offline import simulate_recording
 
@@ -63,6 +64,40 @@ def test_viscous_friction_as_a_term_moves_the_simulated_arm_like_that_of_the_mod
     # A load held over a sample instead of acting at once is worth a few thousandths of its effect.
     assert np.abs(found.q - expected.q).max() < 0.02 * lag
     assert np.linalg.norm(found.tau - expected.tau) < 0.002 * np.linalg.norm(expected.tau)
+
+
+@pytest.mark.parametrize(
+    ("effect", "linear", "shapes"),
+    [
+        ("time_delay", 0.006, {}),
+        ("actuator_bandwidth", 0.015, {}),
+        ("joint_elasticity", 0.001, {"frequency": 8.0, "rotor": 0.3}),
+        ("backlash", 0.8, {"gap": 0.01, "rotor": 0.3}),
+    ],
+)
+def test_a_simulated_arm_feels_the_torque_that_its_own_motion_gives_a_term(
+    robot: RobotConfig, theta: Any, effect: str, linear: float, shapes: dict[str, float]
+) -> None:
+    """What a late or elastic drive adds depends on accelerations and torques, and so on itself."""
+    model = ArmModel.from_config(robot)
+    q_ref = reference(robot)
+    controller = nominal_controller(model, theta, q_ref[::50], DT, 10.0)
+    stanza = Effect(effect=effect, joint="joint_1", parameters=shapes)
+    whole = np.append(theta, linear)
+    extended = ArmModel.from_config(with_effects(robot, stanza)).anchored(whole)
+    found = simulate_with_terms(extended, whole, controller, q_ref, DT, band_hz=30.0)
+    assert found.diverged_at is None
+    torque = extended.term_regressor(extended.motion(found.q, found.qd, found.qdd, DT))[:, 0, 0] * linear
+    own = butterworth(np.append(0.5 * (torque[1:] + torque[:-1]), torque[-1]), DT, 30.0)
+    rigid = simulate(model, theta, controller, q_ref, DT, disturbance=-_on_joint_1(own, robot))
+    felt = np.abs(rigid.q - simulate(model, theta, controller, q_ref, DT).q)[:, 0].max()
+    assert np.abs(found.q - rigid.q)[:, 0].max() < 0.05 * felt
+
+
+def _on_joint_1(torque: Any, robot: RobotConfig) -> Any:
+    joints = np.zeros((torque.size, robot.n))
+    joints[:, 0] = torque
+    return joints @ np.linalg.inv(robot.transmission_matrix)
 
 
 @pytest.mark.slow
