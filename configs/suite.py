@@ -54,6 +54,10 @@ class SuiteEffect(Frozen):
         Linear parameters of the diagnosis as expressions in the effect's parameters and the same names.
     same_as
         Other names that mean the same by physics, by robot.
+    rescales
+        Whether reported torques have another size with it: percentages of them are none of the healthy arm's.
+    brings
+        Effects that the arm gets with it, so that they are no mistake beside its name.
     baseline
         Robots on which it shows against the numbers of a healthy arm only.
     hide
@@ -71,6 +75,8 @@ class SuiteEffect(Frozen):
     expected: Name | None = None
     truth: dict[Name, Expression] = Field(default_factory=dict)
     same_as: dict[Name, tuple[Name, ...]] = Field(default_factory=dict)
+    brings: tuple[Name, ...] = ()
+    rescales: bool = False
     baseline: tuple[Name, ...] = ()
     hide: bool = True
     arm: bool = False

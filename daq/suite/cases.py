@@ -35,6 +35,10 @@ class HiddenPart:
         ``False``: the healthy arm has it already.
     arm
         Whether it is of the arm as a whole, so that no joint of a finding is wrong.
+    brings
+        Names of effects that the arm gets with it.
+    rescales
+        Whether reported torques have another size with it.
     """
 
     effect: str
@@ -46,6 +50,8 @@ class HiddenPart:
     strength: float
     hide: bool = True
     arm: bool = False
+    brings: tuple[str, ...] = ()
+    rescales: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,6 +103,9 @@ class Case:
     def key(self) -> str:
         """Hash of all that decides the result."""
         content = {k: v for k, v in asdict(self).items() if k not in ("quick", "kind", "level")}
+        content["parts"] = [
+            {k: v for k, v in part.items() if k not in ("brings", "rescales")} for part in content["parts"]
+        ]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
@@ -205,6 +214,8 @@ def _part(suite: SuiteConfig, effect: SuiteEffect, robot: str, place: str, level
         strength,
         effect.hide,
         effect.arm,
+        effect.brings,
+        effect.rescales,
     )
 
 

@@ -1,5 +1,6 @@
 """What a diagnosis is worth, and the tables."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -96,6 +97,30 @@ def test_the_gap_closed_is_measured_above_the_noise_of_the_healthy_twin() -> Non
     assert closed_share(case(SPRING), half, HEALTHY["document"]) == pytest.approx(0.5)
     none = record(before=8.01, after=8.0)["document"]
     assert closed_share(case(SPRING), none, HEALTHY["document"]) is None
+
+
+def test_the_gap_is_looked_at_where_it_shows() -> None:
+    def looped(document: Any, before: float, after: float) -> Any:
+        torque = {f"joint_{k}": 5.0 for k in range(1, 7)}
+        errors = {"torque_before": torque | {"joint_2": before}, "torque_after": torque | {"joint_2": after}}
+        return {**document, "simulated": errors}
+
+    healthy = looped(HEALTHY["document"], 6.0, 6.0)
+    # A late torque: measured motion brings the noise of a third derivative, the simulated loop shows the delay.
+    late = looped(record(finding("joint_spring", "joint_2"), before=8.1, after=9.0)["document"], 10.0, 6.0)
+    assert closed_share(case(SPRING), late, healthy) == pytest.approx(1.0)
+    # The other way round, whatever became of it: the larger injected gap decides, not the better end.
+    seen = looped(record(finding("joint_spring", "joint_2"), before=16.0, after=16.0)["document"], 6.5, 6.0)
+    assert closed_share(case(SPRING), seen, healthy) == pytest.approx(0.0)
+
+
+def test_what_an_effect_brings_with_it_is_no_mistake() -> None:
+    bristle = replace(SPRING, brings=("presliding_friction",))
+    found = record(finding("joint_spring", "joint_2"), finding("presliding_friction", "joint_2"))
+    elsewhere = record(finding("joint_spring", "joint_2"), finding("presliding_friction", "joint_3"))
+    assert score(case(bristle), found, HEALTHY).extra == 0
+    assert score(case(bristle), elsewhere, HEALTHY).extra == 1
+    assert case(bristle).key == case(SPRING).key
 
 
 def test_stale_numbers_are_judged_by_the_gap_of_their_own_findings() -> None:
