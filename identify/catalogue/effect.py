@@ -102,6 +102,9 @@ class Effect:
         recording, and there are no columns.
     predicts
         Whether the columns depend on the torques that the model predicts, and so on its parameters.
+    sudden
+        Whether it makes the arm leap, at instants that no simulation meets to the sample: columns at measured signals
+        are their own instruments then, and have to explain more than feedback lets a term without merit explain.
     physical
         Whether physics allows linear parameters (k,) at given nonlinear ones, where signs and bounds do not say it all.
     negligible
@@ -124,18 +127,19 @@ class Effect:
     excitation: tuple[str, ...] = field(default=("reversals", "speeds"))
     rewires: bool = False
     predicts: bool = False
+    sudden: bool = False
     physical: Callable[[Array, Mapping[str, float]], bool] | None = None
     negligible: Callable[[Array, float], bool] | None = None
 
     def allows(self, values: Array, std: Array, shapes: Mapping[str, float]) -> bool:
         """Whether linear parameters (k,) at given nonlinear ones have signs and sizes that physics allows.
 
-        A sign is wrong if it is wrong beyond doubt: of several parameters some may be nothing but noise.
+        Signs and sizes are wrong if they are wrong beyond doubt: of several parameters some may be nothing but noise.
         """
         if self.physical is not None and not self.physical(values, shapes):
             return False
         return all(
-            p.sign * value >= -DOUBT * doubt and p.bounds[0] <= value <= p.bounds[1]
+            p.sign * value >= -DOUBT * doubt and p.bounds[0] - DOUBT * doubt <= value <= p.bounds[1] + DOUBT * doubt
             for p, value, doubt in zip(self.linear, values, std, strict=True)
         )
 

@@ -28,8 +28,17 @@ def _asymmetric_viscous(motion: Motion, place: Place) -> Array:
     return (motion.qd * motion.sign)[:, place.joint, None]
 
 
-def _asymmetric_coulomb(motion: Motion, place: Place) -> Array:
-    return motion.sign[:, place.joint, None] ** 2
+def _asymmetric_coulomb(motion: Motion, place: Place, *, velocity: float = 0.0) -> Array:
+    if velocity == 0.0:
+        return motion.sign[:, place.joint, None] ** 2
+    built: Array = (2 / np.pi * np.arctan(motion.qd[:, place.joint, None] / velocity)) ** 2
+    return built
+
+
+def films(motion: Motion, joint: int) -> Sequence[float]:
+    """Speeds from that of the model's smoothed sign to a twentieth of the joint's top speed."""
+    least, most = 1 / motion.model.smoothing, 0.05 * float(motion.top_speed[joint])
+    return [float(v) for v in np.geomspace(least, most, 5)] if most > least else [least]
 
 
 def _stribeck(motion: Motion, place: Place, *, velocity: float) -> Array:
@@ -128,9 +137,11 @@ EFFECTS = (
     Effect(
         name="asymmetric_coulomb_friction",
         title="dry friction that differs between the directions",
-        says="dry friction differs between the two directions of motion, beyond a constant offset",
+        says="dry friction differs between the two directions of motion, beyond a constant offset, and builds up with "
+        "the speed",
         reference="Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)",
         linear=(Linear("fca", TORQUE),),
+        shapes=(Shape("velocity", ("rad/s", "m/s"), films, default=0.0),),
         columns=_asymmetric_coulomb,
         needs="both directions of motion, and standstill: while moving it looks like a constant offset",
         excitation=("reversals", "standstill"),
@@ -180,7 +191,7 @@ EFFECTS = (
             Shape(
                 "displacement",
                 ("rad", "m"),
-                lambda motion, joint: tuple(float(motion.span[joint]) * np.geomspace(0.002, 0.1, 8)),
+                lambda motion, joint: tuple(float(motion.span[joint]) * np.geomspace(0.0002, 0.1, 12)),
             ),
         ),
         columns=_presliding,

@@ -13,8 +13,8 @@ from identify.model.compiled import compiled
 
 Array = NDArray[np.float64]
 
-DAMPING = 0.7
-"""Damping ratio of the link on its spring: the controlled motor gives way to its swinging, and so calms it."""
+DAMPINGS = (0.1, 0.7)
+"""Damping ratios of a link on its spring: of its own, and where the controlled motor, giving way, calms it."""
 
 LEAST_INERTIA = 0.1
 """Inertia at a joint below which it is not believed, of the largest along the motion: a fit may make it negative."""
@@ -38,12 +38,14 @@ def harmonics(motion: Motion, joint: int) -> Sequence[float]:
     return [float(resolution * k) for k in range(4, 161)]
 
 
-def _elasticity(motion: Motion, place: Place, *, frequency: float, rotor: float = 0.0) -> Array:
+def _elasticity(
+    motion: Motion, place: Place, *, frequency: float, damping: float = DAMPINGS[-1], rotor: float = 0.0
+) -> Array:
     """The link stands behind the motor by compliance times load, and swings there at its own frequency."""
     j, behind = place.joint, -motion.handed_on(place.joint, rotor)
     # Tustin's rule for w^2 s^k / (s^2 + 2 damping w s + w^2), k = 0, 1, 2: way, speed and acceleration of the link.
     w, tustin = 2 * np.pi * frequency, 2 / motion.dt
-    swing = 2 * DAMPING * w * tustin
+    swing = 2 * damping * w * tustin
     a = np.array([tustin**2 + swing + w**2, 2 * w**2 - 2 * tustin**2, tustin**2 - swing + w**2])
     moves = []
     for numerator in ([1.0, 2.0, 1.0], [tustin, 0.0, -tustin], [tustin**2, -2 * tustin**2, tustin**2]):
@@ -55,7 +57,7 @@ def _elasticity(motion: Motion, place: Place, *, frequency: float, rotor: float 
 
 def frequencies(motion: Motion, joint: int) -> Sequence[float]:
     """Resonances up to a fifth of the sampling rate."""
-    return [float(f) for f in np.geomspace(4.0, min(100.0, 0.2 / motion.dt), 7)]
+    return [float(f) for f in np.geomspace(4.0, min(80.0, 0.2 / motion.dt), 7)]
 
 
 def _backlash(motion: Motion, place: Place, *, gap: float, rotor: float = 0.0) -> Array:
@@ -96,9 +98,9 @@ def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
 
 
 def gaps(motion: Motion, joint: int) -> Sequence[float]:
-    """Gaps that the link crosses in 5 to 100 ms under the load that there mostly is."""
+    """Gaps that the link crosses in 5 to 100 ms under the usual load; one that is a quarter off misses the impacts."""
     usual = max(float(np.std(falls(motion, joint))), 1e-9)
-    return [0.5 * usual * float(time) ** 2 for time in np.geomspace(0.005, 0.1, 8)]
+    return [0.5 * usual * float(time) ** 2 for time in np.geomspace(0.005, 0.1, 25)]
 
 
 EFFECTS = (
@@ -121,7 +123,11 @@ EFFECTS = (
         says="the link swings behind its motor: an elastic gear, belt or coupling, or a bending link",
         reference="Spong 1987, J. Dyn. Sys. Meas. Control 109(4)",
         linear=(Linear("compliance", ("rad/(N m)", "m/N"), sign=1),),
-        shapes=(Shape("frequency", ("Hz", "Hz"), frequencies), ROTOR),
+        shapes=(
+            Shape("frequency", ("Hz", "Hz"), frequencies),
+            Shape("damping", ("", ""), lambda motion, joint: DAMPINGS, default=DAMPINGS[-1]),
+            ROTOR,
+        ),
         columns=_elasticity,
         predicts=True,
         needs="quick accelerations near the resonance, under load",
@@ -132,10 +138,11 @@ EFFECTS = (
         title="play in the gear",
         says="the motor turns a little before the link follows when the load changes sides: worn teeth, a loose key",
         reference="Nordin, Gutman 2002, Automatica 38(10)",
-        linear=(Linear("behind", ("", ""), sign=1),),
+        linear=(Linear("behind", ("", ""), sign=1, bounds=(0.1, 1.5)),),
         shapes=(Shape("gap", ("rad", "m"), gaps), ROTOR),
         columns=_backlash,
         predicts=True,
+        sudden=True,
         needs="many changes of the load's direction",
         excitation=("reversals", "accelerations"),
     ),

@@ -61,8 +61,13 @@ class Workshop:
     _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
 
     def with_theta(self, study: Study, theta: Array) -> "Workshop":
-        """The same after a refit; columns that do not depend on theta stay."""
-        still = {key: value for key, value in self.kept.items() if not _predicts(key[0])}
+        """The same after a refit; columns that depend neither on theta nor on another simulation stay."""
+        moved = any(a.simulated is not b.simulated for a, b in zip(study.train, self.study.train, strict=True))
+        still = {
+            key: value
+            for key, value in self.kept.items()
+            if not _predicts(key[0]) and not (moved and key[5] == "simulated")
+        }
         return Workshop(study, theta, still)
 
     def instruments(
@@ -99,6 +104,7 @@ class Workshop:
         keep
             Whether they may be asked for again.
         """
+        kind = "measured" if effect.sudden else kind
         key = (effect.name, place.joint, place.other, shapes, part, kind)
         if key in self.kept:
             return self.kept[key]

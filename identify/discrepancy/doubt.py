@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from configs import DataError
 from identify.discrepancy.findings import CLOSE, described
-from identify.discrepancy.search import MOST, Search, State, added, nearer, places_of, without
+from identify.discrepancy.search import MOST, Search, State, nearer, places_of
+from identify.discrepancy.stanzas import without
 from identify.discrepancy.where import Disagreement, Survey, unexplained
 from identify.document import Finding
 
@@ -84,11 +84,8 @@ def _without(
     for best in rest.passing(search.settings)[:1]:
         if mine and best.score < max(mine) + CLOSE:
             continue
-        try:
-            other = search.state(added(rest.study.robot, best), rest)
-        except DataError:
-            continue
-        if nearer(other, rest, search.settings.material) and places_of(other) not in been:
+        other = search.with_trial(rest, best)
+        if other is not None and nearer(other, rest, search.settings.material) and places_of(other) not in been:
             return other
     return rest
 

@@ -16,7 +16,8 @@ from identify.discrepancy.experiment import recommended_experiment
 from identify.discrepancy.numbers import NumbersFinding
 from identify.discrepancy.precision import standard_deviations
 from identify.discrepancy.regression import relative_errors
-from identify.discrepancy.search import Search, Settings, State, with_values, without
+from identify.discrepancy.search import Search, Settings, State, with_values
+from identify.discrepancy.stanzas import without
 from identify.discrepancy.where import Disagreement
 from identify.discrepancy.wiring_check import WiringFinding
 from identify.document import Alternative, Finding, Gap, Invisible

@@ -9,6 +9,7 @@ from identify.catalogue.terms import Term
 from identify.discrepancy.candidates import Workshop
 from identify.discrepancy.regression import Fit
 from identify.discrepancy.search import State
+from identify.discrepancy.trial import newey_west
 from identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
@@ -21,7 +22,9 @@ def standard_deviations(state: State) -> list[dict[str, float]]:
     """Standard deviations of all parameters of every term of the model, by their names in the configuration.
 
     The derivative of the torque with respect to a nonlinear parameter is one more column, so that its uncertainty
-    enters that of the linear ones (Gauss-Newton); parameters taken from a set of whole numbers count as known.
+    enters that of the linear ones (Gauss-Newton); parameters taken from a set of whole numbers count as known. What the
+    model leaves is no white noise where an effect is only nearly right: spreads are those of the residual along each
+    parameter's influence (Newey, West 1987, Econometrica 55(3)), if that is more.
     """
     study, fit = state.study, state.fit
     slopes: list[Array] = []
@@ -32,15 +35,15 @@ def standard_deviations(state: State) -> list[dict[str, float]]:
             if shape.continuous:
                 slopes.append(_slope(state.workshop, fit.noise, term, shape.name, fit.theta[own]))
                 owners.append((k, shape.name))
-    covariance = _extended(fit, slopes)
+    deviations = _deviations(fit, slopes)
     b = fit.theta.size
     found: list[dict[str, float]] = []
     for k, term in enumerate(study.model.terms):
         own = [study.model.base.names.index(name) for name in term.names]
-        std = {p.name: float(np.sqrt(covariance[i, i])) for p, i in zip(term.effect.linear, own, strict=True)}
+        std = {p.name: float(deviations[i]) for p, i in zip(term.effect.linear, own, strict=True)}
         for place, (owner, name) in enumerate(owners):
             if owner == k:
-                std[name] = float(np.sqrt(covariance[b + place, b + place]))
+                std[name] = float(deviations[b + place])
         found.append(std)
     return found
 
@@ -62,17 +65,23 @@ def _slope(workshop: Workshop, noise: Sequence[ArModel], term: Term, name: str, 
     return slope
 
 
-def _extended(fit: Fit, slopes: list[Array]) -> Array:
-    """Covariance of the parameters and of further ones whose columns at the simulated signals are ``slopes``."""
-    if not slopes:
-        return fit.covariance
+def _deviations(fit: Fit, slopes: list[Array]) -> Array:
+    """Of the model's own parameters and of further ones whose columns at simulated signals are ``slopes``, (b + s,).
+
+    Those of the rigid model stay as they are (4.34).
+    """
+    b, e = fit.theta.size, fit.study.model.e
+    variances: Array = np.concatenate([np.diag(fit.covariance), np.zeros(len(slopes))])
+    if not e:
+        return variances**0.5
     z = np.column_stack([fit.train.z, *slopes])
     scale = np.linalg.norm(z, axis=0)
     scale[scale == 0] = 1.0
-    gram = (z / scale).T @ (z / scale)
-    covariance: Array = np.linalg.pinv(gram, rcond=1e-12, hermitian=True) / np.outer(scale, scale)
+    inverse = np.linalg.pinv((z / scale).T @ (z / scale), rcond=1e-12, hermitian=True)
     # Where the simulator is not exact, 4.34 is wider than (Z'Z)^-1; the further columns only widen it.
-    b = fit.theta.size
-    alone = np.linalg.pinv(gram[:b, :b], rcond=1e-12, hermitian=True) / np.outer(scale[:b], scale[:b])
-    covariance[:b, :b] += fit.covariance - alone
-    return covariance
+    alone = np.linalg.pinv((z[:, :b] / scale[:b]).T @ (z[:, :b] / scale[:b]), rcond=1e-12, hermitian=True)
+    for k in range(b - e, b + len(slopes)):
+        influence = (z / scale) @ inverse[:, k] / scale[k]
+        variances[k] += (inverse[k, k] - (alone[k, k] if k < b else 0.0)) / scale[k] ** 2
+        variances[k] = max(variances[k], newey_west(influence * fit.residual))
+    return variances**0.5

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from identify.discrepancy.study import Stretch, Study
-from identify.discrepancy.whitening import ar_models, log_likelihoods, summed_backwards, whitened
+from identify.discrepancy.whitening import ar_models, summed_backwards, whitened
 from identify.estimators.filtering import filter_columns
 from identify.estimators.noise import ArModel
 from identify.estimators.regression import require_excitation
@@ -176,14 +176,6 @@ class Fit:
         """Of the held-out rows, (R,)."""
         return whitened(self.errors(self.theta, held=True), self.noise)
 
-    @cached_property
-    def likelihoods(self) -> tuple[Array, Array]:
-        """Log-likelihoods of the errors of the training and of the held-out rows, up to a constant, (n,) each."""
-        train, held = (
-            log_likelihoods(self.errors(self.theta, held=h), self.noise, MAX_AR_ORDER) for h in (False, True)
-        )
-        return train, held
-
     def held_at_simulated(self, theta: Array) -> Array:
         """``Z theta`` of the held-out rows, (R,)."""
         return whitened([applied(z, theta) for _, z, _ in self.equations.held], self.noise)
@@ -304,17 +296,20 @@ def relative_errors(fit: Fit, theta: Array | None = None, *, held: bool) -> tupl
 
 def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Array, Array]:
     """Regressor (M, n, b) at measured and at simulated signals, in the band of the comparison."""
-    out = []
+    out: list[Array] = []
     for kind in ("measured", "simulated"):
         signals = getattr(stretch, kind)
-        key = (id(stretch), kind, study.model.base.names[: -study.model.e or None])
+        key = (id(signals), study.model.base.names[: -study.model.e or None])
         if key not in study.rigid:
             made = study.decimation(study.model.rigid_regressor(signals.q, signals.qd, signals.qdd))
-            # With the stretch, whose identity is the key only as long as it lives.
-            study.rigid[key] = stretch, made
+            # With the signals, whose identity is the key only as long as they live.
+            study.rigid[key] = signals, made
         rigid = study.rigid[key][1]
         if study.model.e:
             terms = study.decimation(study.model.term_regressor(study.motion(signals, theta)))
+            if out:
+                sudden = np.flatnonzero([t.effect.sudden for t in study.model.terms for _ in t.names])
+                terms[:, :, sudden] = out[0][:, :, out[0].shape[2] - study.model.e + sudden]
             rigid = np.concatenate([rigid, terms], axis=2)
         out.append(rigid)
     return out[0], out[1]

@@ -1,6 +1,6 @@
 """One step after the other: add the effect that predicts unseen data best, take out what is no longer needed."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,13 +9,16 @@ from scipy import stats
 
 from configs import DataError, RobotConfig
 from configs.robot import Effect as Stanza
-from identify.catalogue.registry import known
-from identify.catalogue.terms import Term, stanza_of
+from identify.catalogue.terms import Term
 from identify.discrepancy.candidates import Workshop, candidates
 from identify.discrepancy.regression import Fit, applied, fit
+from identify.discrepancy.retrial import in_its_loop, suspects
 from identify.discrepancy.screening import shortlist
+from identify.discrepancy.stanzas import added, stanza_number, without
 from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial, judge
+from identify.discrepancy.whitening import rows_of_joints, whitened
+from identify.estimators.noise import ArModel
 from identify.model.arm import ArmModel
 
 Array = NDArray[np.float64]
@@ -25,8 +28,13 @@ HELD_OUT_LEVEL = 0.05
 """The held-out data alone must speak for a finding at this level, whatever the training data say."""
 NEEDED = 0.01
 """Chance of its estimate by accident above which an effect found earlier is taken out again."""
+FEEDBACK = 0.05
+"""Share of a joint's held-out residual power that an effect must explain which is its own instrument: feedback lets the
+motion follow the disturbances, so that terms without merit explain a percent or two."""
 SHORTLIST = 15
 """Candidates that get a trial of their own."""
+LOOPS = 3
+"""Loops in which the nonlinear parameters of one effect are sought."""
 MOST = 8
 """Most effects of one diagnosis."""
 
@@ -78,7 +86,7 @@ class State:
             and t.p_value < level
             and t.p_held < HELD_OUT_LEVEL
             and t.gain > 0
-            and t.share >= settings.material
+            and t.share >= max(settings.material, FEEDBACK if t.candidate.effect.sudden else 0.0)
             and not (t.candidate.effect.negligible and t.candidate.effect.negligible(t.values, self.study.sample))
         ]
 
@@ -131,9 +139,20 @@ class Search:
             promising, hidden, calm = shortlist(found, workshop, every, SHORTLIST)
             judged = [judge(found, candidate, shapes, workshop, calm) for candidate, shapes in promising]
             trials = [trial for trial in judged if trial is not None]
-            trials.sort(key=lambda t: -t.score)
-            self._states[key] = State(study, found, workshop, tuple(trials), len(every) - len(hidden), hidden)
+            made = State(study, found, workshop, _ranked(trials), len(every) - len(hidden), hidden)
+            self._states[key] = self._again(made)
         return self._states[key]
+
+    def _again(self, state: State) -> State:
+        """With a second look at what the simulated loop without it may have been too far off to show."""
+        passing = {t.candidate.key for t in state.passing(self.settings)}
+        failed = [t for t in state.trials if t.candidate.key not in passing]
+        second = {}
+        for trial in suspects(failed):
+            again = in_its_loop(state.fit, trial)
+            if again is not None:
+                second[trial.candidate.key] = again
+        return replace(state, trials=_ranked([second.get(t.candidate.key, t) for t in state.trials]))
 
     def _extended(self, state: State, own: int, been: set[Places]) -> State | None:
         """The state with the best candidate that passes and really makes the held-out error smaller, pruned.
@@ -141,17 +160,31 @@ class Search:
         States that have been left before are not returned to: two effects could take each other's place for ever.
         """
         for trial in state.passing(self.settings):
-            robot = added(state.study.robot, trial)
             self.progress(f"adding {trial.candidate.effect.name} of {state.study.joints[trial.candidate.place.joint]}")
-            try:
-                extended = self.state(robot, state)
-            except DataError:
-                continue
-            if nearer(extended, state, self.settings.material):
+            extended = self.with_trial(state, trial)
+            if extended is not None and nearer(extended, state, self.settings.material):
                 pruned = self._pruned(extended, own)
                 if places_of(pruned) not in been:
                     return pruned
         return None
+
+    def with_trial(self, state: State, trial: Trial) -> State | None:
+        """The state with what a trial found; ``None`` if the motion cannot tell it from what the model has.
+
+        Nonlinear parameters of effects that depend on predicted torques are sought again in the loop that they make,
+        and in that which these make.
+        """
+        effect = trial.candidate.effect
+        if effect.predicts and not effect.sudden and any(shape.continuous for shape in effect.shapes):
+            for _ in range(LOOPS):
+                again = in_its_loop(state.fit, trial)
+                if again is None or again.forbidden or again.score < trial.score:
+                    break
+                trial = again
+        try:
+            return self.state(added(state.study.robot, trial), state)
+        except DataError:
+            return None
 
     def _pruned(self, state: State, own: int) -> State:
         """Without effects that the ones found later have made superfluous; those of the configuration stay."""
@@ -159,11 +192,11 @@ class Search:
             doubtful = [
                 (accident(state, term), k)
                 for k, term in enumerate(state.study.model.terms)
-                if _stanza_number(state.study.robot, k) >= own
+                if stanza_number(state.study.robot, k) >= own
             ]
             if not doubtful or max(doubtful)[0] < NEEDED:
                 return state
-            worst = _stanza_number(state.study.robot, max(doubtful)[1])
+            worst = stanza_number(state.study.robot, max(doubtful)[1])
             robot = without(state.study.robot, worst)
             self.progress(f"taking out {state.study.robot.effects[worst].effect}")
             state = self.state(robot, state)
@@ -179,11 +212,15 @@ class Search:
                 effect, place = trial.candidate.effect, trial.candidate.place
                 if (effect.name, state.study.joints[place.joint]) == (stanza.effect, stanza.joint):
                     continue
-                other = self.state(added(rest.study.robot, trial), rest)
-                if nearer(other, state, self.settings.material):
+                other = self.with_trial(rest, trial)
+                if other is not None and nearer(other, state, self.settings.material):
                     self.progress(f"{effect.name} instead of {stanza.effect}")
                     state = other
         return state
+
+
+def _ranked(trials: Sequence[Trial]) -> tuple[Trial, ...]:
+    return tuple(sorted(trials, key=lambda t: -t.score))
 
 
 def nearer(one: State, other: State, material: float) -> bool:
@@ -195,19 +232,34 @@ def nearer(one: State, other: State, material: float) -> bool:
     Parameters
     ----------
     material
-        Share of the power of a joint's error by which it must be closer where only simulated signals show it.
+        Share of the power of a joint's whitened error by which it must be closer where only simulated signals show it.
     """
-    if _power(one, 0).sum() < _power(other, 0).sum():
+    if _power(one) < _power(other):
         return True
-    now, before = _power(one, 1), _power(other, 1)
-    return bool(now.sum() < before.sum() and np.any(now < (1 - material) * before))
+    noise = one.fit.noise
+    before = other.fit.errors(other.fit.theta, held=True)
+    # Of the error at measured signals, less what of it the change at simulated ones explains: those know no noise.
+    after = [e - c for e, c in zip(before, _change(other, one), strict=True)]
+    was, now = (_whitened_power(e, noise) for e in (before, after))
+    return bool(now.sum() < was.sum() and np.any(now < (1 - material) * was))
 
 
-def _power(state: State, kind: int) -> Array:
-    """Squared norm of every joint's held-out errors at measured (0) or simulated (1) signals, (n,)."""
-    errors = [rows[2] - applied(rows[kind], state.fit.theta) for rows in state.fit.equations.held]
-    total: Array = np.sum(np.concatenate(errors) ** 2, axis=0)
-    return total
+def _power(state: State) -> float:
+    """Squared norm of the held-out errors at measured signals."""
+    return float(sum(np.sum(e**2) for e in state.fit.errors(state.fit.theta, held=True)))
+
+
+def _change(before: State, after: State) -> list[Array]:
+    """Change of the held-out torques at simulated signals from one model to another, (M, n) of every stretch."""
+    pairs = zip(before.fit.equations.held, after.fit.equations.held, strict=True)
+    return [applied(z1, after.fit.theta) - applied(z0, before.fit.theta) for (_, z0, _), (_, z1, _) in pairs]
+
+
+def _whitened_power(errors: Sequence[Array], noise: Sequence[ArModel]) -> Array:
+    """Squared norm of every joint's errors, whitened, (n,)."""
+    white = whitened(errors, noise)
+    joints = rows_of_joints([e.shape[0] for e in errors], noise)
+    return np.array([float(white[rows] @ white[rows]) for rows in joints])
 
 
 def refit(study: Study, robot: RobotConfig, before: State | None) -> tuple[Study, Fit]:
@@ -227,31 +279,15 @@ def refit(study: Study, robot: RobotConfig, before: State | None) -> tuple[Study
         bare = robot.model_copy(update={"effects": ()})
         rigid = fit(replace(study, robot=bare, model=ArmModel.from_config(bare)))
         theta = np.concatenate([rigid.theta, np.zeros(model.e)])
-    return changed, fit(changed, theta)
+    first = fit(changed, theta)
+    moved = changed.resimulated(first.theta)
+    return (changed, first) if moved is changed else (moved, fit(moved, first.theta if model.e else None))
 
 
 def padded(before: State, model: ArmModel) -> Array:
     """Rigid parameters of an earlier fit, zeros for the terms, (b,)."""
     rigid = before.fit.theta[: before.study.model.base.b - before.study.model.e]
     return np.concatenate([rigid, np.zeros(model.e)])
-
-
-def added(robot: RobotConfig, trial: Trial) -> RobotConfig:
-    """The robot with what a trial found as its last stanza."""
-    parameters = dict(trial.shapes) | values_of(trial)
-    stanza = stanza_of(trial.candidate.effect, trial.candidate.place, robot, parameters)
-    return robot.model_copy(update={"effects": (*robot.effects, stanza)})
-
-
-def without(robot: RobotConfig, stanza: int) -> RobotConfig:
-    """The robot without one of its stanzas."""
-    return robot.model_copy(update={"effects": (*robot.effects[:stanza], *robot.effects[stanza + 1 :])})
-
-
-def values_of(trial: Trial) -> dict[str, float]:
-    """Linear parameters of a trial by name."""
-    names = (parameter.name for parameter in trial.candidate.effect.linear)
-    return {name: float(value) for name, value in zip(names, trial.values, strict=True)}
 
 
 def accident(state: State, term: Term) -> float:
@@ -266,7 +302,7 @@ def with_values(state: State, shapes: Mapping[int, Mapping[str, float]] | None =
     """The robot with the estimated values in its stanzas."""
     stanzas: list[Stanza] = list(state.study.robot.effects)
     for k, term in enumerate(state.study.model.terms):
-        number = _stanza_number(state.study.robot, k)
+        number = stanza_number(state.study.robot, k)
         own = [state.study.model.base.names.index(name) for name in term.names]
         linear = zip((p.name for p in term.effect.linear), state.fit.theta[own], strict=True)
         found = {**term.shapes, **{name: float(value) for name, value in linear}, **dict((shapes or {}).get(k, {}))}
@@ -277,8 +313,3 @@ def with_values(state: State, shapes: Mapping[int, Mapping[str, float]] | None =
 def places_of(state: State) -> Places:
     """What the model of a state has beyond the rigid one, and where, whatever the values and the order."""
     return tuple(sorted((e.effect, e.joint, e.other or "") for e in state.study.robot.effects))
-
-
-def _stanza_number(robot: RobotConfig, term: int) -> int:
-    """Stanza of a robot's term: exchanges of signals are stanzas, but no terms."""
-    return [k for k, stanza in enumerate(robot.effects) if not known(stanza.effect).rewires][term]

@@ -86,7 +86,7 @@ class Study:
     loop
         Which closed loop the instruments come from.
     auxiliary
-        That loop, of the rigid arm.
+        That loop, of the rigid arm as least squares have it.
     thinning
         From the recorded to the working rate.
     rigid
@@ -104,7 +104,7 @@ class Study:
     auxiliary: AuxiliaryModel
     thinning: Decimation
     warnings: tuple[str, ...] = ()
-    rigid: dict[tuple[int, str, tuple[str, ...]], tuple[Stretch, Array]] = field(
+    rigid: dict[tuple[int, tuple[str, ...]], tuple[Derivatives, Array]] = field(
         default_factory=dict, repr=False, compare=False
     )
 
@@ -123,6 +123,46 @@ class Study:
         return Motion(
             model or self.model, signals.q, signals.qd, signals.qdd, self.dt, signals.start, theta, self.duration
         )
+
+    def resimulated(self, theta: Array) -> "Study":
+        """The study with the motion that the closed loop makes with its model, terms included, at these parameters.
+
+        Parameters
+        ----------
+        theta
+            (b,).
+
+        Returns
+        -------
+        Study
+            The same where that loop diverges, or follows the arm less closely than the one there is: large additions to
+            the compiled loop may be too stiff for it (see `identify.model.relaxation`).
+        """
+        auxiliary = replace(self.auxiliary.fresh(), model=self.model.anchored(theta), anchor=None)
+        runs = auxiliary.simulate(theta)
+        if runs is None:
+            return self
+        dt, factor = auxiliary.dt, self.thinning.factor
+        cut = {s.experiment: s.measured for s in (*self.train, *self.held)}
+        motions = {k: _seen(runs[k].q, measured, dt) for k, measured in cut.items()}
+
+        def moved(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
+            return tuple(
+                replace(s, simulated=replace(_at(motions[s.experiment], s.rows, dt, factor), start=s.simulated.start))
+                for s in stretches
+            )
+
+        train = moved(self.train)
+        if not _distance(train) < _distance(self.train):
+            return self
+        return replace(self, train=train, held=moved(self.held))
+
+
+def _distance(stretches: Sequence[Stretch]) -> float:
+    """Squared errors of the simulated velocities, each joint over its own measured ones, summed."""
+    apart = sum(np.sum((s.simulated.qd - s.measured.qd) ** 2, axis=0) for s in stretches)
+    size = sum(np.sum(s.measured.qd**2, axis=0) for s in stretches)
+    return float(np.sum(apart / np.maximum(size, 1e-300)))
 
 
 def build_study(training: Sequence[Experiment], validation: Sequence[Experiment], robot: RobotConfig) -> Study:
@@ -193,13 +233,23 @@ def _simulated(
     return motions, str(description["kind"]), auxiliary, warnings
 
 
+def _seen(q: Array, measured: Derivatives, dt: float) -> Derivatives:
+    """A simulated motion as the smoother that the measured one went through sees it.
+
+    Set points arrive in steps, which a simulated acceleration shows and a smoothed one does not: what effects make of
+    either should differ by the noise alone.
+    """
+    assert measured.nvr is not None
+    return replace(differentiate(q, dt, nvr=measured.nvr[:, 0]), start=measured.start)
+
+
 def _at(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: int) -> Derivatives:
     """Signals at some of their samples."""
     return Derivatives(
         np.ascontiguousarray(signals.q[rows]),
         np.ascontiguousarray(signals.qd[rows]),
         np.ascontiguousarray(signals.qdd[rows]),
-        None,
+        signals.nvr,
         dt * factor,
         signals.start + dt * float(rows[0]),
     )

@@ -8,20 +8,21 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from identify.discrepancy.candidates import Candidate, Columns, Shapes, Workshop
-from identify.discrepancy.regression import MAX_AR_ORDER, Fit, applied, noise_models
-from identify.discrepancy.whitening import log_likelihoods
+from identify.discrepancy.regression import MAX_AR_ORDER, Fit, noise_models
+from identify.discrepancy.whitening import rows_of_joints
 from identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
 
 NEWEY_WEST_LAGS = 20
+LEAP = 4.0
+"""Standard deviations beyond which a residual is no noise."""
+MAD_TO_STD = 1.4826
+"""Standard deviation of normal noise over its median absolute deviation."""
 RANK_TOLERANCE = 1e-3
 """Columns that the model nearly contains (relative norm left beside it) cannot be tested."""
 CALM_PASSES = 2
 """Between a candidate's parameters and the noise models that go with it, from calm ones."""
-SUPPORT = 3.0
-"""Evidence may be at most this many times what the instruments support: measured signals hold noise that the torques
-hold too, simulated ones are only as good as the simulated loop, so a candidate counts by the better of both."""
 REFINEMENTS = 12
 """Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""
 
@@ -47,6 +48,8 @@ class Trial:
         Variance of the whitened residuals along the change, over that of white noise; at least 1.
     away
         Change of the model's own parameters that goes with it, (b,).
+    beside
+        The model's own parameters with it, (b,).
     share
         Share of the whitened held-out residual's power that the change takes away, at the joint that it changes most.
     score
@@ -62,6 +65,7 @@ class Trial:
     gain: float
     inflation: float
     away: Array
+    beside: Array
     share: float
     score: float
 
@@ -106,7 +110,10 @@ def screened(fit: Fit, candidate: Candidate, workshop: Workshop) -> tuple[float,
     """Score statistic of a candidate at the shapes of its grid that fit the training data best, and these shapes."""
     best: tuple[float, Shapes] | None = None
     for shapes in candidate.grid:
-        statistic = score_statistic(fit, workshop.instruments(candidate.effect, candidate.place, shapes, fit.noise))
+        # Columns that go with theta are of no use to the next model, and a grid of them is large.
+        keep = not candidate.effect.predicts
+        columns = workshop.instruments(candidate.effect, candidate.place, shapes, fit.noise, keep=keep)
+        statistic = score_statistic(fit, columns)
         if statistic is not None and (best is None or statistic > best[0]):
             best = statistic, shapes
     return best
@@ -170,13 +177,12 @@ def _judged(
     size = float(change @ change)
     if size == 0.0:
         return None
-    inflation = max(1.0, _newey_west(change * after) / size)
+    inflation = max(1.0, newey_west(change * _without_leaps(after)) / size)
     variance = size * inflation + fit.spread(change)
     gain = float(before @ before - after @ after)
     share = _share_of_joint(change, before, after, [s.y.shape[0] for s in fit.study.held], fit.noise)
     fitted = 0.5 * (values.size + len(shapes))
     supported = 0.5 * (statistic + gain)
-    evidence = _evidence(alone, fit, candidate, shapes, workshop, values, away)
     return Trial(
         candidate,
         shapes,
@@ -187,8 +193,9 @@ def _judged(
         gain,
         inflation,
         away,
+        fit.theta - away,
         share,
-        min(SUPPORT * supported, evidence) - fitted,
+        supported - fitted,
     )
 
 
@@ -196,9 +203,7 @@ def _share_of_joint(
     change: Array, before: Array, after: Array, lengths: Sequence[int], noise: Sequence[ArModel]
 ) -> float:
     """See `Trial.share`; rows (R,) of joint after joint, from stretches of ``lengths`` rows each."""
-    ends = np.cumsum([sum(length - ar.order for length in lengths) for ar in noise])
-    joints = [slice(end - size, end) for end, size in zip(ends, np.diff(ends, prepend=0), strict=True)]
-    most = max(joints, key=lambda rows: float(change[rows] @ change[rows]))
+    most = max(rows_of_joints(lengths, noise), key=lambda rows: float(change[rows] @ change[rows]))
     power = float(before[most] @ before[most])
     return (power - float(after[most] @ after[most])) / max(power, 1e-300)
 
@@ -208,35 +213,6 @@ def _calmed(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, 
     columns = np.concatenate(workshop.band(candidate.effect, candidate.place, shapes, "train", "simulated"))
     acts = [bool(np.any(columns[:, j])) for j in range(columns.shape[1])]
     return fit.renoised([c if there else own for c, own, there in zip(calm, fit.noise, acts, strict=True)])
-
-
-def _evidence(
-    alone: Fit,
-    fit: Fit,
-    candidate: Candidate,
-    shapes: Shapes,
-    workshop: Workshop,
-    values: Array,
-    away: Array,
-) -> float:
-    """Gain in log-likelihood over both parts, each model with noise of its own; by the better kind of signals.
-
-    A whitening that suits one candidate would weigh another's residual wrongly, so each has noise models of what it
-    leaves itself; they are all held against the same model without any, with the noise models that it has itself.
-    """
-    left: dict[str, list[list[Array]]] = {"simulated": [], "measured": []}
-    for part, rows in (("train", alone.equations.train), ("held", alone.equations.held)):
-        base = alone.errors(fit.theta, held=part == "held")
-        for kind, errors in left.items():
-            band = workshop.band(candidate.effect, candidate.place, shapes, part, kind)
-            regressors = [z if kind == "simulated" else x for x, z, _ in rows]
-            errors.append([e - c @ values + applied(r, away) for e, c, r in zip(base, band, regressors, strict=True)])
-    gains = []
-    for errors in left.values():
-        own = noise_models(errors[0], fit.theta.size + values.size, MAX_AR_ORDER)
-        both = zip(errors, alone.likelihoods, strict=True)
-        gains.append(sum(float(np.sum(log_likelihoods(e, own, MAX_AR_ORDER) - before)) for e, before in both))
-    return max(gains)
 
 
 def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) -> tuple[Array, Array] | None:
@@ -323,7 +299,16 @@ def replaced(shapes: Shapes, k: int, value: float) -> Shapes:
     return (*shapes[:k], (shapes[k][0], value), *shapes[k + 1 :])
 
 
-def _newey_west(products: Array) -> float:
+def _without_leaps(residual: Array) -> Array:
+    """A whitened residual (R,), cut off where noise does not reach.
+
+    What a right candidate leaves of a few hard impacts is in step with it, and would count as its doubt.
+    """
+    deviation = MAD_TO_STD * float(np.median(np.abs(residual)))
+    return np.clip(residual, -LEAP * deviation, LEAP * deviation)
+
+
+def newey_west(products: Array) -> float:
     """Variance of a sum of serially correlated terms of mean zero, with Bartlett weights."""
     centred = products - products.mean()
     total = float(centred @ centred)

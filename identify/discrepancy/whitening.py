@@ -1,4 +1,4 @@
-"""Autoregressive noise of all joints at once: models, whitening and its transpose, likelihoods.
+"""Autoregressive noise of all joints at once: models, whitening and its transpose.
 
 The same estimates as `identify.estimators.noise`, for a search that makes them by the thousand.
 """
@@ -54,6 +54,12 @@ def whitened(values: Sequence[Array], noise: Sequence[ArModel]) -> Array:
     return out
 
 
+def rows_of_joints(lengths: Sequence[int], noise: Sequence[ArModel]) -> list[slice]:
+    """Where the rows of each joint are in what `whitened` makes of stretches of these lengths."""
+    ends = np.cumsum([sum(length - ar.order for length in lengths) for ar in noise])
+    return [slice(int(begin), int(end)) for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
+
+
 def summed_backwards(direction: Array, noise: Sequence[ArModel], lengths: Sequence[int]) -> list[Array]:
     """Weights (M, n) of each stretch with ``direction' whitened(values) = sum(weights * values)``.
 
@@ -73,22 +79,6 @@ def summed_backwards(direction: Array, noise: Sequence[ArModel], lengths: Sequen
             weight[:, j] = np.convolve(direction[begin : begin + size], backwards)
             begin += size
     return weights
-
-
-def log_likelihoods(errors: Sequence[Array], noise: Sequence[ArModel], skipped: int) -> Array:
-    """Of the errors (M, n) of all stretches under AR noise, up to a constant, (n,).
-
-    Parameters
-    ----------
-    skipped
-        First rows that do not count, so that models of every order up to it are judged by the same ones.
-    """
-    found = np.zeros(len(noise))
-    for j, ar in enumerate(noise):
-        for stretch in errors:
-            e = ar.whiten(stretch[:, j])[skipped - ar.order :]
-            found[j] -= 0.5 * (float(e @ e) + e.size * math.log(ar.variance))
-    return found
 
 
 @compiled

@@ -12,7 +12,7 @@ from identify.catalogue.effect import Place
 from identify.catalogue.motion import Motion
 from identify.catalogue.registry import catalogue
 from identify.catalogue.rotor import rotors
-from identify.catalogue.transmission import DAMPING, crossing
+from identify.catalogue.transmission import crossing
 from identify.model.arm import ArmModel
 from virtual_robot.inertias import plant_parameters
 
@@ -70,6 +70,14 @@ def test_dry_friction_that_differs_between_the_directions_is_constant_but_at_sta
     np.testing.assert_allclose(found[moving], 1.0, atol=0.02)
     still = Motion(axis.model, axis.q, 0 * axis.qd, axis.qdd, DT, 0.0, axis.theta, 5.0)
     assert not columns("asymmetric_coulomb_friction", still).any()
+
+
+def test_the_film_under_one_sided_dry_friction_builds_up_with_the_speed(axis: Motion) -> None:
+    v = axis.qd[:, 0]
+    slow, fast = (columns("asymmetric_coulomb_friction", axis, velocity=f)[:, 0, 0] for f in (0.1, 0.001))
+    assert np.all(slow <= fast)
+    at_film = np.argmin(np.abs(v - 0.1))
+    assert slow[at_film] == pytest.approx(0.25, abs=0.05)
 
 
 def test_stribeck_friction_falls_as_a_bell(axis: Motion) -> None:
@@ -161,15 +169,16 @@ def test_a_spring_pulls_in_proportion(axis: Motion) -> None:
     np.testing.assert_array_equal(columns("joint_spring", axis)[:, 0, 0], axis.q[:, 0])
 
 
-def test_an_elastic_axis_answers_a_sine_with_the_gain_of_its_two_masses(axis: Motion) -> None:
+@pytest.mark.parametrize("damping", [0.1, 0.7])
+def test_an_elastic_axis_answers_a_sine_with_the_gain_of_its_two_masses(axis: Motion, damping: float) -> None:
     frequency = 6.0
     w = 2 * np.pi * frequency
     # m l'' = k (q - l) with damping; m q'' the load of the stiff axis, compliance 1 / k = 1.
-    gain = 1 / (1 - (OMEGA / w) ** 2 + 2j * DAMPING * OMEGA / w)
+    gain = 1 / (1 - (OMEGA / w) ** 2 + 2j * damping * OMEGA / w)
     t = DT * np.arange(axis.samples)
     load = MASS * -0.02 * OMEGA**2 * np.exp(1j * OMEGA * t)
     lag = MASS * OMEGA**2 * (gain * load).imag
-    found = columns("joint_elasticity", axis, frequency=frequency)[:, 0, 0]
+    found = columns("joint_elasticity", axis, frequency=frequency, damping=damping)[:, 0, 0]
     np.testing.assert_allclose(found[2500:], lag[2500:], atol=2e-3 * np.abs(lag).max())
 
 

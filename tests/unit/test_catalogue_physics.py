@@ -22,5 +22,6 @@ def test_a_sign_is_wrong_beyond_doubt_only(inertia: float, allowed: bool) -> Non
     assert known("coupling_friction").allows(values, std, {}) is allowed
 
 
-def test_a_gain_beyond_its_bounds_is_another_fault() -> None:
-    assert not known("drive_gain_error").allows(np.array([-0.7]), np.array([1.0]), {})
+@pytest.mark.parametrize(("gain", "std", "allowed"), [(-0.7, 0.04, False), (-0.62, 0.04, True), (1.7, 0.04, False)])
+def test_a_gain_beyond_its_bounds_beyond_doubt_is_another_fault(gain: float, std: float, allowed: bool) -> None:
+    assert known("drive_gain_error").allows(np.array([gain]), np.array([std]), {}) is allowed

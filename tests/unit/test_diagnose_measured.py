@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from configs import load_robot
+from configs import RobotConfig, load_robot
 from identify.discrepancy.diagnose import Diagnosis, diagnose
+from identify.discrepancy.findings import gap_of
+from identify.discrepancy.search import Search, Settings
+from identify.discrepancy.study import build_study
+from identify.document import Gap
 from identify.experiment import Experiment
 
 FORCE_PER_VOLT = 35.15065
@@ -30,9 +34,7 @@ def worn_screw(shared_data: Path) -> Diagnosis:
     return diagnose([training], [unseen], load_robot("emps"))
 
 
-@pytest.fixture(scope="module")
-def uncoupled_wrist(shared_data: Path) -> Diagnosis:
-    """TX40 whose model does not know that motor 6 turns with joint 5, too."""
+def tx40(shared_data: Path, robot: RobotConfig) -> Experiment:
     folder = shared_data / "tx40"
     if not folder.is_dir():
         pytest.skip("no tx40 folder in the measured data")
@@ -40,10 +42,24 @@ def uncoupled_wrist(shared_data: Path) -> Diagnosis:
         np.loadtxt(folder / name, delimiter=",", skiprows=1)[: round(STANDSTILL_S / TX40_DT)]
         for name in ("pos_read_data.csv", "curr_data.csv")
     )
-    robot = load_robot("tx40").model_copy(update={"couplings": ()})
     ratios = robot.transmission_matrix
     q = np.ascontiguousarray(np.linalg.solve(ratios, q.T).T)
-    return diagnose([Experiment(q=q, tau=tau @ ratios, q_ref=None, dt=TX40_DT)], [], robot)
+    return Experiment(q=q, tau=tau @ ratios, q_ref=None, dt=TX40_DT)
+
+
+@pytest.fixture(scope="module")
+def uncoupled_wrist(shared_data: Path) -> Diagnosis:
+    """TX40 whose model does not know that motor 6 turns with joint 5, too."""
+    robot = load_robot("tx40").model_copy(update={"couplings": ()})
+    return diagnose([tx40(shared_data, robot)], [], robot)
+
+
+@pytest.fixture(scope="module")
+def coupled_wrist(shared_data: Path) -> tuple[Gap, Gap]:
+    """Errors of the model that knows it, on the same parts of the recording."""
+    robot = load_robot("tx40")
+    state = Search(build_study([tx40(shared_data, robot)], [], robot), Settings()).start()
+    return gap_of(state, held=False), gap_of(state, held=True)
 
 
 def test_the_worn_screw_of_the_emps_is_named_first(worn_screw: Diagnosis) -> None:
@@ -72,15 +88,17 @@ def test_the_uncoupled_wrist_of_the_tx40_is_named_first(uncoupled_wrist: Diagnos
     assert finding.parameters["fcc"] == pytest.approx(1.93, abs=3 * std["fcc"])
 
 
-def test_the_wrist_coupling_closes_the_gap_of_joints_5_and_6(uncoupled_wrist: Diagnosis) -> None:
+def test_the_wrist_coupling_closes_the_gap_of_joints_5_and_6(
+    uncoupled_wrist: Diagnosis, coupled_wrist: tuple[Gap, Gap]
+) -> None:
     gap = uncoupled_wrist.document.gap
-    before, after = gap.train.before.by_joint, gap.train.after.by_joint
+    before = gap.train.before.by_joint
     assert before["joint_5"] > 35.0
     assert before["joint_6"] > 30.0
-    # What the model with the coupling reaches on all of the recording.
-    assert after["joint_5"] < 10.5
-    assert after["joint_6"] < 8.8
     unseen = gap.validation
     assert unseen.after.all < 0.5 * unseen.before.all
     for joint in ("joint_5", "joint_6"):
+        # Down to what the full model reaches; instruments are no least squares, so by a percent or two it may be more.
+        for found, known in zip((gap.train.after, unseen.after), coupled_wrist, strict=True):
+            assert found.by_joint[joint] < 1.02 * known.by_joint[joint]
         assert unseen.after.by_joint[joint] < 0.55 * unseen.before.by_joint[joint]

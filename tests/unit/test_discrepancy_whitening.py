@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identify.discrepancy.whitening import ar_models, log_likelihoods, summed_backwards, whitened
+from identify.discrepancy.whitening import ar_models, summed_backwards, whitened
 from identify.estimators.noise import ArModel, fit_ar
 
 Array = NDArray[np.float64]
@@ -56,12 +56,3 @@ def test_weights_are_the_transpose_of_whitening(errors: list[Array]) -> None:
     weights = summed_backwards(direction, noise, [v.shape[0] for v in values])
     through = sum(float(np.sum(w * v)) for w, v in zip(weights, values, strict=True))
     assert through == pytest.approx(float(direction @ whitened(values, noise)), rel=1e-12)
-
-
-def test_likelihoods_of_every_order_count_the_same_rows(errors: list[Array]) -> None:
-    noise = [ArModel(np.array([-1.6, 0.9]), 1.0, 0.0), ArModel(np.empty(0), 2.0, 0.0)]
-    found = log_likelihoods(errors, noise, 30)
-    e = np.concatenate([x[30:, 1] for x in errors]) / np.sqrt(2.0)
-    assert found[1] == pytest.approx(-0.5 * (e @ e + e.size * np.log(2.0)), rel=1e-12)
-    swapped = log_likelihoods(errors, [ArModel(np.empty(0), 1.0, 0.0), noise[1]], 30)
-    assert found[0] > swapped[0] + 100

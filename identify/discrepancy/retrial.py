@@ -1,0 +1,58 @@
+"""A second look at candidates, in the closed loop that they would make.
+
+Candidates are judged at simulated signals, and the loop that these come from does not have them in it. Where a missing
+effect moves the arm visibly otherwise (elasticity, a late torque), that loop is a poor likeness and the candidate may
+fail although much speaks for it. Simulated once more with the candidate inside, it makes instruments that still know
+nothing of the noise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from identify.discrepancy.candidates import Workshop
+from identify.discrepancy.regression import Fit
+from identify.discrepancy.regression import fit as fitted
+from identify.discrepancy.screening import noise_beyond_shapes
+from identify.discrepancy.shaping import instrumented
+from identify.discrepancy.stanzas import added
+from identify.discrepancy.trial import Trial, judge, refined, screened
+from identify.model.arm import ArmModel
+
+SECOND_LOOKS = 2
+"""Most candidates of one state that are looked at again."""
+
+SUSPECT = 20.0
+"""Score that makes it worth while: what passes has about ten, without merit there is hardly any."""
+
+
+def suspects(failed: Sequence[Trial]) -> list[Trial]:
+    """Trials that failed in spite of their score, those first that have most."""
+    able = [t for t in failed if t.candidate.effect.predicts and not t.candidate.effect.sudden and not t.forbidden]
+    return sorted((t for t in able if t.score > SUSPECT), key=lambda t: -t.score)[:SECOND_LOOKS]
+
+
+def in_its_loop(fit: Fit, trial: Trial) -> Trial | None:
+    """The trial repeated with instruments from the loop that has its candidate inside.
+
+    Returns
+    -------
+    Trial or None
+        ``None`` where that loop diverges or is no better likeness of the arm.
+    """
+    study, candidate = fit.study, trial.candidate
+    robot = added(study.robot, trial)
+    theta = np.concatenate([trial.beside, trial.values])
+    whole = replace(study, robot=robot, model=ArmModel.from_config(robot))
+    moved = whole.resimulated(theta)
+    if moved is whole:
+        return None
+    again = fitted(replace(study, train=moved.train, held=moved.held), fit.theta)
+    bench = Workshop(again.study, again.theta)
+    calm = again.renoised(noise_beyond_shapes(again, bench))
+    look = screened(calm, candidate, bench)
+    if look is None:
+        return None
+    shapes = instrumented(calm, candidate, bench, refined(calm, candidate, bench, look))
+    return judge(again, candidate, shapes, bench, calm.noise)

@@ -1,0 +1,29 @@
+"""Robot configurations with the findings of a search as stanzas."""
+
+from configs import RobotConfig
+from identify.catalogue.registry import known
+from identify.catalogue.terms import stanza_of
+from identify.discrepancy.trial import Trial
+
+
+def added(robot: RobotConfig, trial: Trial) -> RobotConfig:
+    """The robot with what a trial found as its last stanza."""
+    parameters = dict(trial.shapes) | values_of(trial)
+    stanza = stanza_of(trial.candidate.effect, trial.candidate.place, robot, parameters)
+    return robot.model_copy(update={"effects": (*robot.effects, stanza)})
+
+
+def without(robot: RobotConfig, stanza: int) -> RobotConfig:
+    """The robot without one of its stanzas."""
+    return robot.model_copy(update={"effects": (*robot.effects[:stanza], *robot.effects[stanza + 1 :])})
+
+
+def values_of(trial: Trial) -> dict[str, float]:
+    """Linear parameters of a trial by name."""
+    names = (parameter.name for parameter in trial.candidate.effect.linear)
+    return {name: float(value) for name, value in zip(names, trial.values, strict=True)}
+
+
+def stanza_number(robot: RobotConfig, term: int) -> int:
+    """Stanza of a robot's term: exchanges of signals are stanzas, but no terms."""
+    return [k for k, stanza in enumerate(robot.effects) if not known(stanza.effect).rewires][term]
