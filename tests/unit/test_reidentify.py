@@ -37,7 +37,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     robot, trajectory = load_robot("tx40.yaml"), load_trajectory("trajectories/tx40_excitation.yaml")
     worn = Scenario.model_validate(WORN)
     for name, seed, scenario in (("a_monday", 1, None), ("b_tuesday", 2, None), ("d_worn", 3, worn)):
-        recording = simulate_recording(robot, trajectory, seed, 1.0, scenario, 0.002, 1)
+        recording = simulate_recording(robot, trajectory, seed, 1.0, scenario, 0.001, 1)
         write_recording(recording, folder / f"{name}.mcap")
     return folder
 
