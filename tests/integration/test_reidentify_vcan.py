@@ -63,9 +63,10 @@ def one_line(err: str) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_an_arm_is_the_same_and_then_it_is_worn(vcan_bus: str, tmp_path: Path) -> None:
     """First run, second run, a tenth more friction in joint 2: exit codes, words, history and diagnosis."""
-    config = cell_file(tmp_path, vcan_bus, "weekly", **QUICK)
+    config = cell_file(tmp_path, vcan_bus, "weekly", sync={"period_us": 1000})
     with arm(config, "--seed", "1"):
         first, err = finished(job(config, tmp_path), 0)
         assert "first run of tx40: it is the baseline from now on" in first["words"]
