@@ -20,6 +20,7 @@ from identify.catalogue.registry import catalogue
 from identify.discrepancy.baseline import Change, Comparison, cautious, compared
 from identify.discrepancy.candidates import Workshop, places
 from identify.discrepancy.regression import Fit, relative_errors
+from identify.discrepancy.trial import newey_west
 from identify.document import IdentificationDocument
 
 Array = NDArray[np.float64]
@@ -33,7 +34,6 @@ STRUCTURAL = {
 of either sign; and how to say so."""
 
 ALTERNATIVES = 3
-NEWEY_WEST_LAGS = 20
 
 
 @dataclass(frozen=True)
@@ -197,20 +197,10 @@ def _held_out(comparison: Comparison, before: Array, after: Array) -> float:
     if size == 0.0:
         return 0.0
     residual = held.y - held.x @ before
-    inflation = max(1.0, _newey_west(change * (residual - change)) / size)
+    inflation = max(1.0, newey_west(change * (residual - change)) / size)
     through = change @ held.x[:, comparison.known]
     spread = float(through @ comparison.covariance0 @ through)
     return float(change @ residual) / float(np.sqrt(size * inflation + spread))
-
-
-def _newey_west(products: Array) -> float:
-    """Variance of a sum of serially correlated terms of mean zero, with Bartlett weights."""
-    centred = products - products.mean()
-    lags = min(NEWEY_WEST_LAGS, centred.size - 1)
-    sums = np.array([centred[lag:] @ centred[: centred.size - lag] for lag in range(lags + 1)])
-    weights = 2 * (1 - np.arange(lags + 1) / (lags + 1))
-    weights[0] = 1.0
-    return max(float(weights @ sums), 0.0)
 
 
 def _described(
