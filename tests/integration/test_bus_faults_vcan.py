@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def events_until(receiver: Receiver, kind: str) -> list[BusEvent]:
 def test_a_bus_that_is_back_is_read_again(vcan_buses: list[str], removed: bool) -> None:
     """Down and up again with the same socket; removed and made again with a new one. The other bus goes on."""
     names = vcan_buses
-    with Receiver([lambda name=name: RawSocket(name) for name in names]) as receiver:  # type: ignore[misc]
+    with Receiver([partial(RawSocket, name) for name in names]) as receiver:
         socket = receiver._lines[1].bus
         if removed:
             remove_vcan(names[1])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import typer.main
+from typer.core import TyperGroup
 
 from configs.loading import HERE
 from daq.cli import application
@@ -20,9 +21,11 @@ CRON = HERE / "cron" / "armident-reidentify.cron"
 class Unit(ConfigParser):
     """A unit file: keys may repeat, and are written as they are."""
 
+    def optionxform(self, optionstr: str) -> str:
+        return optionstr
+
     def __init__(self, path: Path) -> None:
         super().__init__(interpolation=None, strict=False, delimiters=("=",), comment_prefixes=("#", ";"))
-        self.optionxform = str  # type: ignore[assignment, method-assign]
         # Every value of a key that repeats counts.
         seen: dict[str, int] = {}
         lines = []
@@ -38,7 +41,8 @@ class Unit(ConfigParser):
 def accepted(words: list[str]) -> None:
     """Parse a command line as the program would, without running it."""
     group = typer.main.get_command(application(words))
-    command = group.commands[words[0]]  # type: ignore[attr-defined]
+    assert isinstance(group, TyperGroup)
+    command = group.commands[words[0]]
     command.make_context(words[0], words[1:])
 
 

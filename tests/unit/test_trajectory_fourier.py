@@ -1,6 +1,7 @@
 """Fourier trajectories begin and end at rest, keep the limits, and tell as much as moves; the picture shows it."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,6 +109,6 @@ def test_a_trajectory_outside_the_limits_is_refused_by_name(tmp_path: Path) -> N
         ({"look_at": Path("b.yaml")}, "give --out FILE for a new trajectory, or --look-at FILE"),
     ],
 )
-def test_options_that_contradict_each_other_are_refused(tmp_path: Path, options: dict[str, object], says: str) -> None:
+def test_options_that_contradict_each_other_are_refused(tmp_path: Path, options: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
-        trajectory_command(Path("emps.yaml"), tmp_path / "x.yaml", evaluations=1, **options)  # type: ignore[arg-type]
+        trajectory_command(Path("emps.yaml"), tmp_path / "x.yaml", evaluations=1, **options)
