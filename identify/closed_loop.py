@@ -18,6 +18,7 @@ from identify.experiment import Experiment
 from identify.methods import MEASURED
 from identify.model.arm import ArmModel
 from identify.model.controller import DiscreteController
+from identify.model.simulation import Simulation
 from identify.options import Options
 from identify.preparation import PIV_CUTOFF
 from identify.signals.bandpass import butterworth
@@ -42,8 +43,12 @@ def closed_loop(
     decimation: Decimation,
     bandwidth: float,
     warnings: list[str],
+    without: str | None = None,
 ) -> tuple[AuxiliaryModel, Array, dict[str, Any]]:
-    """The first closed loop that runs and moves like the robot, the theta it starts from, and what it is."""
+    """The first closed loop that runs and moves like the robot, the theta it starts from, and what it is.
+
+    ``without`` is a kind of controller that is passed over.
+    """
     dt = experiments[0].dt
     starts = [("idim-ls", ls), ("initial_parameters", initial_parameters(model))]
     fastest = RUNAWAY * np.max([np.abs(s.qd).max(axis=0) for s in signals], axis=0) + 1e-3
@@ -54,7 +59,7 @@ def closed_loop(
 
     closest: tuple[float, AuxiliaryModel, Array, dict[str, Any]] | None = None
     for controller, references, description in _controllers(
-        model, experiments, signals, options, ls, bandwidth, surrogate
+        model, experiments, signals, options, ls, bandwidth, surrogate, without
     ):
         for origin, start in starts:
             auxiliary = AuxiliaryModel(
@@ -73,8 +78,7 @@ def closed_loop(
             runs = auxiliary.simulate(start)
             if runs is None:
                 continue
-            apart = [float(np.linalg.norm(r.qd - s.qd)) for r, s in zip(runs, signals, strict=True)]
-            miss = float(np.linalg.norm(apart) / np.linalg.norm([np.linalg.norm(s.qd) for s in signals]))
+            miss = velocity_error(runs, signals)
             found = description | {"start": origin, "velocity_error_pct": 100 * miss}
             if closest is None or miss < closest[0]:
                 closest = (miss, auxiliary, start, found)
@@ -93,6 +97,12 @@ def closed_loop(
     return auxiliary, start, found
 
 
+def velocity_error(runs: Sequence[Simulation], signals: Sequence[Derivatives]) -> float:
+    """Norm of the difference of simulated and smoothed velocities over that of the smoothed ones."""
+    apart = [float(np.linalg.norm(run.qd - s.qd)) for run, s in zip(runs, signals, strict=True)]
+    return float(np.linalg.norm(apart) / np.linalg.norm([np.linalg.norm(s.qd) for s in signals]))
+
+
 def _controllers(
     model: ArmModel,
     experiments: Sequence[Experiment],
@@ -101,13 +111,16 @@ def _controllers(
     ls: Array,
     bandwidth: float,
     surrogate: Callable[[], Sequence[Array]],
+    without: str | None,
 ) -> Iterator[tuple[DiscreteController, Sequence[Array], dict[str, Any]]]:
     """Controllers with their references, the preferred one first, a stiff stand-in last."""
     robot, dt = model.robot, experiments[0].dt
     references = [e.q_ref for e in experiments if e.q_ref is not None]
     reason = "no reference trajectory in the recording: instruments from a simulation that follows the smoothed motion"
     if len(references) == len(experiments):
-        if options.controller == "known":
+        if options.controller == without:
+            pass
+        elif options.controller == "known":
             yield known_controller(robot, dt), references, {"kind": "known"}
         else:
             yield _identified(robot, experiments, references, options, dt)

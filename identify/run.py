@@ -11,12 +11,12 @@ from threadpoolctl import threadpool_limits
 
 from configs import DataError, RobotConfig
 from identify.catalogue.wiring import rewired
-from identify.closed_loop import closed_loop
+from identify.closed_loop import RELEVANT, closed_loop, velocity_error
 from identify.estimators.diagnostics import diagnose_estimate
 from identify.estimators.essential import essential_parameters
 from identify.estimators.idim_ls import idim_ls
 from identify.experiment import Experiment
-from identify.methods import PREFILTERED, Problem, decimation_of, solve
+from identify.methods import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
 from identify.model.arm import ArmModel
 from identify.model.consistent import nearest_consistent
 from identify.options import CONTROLLERS, Options
@@ -113,11 +113,20 @@ def _identify(
     else:
         clock.enter("controller", 0.35)
         decimation = decimate(options.method, dt, bandwidth, factor)
-        auxiliary, start, controller = closed_loop(
-            model, experiments, signals, options, ls.theta, decimation, bandwidth, warnings
-        )
+        loop = partial(closed_loop, model, experiments, signals, options, ls.theta, decimation, bandwidth)
+        said: list[str] = []
+        auxiliary, start, controller = loop(said)
         clock.enter(options.method, 0.5)
         solution = solve(Problem(prepared, auxiliary, start, plain, options))
+        if options.method in MEASURED and controller["kind"] in CONTROLLERS:
+            astray = _astray(solution, signals)
+            if astray:
+                again: list[str] = []
+                auxiliary, start, stand_in = loop(again, without=controller["kind"])
+                second = solve(Problem(prepared, auxiliary, start, plain, options))
+                if not _astray(second, signals):
+                    solution, controller, said = second, stand_in | {"reason": astray}, [astray]
+        warnings += said
         estimate, blocks = solution.estimate, solution.problem.blocks
         warnings += [*solution.warnings, *estimate.warnings]
         if not estimate.converged:
@@ -146,6 +155,24 @@ def _identify(
         options, model, estimate, essential, diagnostics, physical, delay, blocks, ls, ls_blocks, controller,
         "joint torque" if solution is None else solution.noise_of, warnings, clock.spent,
     )  # fmt: skip
+
+
+def _astray(solution: Solution, signals: Sequence[Derivatives]) -> str:
+    """Why the instruments of an estimate are not to be trusted, or nothing.
+
+    A controller can move the arm with the first estimate and, at the edge of stability, not with a later one: the
+    iterates then wander, or come to rest where the instruments have little to do with the motion.
+    """
+    runs = solution.problem.auxiliary.simulate(solution.estimate.theta)
+    if runs is None:
+        why = "diverges"
+    elif (miss := velocity_error(runs, signals)) >= RELEVANT:
+        why = f"misses the measured velocities by {100 * miss:.0f} %"
+    elif solution.estimate.converged:
+        return ""
+    else:
+        why = "leads to no convergence"
+    return f"the loop of the identified controller {why} with the parameters it leads to: a stiff stand-in is used"
 
 
 def _anchored(
