@@ -86,13 +86,15 @@ class Effect(Frozen):
     """An effect of the discrepancy catalogue that is part of this robot's model, and its parameters.
 
     Shape parameters (a Stribeck velocity, a harmonic) stay as given; linear ones are estimated with the rest.
-    ``other`` is the second joint of an effect between two.
+    ``other`` is the second joint of an effect between two. Linear parameters named in ``without`` are left out: what
+    they stand for, the rigid model of this arm has already.
     """
 
     effect: Name
     joint: Name
     other: Name | None = None
     parameters: dict[str, float] = Field(default_factory=dict)
+    without: tuple[Name, ...] = ()
 
 
 class Friction(Frozen):

@@ -146,10 +146,11 @@ class Invisible(Document):
 
 
 class Gap(Document):
-    """Relative torque error in percent, of all joints together and of each."""
+    """Relative torque error in percent, of all joints together and of each; ``rms`` is that of each in N m or N."""
 
     all: float
     by_joint: dict[str, float]
+    rms: dict[str, float] = {}
 
 
 class BeforeAfter(Document):

@@ -1,7 +1,7 @@
 """What a diagnosis is worth, beside what was hidden."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -114,7 +114,8 @@ def closed_share(case: Case, document: Document, healthy: Document) -> float | N
 
     Errors of the torques at measured motion, or of the simulated closed loop's, whichever shows the injected gap more
     clearly: measured motion differentiated once more brings noise that a delay or an elastic joint does not have.
-    ``None`` where there is no gap to speak of, or where the healthy arm's percentages are of torques of another size.
+    In N m or N: an arm that lost half its friction needs less torque, of which the same noise is a larger percentage.
+    ``None`` where there is no gap to speak of, or where reported torques have another size than the healthy arm's.
     """
     if any(part.rescales for part in case.parts) and not case.baseline:
         return None
@@ -132,38 +133,40 @@ Powers = tuple[float, float, float]
 
 
 def _at_measured_motion(case: Case, document: Document, healthy: Document) -> Powers:
-    whole = any(part.arm for part in case.parts)
-
     def power(gap: Document) -> float:
-        return float(gap["all"] ** 2) if whole else sum(float(gap["by_joint"][j]) ** 2 for j in _joints(case))
+        return sum(float(gap["rms"][j]) ** 2 for j in _joints(case, gap["rms"]))
 
     validation = document["gap"]["validation"]
     numbers = [f for f in document["findings"] if f["kind"] == "numbers"]
     if case.baseline and numbers:
         place = numbers[0]["joint"]
+        torque = _torques(document)[place]
         return (
-            float(numbers[0]["gap_before"]) ** 2,
-            float(numbers[-1]["gap_after"]) ** 2,
-            float(healthy["gap"]["validation"]["before"]["by_joint"][place]) ** 2,
+            (float(numbers[0]["gap_before"]) * torque) ** 2,
+            (float(numbers[-1]["gap_after"]) * torque) ** 2,
+            float(healthy["gap"]["validation"]["before"]["rms"][place]) ** 2,
         )
     return power(validation["before"]), power(validation["after"]), power(healthy["gap"]["validation"]["before"])
 
 
 def _of_the_simulated_loop(case: Case, document: Document, healthy: Document) -> Powers:
-    whole = any(part.arm for part in case.parts)
+    def power(of: Document, when: str) -> float:
+        errors, torques = of["simulated"][when], _torques(of)
+        return float(sum((errors[j] * torques[j]) ** 2 for j in _joints(case, errors)))
 
-    def power(errors: dict[str, float]) -> float:
-        return sum(error**2 for joint, error in errors.items() if whole or joint in _joints(case))
-
-    simulated = document["simulated"]
-    return (
-        power(simulated["torque_before"]),
-        power(simulated["torque_after"]),
-        power(healthy["simulated"]["torque_before"]),
-    )
+    return power(document, "torque_before"), power(document, "torque_after"), power(healthy, "torque_before")
 
 
-def _joints(case: Case) -> set[str]:
+def _torques(document: Document) -> dict[str, float]:
+    """A hundredth of the torque of each joint (RMS), N m or N: that of which errors are percentages."""
+    before = document["gap"]["validation"]["before"]
+    return {joint: before["rms"][joint] / max(before["by_joint"][joint], 1e-300) for joint in before["rms"]}
+
+
+def _joints(case: Case, every: Iterable[str]) -> set[str]:
+    """Joints that the effects of a case act on."""
+    if any(part.arm for part in case.parts):
+        return set(every)
     return {j for part in case.parts for j in (part.joint, part.other) if j is not None}
 
 

@@ -13,8 +13,8 @@ from identify.model.compiled import compiled
 Array = NDArray[np.float64]
 
 TORQUE = ("N m", "N")
-EXPONENTS = (2 / 3, 0.8, 1.25, 1.5, 2.0, 2.5, 3.0)
-"""Of speed, from the two thirds of a rolling bearing (Palmgren) up; close to one it is what every model has."""
+LATE = 0.1
+"""Share of a joint's speed limit from which on friction may grow faster than speed: lubricants do not churn at rest."""
 VISCOUS = ("N m s/rad", "N s/m")
 
 
@@ -46,16 +46,23 @@ def _stribeck(motion: Motion, place: Place, *, velocity: float) -> Array:
     return (np.exp(-((motion.qd[:, j] / velocity) ** 2)) * motion.sign[:, j])[:, None]
 
 
-def _nonlinear_viscous(motion: Motion, place: Place, *, exponent: float) -> Array:
+def _nonlinear_viscous(motion: Motion, place: Place, *, knee: float) -> Array:
     j = place.joint
-    # Measured in the joint's own speeds, so that the parameter is a torque whatever the exponent.
-    share = np.abs(motion.qd[:, j]) / motion.model.robot.joints[j].limits.velocity
-    return (share**exponent * motion.sign[:, j])[:, None]
+    # Measured in the joint's own speeds, so that the parameter is a torque whatever the knee.
+    share = motion.qd[:, j] / motion.model.robot.joints[j].limits.velocity
+    curved: Array = np.arcsinh(share / knee) / np.arcsinh(1.0 / knee)
+    return curved[:, None]
+
+
+def knees(motion: Motion, joint: int) -> Sequence[float]:
+    """From a hundredth of the joint's top speed to a third of it, as shares of its speed limit."""
+    limit = motion.model.robot.joints[joint].limits.velocity
+    return [speed / limit for speed in speeds(motion, joint)]
 
 
 def _rises_from_rest(values: Array, shapes: Mapping[str, float]) -> bool:
-    """Below one, a negative power of speed falls infinitely steeply from standstill: extra friction at low speed."""
-    return bool(shapes["exponent"] >= 1.0 or values[0] >= 0.0)
+    """A negative one falls steeply from standstill where its knee is early: extra friction at low speed."""
+    return bool(shapes["knee"] >= LATE or values[0] >= 0.0)
 
 
 def _load_dependent(motion: Motion, place: Place, *, rotor: float = 0.0) -> Array:
@@ -161,9 +168,9 @@ EFFECTS = (
         name="nonlinear_viscous_friction",
         title="friction curved in speed",
         says="friction does not grow in proportion to speed: the lubricant thins or churns",
-        reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
+        reference="Ree, Ree, Eyring 1958, Ind. Eng. Chem. 50(7)",
         linear=(Linear("fvn", TORQUE),),
-        shapes=(Shape("exponent", ("", ""), lambda motion, joint: EXPONENTS, continuous=False),),
+        shapes=(Shape("knee", ("", ""), knees),),
         columns=_nonlinear_viscous,
         physical=_rises_from_rest,
         needs="slow and fast motion",

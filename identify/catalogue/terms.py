@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from configs import ConfigError, RobotConfig
 from configs.robot import Effect as Stanza
-from identify.catalogue.effect import Effect, Place
+from identify.catalogue.effect import Effect, Linear, Place
 from identify.catalogue.motion import Motion
 from identify.catalogue.registry import known
 
@@ -22,22 +22,37 @@ class Term:
     ----------
     effect, place, shapes
         The entry of the catalogue, where it sits, and its nonlinear parameters.
+    kept
+        Numbers of the effect's linear parameters that the term has, (k,).
     names, units
-        Of its linear parameters, as they stand in results.
+        Of these, as they stand in results.
     values
-        Of its linear parameters in the configuration, zero where it gives none, (k,).
+        Of them in the configuration, zero where it gives none, (k,).
     """
 
     effect: Effect
     place: Place
     shapes: dict[str, float]
+    kept: tuple[int, ...]
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: Array
 
     def columns(self, motion: Motion) -> Array:
         """Torques of all joints per unit of the linear parameters, (N, n, k)."""
-        return self.effect.torque(motion, self.place, self.shapes)
+        every = self.effect.torque(motion, self.place, self.shapes)
+        return every if len(self.kept) == every.shape[2] else every[:, :, list(self.kept)]
+
+    @property
+    def linear(self) -> tuple[Linear, ...]:
+        """Its linear parameters."""
+        return tuple(self.effect.linear[k] for k in self.kept)
+
+    def of_effect(self, values: Array) -> Array:
+        """Values (k,) of its linear parameters among all of the effect's, the others zero."""
+        every = np.zeros(len(self.effect.linear))
+        every[list(self.kept)] = values
+        return every
 
 
 def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
@@ -59,8 +74,9 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
         shapes = _shapes(stanza, effect, where)
         kind = int(robot.joints[place.joint].type == "prismatic")
         number = f"{place.joint + 1}" if place.other is None else f"{place.joint + 1}{place.other + 1}"
+        kept = _kept(stanza, effect, where)
         names = []
-        for linear in effect.linear:
+        for linear in (effect.linear[k] for k in kept):
             name = f"{linear.name}{number}"
             taken[name] = taken.get(name, 0) + 1
             names.append(name if taken[name] == 1 else f"{name}_{taken[name]}")
@@ -69,9 +85,10 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
                 effect,
                 place,
                 shapes,
+                kept,
                 tuple(names),
-                tuple(linear.unit[kind] for linear in effect.linear),
-                np.array([stanza.parameters.get(linear.name, 0.0) for linear in effect.linear]),
+                tuple(effect.linear[k].unit[kind] for k in kept),
+                np.array([stanza.parameters.get(effect.linear[k].name, 0.0) for k in kept]),
             )
         )
     return tuple(terms)
@@ -96,10 +113,26 @@ def place_of(stanza: Stanza, effect: Effect, robot: RobotConfig, where: str) -> 
     return Place(joint, names.index(stanza.other))
 
 
-def stanza_of(effect: Effect, place: Place, robot: RobotConfig, parameters: dict[str, float]) -> Stanza:
+def stanza_of(
+    effect: Effect, place: Place, robot: RobotConfig, parameters: dict[str, float], without: tuple[str, ...] = ()
+) -> Stanza:
     """The stanza of an effect at a place."""
     other = None if place.other is None else robot.joints[place.other].name
-    return Stanza(effect=effect.name, joint=robot.joints[place.joint].name, other=other, parameters=parameters)
+    return Stanza(
+        effect=effect.name, joint=robot.joints[place.joint].name, other=other, parameters=parameters, without=without
+    )
+
+
+def _kept(stanza: Stanza, effect: Effect, where: str) -> tuple[int, ...]:
+    """Numbers of the linear parameters that a stanza does not leave out."""
+    names = [parameter.name for parameter in effect.linear]
+    for name in stanza.without:
+        if name not in names:
+            raise ConfigError(f"{where}: without: {name!r} is none of its linear parameters ({', '.join(names)})")
+    kept = tuple(k for k, name in enumerate(names) if name not in stanza.without)
+    if not kept:
+        raise ConfigError(f"{where}: without: nothing is left of it")
+    return kept
 
 
 def _shapes(stanza: Stanza, effect: Effect, where: str) -> dict[str, float]:

@@ -18,6 +18,7 @@ from identify.discrepancy.precision import standard_deviations
 from identify.discrepancy.regression import relative_errors
 from identify.discrepancy.search import Search, Settings, State, with_values
 from identify.discrepancy.stanzas import without
+from identify.discrepancy.trial import CLOSE
 from identify.discrepancy.where import Disagreement
 from identify.discrepancy.wiring_check import WiringFinding
 from identify.document import Alternative, Finding, Gap, Invisible
@@ -29,9 +30,6 @@ RIVALS = 3
 
 DOUBTFUL = 0.6
 """Confidence below which another experiment is recommended."""
-
-CLOSE = float(np.log(20.0))
-"""Difference in log-likelihood below which a rival cannot be told apart: odds of less than 20 to 1."""
 
 
 def described(search: Search, first: State, final: State, left: Sequence[Disagreement]) -> list[Finding]:
@@ -134,7 +132,14 @@ def miswired(wiring: WiringFinding, robot: RobotConfig) -> list[Finding]:
 def gap_of(state: State, *, held: bool) -> Gap:
     """Relative torque errors of a model."""
     overall, each = relative_errors(state.fit, held=held)
-    return Gap(all=overall, by_joint=dict(zip(state.study.joints, (float(v) for v in each), strict=True)))
+    errors = np.concatenate(state.fit.errors(state.fit.theta, held=held))
+    rms = np.sqrt(np.mean(errors**2, axis=0))
+    joints = state.study.joints
+    return Gap(
+        all=overall,
+        by_joint=dict(zip(joints, (float(v) for v in each), strict=True)),
+        rms=dict(zip(joints, (float(v) for v in rms), strict=True)),
+    )
 
 
 def noise_floor(final: State, left: Sequence[Disagreement]) -> Gap:
@@ -184,10 +189,8 @@ def outdated(numbers: Sequence[NumbersFinding]) -> list[Finding]:
             other=n.other,
             kind="numbers",
             parameters=n.parameters,
-            confidence=1.0 - n.p_value,
-            alternatives=[
-                Alternative(effect=e, joint=j, score=float(-np.log(max(p, 1e-300)))) for e, j, p in n.alternatives
-            ],
+            confidence=n.confidence,
+            alternatives=[Alternative(effect=e, joint=j, score=score) for e, j, score in n.alternatives],
             gap_before=n.gap_before,
             gap_after=n.gap_after,
             evidence={
@@ -195,6 +198,7 @@ def outdated(numbers: Sequence[NumbersFinding]) -> list[Finding]:
                 "says": n.words,
                 "p_value": n.p_value,
                 "std": n.std,
+                "ambiguous_with": list(n.ambiguous_with),
             },
         )
         for n in numbers

@@ -8,30 +8,22 @@ held-out torques better than the baseline's numbers do.
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special, stats
 
 from identify.catalogue.effect import Effect
-from identify.catalogue.registry import catalogue
 from identify.discrepancy.baseline import Change, Comparison, cautious, compared
-from identify.discrepancy.candidates import Workshop, places
+from identify.discrepancy.candidates import Workshop
+from identify.discrepancy.changes import STRUCTURAL, changes, p_value, ranked
 from identify.discrepancy.regression import Fit, relative_errors
-from identify.discrepancy.trial import newey_west
+from identify.discrepancy.trial import CLOSE, newey_west
 from identify.document import IdentificationDocument
 
 Array = NDArray[np.float64]
-
-STRUCTURAL = {
-    "drive_gain_error": "another torque per ampere than in the baseline",
-    "gravity_direction": "gravity comes from another direction than in the baseline",
-    "rotor_inertia": "another inertia at the motor than in the baseline",
-}
-"""Effects that a model can also lack, which parameters of an arm take over in part: another number against a baseline,
-of either sign; and how to say so."""
 
 ALTERNATIVES = 3
 
@@ -52,8 +44,12 @@ class NumbersFinding:
     gap_before, gap_after
         Relative torque error on held-out data, percent, with the baseline's numbers and all findings before this one,
         and with this one: of the joint, or of all joints where the arm as a whole is concerned.
+    confidence
+        Share of the posterior odds that is its own, times the chance that anything has changed at all.
+    ambiguous_with
+        Effects at odds of less than 20 to 1.
     alternatives
-        Effect, joint and p-value of the candidates next to this one.
+        Effect, joint and score (see `Standing`) of the candidates next to this one.
     words
         What it means, in plain language.
     """
@@ -66,6 +62,8 @@ class NumbersFinding:
     p_value: float
     gap_before: float
     gap_after: float
+    confidence: float
+    ambiguous_with: tuple[str, ...]
     alternatives: tuple[tuple[str, str, float], ...]
     words: str
 
@@ -94,17 +92,18 @@ def stale_numbers(
     comparison = compared(cautious(fit), baseline)
     if not _stale(comparison, alpha):
         return []
-    pool = list(_changes(comparison, workshop))
+    pool = list(changes(comparison, workshop))
     found: list[Change] = []
     barred: list[Change] = []
     while True:
-        ranked = _ranked(comparison, found, [c for c in pool if c not in found and c not in barred])
-        if not ranked or ranked[0][0] * len(pool) > alpha:
+        standings = ranked(comparison, found, [c for c in pool if c not in found and c not in barred])
+        passing = [standing.change for standing in standings if standing.p_value * len(pool) <= alpha]
+        if not passing:
             break
-        best = ranked[0][1]
+        best = passing[0]
         if _closes(comparison, found, [*found, best], alpha):
             found.append(best)
-            found = [c for c in found if _p_value(comparison, [o for o in found if o is not c], c) * len(pool) <= alpha]
+            found = [c for c in found if p_value(comparison, [o for o in found if o is not c], c) * len(pool) <= alpha]
             if best not in found:
                 barred.append(best)
         else:
@@ -134,51 +133,6 @@ def _changed_names(comparison: Comparison, changes: Sequence[Change], alpha: flo
             break
         found.append((int(k), float(rest[k]), float(std[k])))
     return found
-
-
-def _changes(comparison: Comparison, workshop: Workshop) -> Iterator[Change]:
-    """All effects that are other numbers, at all their places."""
-    fit = comparison.fit
-    motion = workshop.motion(fit.study.train[0], "measured")
-    rigid = fit.theta.size - fit.study.model.e
-    for effect in catalogue().values():
-        if effect.numbers is None and effect.name not in STRUCTURAL:
-            continue
-        for place in places(effect, fit.study.robot.n):
-            if effect.numbers is not None:
-                exact = effect.numbers(motion, place)
-                directions = np.zeros((fit.theta.size, exact.shape[1]))
-                directions[:rigid] = exact[:rigid]
-            elif effect.name == "gravity_direction" and effect.visible is not None and effect.visible(motion, place):
-                continue
-            else:
-                directions = fit.absorbed(workshop.columns(effect, place, (), fit.noise).x)
-            directions = directions[comparison.known]
-            if directions.any():
-                yield Change(effect, place, directions)
-
-
-def _p_value(comparison: Comparison, others: Sequence[Change], change: Change) -> float:
-    """That a change beside others explains so much of the difference without merit."""
-    _, _, _, before, free_before = comparison.solved(others)
-    _, _, _, after, free_after = comparison.solved([*others, change])
-    if free_before == free_after:
-        return 1.0
-    return float(stats.chi2.sf(before - after, free_before - free_after))
-
-
-def _ranked(
-    comparison: Comparison, found: Sequence[Change], pool: Sequence[Change]
-) -> list[tuple[float, Change, float]]:
-    """Candidates by p-value: it, the candidate, and its logarithm, which does not underflow."""
-    _, _, _, before, free_before = comparison.solved(found)
-    trials = []
-    for change in pool:
-        _, _, _, after, free_after = comparison.solved([*found, change])
-        if free_before > free_after:
-            gain, size = before - after, free_before - free_after
-            trials.append((float(stats.chi2.sf(gain, size)), change, float(stats.chi2.logsf(gain, size))))
-    return sorted(trials, key=lambda trial: trial[2])
 
 
 def _closes(comparison: Comparison, before: Sequence[Change], after: Sequence[Change], alpha: float) -> bool:
@@ -220,8 +174,11 @@ def _described(
     std = {n: float(np.sqrt(v)) for n, v, o in zip(names, np.diag(covariance)[-m:], own[-m:], strict=True) if o}
     gap_before = _gap(fit, comparison.predicted(before), change)
     gap_after = _gap(fit, comparison.predicted([*before, change]), change)
-    p = min(1.0, _p_value(comparison, others, change) * len(pool))
-    rivals = _ranked(comparison, others, [c for c in pool if c not in found])[:ALTERNATIVES]
+    p = min(1.0, p_value(comparison, others, change) * len(pool))
+    every = ranked(comparison, others, [change, *(c for c in pool if c not in found)])
+    own_score = next((s.score for s in every if s.change is change), -np.inf)
+    rivals = [s for s in every if s.change is not change]
+    share = float(np.exp(own_score - special.logsumexp([s.score for s in every]))) if every else 0.0
     joint = _joint(fit, change)
     return NumbersFinding(
         effect=change.effect.name,
@@ -232,7 +189,9 @@ def _described(
         p_value=p,
         gap_before=gap_before,
         gap_after=gap_after,
-        alternatives=tuple((c.effect.name, _joint(fit, c), q) for q, c, _ in rivals),
+        confidence=share * (1.0 - p),
+        ambiguous_with=tuple(s.change.effect.name for s in rivals if s.score > own_score - CLOSE),
+        alternatives=tuple((s.change.effect.name, _joint(fit, s.change), s.score) for s in rivals[:ALTERNATIVES]),
         words=_words(change.effect, joint, told, std),
     )
 
@@ -294,6 +253,8 @@ def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list
             p_value=p,
             gap_before=relative_errors(fit, before, held=True)[0],
             gap_after=relative_errors(fit, held=True)[0],
+            confidence=1.0 - p,
+            ambiguous_with=(),
             alternatives=(),
             words=f"numbers differ from the baseline and no effect of the catalogue explains it: {told}",
         )

@@ -33,14 +33,14 @@ def standard_deviations(state: State) -> list[dict[str, float]]:
         own = [study.model.base.names.index(name) for name in term.names]
         for shape in term.effect.shapes:
             if shape.continuous:
-                slopes.append(_slope(state.workshop, fit.noise, term, shape.name, fit.theta[own]))
+                slopes.append(_slope(state.workshop, fit.noise, term, shape.name, term.of_effect(fit.theta[own])))
                 owners.append((k, shape.name))
     deviations = _deviations(fit, slopes)
     b = fit.theta.size
     found: list[dict[str, float]] = []
     for k, term in enumerate(study.model.terms):
         own = [study.model.base.names.index(name) for name in term.names]
-        std = {p.name: float(deviations[i]) for p, i in zip(term.effect.linear, own, strict=True)}
+        std = {p.name: float(deviations[i]) for p, i in zip(term.linear, own, strict=True)}
         for place, (owner, name) in enumerate(owners):
             if owner == k:
                 std[name] = float(deviations[b + place])

@@ -43,7 +43,7 @@ def in_its_loop(fit: Fit, trial: Trial) -> Trial | None:
     """
     study, candidate = fit.study, trial.candidate
     robot = added(study.robot, trial)
-    theta = np.concatenate([trial.beside, trial.values])
+    theta = np.concatenate([trial.beside, trial.kept])
     whole = replace(study, robot=robot, model=ArmModel.from_config(robot))
     moved = whole.resimulated(theta)
     if moved is whole:

@@ -304,7 +304,7 @@ def with_values(state: State, shapes: Mapping[int, Mapping[str, float]] | None =
     for k, term in enumerate(state.study.model.terms):
         number = stanza_number(state.study.robot, k)
         own = [state.study.model.base.names.index(name) for name in term.names]
-        linear = zip((p.name for p in term.effect.linear), state.fit.theta[own], strict=True)
+        linear = zip((p.name for p in term.linear), state.fit.theta[own], strict=True)
         found = {**term.shapes, **{name: float(value) for name, value in linear}, **dict((shapes or {}).get(k, {}))}
         stanzas[number] = stanzas[number].model_copy(update={"parameters": found})
     return state.study.robot.model_copy(update={"effects": tuple(stanzas)})

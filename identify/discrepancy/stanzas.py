@@ -9,7 +9,9 @@ from identify.discrepancy.trial import Trial
 def added(robot: RobotConfig, trial: Trial) -> RobotConfig:
     """The robot with what a trial found as its last stanza."""
     parameters = dict(trial.shapes) | values_of(trial)
-    stanza = stanza_of(trial.candidate.effect, trial.candidate.place, robot, parameters)
+    effect = trial.candidate.effect
+    contained = tuple(p.name for p, there in zip(effect.linear, trial.contained, strict=True) if there)
+    stanza = stanza_of(effect, trial.candidate.place, robot, parameters, contained)
     return robot.model_copy(update={"effects": (*robot.effects, stanza)})
 
 
@@ -19,9 +21,9 @@ def without(robot: RobotConfig, stanza: int) -> RobotConfig:
 
 
 def values_of(trial: Trial) -> dict[str, float]:
-    """Linear parameters of a trial by name."""
-    names = (parameter.name for parameter in trial.candidate.effect.linear)
-    return {name: float(value) for name, value in zip(names, trial.values, strict=True)}
+    """Linear parameters of a trial by name; none of those that the model contains."""
+    each = zip(trial.candidate.effect.linear, trial.values, trial.contained, strict=True)
+    return {parameter.name: float(value) for parameter, value, contained in each if not contained}
 
 
 def stanza_number(robot: RobotConfig, term: int) -> int:

@@ -14,6 +14,8 @@ from identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
 
+CLOSE = float(np.log(20.0))
+"""Difference in log-likelihood below which a rival cannot be told apart: odds of less than 20 to 1."""
 NEWEY_WEST_LAGS = 20
 LEAP = 4.0
 """Standard deviations beyond which a residual is no noise."""
@@ -21,6 +23,8 @@ MAD_TO_STD = 1.4826
 """Standard deviation of normal noise over its median absolute deviation."""
 RANK_TOLERANCE = 1e-3
 """Columns that the model nearly contains (relative norm left beside it) cannot be tested."""
+ALONE = 1e-2
+"""Part of a column in the directions beside the model below which the model contains it."""
 CALM_PASSES = 2
 """Between a candidate's parameters and the noise models that go with it, from calm ones."""
 REFINEMENTS = 12
@@ -54,6 +58,8 @@ class Trial:
         Share of the whitened held-out residual's power that the change takes away, at the joint that it changes most.
     score
         Gain in log-likelihood over both parts, less what fitting alone gains on the training part.
+    contained
+        Of every linear parameter, whether the model has it already; its value is zero then.
     """
 
     candidate: Candidate
@@ -68,6 +74,13 @@ class Trial:
     beside: Array
     share: float
     score: float
+    contained: tuple[bool, ...]
+
+    @property
+    def kept(self) -> Array:
+        """The linear parameters that the model does not contain."""
+        kept: Array = self.values[~np.array(self.contained)]
+        return kept
 
     @property
     def forbidden(self) -> bool:
@@ -196,6 +209,7 @@ def _judged(
         fit.theta - away,
         share,
         supported - fitted,
+        tuple(bool(there) for there in values == 0.0),
     )
 
 
@@ -240,6 +254,8 @@ def _values(fit: Fit, columns: Columns) -> tuple[float, Array, Array] | None:
     if basis is None:
         return None
     u, right, scale = basis
+    # A column of its own that the model contains has no part in any direction that is kept.
+    alone = np.linalg.norm(right, axis=1) > ALONE
     score = u.T @ fit.residual
     # (D~' C) in the coordinates of u: how much of the instrument's direction the measured columns have.
     gram = u.T @ (columns.x / scale) @ right
@@ -247,7 +263,7 @@ def _values(fit: Fit, columns: Columns) -> tuple[float, Array, Array] | None:
         inverse = np.linalg.inv(gram)
     except np.linalg.LinAlgError:
         return None
-    values = (right @ (inverse @ score)) / scale
+    values = np.where(alone, (right @ (inverse @ score)) / scale, 0.0)
     std = np.sqrt(np.sum((right @ inverse) ** 2, axis=1)) / scale
     return float(score @ score), values, std
 

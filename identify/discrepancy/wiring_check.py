@@ -80,6 +80,8 @@ class WiringFinding:
     unexplained_before: Array
     unexplained_after: Array
     alternatives: tuple[tuple[str, ...], ...]
+    certain: bool = True
+    """Whether the fits as recorded are so much worse that no effect could be to blame instead."""
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,10 @@ class _Fit:
         """Whether it is better by so much that the other one must be mistaken."""
         drop = float(other.shares.sum()) / float(self.shares.sum())
         return other.misfit - self.misfit >= LEAST_GAIN and drop >= LEAST_DROP
+
+    def nearer(self, other: "_Fit") -> bool:
+        """Whether it is better both by likelihood and by what the drives together leave unexplained."""
+        return self.misfit < other.misfit and float(self.shares.sum()) < float(other.shares.sum())
 
 
 @dataclass
@@ -209,7 +215,9 @@ class _Bench:
 def find_wiring(experiments: Sequence[Experiment], robot: RobotConfig) -> WiringFinding | None:
     """Wrong signs and exchanged drives, or ``None``.
 
-    Mistakes that the robot's effects name are undone first; what is found comes on top of them.
+    Mistakes that the robot's effects name are undone first; what is found comes on top of them. A single mistake that
+    the recordings prefer throughout, though not by much, is returned as not ``certain``: two like joints exchanged as a
+    whole, or an effect that is missing from the model.
 
     Parameters
     ----------
@@ -236,6 +244,9 @@ def find_wiring(experiments: Sequence[Experiment], robot: RobotConfig) -> Wiring
         best, fitted = min(fits, key=lambda pair: pair[1].misfit)
         p = min(1.0, len(hypotheses) * _preferred(current, fitted))
         if p > ALPHA or not fitted.beats(current):
+            if not found and p <= ALPHA and fitted.nearer(current):
+                suspected = (_words(best.stanza, robot),)
+                return WiringFinding((best.stanza,), suspected, (p,), first.shares, fitted.shares, ((),), certain=False)
             break
         equal = [
             _words(h.stanza, robot)

@@ -7,13 +7,11 @@ from identify.catalogue.registry import known
 
 
 @pytest.mark.parametrize(
-    ("value", "exponent", "allowed"), [(-5.0, 2 / 3, False), (5.0, 2 / 3, True), (-5.0, 2.0, True)]
+    ("value", "knee", "allowed"), [(-5.0, 0.02, False), (5.0, 0.02, True), (-5.0, 0.3, True)]
 )
-def test_friction_does_not_fall_from_standstill_as_a_power_of_speed(
-    value: float, exponent: float, allowed: bool
-) -> None:
+def test_friction_does_not_fall_from_standstill(value: float, knee: float, allowed: bool) -> None:
     effect = known("nonlinear_viscous_friction")
-    assert effect.allows(np.array([value]), np.array([0.1]), {"exponent": exponent}) is allowed
+    assert effect.allows(np.array([value]), np.array([0.1]), {"knee": knee}) is allowed
 
 
 @pytest.mark.parametrize(("inertia", "allowed"), [(-0.0028, True), (-0.055, False), (0.055, True)])

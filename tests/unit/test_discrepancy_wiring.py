@@ -137,3 +137,11 @@ def test_of_a_single_axis_physics_alone_tells_a_wrong_sign(emps: list[Experiment
 def test_different_rates_are_refused(virtual: list[Experiment], robot: RobotConfig) -> None:
     with pytest.raises(DataError, match="sampling rates"):
         find_wiring([*virtual, replace(virtual[0], dt=2e-3)], robot)
+
+
+def test_like_joints_exchanged_as_a_whole_are_suspected(virtual: list[Experiment], robot: RobotConfig) -> None:
+    made = order("joint_4", "joint_5", BOTH)
+    found = find_wiring(mistaken(virtual, robot, made), robot)
+    assert found is not None
+    assert found.stanzas == (made,)
+    assert found.p_values[0] < 0.01

@@ -20,6 +20,10 @@ def case(
     return Case(kind, level, "tx40", "tx40.yaml", "t.yaml", 1, 1e-3, seed, parts, baseline)
 
 
+TORQUE = 5.0
+"""Of every joint, N m (RMS)."""
+
+
 def finding(effect: str, joint: str, other: str | None = None, **more: Any) -> dict[str, Any]:
     return {
         "effect": effect, "joint": joint, "other": other, "kind": "structure", "parameters": {}, "confidence": 0.99,
@@ -28,10 +32,16 @@ def finding(effect: str, joint: str, other: str | None = None, **more: Any) -> d
 
 
 def record(
-    *findings: dict[str, Any], before: float = 10.0, after: float = 8.0, verdict: str = "explained", truth: Any = ()
+    *findings: dict[str, Any],
+    before: float = 10.0,
+    after: float = 8.0,
+    verdict: str = "explained",
+    truth: Any = (),
+    torque: float = TORQUE,
 ) -> dict[str, Any]:
     def gap(value: float) -> dict[str, Any]:
-        return {"all": value, "by_joint": {f"joint_{k}": value for k in range(1, 7)}}
+        each = {f"joint_{k}": value for k in range(1, 7)}
+        return {"all": value, "by_joint": each, "rms": {joint: error * torque / 100 for joint, error in each.items()}}
 
     validation = {"before": gap(before), "after": gap(after)}
     document = {"verdict": verdict, "findings": list(findings), "gap": {"validation": validation}, "not_visible": []}
@@ -173,3 +183,9 @@ def test_the_bounds_of_false_alarms_are_clopper_and_pearsons() -> None:
     # Rule of three: none of n is compatible with 1 - 0.025^(1/n).
     assert clopper_pearson(0, 60) == pytest.approx((0.0, 1 - 0.025 ** (1 / 60)))
     assert clopper_pearson(1, 90) == pytest.approx((0.000281, 0.0604), rel=2e-2)
+
+
+def test_the_same_noise_is_a_larger_percentage_of_less_torque() -> None:
+    """An arm that lost half of its friction: 20 % of half the torque is the gap, 16 % of it the healthy arm's noise."""
+    thinned = record(finding("joint_spring", "joint_2"), before=20.0, after=16.0, torque=TORQUE / 2)
+    assert score(case(SPRING), thinned, HEALTHY).closed == pytest.approx(1.0)
