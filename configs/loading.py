@@ -4,17 +4,28 @@ import difflib
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ValidationError
 
 from configs.errors import ConfigError
+from configs.reading import read_yaml
 from configs.robot import RobotConfig
+from configs.scenario import Scenario
 from configs.session import SessionConfig
 from configs.suite import SuiteConfig
 from configs.trajectory import Trajectory
 from configs.urdf import UrdfGeometry, geometry_from_urdf
 
 HERE = Path(__file__).parent
+KINDS: dict[str, type[BaseModel]] = {
+    "robot": RobotConfig,
+    "session": SessionConfig,
+    "trajectory": Trajectory,
+    "suite": SuiteConfig,
+    "scenario": Scenario,
+}
+"""Kinds of files, by the word for them in their ``schema``."""
+_LONGEST = 80
+"""Most characters of a file that a message repeats."""
 T = TypeVar("T", bound=BaseModel)
 
 
@@ -146,22 +157,61 @@ def _read_text(path: Path) -> str:
 
 
 def _read_mapping(text: str, where: str) -> dict[str, Any]:
-    try:
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f" line {mark.line + 1}" if mark is not None else ""
-        raise ConfigError(f"{where}:{line} not valid YAML: {getattr(error, 'problem', error)}") from error
+    data = read_yaml(text, where)
     if not isinstance(data, dict):
         raise ConfigError(f"{where}: expected keys and values, found {type(data).__name__}")
+    for key in data:
+        if not isinstance(key, str):
+            raise ConfigError(f"{where}: {_shown(key)}: expected a word as key")
     return data
 
 
 def _checked(data: dict[str, Any], kind: type[T], where: str) -> T:
     try:
-        return kind.model_validate(data)
+        model = kind.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(f"{where}: {_first_problem(error, kind, data)}") from error
+        other = _other_kind(data, kind)
+        raise ConfigError(f"{where}: {other or _first_problem(error, kind, data)}") from error
+    misread = _truth_as_number(data, model.model_dump(by_alias=True), "")
+    if misread is not None:
+        raise ConfigError(f"{where}: {misread}")
+    return model
+
+
+def _other_kind(data: dict[str, Any], kind: type[BaseModel]) -> str | None:
+    """What is said of a file that is another kind of file than the one wanted; ``None`` if it looks like that one."""
+    if kind not in KINDS.values():
+        return None
+    wanted = next(name for name, one in KINDS.items() if one is kind)
+    said = str(data.get("schema", ""))
+    for name in KINDS:
+        if said.startswith(f"armident/{name}/"):
+            return None if name == wanted else f"this is a {name} file ({said}); a {wanted} file is wanted"
+    shared = {name: len(data.keys() & _own_keys(one)) for name, one in KINDS.items()}
+    best = max(shared, key=lambda name: shared[name])
+    if shared[best] > shared[wanted]:
+        matching = ", ".join(sorted(data.keys() & _own_keys(KINDS[best])))
+        return f"this looks like a {best} file (it has {matching}); a {wanted} file is wanted"
+    return None
+
+
+def _own_keys(kind: type[BaseModel]) -> set[str]:
+    """Keys of the first level that say of what kind a file is."""
+    keys = {field.alias or name for name, field in kind.model_fields.items()} - {"schema", "description"}
+    return keys | ({"urdf"} if kind is RobotConfig else set())
+
+
+def _truth_as_number(said: Any, understood: Any, key: str) -> str | None:
+    """What is said of the first true or false (in YAML also yes, no, on, off) taken as a number, or the reverse."""
+    if isinstance(said, bool) != isinstance(understood, bool):
+        wanted = "true or false" if isinstance(understood, bool) else "a number or a word"
+        return f"{key}: expected {wanted}, found {str(said).lower():.80}"
+    below: list[tuple[Any, Any, str]] = []
+    if isinstance(said, dict) and isinstance(understood, dict):
+        below = [(value, understood.get(k), f"{key}.{k}" if key else str(k)) for k, value in said.items()]
+    elif isinstance(said, list) and isinstance(understood, tuple | list):
+        below = [(one, other, f"{key}[{k}]") for k, (one, other) in enumerate(zip(said, understood, strict=False))]
+    return next((found for entry in below if (found := _truth_as_number(*entry)) is not None), None)
 
 
 def _first_problem(error: ValidationError, kind: type[BaseModel], data: dict[str, Any]) -> str:
@@ -169,18 +219,26 @@ def _first_problem(error: ValidationError, kind: type[BaseModel], data: dict[str
     first = problems[0]
     key = ""
     for part in first["loc"]:
-        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else str(part)
+        key += f"[{part}]" if isinstance(part, int) else f".{_shown(part)}" if key else _shown(part)
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     if first["type"] == "extra_forbidden":
         missing = [str(p["loc"][-1]) for p in problems if p["type"] == "missing"]
         offered = _keys(kind) | (_keys(UrdfGeometry) if kind is RobotConfig else set())
-        near = difflib.get_close_matches(str(first["loc"][-1]), missing + sorted(offered), n=1)
+        near = difflib.get_close_matches(str(first["loc"][-1])[:_LONGEST], missing + sorted(offered), n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         return f"{key}: unknown key{hint}{more}"
     value = first.get("input")
-    found = f", found {value!r}" if isinstance(value, str | int | float | bool) or value is None else ""
-    message = first["msg"].removeprefix("Value error, ")
-    return f"{key + ': ' if key else ''}{message[0].lower() + message[1:]}{found}{more}"
+    found = f", found {_shown(repr(value))}" if isinstance(value, str | float | bool) or value is None else ""
+    if isinstance(value, int) and not isinstance(value, bool):
+        found = f", found {value}" if abs(value) < 10**20 else ", found a number of more than 20 digits"
+    message = " ".join(first["msg"].removeprefix("Value error, ").split())
+    return f"{key + ': ' if key else ''}{_shown(message[0].lower() + message[1:], 500)}{found}{more}"
+
+
+def _shown(text: object, longest: int = _LONGEST) -> str:
+    """A text as a message shows it: in one line, and not longer than it is worth."""
+    line = "".join(c if c.isprintable() else "?" for c in str(text))
+    return line if len(line) <= longest else f"{line[: longest - 3]}..."
 
 
 def _keys(kind: type[BaseModel]) -> set[str]:

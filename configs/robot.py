@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from configs.base import Frozen
 
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=64)]
 Positive = Annotated[float, Field(gt=0)]
 
 

@@ -13,6 +13,9 @@ from configs.robot import RobotConfig
 RAMP_SHARE = 0.4
 """Share of a move spent accelerating; as much again decelerating, the rest at constant speed."""
 
+LONGEST_S = 3600.0
+"""Longest trajectory, s: its set points are in memory while it is played."""
+
 REST_TOLERANCE = 1e-4
 """How far from zero a Fourier sum's first velocity and acceleration may be, relative to those of its harmonics."""
 
@@ -79,6 +82,8 @@ class Trajectory(Frozen):
     def _same_length(self) -> Self:
         if bool(self.moves) == (self.fourier is not None):
             raise ValueError("expected either moves or fourier")
+        if not self.duration <= LONGEST_S:
+            raise ValueError(f"takes {self.duration:.6g} s; expected at most {LONGEST_S:g}, a session can repeat it")
         if self.fourier is not None and len(self.fourier.sine[0]) != len(self.start):
             raise ValueError(f"fourier: expected rows of {len(self.start)} numbers")
         for k, move in enumerate(self.moves):

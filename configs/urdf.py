@@ -31,6 +31,9 @@ ENDLESS = (-2.0 * math.pi, 2.0 * math.pi)
 WRITTEN_DECIMALS = 4
 """An angle with at least so many decimals that equals a multiple of 15 degrees to these decimals is that multiple."""
 
+LARGEST = 1e9
+"""No number of an arm is larger than this, in SI units."""
+
 Floats = NDArray[np.float64]
 
 
@@ -311,7 +314,7 @@ class _Tree:
             expected = "a number" if count == 1 else f"{count} numbers"
             hint = "; expand the xacro first" if "$" in (text or "") else ""
             where = f"{self.file}: joint {element.get('name')!r}: {child.tag} {key}"
-            raise ConfigError(f"{where}: expected {expected}, found {text!r}{hint}")
+            raise ConfigError(f"{where}: expected {expected}, found {text!r:.80}{hint}")
         return words
 
 
@@ -381,7 +384,7 @@ def _angle(word: str) -> float:
 
 def _is_finite(word: str) -> bool:
     try:
-        return Decimal(word).is_finite()
+        return abs(Decimal(word)) <= LARGEST
     except InvalidOperation:
         return False
 

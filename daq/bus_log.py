@@ -7,9 +7,7 @@ matched to their SYNC, every SYNC accounted for.
 import hashlib
 import itertools
 import os
-import struct
 import sys
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +21,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn
 
 from configs import ConfigError, DataError, RobotConfig, SessionConfig
 from daq.assembler import Assembler, Batch
+from daq.foreign import said
 from daq.recording import Gap, Recording, Stream
 from daq.streams import CapturedStream, bus_numbers, captured_streams
 from drivers.frames import Frames, frames
@@ -31,10 +30,9 @@ from drivers.objects import COB_SYNC
 SUFFIXES = (".log", ".asc", ".blf", ".trc")
 """Kinds of logs: candump -l, Vector's text and binary, PEAK's."""
 
-_UNREADABLE = (ValueError, IndexError, KeyError, TypeError, EOFError, struct.error, zlib.error, can.CanError)
-"""What python-can's readers raise at a file that is not what its name says."""
-
 _BATCH = 4096
+_SMALLEST_OBJECT = 16
+"""Bytes of the head of an object in a BLF file."""
 _TURN_NS = 1_000_000_000
 _ANSWER_NS = 20_000
 """Time between a SYNC and its answers in a log that is written from a recording, which keeps the time of SYNC alone."""
@@ -105,12 +103,11 @@ def _in_turn(read: Sequence[Frames]) -> Iterator[tuple[int, Frames]]:
     if len(read) == 1:
         yield from ((0, read[0][first : first + _BATCH]) for first in range(0, read[0].size, _BATCH))
         return
-    begin, end = min(int(f["t_ns"].min()) for f in read), max(int(f["t_ns"].max()) for f in read)
-    for t_ns in range(begin, end + 1, _TURN_NS):
+    # Up to the first frame after a second: clocks that were set back keep frames in the order they came.
+    seconds = [np.maximum.accumulate(f["t_ns"]) // _TURN_NS for f in read]
+    for second in np.unique(np.concatenate(seconds)):
         for bus, frames_of_it in enumerate(read):
-            # Up to the first frame after this second: clocks that were set back keep frames in the order they came.
-            latest = np.maximum.accumulate(frames_of_it["t_ns"])
-            first, last = np.searchsorted(latest, [t_ns, t_ns + _TURN_NS])
+            first, last = np.searchsorted(seconds[bus], [second, second + 1])
             yield bus, frames_of_it[first:last]
 
 
@@ -190,17 +187,31 @@ def _read(path: Path) -> _Log:
                 advance(done)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except _UNREADABLE as error:
-        raise DataError(f"{path}: not a readable {path.suffix[1:]} log (after {done} frames): {error}") from error
+    except Exception as error:  # whatever python-can's readers say of a file that is not what its name says
+        raise DataError(f"{path}: not a readable {path.suffix[1:]} log (after {done} frames): {said(error)}") from error
     if not parts:
         raise DataError(f"{path}: no frames in it")
     return _Log(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), tuple(numbers), foreign)
 
 
+class _BlfReader(can.BLFReader):
+    """Python-can's reader, which objects that say they have no size would keep busy for ever."""
+
+    def _parse_data(self, data: bytes) -> Iterator[can.Message]:
+        at = data.find(b"LOBJ")
+        while 0 <= at <= len(data) - 16:
+            size = int.from_bytes(data[at + 8 : at + 12], "little")
+            if size < _SMALLEST_OBJECT:
+                raise ValueError(f"an object of {size} bytes")
+            at = data.find(b"LOBJ", at + size, at + size + 8)
+        yield from super()._parse_data(data)
+
+
 def _batches(path: Path) -> Iterator[list[can.Message]]:
     # Times in the file as they are: without, those of an ASC log would begin at zero.
     options = {"relative_timestamp": False} if path.suffix.lower() == ".asc" else {}
-    with can.LogReader(path, **options) as reader:
+    opened = _BlfReader(path) if path.suffix.lower() == ".blf" else can.LogReader(path, **options)
+    with opened as reader:
         messages = iter(reader)
         while batch := list(itertools.islice(messages, _BATCH)):
             yield batch

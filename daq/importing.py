@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs import ConfigError, DataError, RobotConfig
+from daq.foreign import said
 from daq.polled import on_clock
 from daq.recording import Field, Recording, Stream
 from daq.recording.model import Quantity, Side
@@ -151,8 +152,8 @@ def _load(path: Path, robot: RobotConfig) -> Source:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
-        except (OSError, ValueError) as error:
-            raise DataError(f"{path}: not a readable NPZ file: {error}") from error
+        except Exception as error:  # whatever zipfile, zlib and numpy say of a damaged file
+            raise DataError(f"{path}: not a readable NPZ file: {said(error)}") from error
         return Source(path, _numeric(arrays))
     if kind == ".mat":
         return Source(path, _numeric(_mat(path)))
@@ -177,8 +178,8 @@ def _parquet(path: Path) -> dict[str, Any]:
     try:
         table = pyarrow.parquet.read_table(path)  # type: ignore[no-untyped-call]
         return {name: table.column(name).to_numpy() for name in table.column_names}
-    except (OSError, pyarrow.ArrowException) as error:
-        raise DataError(f"{path}: not a readable Parquet file: {error}") from error
+    except Exception as error:  # whatever pyarrow says of a damaged file
+        raise DataError(f"{path}: not a readable Parquet file: {said(error)}") from error
 
 
 def _mat(path: Path) -> dict[str, Any]:
@@ -188,8 +189,8 @@ def _mat(path: Path) -> dict[str, Any]:
         arrays: dict[str, Any] = loadmat(path)
     except NotImplementedError as error:
         raise DataError(f"{path}: MAT version 7.3 is not read; save it with -v7") from error
-    except (OSError, ValueError, TypeError) as error:
-        raise DataError(f"{path}: not a readable MAT file: {error}") from error
+    except Exception as error:  # whatever scipy and zlib say of a damaged file
+        raise DataError(f"{path}: not a readable MAT file: {said(error)}") from error
     return arrays
 
 

@@ -1,10 +1,8 @@
 """rosbag2 files, through the MCAP they are made of: joint states in and out (sensor_msgs/msg/JointState)."""
 
-import struct
 from pathlib import Path
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.summary import Summary
 from mcap_ros2.decoder import DecoderFactory
@@ -12,6 +10,7 @@ from mcap_ros2.writer import Writer
 from numpy.typing import NDArray
 
 from configs import DataError, RobotConfig
+from daq.foreign import said
 
 TOPIC = "/joint_states"
 _TYPE = "sensor_msgs/msg/JointState"
@@ -62,8 +61,10 @@ def read_joint_states(path: Path, robot: RobotConfig) -> dict[str, NDArray[np.fl
                             f"{path}: message {len(t)} of {topic} has {len(values)} {what} of {len(names)} joints"
                         )
                     into.append([values[k] for k in order])
-    except (McapError, ValueError, RuntimeError, struct.error) as error:
-        raise DataError(f"{path}: not a readable rosbag2 file: {error}") from error
+    except DataError:
+        raise
+    except Exception as error:  # whatever the readers of MCAP, zstd and ROS 2's messages say of a damaged file
+        raise DataError(f"{path}: not a readable rosbag2 file: {said(error)}") from error
     if not t:
         raise DataError(f"{path}: no message on {topic}")
     times = np.array(t, dtype=np.int64)

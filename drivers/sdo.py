@@ -16,6 +16,9 @@ for _logger in ("canopen", "can"):
     # Their warnings repeat on stderr what our exceptions say in one line.
     logging.getLogger(_logger).addHandler(logging.NullHandler())
 
+_EXPEDITED, _LARGEST = 4, 8
+"""Bytes of a value in the answer itself, and most bytes that an object we read has."""
+
 
 class DriveSdo:
     """The object dictionary of one drive.
@@ -52,16 +55,31 @@ class DriveSdo:
             If the bus is down.
         """
         try:
-            data = self.node.sdo.upload(index, sub)
-            return int(struct.unpack("<" + code, data)[0])
+            data = self._upload(index, sub, struct.calcsize("<" + code))
         except SdoAbortedError as error:
             raise ConfigError(f"{self.who}: refuses to read {_name(index, sub)}: {_abort(error)}") from error
         except SdoCommunicationError as error:
             raise self._silent() from error
-        except struct.error as error:
-            raise ConfigError(f"{self.who}: {_name(index, sub)} has {len(data)} bytes") from error
+        except (struct.error, IndexError) as error:
+            raise self._garbled(index, sub) from error
         except (can.CanError, OSError) as error:
             raise self._down(error) from error
+        return int(struct.unpack("<" + code, data)[0])
+
+    def _upload(self, index: int, sub: int, size: int) -> bytes:
+        """The first ``size`` bytes of an object; some drives send four of smaller ones."""
+        data = b""
+        with self.node.sdo.open(index, sub, "rb", buffering=0) as stream:
+            # A drive that never says that it has ended is not listened to for ever.
+            while len(data) <= _LARGEST and (part := stream.read(_LARGEST)):
+                data += part
+            said = stream.size
+        if not (said == len(data) >= size or (said is None and len(data) in (size, max(size, _EXPEDITED)))):
+            raise ConfigError(
+                f"{self.who}: {_name(index, sub)} has {'more than ' * (len(data) > _LARGEST)}"
+                f"{min(len(data), _LARGEST)} bytes{'' if said is None else f', says {said}'}; expected {size}"
+            )
+        return data[:size]
 
     def order(self, index: int, sub: int, value: int, code: str) -> None:
         """Write an object that acts at once and need not read back the same.
@@ -79,6 +97,8 @@ class DriveSdo:
             raise ConfigError(f"{self.who}: refuses {_name(index, sub)} = {value:X}h: {_abort(error)}") from error
         except SdoCommunicationError as error:
             raise self._silent() from error
+        except (struct.error, IndexError) as error:
+            raise self._garbled(index, sub) from error
         except (can.CanError, OSError) as error:
             raise self._down(error) from error
 
@@ -108,6 +128,9 @@ class DriveSdo:
             f"{self.who}: does not answer on {self._bus.channel} within {self._timeout:g} s; "
             "is the drive on, and the node id right?"
         )
+
+    def _garbled(self, index: int, sub: int) -> ConfigError:
+        return ConfigError(f"{self.who}: its answer about {_name(index, sub)} is no SDO answer (CiA 301)")
 
     def _down(self, error: Exception) -> BusDown:
         return BusDown(f"bus {self._bus.channel}: {error}")

@@ -5,10 +5,11 @@ tag bytes: a whole batch is written and read as one numpy array. ``protoc``'s ow
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from google.protobuf import descriptor_pb2
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from configs import DataError
 from daq.recording.mcap_format import MESSAGE, RECORD_HEAD
-from daq.recording.model import Field, Stream
+from daq.recording.model import Field, Quantity, Side, Stream
 
 _PROTO = descriptor_pb2.FieldDescriptorProto
 _WIRE = {
@@ -48,7 +49,7 @@ class StreamLayout:
     def __post_init__(self) -> None:
         for field, dtype in zip(self.fields, self.dtypes, strict=True):
             if dtype not in _WIRE:
-                raise DataError(f"stream {self.name}: {field.name} has dtype {dtype}, which recordings do not hold")
+                raise DataError(f"stream {self.name}: {field.name} has dtype {dtype:.60}, which recordings do not hold")
             if len(field.scale) != len(self.joints):
                 raise DataError(f"stream {self.name}: {field.name} needs {len(self.joints)} scale factors")
 
@@ -103,14 +104,26 @@ class StreamLayout:
         try:
             data = json.loads(text)
             fields = tuple(
-                Field(f["name"], f["quantity"], f["unit"], f["side"], tuple(float(s) for s in f["scale"]))
+                Field(_text(f["name"]), f["quantity"], _text(f["unit"]), f["side"], tuple(map(_finite, f["scale"])))
                 for f in data["fields"]
             )
-            dtypes = tuple(str(f["dtype"]) for f in data["fields"])
-            joints = tuple(str(j) for j in data["joints"])
-            return cls(str(data["name"]), int(data["every"]), joints, fields, dtypes)
-        except (ValueError, KeyError, TypeError) as error:
-            raise DataError(f"a stream layout that cannot be understood: {error!r}") from error
+            dtypes = tuple(_text(f["dtype"]) for f in data["fields"])
+            layout = cls(_text(data["name"]), data["every"], tuple(map(_text, data["joints"])), fields, dtypes)
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+            raise DataError(f"a stream layout that cannot be understood: {_short(error)}") from error
+        for what, values, known in (
+            ("quantity", [f.quantity for f in fields], get_args(Quantity)),
+            ("side", [f.side for f in fields], get_args(Side)),
+        ):
+            for value in values:
+                if value not in known:
+                    raise DataError(f"a stream layout with {what} {value!r:.60}; expected {', '.join(known)}")
+        names = [f.name for f in fields]
+        if len(set(names)) < len(names) or len(set(layout.joints)) < len(layout.joints):
+            raise DataError("a stream layout that names a field or a joint twice")
+        if type(layout.every) is not int or layout.every < 1 or not fields or not layout.joints:
+            raise DataError("a stream layout without fields or joints, or that never comes")
+        return layout
 
     @cached_property
     def descriptor(self) -> bytes:
@@ -229,6 +242,25 @@ class StreamLayout:
                 return count + int(wrong[0])
             count += step
         return count
+
+
+def _text(value: object) -> str:
+    """A text that is one, and can be written."""
+    if not isinstance(value, str):
+        raise TypeError(f"expected a text, found {value!r:.60}")
+    value.encode()
+    return value
+
+
+def _finite(value: object) -> float:
+    """A number that is one."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise TypeError(f"expected a number, found {value!r:.60}")
+    return float(value)
+
+
+def _short(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error)[:120]}".replace("\n", " ")
 
 
 def _varint(value: int) -> bytes:

@@ -15,6 +15,7 @@ MESSAGE = 0x05
 CHUNK = 0x06
 MESSAGE_INDEX = 0x07
 CHUNK_INDEX = 0x08
+ATTACHMENT = 0x09
 STATISTICS = 0x0B
 METADATA = 0x0C
 METADATA_INDEX = 0x0D
@@ -24,6 +25,12 @@ DATA_END = 0x0F
 RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")
+_STATISTICS_HEAD = struct.Struct("<QHIIIIQQI")
+
+FOOTER_SIZE = RECORD_HEAD.size + 20
+
+IN_DATA = frozenset((HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END))
+"""Records that may stand before the summary."""
 
 
 class MalformedRecord(ValueError):
@@ -70,6 +77,11 @@ def message(channel_id: int, sequence: int, t_ns: int, data: bytes) -> bytes:
 def metadata(name: str, entries: Mapping[str, str]) -> bytes:
     """A named set of strings."""
     return record(METADATA, _string(name) + _mapping(entries))
+
+
+def check(name: str, data: bytes, start: int = 0) -> bytes:
+    """Metadata with the checksum of the bytes before it, which begins with ``start``."""
+    return metadata(name, {"bytes": str(len(data)), "crc32": str(zlib.crc32(data, start))})
 
 
 def index_entry(t_ns: int, offset: int) -> bytes:
@@ -181,18 +193,27 @@ class Cursor:
         """An unsigned number of ``size`` bytes."""
         return int.from_bytes(self.bytes(size), "little")
 
+    @property
+    def over(self) -> bool:
+        """Whether there is no more."""
+        return self._at >= len(self._data)
+
+    def prefixed(self) -> memoryview:
+        """Bytes with their length before them."""
+        return memoryview(self.bytes(self.number(4)))
+
     def string(self) -> str:
         """A prefixed string."""
         try:
-            return self.bytes(self.number(4)).decode()
+            return str(self.prefixed(), "utf-8")
         except UnicodeDecodeError as error:
             raise MalformedRecord("a string is not UTF-8") from error
 
     def mapping(self) -> dict[str, str]:
         """A prefixed map of strings."""
-        inner = Cursor(self.bytes(self.number(4)))
+        inner = Cursor(self.prefixed())
         entries: dict[str, str] = {}
-        while inner._at < len(inner._data):
+        while not inner.over:
             key = inner.string()
             entries[key] = inner.string()
         return entries
@@ -250,7 +271,30 @@ def read_chunk(content: memoryview) -> ChunkRecord:
 def read_message_index(content: memoryview) -> tuple[int, int]:
     """Channel of a message index record's content, and how many messages it lists."""
     cursor = Cursor(content)
-    return cursor.number(2), cursor.number(4) // 16
+    channel_id, size = cursor.number(2), cursor.number(4)
+    if size % 16 or len(content) != 6 + size:
+        raise MalformedRecord("a message index that is not as long as it says")
+    return channel_id, size // 16
+
+
+def read_message_counts(content: memoryview) -> dict[int, int]:
+    """How many messages of every channel there are, from a statistics record's content."""
+    if len(content) < _STATISTICS_HEAD.size:
+        raise MalformedRecord("statistics without a head")
+    counts = Cursor(Cursor(content[_STATISTICS_HEAD.size - 4 :]).prefixed())
+    found = {}
+    while not counts.over:
+        channel_id = counts.number(2)
+        found[channel_id] = counts.number(8)
+    return found
+
+
+def read_footer(data: memoryview) -> tuple[int, int]:
+    """Where the summary starts, and the checksum of it and of the footer up to the checksum; from a footer record."""
+    if len(data) != FOOTER_SIZE or RECORD_HEAD.unpack_from(data) != (FOOTER, 20):
+        raise MalformedRecord("no footer")
+    start, _, crc = struct.unpack_from("<QQI", data, RECORD_HEAD.size)
+    return start, crc
 
 
 def records(data: memoryview, start: int) -> Iterator[tuple[int, int, memoryview]]:

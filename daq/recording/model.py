@@ -2,9 +2,9 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,47 @@ class Mark:
     sync: int
     t_ns: int
     text: str = ""
+
+
+def gap_from(entries: object) -> Gap:
+    """A gap from what a file or a stream says of it.
+
+    Raises
+    ------
+    DataError
+        If that is none.
+    """
+    if not isinstance(entries, dict) or not {"stream", "first", "last"} <= entries.keys() <= _GAP_ENTRIES:
+        raise DataError(f"no gap: {entries!r:.100}")
+    gap = Gap(**entries)
+    numbers = type(gap.first) is int and type(gap.last) is int and 0 <= gap.first <= gap.last < _NO_SYNC
+    words = isinstance(gap.stream, str) and isinstance(gap.reason, str) and isinstance(gap.joint, str | None)
+    if not (numbers and words):
+        raise DataError(f"no gap: {entries!r:.100}")
+    return gap
+
+
+def mark_from(entries: object) -> Mark:
+    """A mark from what a file or a stream says of it.
+
+    Raises
+    ------
+    DataError
+        If that is none.
+    """
+    if not isinstance(entries, dict) or not {"kind", "sync", "t_ns"} <= entries.keys() <= _MARK_ENTRIES:
+        raise DataError(f"no mark: {entries!r:.100}")
+    mark = Mark(**entries)
+    numbers = type(mark.sync) is int and type(mark.t_ns) is int and -1 <= mark.sync < _NO_SYNC
+    if not (numbers and mark.kind in get_args(MarkKind) and isinstance(mark.text, str)):
+        raise DataError(f"no mark: {entries!r:.100}")
+    return mark
+
+
+_NO_SYNC = 2**63
+"""No SYNC has so large a number."""
+_GAP_ENTRIES = {entry.name for entry in fields(Gap)}
+_MARK_ENTRIES = {entry.name for entry in fields(Mark)}
 
 
 def join_parts(parts: "Sequence[Recording]") -> "Recording":

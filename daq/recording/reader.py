@@ -15,11 +15,11 @@ from pydantic import ValidationError
 from configs import ConfigError, DataError, RobotConfig, SessionConfig
 from daq.recording import mcap_format as mcap
 from daq.recording.layout import StreamLayout
-from daq.recording.model import Gap, Mark, Recording, Stream
-from daq.recording.writer import GAPS_TOPIC, MARKS_TOPIC, SCHEMA
+from daq.recording.model import Gap, Mark, Recording, Stream, gap_from, mark_from
+from daq.recording.writer import CHECK, COUNTERS, GAPS_TOPIC, MARKS_TOPIC, SCHEMA
 
 _Rows = tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[Any]]]
-_LARGEST_CHUNK = 1 << 30
+_LARGEST_CHUNK = 1 << 28
 HEALED = "armident.healed"
 """Metadata of a file that was torn and has been given its end: what it lacks."""
 
@@ -31,12 +31,25 @@ class _Content:
     channels: dict[int, mcap.ChannelRecord] = field(default_factory=dict)
     layouts: dict[int, StreamLayout] = field(default_factory=dict)
     rows: dict[int, list[_Rows]] = field(default_factory=dict)
+    messages: dict[int, int] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     gaps: list[Gap] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
     damaged: list[str] = field(default_factory=list)
+    headed: bool = False
+    head_crc: int = 0
     finished: bool = False
     end: int = 0
+    counts: dict[int, int] | None = None
+
+    def add(self, part: "_Content") -> None:
+        """Take what a chunk holds."""
+        for channel, rows in part.rows.items():
+            self.rows.setdefault(channel, []).extend(rows)
+        for channel, count in part.messages.items():
+            self.messages[channel] = self.messages.get(channel, 0) + count
+        self.gaps += part.gaps
+        self.marks += part.marks
 
 
 def read_recording(path: Path | str) -> Recording:
@@ -77,11 +90,13 @@ def _read(path: Path, data: memoryview) -> Recording:
     content = _Content()
     try:
         for opcode, at, body in mcap.records(data, len(mcap.MAGIC)):
-            _take(content, opcode, at, body)
+            _take(content, data, opcode, at, body)
             content.end = at + mcap.RECORD_HEAD.size + len(body)
             if content.finished:
                 break
         content.finished = content.finished and bytes(data[-len(mcap.MAGIC) :]) == mcap.MAGIC
+        if content.finished:
+            content.counts = message_counts(data, content.end)
         return _recording(path, content, len(data))
     except mcap.MalformedRecord as error:
         raise DataError(f"{path}: damaged: {error}") from error
@@ -89,20 +104,62 @@ def _read(path: Path, data: memoryview) -> Recording:
         raise error if str(path) in str(error) else DataError(f"{path}: {error}") from error
 
 
-def _take(content: _Content, opcode: int, at: int, body: memoryview) -> None:
-    if opcode == mcap.CHANNEL:
-        _take_channel(content, mcap.read_channel(body))
-    elif opcode == mcap.METADATA:
-        name, entries = mcap.read_metadata(body)
-        content.metadata[name] = entries
-    elif opcode == mcap.CHUNK:
-        raw = uncompressed(mcap.read_chunk(body))
-        if raw is None:
+def _take(content: _Content, data: memoryview, opcode: int, at: int, body: memoryview) -> None:
+    if opcode == mcap.CHUNK:
+        chunk = uncompressed(body, content.headed)
+        if chunk is None:
             content.damaged.append(damaged_text(at))
+            return
+        part = _Content(channels=content.channels, layouts=content.layouts)
+        try:
+            _take_chunk(part, chunk)
+        except mcap.MalformedRecord as error:
+            content.damaged.append(damaged_text(at, error))
         else:
-            _take_chunk(content, raw)
-    elif opcode == mcap.DATA_END:
+            content.add(part)
+        return
+    if opcode == mcap.DATA_END:
         content.finished = True
+        return
+    try:
+        name = checked_record(data, opcode, at, body, content.head_crc)
+        if opcode == mcap.CHANNEL:
+            _take_channel(content, mcap.read_channel(body))
+    except mcap.MalformedRecord as error:
+        if not content.headed:
+            raise
+        content.metadata.pop(COUNTERS, None)
+        content.damaged.append(damaged_text(at, error))
+        return
+    if opcode == mcap.METADATA:
+        content.metadata[name] = entries = mcap.read_metadata(body)[1]
+        if name == CHECK and not content.headed:
+            content.headed, content.head_crc = True, int(entries["crc32"])
+
+
+def checked_record(data: memoryview, opcode: int, at: int, body: memoryview, head_crc: int) -> str:
+    """Name of a metadata record, empty of another one; ``head_crc`` is the checksum of the head, 0 in the head.
+
+    Raises
+    ------
+    MalformedRecord
+        If it is none that may stand there, or what it is to check is not what was written.
+    """
+    if opcode not in mcap.IN_DATA:
+        raise mcap.MalformedRecord(f"a record of kind {opcode:02X}h before the end of the data")
+    if opcode == mcap.MESSAGE_INDEX:
+        mcap.read_message_index(body)
+    if opcode != mcap.METADATA:
+        return ""
+    name, entries = mcap.read_metadata(body)
+    if name == CHECK:
+        try:
+            size, crc = int(entries["bytes"]), int(entries["crc32"])
+        except (KeyError, ValueError) as error:
+            raise mcap.MalformedRecord("a checksum that is none") from error
+        if not 0 < size <= at or zlib.crc32(data[at - size : at], head_crc) != crc:
+            raise mcap.MalformedRecord(f"the {size} bytes before byte {at} are not what was written")
+    return name
 
 
 def _take_channel(content: _Content, channel: mcap.ChannelRecord) -> None:
@@ -111,20 +168,29 @@ def _take_channel(content: _Content, channel: mcap.ChannelRecord) -> None:
         content.layouts[channel.channel_id] = StreamLayout.from_json(channel.metadata["armident.stream"])
 
 
-def uncompressed(chunk: mcap.ChunkRecord) -> bytes | None:
-    """The chunk's records, or ``None`` if it is damaged."""
+def uncompressed(body: memoryview, checked: bool) -> bytes | None:
+    """The records in a chunk record's content, or ``None`` if it is damaged; ``checked`` ones have a checksum."""
+    try:
+        chunk = mcap.read_chunk(body)
+    except mcap.MalformedRecord:
+        return None
     if chunk.size > _LARGEST_CHUNK:
         return None
     if chunk.compression == "zstd":
         try:
+            # The size in the chunk's head is no reason to reserve memory.
+            if zstandard.frame_content_size(chunk.data) not in (-1, chunk.size):
+                return None
             raw = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.size)
         except zstandard.ZstdError:
             return None
     elif chunk.compression == "":
         raw = bytes(chunk.data)
+    elif chunk.compression == "lz4":
+        raise DataError("compressed with lz4; recordings are compressed with zstd")
     else:
-        raise DataError(f"compressed with {chunk.compression!r}; recordings are compressed with zstd")
-    if len(raw) != chunk.size or (chunk.crc and zlib.crc32(raw) != chunk.crc):
+        return None
+    if len(raw) != chunk.size or ((checked or chunk.crc) and zlib.crc32(raw) != chunk.crc):
         return None
     return raw
 
@@ -148,8 +214,12 @@ def _take_chunk(content: _Content, raw: bytes) -> None:
                 dtype = layout.record[0]
                 rows = np.frombuffer(raw, dtype, count=count, offset=at)
                 content.rows.setdefault(channel_id, []).append(layout.unpack(rows))
+                content.messages[channel_id] = content.messages.get(channel_id, 0) + count
                 at += count * dtype.itemsize
                 continue
+            if channel_id not in content.channels:
+                raise mcap.MalformedRecord(f"messages of a channel {channel_id} that this file has not")
+            content.messages[channel_id] = content.messages.get(channel_id, 0) + 1
             _take_event(content, channel_id, raw[body + mcap.MESSAGE_HEAD.size : body + length])
         at = body + length
 
@@ -159,12 +229,13 @@ def _take_event(content: _Content, channel_id: int, data: bytes) -> None:
     if channel is None or channel.topic not in (GAPS_TOPIC, MARKS_TOPIC):
         return
     try:
+        entries = json.loads(data)
         if channel.topic == GAPS_TOPIC:
-            content.gaps.append(Gap(**json.loads(data)))
+            content.gaps.append(gap_from(entries))
         else:
-            content.marks.append(Mark(**json.loads(data)))
-    except (ValueError, TypeError) as error:
-        raise DataError(f"topic {channel.topic}: an event that cannot be understood: {error}") from error
+            content.marks.append(mark_from(entries))
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"topic {channel.topic}: an event that cannot be understood: {_one_line(error)}") from error
 
 
 def _recording(path: Path, content: _Content, size: int) -> Recording:
@@ -172,6 +243,8 @@ def _recording(path: Path, content: _Content, size: int) -> Recording:
     if head is None:
         what = "no metadata 'armident.recording'" if content.finished else "torn before its first chunk"
         raise DataError(f"{path}: an MCAP file, but not a recording of armident ({what})")
+    if head.get("check") == CHECK and not content.headed:
+        raise DataError(f"{path}: torn before its first chunk, or its head is damaged")
     if head.get("schema") != SCHEMA:
         raise DataError(f"{path}: a recording of schema {head.get('schema')!r}, this version reads {SCHEMA}")
     streams = {layout.name: _stream(layout, content.rows.get(k, [])) for k, layout in content.layouts.items()}
@@ -218,18 +291,49 @@ def _stream(layout: StreamLayout, parts: list[_Rows]) -> Stream:
     return Stream(layout.name, layout.every, sync, t_ns, {f.name: f for f in layout.fields}, raw)
 
 
+def message_counts(data: memoryview, data_end: int) -> dict[int, int] | None:
+    """How many messages of every channel a finished file says it has; ``None`` if its summary is not what was written.
+
+    ``data_end`` is where the data end.
+    """
+    footer = len(data) - len(mcap.MAGIC) - mcap.FOOTER_SIZE
+    try:
+        start, crc = mcap.read_footer(data[footer : footer + mcap.FOOTER_SIZE])
+        if not data_end <= start <= footer or (crc and zlib.crc32(data[start : footer + mcap.FOOTER_SIZE - 4]) != crc):
+            return None
+        for opcode, _, body in mcap.records(data[:footer], start):
+            if opcode == mcap.STATISTICS:
+                return mcap.read_message_counts(body)
+    except mcap.MalformedRecord:
+        return None
+    return None
+
+
+def short_text(topic: str, found: int, written: int) -> str:
+    """What is said of a topic that has not as many messages as the file's summary says."""
+    return f"{found} messages of topic {topic} where {written} were written"
+
+
 def _missing(content: _Content, samples: Stream, size: int) -> str | None:
     healed = content.metadata.get(HEALED)
     words = [healed["missing"]] if healed and "missing" in healed else []
     words += content.damaged
+    if content.counts is not None and not content.damaged:
+        words += [
+            short_text(content.channels[k].topic, content.messages.get(k, 0), written)
+            for k, written in content.counts.items()
+            if k in content.channels and written != content.messages.get(k, 0)
+        ]
     if not content.finished:
         words.append(torn_text(int(samples.sync[-1]) if samples.sync.size else None, size - content.end))
     return "; ".join(words) or None
 
 
-def damaged_text(at: int) -> str:
-    """What is said of a chunk at byte ``at`` that cannot be read."""
-    return f"the chunk at byte {at} is damaged and left out"
+def damaged_text(at: int, why: Exception | None = None) -> str:
+    """What is said of a chunk (or another record, with the reason) at byte ``at`` that cannot be read."""
+    if why is None:
+        return f"the chunk at byte {at} is damaged and left out"
+    return f"the record at byte {at} is damaged and left out ({why})"
 
 
 def torn_text(last_sync: int | None, left_out: int) -> str:

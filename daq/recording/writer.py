@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import json
 import os
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -23,8 +24,15 @@ from daq.recording.summary import Summary
 
 SCHEMA = "armident/recording/1"
 GAPS_TOPIC, MARKS_TOPIC = "/events/gaps", "/events/marks"
+COUNTERS = "armident.counters"
+CHECK = "armident.check"
+"""Metadata that follow what they check: the checksum of so many bytes before them.
+
+The first checks the head; those of what comes at the end begin with the head's, so that they are of this file alone.
+"""
 _ZSTD_LEVEL = 1
 _ROWS_PER_CHUNK = 5000
+_MOST_CHANNELS = 65_000
 
 _EVENTS = {
     GAPS_TOPIC: {"stream": "string", "first": "integer", "last": "integer", "joint": "string", "reason": "string"},
@@ -74,8 +82,17 @@ class RecordingWriter:
         self.lost_rows = 0
         self.problem: str | None = None
         self._chunk_ns = chunk_ns
-        self._layouts = {layout.name: (k, layout) for k, layout in enumerate(layouts, start=1)}
-        self._topics = {topic: len(layouts) + k for k, topic in enumerate(_EVENTS, start=1)}
+        facts = {"schema": SCHEMA, "sample_rate_hz": repr(sample_rate_hz), "check": CHECK}
+        texts = {
+            "armident.recording": facts,
+            "armident.robot": {"json": robot.model_dump_json(by_alias=True)},
+            "armident.session": {} if session is None else {"json": session.model_dump_json(by_alias=True)},
+            "armident.facts": dict(metadata),
+        }
+        # Channels have numbers of their own in every file: a chunk that strayed in from another one is noticed.
+        first = 1 + zlib.crc32(repr(texts).encode()) % _MOST_CHANNELS
+        self._layouts = {layout.name: (k, layout) for k, layout in enumerate(layouts, start=first)}
+        self._topics = {topic: first + len(layouts) + k for k, topic in enumerate(_EVENTS)}
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
         self._parts: list[bytes] = []
         self._indexes: dict[int, list[NDArray[np.uint64]]] = {}
@@ -101,15 +118,15 @@ class RecordingWriter:
                 fcntl.flock(self._file, fcntl.LOCK_EX)
         except OSError as error:
             raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
-        self._position = 0
+        self._position = self._head_crc = 0
         try:
-            self._append(mcap.MAGIC + mcap.header(f"armident {_version()}") + b"".join(schemas + channels))
-            head = {"schema": SCHEMA, "sample_rate_hz": repr(sample_rate_hz)}
-            self._add_metadata("armident.recording", head)
-            self._add_metadata("armident.robot", {"json": robot.model_dump_json(by_alias=True)})
-            if session is not None:
-                self._add_metadata("armident.session", {"json": session.model_dump_json(by_alias=True)})
-            self._add_metadata("armident.facts", metadata)
+            head = mcap.MAGIC + mcap.header(f"armident {_version()}") + b"".join(schemas + channels)
+            self._append(head)
+            for name, text in texts.items():
+                if text or name == "armident.facts":
+                    head += self._add_metadata(name, text)
+            self._add_check(head)
+            self._head_crc = zlib.crc32(head)
         except OSError as error:
             self.abort()
             raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
@@ -183,7 +200,7 @@ class RecordingWriter:
         """
         try:
             self.flush()
-            self._add_metadata("armident.counters", {key: str(value) for key, value in counters.items()})
+            self._add_check(self._add_metadata(COUNTERS, {key: str(value) for key, value in counters.items()}))
             self._append(self._summary.ending(self._position))
             os.fsync(self._file)
         except OSError as error:
@@ -224,10 +241,19 @@ class RecordingWriter:
         if high - low >= self._chunk_ns:
             self.flush()
 
-    def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
+    def _add_metadata(self, name: str, entries: Mapping[str, str]) -> bytes:
+        """Write a metadata record; the bytes of it."""
         data = mcap.metadata(name, entries)
         place = mcap.MetadataPlace(name, self._position, len(data))
         self._append(data)
+        self._summary.metadata.append(place)
+        return data
+
+    def _add_check(self, data: bytes) -> None:
+        """Write the checksum of what was just written: chunks have their own, the other records have none."""
+        record = mcap.check(CHECK, data, self._head_crc)
+        place = mcap.MetadataPlace(CHECK, self._position, len(record))
+        self._append(record)
         self._summary.metadata.append(place)
 
     def _append(self, data: bytes) -> None:

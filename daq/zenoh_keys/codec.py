@@ -6,6 +6,7 @@ endian, row by row.
 """
 
 import json
+import math
 import struct
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,14 +16,24 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from configs import DataError, RobotConfig, SessionConfig
 from daq.recording import Gap, Mark, Recording, Stream, StreamLayout
+from daq.recording.model import gap_from, mark_from
 
 VERSION = 1
 EVENT_SCHEMA = "armident/event/1"
 _MAGIC = b"ARMB"
+_NEEDED: dict[str, dict[str, type | tuple[type, ...]]] = {
+    "experiment_start": {
+        "capture": str, "sample_rate_hz": (int, float), "robot": dict, "session": dict, "layouts": list,
+        "metadata": dict,
+    },
+    "experiment_end": {
+        "capture": str, "blocks": int, "counters": dict, "gaps": list, "marks": list, "paths": list,
+    },
+}  # fmt: skip
+"""What whoever assembles a capture relies on."""
 _HEAD = struct.Struct("<4sHII")
 _LARGEST_HEAD = 1 << 16
 _MOST_ROWS = 1 << 20
@@ -73,10 +84,10 @@ def decode_block(data: bytes) -> Block:
         raise DataError("a block whose checksum is wrong")
     try:
         head = json.loads(bytes(body[:head_size]))
-        sequence, rows = int(head["sequence"]), int(head["rows"])
+        sequence, rows = _count(head["sequence"]), _count(head["rows"])
         layout = StreamLayout.from_json(json.dumps(head["layout"]))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DataError(f"a block whose head cannot be understood: {error!r}") from error
+        raise DataError(f"a block whose head cannot be understood: {_short(error)}") from error
     shape = rows, len(layout.joints)
     dtypes = [np.dtype(dtype).newbyteorder("<") for dtype in layout.dtypes]
     size = rows * (16 + sum(dtype.itemsize for dtype in dtypes) * len(layout.joints))
@@ -110,9 +121,13 @@ def decode_event(data: bytes) -> dict[str, Any]:
     try:
         event = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise DataError(f"an event that is not JSON: {error}") from error
+        raise DataError(f"an event that is not JSON: {_short(error)}") from error
     if not isinstance(event, dict) or event.get("schema") != EVENT_SCHEMA or not isinstance(event.get("kind"), str):
         raise DataError(f"not an event of schema {EVENT_SCHEMA}")
+    needed = _NEEDED.get(event["kind"], {})
+    for key, kinds in needed.items():
+        if key not in event or not isinstance(event[key], kinds) or isinstance(event[key], bool):
+            raise DataError(f"an event {event['kind']} whose {key!r} is missing or cannot be understood")
     return event
 
 
@@ -180,14 +195,21 @@ def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str
         robot = RobotConfig.model_validate_json(json.dumps(start["robot"]))
         session = SessionConfig.model_validate_json(json.dumps(start["session"]))
         layouts = [StreamLayout.from_json(json.dumps(layout)) for layout in start["layouts"]]
-        rate, total = float(start["sample_rate_hz"]), int(end["blocks"])
-        gaps = tuple(Gap(**gap) for gap in end["gaps"])
-        marks = tuple(Mark(**mark) for mark in end["marks"])
+        rate, total = float(start["sample_rate_hz"]), _count(end["blocks"])
+        gaps = tuple(gap_from(gap) for gap in end["gaps"])
+        marks = tuple(mark_from(mark) for mark in end["marks"])
         counters = {str(key): int(value) for key, value in end["counters"].items()}
         metadata = {str(key): str(value) for key, value in start["metadata"].items()}
         path = Path(end["paths"][-1]) if end["paths"] else None
-    except (KeyError, TypeError, ValueError, ValidationError) as error:
-        raise DataError(f"an event that cannot be understood: {str(error).splitlines()[0]}") from error
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        raise DataError(f"an event that cannot be understood: {_short(error)}") from error
+    if not 0.0 < rate < math.inf:
+        raise DataError(f"an event that cannot be understood: a rate of {rate} samples/s")
+    joints = tuple(joint.name for joint in robot.joints)
+    if {layout.joints for layout in layouts} != {joints} or len({la.name for la in layouts}) < len(layouts):
+        raise DataError("an event that cannot be understood: streams of other joints than the robot's")
+    if "samples" not in {layout.name for layout in layouts}:
+        raise DataError("an event that cannot be understood: no stream of samples")
     by_number = {block.sequence: block for block in blocks if 0 <= block.sequence < total}
     ordered = [by_number[k] for k in sorted(by_number)]
     known = {layout.name: layout for layout in layouts}
@@ -209,6 +231,17 @@ def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str
         metadata=metadata,
         missing=f"{lost} of {total} blocks did not arrive" if lost else None,
     )
+
+
+def _count(value: object) -> int:
+    """A number that counts something."""
+    if type(value) is not int or value < 0:
+        raise TypeError(f"expected a count, found {value!r:.60}")
+    return value
+
+
+def _short(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error)[:160]}".replace("\n", " ")
 
 
 def _stream(layout: StreamLayout, blocks: list[Block]) -> Stream:

@@ -1,0 +1,95 @@
+"""``python -m tests.fuzz --target recording --seconds 60``: tries inputs for so long and says what was found.
+
+Inputs that fail are kept in ``tests/fuzz/corpus``, where the quick tests try them again. The inputs run in a process of
+their own: one that takes it down, or keeps it busy where no signal ends it, is found too.
+"""
+
+import argparse
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from tests.fuzz.harness import Finding, Target, attempt
+from tests.fuzz.targets import TARGETS
+
+STUCK_S = 60.0
+"""A process that has not begun another input for so long is killed, s."""
+NOTE_S = 0.25
+
+
+def main() -> int:
+    """Fuzz the targets named on the command line; 1 if something was found."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser.add_argument("--target", action="append", choices=[*TARGETS, "all"], help="default: all")
+    parser.add_argument("--seconds", type=float, default=60.0, help="for each target")
+    parser.add_argument("--seed", type=int, default=int(time.time()))
+    parser.add_argument("--child", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    wanted = arguments.target or ["all"]
+    targets = [t for t in TARGETS.values() if t.name in wanted or "all" in wanted]
+    if arguments.child is not None:
+        return _child(targets[0], arguments.seconds, arguments.seed, Path(arguments.child))
+    print(f"seed {arguments.seed}")
+    found = sum(_supervise(target, arguments.seconds, arguments.seed) for target in targets)
+    return int(found > 0)
+
+
+def _child(target: Target, seconds: float, seed: int, state: Path) -> int:
+    """Try inputs; what is being tried is in the file ``state``."""
+    seen: set[str] = set()
+    count = accepted = 0
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, state.open("r+b", buffering=0) as file:
+        target.warm_up(Path(folder))
+        until = time.monotonic() + seconds
+        for data in target.inputs(seed):
+            if time.monotonic() > until:
+                break
+            os.pwrite(file.fileno(), len(data).to_bytes(8, "little") + data, 0)
+            os.utime(state)
+            result = attempt(target, data, Path(folder))
+            count += 1
+            accepted += result is True
+            if isinstance(result, Finding) and (kind := _kind(result)) not in seen:
+                seen.add(kind)
+                print(f"FOUND {target.name}: {result.where[:300]}\n  kept as {result.keep()}", flush=True)
+                print("    " + result.trace.rstrip().replace("\n", "\n    "), file=sys.stderr, flush=True)
+    print(f"{target.name}: {count} inputs in {seconds:.0f} s, {accepted} accepted, {len(seen)} findings", flush=True)
+    return int(bool(seen))
+
+
+def _kind(found: Finding) -> str:
+    """Findings of the same kind are told once."""
+    place, _, said = found.where.partition(": ")
+    return place if " at " in place and "Misread" not in place else re.sub(r"\d+|'[^']*'", "#", place + said)[:90]
+
+
+def _supervise(target: Target, seconds: float, seed: int) -> int:
+    """Run the inputs of one target in a process, and in another one where that does not end by itself."""
+    found = 0
+    until = time.monotonic() + seconds
+    while (left := until - time.monotonic()) > 0:
+        with tempfile.NamedTemporaryFile(prefix="fuzz-state-") as state:
+            command = [sys.executable, "-m", "tests.fuzz", "--target", target.name, "--seconds", str(left)]
+            process = subprocess.Popen([*command, "--seed", str(seed), "--child", state.name])
+            while process.poll() is None:
+                time.sleep(NOTE_S)
+                if time.time() - os.stat(state.name).st_mtime > STUCK_S:
+                    process.send_signal(signal.SIGKILL)
+                    process.wait()
+            if process.returncode in (0, 1):
+                return found + process.returncode
+            raw = Path(state.name).read_bytes()
+            data = raw[8 : 8 + int.from_bytes(raw[:8], "little")]
+            kept = Finding(target.name, data, "", "").keep()
+            print(f"FOUND {target.name}: the process ended with {process.returncode}\n  kept as {kept}", flush=True)
+            found, seed = found + 1, seed + 1
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())

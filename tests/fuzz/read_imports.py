@@ -1,0 +1,119 @@
+"""Files of other tools: tables, and logs of a bus."""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from configs import RobotConfig, SessionConfig, load_robot, load_session
+from daq.bus_log import recording_from_log
+from daq.exporting import export_recording
+from daq.importing import import_recording
+from daq.recording import Recording, read_recording, write_recording
+from tests.fuzz.harness import MisreadError, Target
+from tests.fuzz.mutate import Mutator, either, spoil_bytes, spoil_text
+from tests.unit.test_daq_recording import make_recording
+
+ROWS = 60
+
+
+@cache
+def _recording() -> Recording:
+    """A recording whose values are within the limits of the robot."""
+    made = make_recording(ROWS)
+    samples = made.samples
+    rng = np.random.default_rng(3)
+    raw = samples.raw | {
+        "position": np.cumsum(rng.integers(-50, 50, (ROWS, made.robot.n)), axis=0).astype(np.int32),
+        "current": rng.integers(-300, 300, (ROWS, made.robot.n)).astype(np.int16),
+    }
+    sync = np.arange(ROWS, dtype=np.int64)
+    samples = replace(samples, raw=raw, sync=sync, t_ns=samples.t_ns[0] + sync * 200_000)
+    demand = made.streams["demand"]
+    slow = raw["position"][4::5].copy()
+    sync = sync[4::5]
+    demand = replace(demand, raw={"demand": slow}, sync=sync, t_ns=samples.t_ns[4::5])
+    session = load_session("tx40_cell.yaml")
+    return replace(made, session=session, streams={"samples": samples, "demand": demand}, gaps=(), marks=())
+
+
+def _exported(suffix: str) -> Callable[[], list[bytes]]:
+    def seeds() -> list[bytes]:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, f"x{suffix}")
+            recording = _recording()
+            if suffix not in (".log", ".asc", ".blf", ".trc"):
+                recording = replace(recording, streams={"samples": recording.samples})
+            export_recording(recording, path)
+            return [path.read_bytes()]
+
+    return seeds
+
+
+def _check_consistent(recording: Recording, folder: Path) -> None:
+    """What was imported can be written and read, and has one row of numbers for every sample."""
+    for stream in recording.streams.values():
+        for name, values in stream.raw.items():
+            if values.shape != (stream.sync.size, recording.robot.n):
+                raise MisreadError(f"{name} has shape {values.shape} for {stream.sync.size} samples")
+            if not np.isfinite(values).all():
+                raise MisreadError(f"{name} is not finite")
+    if not 0.0 < recording.sample_rate_hz < np.inf:
+        raise MisreadError(f"a rate of {recording.sample_rate_hz}")
+    path = folder / "imported.mcap"
+    path.unlink(missing_ok=True)
+    write_recording(recording, path)
+    if read_recording(path).sha256 != recording.sha256:
+        raise MisreadError("what was imported is not what is read")
+
+
+def _check_table(suffix: str) -> Callable[[bytes, Path], bool]:
+    robot = load_robot("tx40.yaml")
+
+    def check(data: bytes, folder: Path) -> bool:
+        path = folder / f"x{suffix}"
+        path.write_bytes(data)
+        _check_consistent(import_recording(path, robot), folder)
+        return True
+
+    return check
+
+
+@cache
+def _cell() -> tuple[SessionConfig, RobotConfig]:
+    session = load_session("tx40_cell.yaml")
+    return session, load_robot(session.robot)
+
+
+def _check_log(suffix: str) -> Callable[[bytes, Path], bool]:
+    def check(data: bytes, folder: Path) -> bool:
+        path = folder / f"x{suffix}"
+        path.write_bytes(data)
+        _check_consistent(recording_from_log(path, *_cell()), folder)
+        return True
+
+    return check
+
+
+def _table(suffix: str, mutate: Mutator) -> Target:
+    return Target(f"import{suffix.replace('.', '-')}", _exported(suffix), mutate, _check_table(suffix))
+
+
+def _log(suffix: str, mutate: Mutator) -> Target:
+    return Target(f"import{suffix.replace('.', '-')}", _exported(suffix), mutate, _check_log(suffix))
+
+
+TARGETS = (
+    _table(".csv", either(spoil_text, spoil_bytes)),
+    _table(".npz", spoil_bytes),
+    _table(".mat", spoil_bytes),
+    _table(".parquet", spoil_bytes),
+    _table(".mcap", spoil_bytes),
+    _log(".log", either(spoil_text, spoil_bytes)),
+    _log(".asc", either(spoil_text, spoil_bytes)),
+    _log(".blf", spoil_bytes),
+    _log(".trc", either(spoil_text, spoil_bytes)),
+)
