@@ -1,5 +1,7 @@
 """Configuration files: what is accepted, and that every mistake is named in one line."""
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import yaml
 
 from configs import ConfigError, RobotConfig, config_path, load_robot, load_session, load_suite, load_trajectory
 from configs.loading import HERE, parse
+from configs.reading import read_yaml
 
 TX40 = yaml.safe_load((HERE / "tx40.yaml").read_text())
 
@@ -136,3 +139,44 @@ def test_a_trajectory_beyond_a_limit_is_refused_with_joint_and_value() -> None:
         far.check(load_robot("tx40"))
     with pytest.raises(ConfigError, match="6 joints, but emps has 1"):
         trajectory.check(load_robot("emps"))
+
+
+@pytest.mark.parametrize(
+    ("load", "name", "expected"),
+    [
+        (load_session, "tx40.yaml", "this is a robot file (armident/robot/1); a session file is wanted"),
+        (load_robot, "tx40_cell.yaml", "this is a session file (armident/session/1); a robot file is wanted"),
+        (load_suite, "trajectories/tx40_1.yaml", "this is a trajectory file"),
+    ],
+)
+def test_a_file_of_another_kind_is_named_for_what_it_is(
+    load: Callable[[Path], object], name: str, expected: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=re.escape(expected)):
+        load(HERE / name)
+    path = tmp_path / "nameless.yaml"
+    path.write_text(re.sub(r"(?m)^schema:.*$", "", (HERE / name).read_text()))
+    with pytest.raises(ConfigError, match=rf"nameless\.yaml: this looks like a {expected.split()[3]} file \(it has "):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("bandwidth_hz: 5\nbandwidth_hz: 6", "the key 'bandwidth_hz' is there twice"),
+        ("bandwidth_hz: yes", "bandwidth_hz: expected a number or a word, found true"),
+        ("bandwidth_hz: 1:30", "bandwidth_hz: input should be a valid number"),
+        ("description: " + "[" * 5000, "not valid YAML: brackets or indentation too deep"),
+        ("bandwidth_hz: " + "9" * 5000, "not valid YAML"),
+        ("controller: 2024-13-45", "controller: input should be a valid dictionary"),
+    ],
+)
+def test_what_yaml_would_take_for_something_else_is_refused(line: str, expected: str) -> None:
+    text = re.sub(r"(?m)^bandwidth_hz:.*\n", "", (HERE / "tx40.yaml").read_text())
+    with pytest.raises(ConfigError) as caught:
+        parse(f"{text}\n{line}\n", RobotConfig, "robot.yaml")
+    assert expected in str(caught.value)
+
+
+def test_numbers_are_those_of_yaml_1_2() -> None:
+    assert read_yaml("[010, 0x1F, 1e-3, 1_000, .5, 2024-01-02]", "x") == ["010", 31, 0.001, 1000, 0.5, "2024-01-02"]
