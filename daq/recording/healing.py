@@ -235,7 +235,7 @@ def _scanned(data: memoryview) -> _Scan:
         elif opcode == mcap.DATA_END:
             found.finished = bytes(data[-len(mcap.MAGIC) :]) == mcap.MAGIC
             if found.finished and not found.damage:
-                found.damage += _short(found, message_counts(data, end))
+                found.damage += _short(found, message_counts(data))
             break
         found.end = end
     if not known:

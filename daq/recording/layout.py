@@ -169,7 +169,7 @@ class StreamLayout:
         fixed = np.zeros(size, dtype=bool)
         RECORD_HEAD.pack_into(template, 0, MESSAGE, size - RECORD_HEAD.size)
         fixed[: RECORD_HEAD.size] = True
-        names, formats, offsets = ["record_head", "channel"], [f"V{RECORD_HEAD.size}", "<u2"], [0, RECORD_HEAD.size]
+        names, formats, offsets = ["opcode", "length", "channel"], ["u1", "<u8", "<u2"], [0, 1, RECORD_HEAD.size]
         at = head
         for part in parts:
             if isinstance(part, bytes):
@@ -201,27 +201,50 @@ class StreamLayout:
                 rows[f"{field.name}/{j}"] = values[:, j]
         return rows
 
-    def unpack(self, rows: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[Any]]]:
-        """``sync``, ``t_ns`` and raw values of message records.
+    def unpack(
+        self,
+        rows: NDArray[Any],
+        sync: NDArray[np.int64],
+        t_ns: NDArray[np.int64],
+        raw: Mapping[str, NDArray[Any]],
+    ) -> None:
+        """Put what message records hold into arrays: ``sync`` and ``t_ns`` (N,), every ``raw`` (N, n).
 
         Raises
         ------
         DataError
             If a record is not laid out as the stream's channel says.
         """
-        _, template, fixed = self.record
-        octets = np.frombuffer(rows, dtype=np.uint8).reshape(len(rows), len(template))
-        if not np.array_equal(
-            octets[:, fixed], np.broadcast_to(np.frombuffer(template, np.uint8)[fixed], (len(rows), len(fixed)))
-        ):
+        octets = np.frombuffer(rows, dtype=np.uint8)
+        template, mask = self._pattern(len(rows))
+        whole = octets.size // 8 * 8
+        # Eight bytes at a time, all of them in order: what is fixed is scattered over every record.
+        differing = octets[:whole].view(np.uint64) ^ template[:whole].view(np.uint64)
+        differing &= mask[:whole].view(np.uint64)
+        if differing.any() or ((octets[whole:] ^ template[whole:]) & mask[whole:]).any():
             raise DataError(f"messages of topic {self.topic} are not laid out as their channel says")
-        raw = {}
-        for field, dtype in zip(self.fields, self.dtypes, strict=True):
-            values = np.empty((len(rows), len(self.joints)), dtype=dtype)
+        for field in self.fields:
+            values = raw[field.name]
             for j in range(len(self.joints)):
                 values[:, j] = rows[f"{field.name}/{j}"]
-            raw[field.name] = values
-        return rows["sync"].astype(np.int64), rows["t_ns"].copy(), raw
+        sync[:] = rows["sync"]
+        t_ns[:] = rows["t_ns"]
+
+    def _pattern(self, count: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """The fixed bytes of ``count`` records, and a mask that is FFh where bytes are fixed."""
+        dtype, template, fixed = self.record
+        size = count * dtype.itemsize
+        if not self._patterns or self._patterns[-1][0].size < size:
+            mask = np.zeros(len(template), np.uint8)
+            mask[fixed] = 0xFF
+            self._patterns[:] = [(np.tile(np.frombuffer(template, np.uint8), count), np.tile(mask, count))]
+        wanted, mask = self._patterns[-1]
+        return wanted[:size], mask[:size]
+
+    @cached_property
+    def _patterns(self) -> list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+        """The longest pattern made so far."""
+        return []
 
     def last_sync(self, data: bytes, at: int, count: int) -> int:
         """SYNC number of the last of ``count`` records in ``data`` from ``at`` on."""
@@ -232,14 +255,14 @@ class StreamLayout:
         """How many records of this stream follow each other in ``data`` from ``at`` on."""
         dtype, template, _ = self.record
         limit = (len(data) - at) // dtype.itemsize
-        head = np.void(template[: RECORD_HEAD.size])
-        count, step = 0, 64
+        opcode, length = RECORD_HEAD.unpack_from(template)
+        count, step = 0, 256
         while count < limit:
             step = min(2 * step, limit - count)
             rows = np.frombuffer(data, dtype, count=step, offset=at + count * dtype.itemsize)
-            wrong = np.flatnonzero((rows["record_head"] != head) | (rows["channel"] != channel_id))
-            if wrong.size:
-                return count + int(wrong[0])
+            right = (rows["length"] == length) & (rows["channel"] == channel_id) & (rows["opcode"] == opcode)
+            if not right.all():
+                return count + int(np.argmin(right))
             count += step
         return count
 

@@ -3,6 +3,9 @@
 import json
 import mmap
 import zlib
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,10 +19,14 @@ from configs import ConfigError, DataError, RobotConfig, SessionConfig
 from daq.recording import mcap_format as mcap
 from daq.recording.layout import StreamLayout
 from daq.recording.model import Gap, Mark, Recording, Stream, gap_from, mark_from
+from daq.recording.rows import Rows
 from daq.recording.writer import CHECK, COUNTERS, GAPS_TOPIC, MARKS_TOPIC, SCHEMA
 
-_Rows = tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[Any]]]
 _LARGEST_CHUNK = 1 << 28
+_LEAST_ROW = 2
+"""Least share of a compressed file that a row takes, bytes."""
+_WORKERS, _CHUNKS_AHEAD = 2, 16
+_LET_GO = 1 << 26
 HEALED = "armident.healed"
 """Metadata of a file that was torn and has been given its end: what it lacks."""
 
@@ -30,7 +37,7 @@ class _Content:
 
     channels: dict[int, mcap.ChannelRecord] = field(default_factory=dict)
     layouts: dict[int, StreamLayout] = field(default_factory=dict)
-    rows: dict[int, list[_Rows]] = field(default_factory=dict)
+    rows: dict[int, Rows] = field(default_factory=dict)
     messages: dict[int, int] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     gaps: list[Gap] = field(default_factory=list)
@@ -41,15 +48,28 @@ class _Content:
     finished: bool = False
     end: int = 0
     counts: dict[int, int] | None = None
+    most_rows: int = 0
 
-    def add(self, part: "_Content") -> None:
-        """Take what a chunk holds."""
-        for channel, rows in part.rows.items():
-            self.rows.setdefault(channel, []).extend(rows)
-        for channel, count in part.messages.items():
-            self.messages[channel] = self.messages.get(channel, 0) + count
-        self.gaps += part.gaps
-        self.marks += part.marks
+    def rows_of(self, channel: int) -> Rows:
+        """The rows of a channel with a layout."""
+        if channel not in self.rows:
+            expected = min((self.counts or {}).get(channel, 0), self.most_rows)
+            self.rows[channel] = Rows(self.layouts[channel], expected)
+        return self.rows[channel]
+
+
+@dataclass
+class _Part:
+    """What was found in a chunk."""
+
+    rows: list[tuple[int, NDArray[Any]]] = field(default_factory=list)
+    messages: dict[int, int] = field(default_factory=dict)
+    gaps: list[Gap] = field(default_factory=list)
+    marks: list[Mark] = field(default_factory=list)
+
+    def count(self, channel: int, messages: int) -> None:
+        """Count messages of a channel."""
+        self.messages[channel] = self.messages.get(channel, 0) + messages
 
 
 def read_recording(path: Path | str) -> Recording:
@@ -77,26 +97,32 @@ def read_recording(path: Path | str) -> Recording:
         with path.open("rb") as file:
             if path.stat().st_size == 0:
                 raise DataError(f"{path}: empty, not a recording")
-            return _read(path, memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
+            return _read(path, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such recording") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def _read(path: Path, data: memoryview) -> Recording:
+def _read(path: Path, mapped: mmap.mmap) -> Recording:
+    data = memoryview(mapped)
     if bytes(data[: len(mcap.MAGIC)]) != mcap.MAGIC:
         raise DataError(f"{path}: not a recording (not an MCAP file)")
-    content = _Content()
+    # No row takes less of a file than this, so that a file cannot have us reserve what it has no room for.
+    content = _Content(counts=message_counts(data), most_rows=len(data) // _LEAST_ROW)
+    let_go = 0
     try:
-        for opcode, at, body in mcap.records(data, len(mcap.MAGIC)):
-            _take(content, data, opcode, at, body)
-            content.end = at + mcap.RECORD_HEAD.size + len(body)
-            if content.finished:
-                break
+        with ThreadPoolExecutor(_WORKERS, "zstd") as pool:
+            for opcode, at, body, chunk in _ahead(data, pool, content):
+                _take(content, data, opcode, at, body, chunk)
+                content.end = at + mcap.RECORD_HEAD.size + len(body)
+                if content.finished:
+                    break
+                if content.end - let_go > _LET_GO:
+                    # What was read need not stay in memory; the kernel has it, should anybody ask again.
+                    let_go = content.end // mmap.PAGESIZE * mmap.PAGESIZE
+                    mapped.madvise(mmap.MADV_DONTNEED, 0, let_go)
         content.finished = content.finished and bytes(data[-len(mcap.MAGIC) :]) == mcap.MAGIC
-        if content.finished:
-            content.counts = message_counts(data, content.end)
         return _recording(path, content, len(data))
     except mcap.MalformedRecord as error:
         raise DataError(f"{path}: damaged: {error}") from error
@@ -104,19 +130,31 @@ def _read(path: Path, data: memoryview) -> Recording:
         raise error if str(path) in str(error) else DataError(f"{path}: {error}") from error
 
 
-def _take(content: _Content, data: memoryview, opcode: int, at: int, body: memoryview) -> None:
-    if opcode == mcap.CHUNK:
-        chunk = uncompressed(body, content.headed)
-        if chunk is None:
-            content.damaged.append(damaged_text(at))
-            return
-        part = _Content(channels=content.channels, layouts=content.layouts)
-        try:
-            _take_chunk(part, chunk)
-        except mcap.MalformedRecord as error:
-            content.damaged.append(damaged_text(at, error))
-        else:
-            content.add(part)
+_Pending = tuple[int, int, memoryview, "Future[bytes | None] | None"]
+
+
+def _ahead(data: memoryview, pool: ThreadPoolExecutor, content: _Content) -> Iterator[_Pending]:
+    """The records of a file in their order; chunks are decompressed ahead by other threads."""
+    waiting: deque[_Pending] = deque()
+    chunks = 0
+    for opcode, at, body in mcap.records(data, len(mcap.MAGIC)):
+        future = None
+        if opcode == mcap.CHUNK:
+            # Whatever stood before the first chunk was taken by then: it says whether chunks have checksums.
+            future = pool.submit(uncompressed, body, content.headed)
+            chunks += 1
+        waiting.append((opcode, at, body, future))
+        while waiting and (chunks > _CHUNKS_AHEAD or chunks == 0):
+            chunks -= waiting[0][3] is not None
+            yield waiting.popleft()
+    yield from waiting
+
+
+def _take(
+    content: _Content, data: memoryview, opcode: int, at: int, body: memoryview, chunk: "Future[bytes | None] | None"
+) -> None:
+    if chunk is not None:
+        _take_chunk(content, at, chunk.result())
         return
     if opcode == mcap.DATA_END:
         content.finished = True
@@ -163,7 +201,8 @@ def checked_record(data: memoryview, opcode: int, at: int, body: memoryview, hea
 
 
 def _take_channel(content: _Content, channel: mcap.ChannelRecord) -> None:
-    content.channels[channel.channel_id] = channel
+    if content.channels.setdefault(channel.channel_id, channel) != channel:
+        raise mcap.MalformedRecord(f"another channel {channel.channel_id}")
     if "armident.stream" in channel.metadata:
         content.layouts[channel.channel_id] = StreamLayout.from_json(channel.metadata["armident.stream"])
 
@@ -195,7 +234,26 @@ def uncompressed(body: memoryview, checked: bool) -> bytes | None:
     return raw
 
 
-def _take_chunk(content: _Content, raw: bytes) -> None:
+def _take_chunk(content: _Content, at: int, raw: bytes | None) -> None:
+    """Take all that a chunk holds, or nothing."""
+    if raw is None:
+        content.damaged.append(damaged_text(at))
+        return
+    part = _Part()
+    try:
+        _scan_chunk(content, part, raw)
+    except mcap.MalformedRecord as error:
+        content.damaged.append(damaged_text(at, error))
+        return
+    for channel, rows in part.rows:
+        content.rows_of(channel).append(rows)
+    for channel, count in part.messages.items():
+        content.messages[channel] = content.messages.get(channel, 0) + count
+    content.gaps += part.gaps
+    content.marks += part.marks
+
+
+def _scan_chunk(content: _Content, part: _Part, raw: bytes) -> None:
     at = 0
     while at + mcap.RECORD_HEAD.size <= len(raw):
         opcode, length = mcap.RECORD_HEAD.unpack_from(raw, at)
@@ -212,30 +270,28 @@ def _take_chunk(content: _Content, raw: bytes) -> None:
                 if count == 0:
                     raise DataError(f"a message of topic {layout.topic} is not as long as its channel says")
                 dtype = layout.record[0]
-                rows = np.frombuffer(raw, dtype, count=count, offset=at)
-                content.rows.setdefault(channel_id, []).append(layout.unpack(rows))
-                content.messages[channel_id] = content.messages.get(channel_id, 0) + count
+                part.rows.append((channel_id, np.frombuffer(raw, dtype, count=count, offset=at)))
+                part.count(channel_id, count)
                 at += count * dtype.itemsize
                 continue
-            if channel_id not in content.channels:
+            channel = content.channels.get(channel_id)
+            if channel is None:
                 raise mcap.MalformedRecord(f"messages of a channel {channel_id} that this file has not")
-            content.messages[channel_id] = content.messages.get(channel_id, 0) + 1
-            _take_event(content, channel_id, raw[body + mcap.MESSAGE_HEAD.size : body + length])
+            part.count(channel_id, 1)
+            if channel.topic in (GAPS_TOPIC, MARKS_TOPIC):
+                _take_event(part, channel.topic, raw[body + mcap.MESSAGE_HEAD.size : body + length])
         at = body + length
 
 
-def _take_event(content: _Content, channel_id: int, data: bytes) -> None:
-    channel = content.channels.get(channel_id)
-    if channel is None or channel.topic not in (GAPS_TOPIC, MARKS_TOPIC):
-        return
+def _take_event(part: _Part, topic: str, data: bytes) -> None:
     try:
         entries = json.loads(data)
-        if channel.topic == GAPS_TOPIC:
-            content.gaps.append(gap_from(entries))
+        if topic == GAPS_TOPIC:
+            part.gaps.append(gap_from(entries))
         else:
-            content.marks.append(mark_from(entries))
+            part.marks.append(mark_from(entries))
     except (ValueError, RecursionError) as error:
-        raise DataError(f"topic {channel.topic}: an event that cannot be understood: {_one_line(error)}") from error
+        raise DataError(f"topic {topic}: an event that cannot be understood: {_one_line(error)}") from error
 
 
 def _recording(path: Path, content: _Content, size: int) -> Recording:
@@ -247,7 +303,7 @@ def _recording(path: Path, content: _Content, size: int) -> Recording:
         raise DataError(f"{path}: torn before its first chunk, or its head is damaged")
     if head.get("schema") != SCHEMA:
         raise DataError(f"{path}: a recording of schema {head.get('schema')!r}, this version reads {SCHEMA}")
-    streams = {layout.name: _stream(layout, content.rows.get(k, [])) for k, layout in content.layouts.items()}
+    streams = {layout.name: _stream(content.rows_of(k), layout) for k, layout in content.layouts.items()}
     if "samples" not in streams:
         raise DataError(f"{path}: no topic /samples")
     try:
@@ -276,30 +332,21 @@ def _recording(path: Path, content: _Content, size: int) -> Recording:
     )
 
 
-def _stream(layout: StreamLayout, parts: list[_Rows]) -> Stream:
-    names = [f.name for f in layout.fields]
-    if parts:
-        sync = np.concatenate([p[0] for p in parts])
-        t_ns = np.concatenate([p[1] for p in parts])
-        raw = {name: np.concatenate([p[2][name] for p in parts]) for name in names}
-    else:
-        sync, t_ns = np.empty(0, np.int64), np.empty(0, np.int64)
-        shape = (0, len(layout.joints))
-        raw = {name: np.empty(shape, dtype) for name, dtype in zip(names, layout.dtypes, strict=True)}
-    if np.any(np.diff(sync) <= 0):
+def _stream(rows: Rows, layout: StreamLayout) -> Stream:
+    sync, t_ns, raw = rows.arrays()
+    if np.any(sync[1:] <= sync[:-1]):
         raise DataError(f"topic {layout.topic}: SYNC numbers do not increase")
     return Stream(layout.name, layout.every, sync, t_ns, {f.name: f for f in layout.fields}, raw)
 
 
-def message_counts(data: memoryview, data_end: int) -> dict[int, int] | None:
-    """How many messages of every channel a finished file says it has; ``None`` if its summary is not what was written.
-
-    ``data_end`` is where the data end.
-    """
+def message_counts(data: memoryview) -> dict[int, int] | None:
+    """How many messages of every channel a finished file says it has; ``None`` if its summary was not written so."""
     footer = len(data) - len(mcap.MAGIC) - mcap.FOOTER_SIZE
+    if footer < len(mcap.MAGIC) or bytes(data[-len(mcap.MAGIC) :]) != mcap.MAGIC:
+        return None
     try:
         start, crc = mcap.read_footer(data[footer : footer + mcap.FOOTER_SIZE])
-        if not data_end <= start <= footer or (crc and zlib.crc32(data[start : footer + mcap.FOOTER_SIZE - 4]) != crc):
+        if not 0 < start <= footer or (crc and zlib.crc32(data[start : footer + mcap.FOOTER_SIZE - 4]) != crc):
             return None
         for opcode, _, body in mcap.records(data[:footer], start):
             if opcode == mcap.STATISTICS:
@@ -318,7 +365,7 @@ def _missing(content: _Content, samples: Stream, size: int) -> str | None:
     healed = content.metadata.get(HEALED)
     words = [healed["missing"]] if healed and "missing" in healed else []
     words += content.damaged
-    if content.counts is not None and not content.damaged:
+    if content.counts is not None and content.finished and not content.damaged:
         words += [
             short_text(content.channels[k].topic, content.messages.get(k, 0), written)
             for k, written in content.counts.items()

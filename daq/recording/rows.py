@@ -1,0 +1,58 @@
+"""Rows of a stream as they are read, in arrays that grow: every value is copied once, from its chunk to its place."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.recording.layout import StreamLayout
+
+_FEWEST = 4096
+
+
+class Rows:
+    """What was read of one stream so far.
+
+    Parameters
+    ----------
+    layout
+        Of its messages.
+    expected
+        How many rows there will be, where that is known; memory is touched when they come.
+    """
+
+    def __init__(self, layout: StreamLayout, expected: int = 0) -> None:
+        self.size = 0
+        self._layout = layout
+        n = len(layout.joints)
+        room = max(expected, _FEWEST)
+        self._sync, self._t_ns = np.empty(room, np.int64), np.empty(room, np.int64)
+        self._raw: dict[str, NDArray[Any]] = {
+            field.name: np.empty((room, n), dtype) for field, dtype in zip(layout.fields, layout.dtypes, strict=True)
+        }
+
+    def append(self, records: NDArray[Any]) -> None:
+        """Add message records of the stream.
+
+        Raises
+        ------
+        DataError
+            If a record is not laid out as the stream's channel says.
+        """
+        end = self.size + len(records)
+        if end > self._sync.size:
+            self._resize(max(end, 2 * self._sync.size))
+        part = slice(self.size, end)
+        raw = {name: values[part] for name, values in self._raw.items()}
+        self._layout.unpack(records, self._sync[part], self._t_ns[part], raw)
+        self.size = end
+
+    def arrays(self) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[Any]]]:
+        """``sync`` and ``t_ns`` (N,), every raw value (N, n); nothing can be added any more."""
+        self._resize(self.size)
+        return self._sync, self._t_ns, self._raw
+
+    def _resize(self, room: int) -> None:
+        # In place, where the allocator can: nobody else holds these arrays.
+        for values in (self._sync, self._t_ns, *self._raw.values()):
+            values.resize((room, *values.shape[1:]), refcheck=False)
