@@ -31,6 +31,9 @@ ENDLESS = (-2.0 * math.pi, 2.0 * math.pi)
 WRITTEN_DECIMALS = 4
 """An angle with at least so many decimals that equals a multiple of 15 degrees to these decimals is that multiple."""
 
+LONGEST = 500
+"""No attribute has more characters than this."""
+
 LARGEST = 1e9
 """No number of an arm is larger than this, in SI units."""
 
@@ -323,10 +326,14 @@ def _read_tree(file: Path) -> _Tree:
         root = ET.parse(file).getroot()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file}: cannot be read: {error}") from error
-    except ET.ParseError as error:
+    except (ET.ParseError, LookupError, ValueError) as error:
         raise ConfigError(f"{file}: not valid XML: {error}") from error
+    for element in root.iter():
+        for key, value in element.items():
+            if len(value) > LONGEST:
+                raise ConfigError(f"{file}: {element.tag:.40} {key:.40}: {len(value)} characters, expected {LONGEST}")
     if root.tag != "robot":
-        raise ConfigError(f"{file}: expected a URDF with the root element robot, found {root.tag}")
+        raise ConfigError(f"{file}: expected a URDF with the root element robot, found {root.tag:.40}")
     links = frozenset(str(link.get("name")) for link in root.findall("link"))
     above: dict[str, ET.Element] = {}
     below: dict[str, list[ET.Element]] = {}

@@ -71,6 +71,7 @@ class Health:
             "queue_depth": self._publisher.depth,
             "disk_free_bytes": free_space(self._order.directory),
             "blocks_dropped": self._publisher.dropped,
+            "events_dropped": self._publisher.events_dropped,
             **events,
         }
         for name, value in worst(self._jitters).items():

@@ -19,6 +19,7 @@ COUNTERS = {
     "rows_not_written": "Rows that the disk did not take",
     "kernel_drops": "Frames that the kernel dropped because the receive buffer was full",
     "blocks_dropped": "Blocks that Zenoh listeners did not get because the queue was full",
+    "events_dropped": "Events that Zenoh listeners did not get because they were held up",
     "emcy": "Emergency messages of drives",
     "heartbeat_lost": "Heartbeats of drives that stayed away",
     "rebooted": "Drives that booted again",

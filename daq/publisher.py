@@ -14,6 +14,8 @@ from daq.remote import Commands
 from daq.zenoh_keys import Block, Keys, encode_block, open_session
 
 _EVENTS_KEPT = 64
+_MOST_EVENTS = 4096
+"""Events that may wait."""
 _HEARTBEAT_S = 0.2
 _LINGER_S = 0.5
 _LONGEST_CLOSE_S = 5.0
@@ -24,7 +26,7 @@ class Publisher:
 
     Blocks wait in a queue of ``session.zenoh.queue_blocks``; when it is full they are dropped and counted: the file is
     the truth. Their sequence numbers show listeners what they miss; the last ``cache_blocks`` can be asked for again.
-    Events are never dropped.
+    Events are dropped only where thousands wait, because a listener holds them up. Of health and status the last waits.
 
     Parameters
     ----------
@@ -42,9 +44,12 @@ class Publisher:
     def __init__(self, session: SessionConfig, keys: Keys) -> None:
         self.offered = 0
         self.dropped = 0
+        self.events_dropped = 0
         self._limit = session.zenoh.queue_blocks
         self._waiting = 0
         self._queue: deque[tuple[str, Block | bytes]] = deque()
+        self._events_waiting = 0
+        self._latest: dict[str, bytes] = {}
         self._ready = threading.Condition()
         self._closing = False
         self._keys = keys
@@ -73,15 +78,21 @@ class Publisher:
             self._ready.notify()
 
     def event(self, data: bytes) -> None:
-        """Queue an event."""
-        self._put(self._keys.events, data)
+        """Queue an event; never waits for a listener."""
+        with self._ready:
+            if self._events_waiting >= _MOST_EVENTS:
+                self.events_dropped += 1
+                return
+            self._events_waiting += 1
+            self._queue.append((self._keys.events, data))
+            self._ready.notify()
 
     def health(self, content: Mapping[str, Any]) -> None:
-        """Queue a health message."""
+        """Queue a health message, in the place of one that still waits."""
         self._put(self._keys.health, json.dumps(content).encode())
 
     def status(self, content: Mapping[str, Any]) -> None:
-        """Queue a status message."""
+        """Queue a status message, in the place of one that still waits."""
         self._put(self._keys.status, json.dumps({"component": "capture", **content}).encode())
 
     def close(self) -> None:
@@ -107,22 +118,28 @@ class Publisher:
 
     def _put(self, key: str, data: bytes) -> None:
         with self._ready:
-            self._queue.append((key, data))
+            self._latest[key] = data
             self._ready.notify()
 
     def _run(self) -> None:
         while True:
             with self._ready:
-                while not self._queue and not self._closing:
+                while not self._queue and not self._latest and not self._closing:
                     self._ready.wait()
-                if not self._queue:
+                latest, self._latest = self._latest, {}
+                waiting = self._queue.popleft() if self._queue else None
+                if waiting is None and not latest:
                     return
-                key, item = self._queue.popleft()
+            for key, data in latest.items():
+                self._session.put(key, data)
+            if waiting is None:
+                continue
+            key, item = waiting
             if isinstance(item, Block):
                 self._samples.put(encode_block(item))
                 with self._ready:
                     self._waiting -= 1
-            elif key == self._keys.events:
-                self._events.put(item)
             else:
-                self._session.put(key, item)
+                self._events.put(item)
+                with self._ready:
+                    self._events_waiting -= 1

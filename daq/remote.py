@@ -13,6 +13,8 @@ from daq.zenoh_keys import Keys, open_session
 CommandName = Literal["save", "mark", "stop"]
 COMMANDS: tuple[CommandName, ...] = get_args(CommandName)
 _LONGEST_TEXT = 500
+_MOST_WAITING = 32
+"""Commands that may wait for the capture to look at them, which it does some fifty times a second."""
 ANSWER_S = 5.0
 """How long an answer is waited for, s."""
 
@@ -53,15 +55,19 @@ class Commands:
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             name = str(query.key_expr).rsplit("/", 1)[-1]
-            text = "" if query.payload is None else bytes(query.payload).decode(errors="replace")
             known = next((command for command in COMMANDS if command == name), None)
+            # Nothing is made of what a query carries before it is known to be wanted.
+            size = 0 if query.payload is None else len(query.payload)
             if not self._allowed:
                 query.reply_err("commands are not enabled: zenoh.commands in the session configuration")
             elif known is None:
-                query.reply_err(f"no command {name!r}; there are {', '.join(COMMANDS)}")
-            elif len(text) > _LONGEST_TEXT:
-                query.reply_err(f"a text of {len(text)} characters is longer than {_LONGEST_TEXT}")
+                query.reply_err(f"no command {name[:40]!r}; there are {', '.join(COMMANDS)}")
+            elif size > _LONGEST_TEXT:
+                query.reply_err(f"a text of {size} bytes is longer than {_LONGEST_TEXT}")
+            elif self._waiting.qsize() >= _MOST_WAITING:
+                query.reply_err(f"{_MOST_WAITING} commands are waiting already")
             else:
+                text = "" if query.payload is None else bytes(query.payload).decode(errors="replace")
                 self._waiting.put(Command(known, text))
                 query.reply(query.key_expr, "accepted")
 

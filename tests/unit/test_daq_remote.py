@@ -28,7 +28,7 @@ def test_commands_arrive_in_order_with_their_texts() -> None:
             send_command(cell, "tx40", command)
         assert commands.pending() == [Command("mark", "gripper changed"), Command("save"), Command("stop")]
         assert commands.pending() == []
-        with pytest.raises(DataError, match="a text of 501 characters"):
+        with pytest.raises(DataError, match="a text of 501 bytes"):
             send_command(cell, "tx40", Command("mark", "x" * 501))
         assert commands.pending() == []
 
