@@ -23,8 +23,9 @@ from daq.books import (
     room_for,
 )
 from daq.gaps import SYNC_LOST, OpenGaps
-from daq.matching import count_sync, finish, match
+from daq.matching import EVER, count_sync, finish, match
 from daq.recording import Gap
+from drivers.objects import COB_SDO_REQUEST
 
 UNSENT = "pack not complete"
 """SYNCs after the last packed TPDO: no drive was to send their samples any more."""
@@ -38,6 +39,8 @@ PATIENCE_S = 120.0
 Only drives that owe nothing at some SYNC prove that nothing was lost, so what came since the last such SYNC is kept."""
 _FEWEST_LATE = 8
 _LONGEST_OUTAGE_S = 60.0
+_MISALIGNED = 20
+"""So many first SYNCs of a bus with another number than that of the others are another master's, fewer a late stamp."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,9 @@ class Assembler:
         COB-ID of SYNC.
     bus_of
         Number of the bus that each joint's drive is on; empty: all on one.
+    nodes
+        Node of each joint's drive, if SDO requests are looked at: whoever writes there what a TPDO holds makes it
+        suspect, until :meth:`suspect` says how long.
     """
 
     def __init__(
@@ -107,6 +113,7 @@ class Assembler:
         first_counter: int | None = 1,
         sync_id: int = 0x80,
         bus_of: Sequence[int] = (),
+        nodes: Sequence[int] = (),
     ) -> None:
         self._streams, self._joints = tuple(streams), tuple(joints)
         self._timing = sync_id, period_ns, overflow
@@ -116,12 +123,15 @@ class Assembler:
         for s, stream in enumerate(streams):
             for j, cob_id in enumerate(stream.cob_ids):
                 channel_of[where[j], cob_id] = s * len(joints) + j
+        writes_to = np.full((max(where) + 1, 0x800), -1, np.int64)
+        for j, node in enumerate(nodes):
+            writes_to[where[j], COB_SDO_REQUEST + node] = j
         self._shapes = [stream.shape for stream in streams]
         window, patience = (
             [max(_FEWEST_LATE, int(seconds * 1e9 / period_ns) // shape.every) for shape in self._shapes]
             for seconds in (LATE_S, PATIENCE_S)
         )
-        self._books = open_books(self._shapes, window, patience, where, channel_of)
+        self._books = open_books(self._shapes, window, patience, where, channel_of, writes_to)
         self._slack = int(self._books.slack[0])
         if first_counter is not None:
             self._books.state[:, COUNTER] = (first_counter - 1) % overflow
@@ -183,6 +193,9 @@ class Assembler:
         """
         arguments = (*_columns(frames), *self._timing, bus)
         self._lossy[bus] |= dropped
+        if frames.size:
+            # Whoever speaks is not silent.
+            self._books.slack[bus] = self._slack
         last = int(self._books.state[bus, SYNC])
         longest = self._longest if sent is None else min(self._longest, sent - last)
         if sent is not None and not self._lossy[bus]:
@@ -193,7 +206,7 @@ class Assembler:
             self._books.mark[:, HOLE] = self._books.mark[:, TOP] + syncs + 1
         out = room_for(self._books, syncs)
         _match(*arguments, longest, self._books, out)
-        if self._books.counts[SYNC_MISALIGNED]:
+        if self._books.counts[SYNC_MISALIGNED] >= _MISALIGNED:
             raise DataError(
                 f"bus {bus + 1}: its SYNC counter says another number than that of another bus at the same time; "
                 "buses of one session need SYNC from one master"
@@ -204,6 +217,13 @@ class Assembler:
         """Say that a bus is known to be down, or back: its drives owe nothing meanwhile, and the others go on."""
         self._books.slack[bus] = 0 if silent else self._slack
         self._lossy[bus] |= silent
+
+    def suspect(self, joint: str, since_ns: int, until_ns: int) -> None:
+        """Say that TPDOs of a joint that came in this time (ns, UTC) hold something else than the session says."""
+        span = self._books.suspect[self._joints.index(joint)]
+        if span[0] < span[1] and span[1] == EVER:
+            since_ns = min(since_ns, int(span[0]))
+        span[:] = since_ns, until_ns
 
     def finish(self, sent: int | None = None) -> Batch:
         """No more frames come; ``sent`` SYNC were sent in all, if we know."""
@@ -216,7 +236,7 @@ class Assembler:
         """Compile the loops for frames like these, so that no SYNC waits for the compiler."""
         few = [_FEWEST_LATE] * len(self._shapes)
         nobody = np.full((self._lossy.size, 1), -1, np.int64)
-        scratch = open_books(self._shapes, few, few, self._books.bus_of.tolist(), nobody)
+        scratch = open_books(self._shapes, few, few, self._books.bus_of.tolist(), nobody, nobody)
         arguments = (*_columns(frames), *self._timing, 0)
         out = room_for(scratch, _count_sync(*arguments, self._longest, scratch))
         _match(*arguments, self._longest, scratch, out)

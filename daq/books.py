@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-LOST, RECEIVED, WRONG_LENGTH, AMBIGUOUS, NO_SYNC = 0, 1, 2, 3, 4
+LOST, RECEIVED, WRONG_LENGTH, AMBIGUOUS, NO_SYNC, WRONG_MAPPING = range(6)
 """What is known of one joint's sample at one SYNC."""
 
 UNSEEN = int(np.iinfo(np.int64).min)
@@ -51,7 +51,9 @@ class Books(NamedTuple):
     Rows ``u`` of stream ``s`` stand in ring slots ``(u - base) % C`` until every joint has settled them; with nothing
     open the ring begins anew, so that memory is only touched where answers are late. ``head`` counts the rows that the
     SYNCs of a bus have asked for, ``TOP`` of ``mark`` those of the bus that is ahead. A bus may be ``slack`` SYNCs
-    behind another one before it is taken for silent.
+    behind another one before it is taken for silent. ``behind`` is how many answers a drive has owed at once lately,
+    and at which row (``behind_at``); what is placed before row ``doubt`` is not certain. TPDOs that came in the time
+    ``suspect`` (n, 2) were mapped by others.
     """
 
     state: NDArray[np.int64]
@@ -62,11 +64,16 @@ class Books(NamedTuple):
     mark: NDArray[np.int64]
     bus_of: NDArray[np.int64]
     channel_of: NDArray[np.int64]
+    writes_to: NDArray[np.int64]
     head: NDArray[np.int64]
     settled: NDArray[np.int64]
     pending: NDArray[np.int64]
     fresh: NDArray[np.int64]
     wrong: NDArray[np.int64]
+    behind: NDArray[np.int64]
+    behind_at: NDArray[np.int64]
+    doubt: NDArray[np.int64]
+    suspect: NDArray[np.int64]
     label: NDArray[np.int64]
     answer: NDArray[np.uint64]
     answer_code: NDArray[np.uint8]
@@ -101,8 +108,12 @@ def open_books(
     patience: list[int],
     bus_of: Sequence[int],
     channel_of: NDArray[np.int64],
+    writes_to: NDArray[np.int64],
 ) -> Books:
-    """Empty books; ``channel_of`` (buses, identifiers) maps a COB-ID on a bus to ``s n + j``, or -1."""
+    """Empty books; ``channel_of`` (buses, identifiers) maps a COB-ID on a bus to ``s n + j``, or -1.
+
+    ``writes_to`` maps that of an SDO request likewise to the joint ``j``.
+    """
     buses, streams, n = len(channel_of), len(shapes), len(bus_of)
     rows = 2 * max(patience) + 8
     answers = rows + 64
@@ -120,11 +131,16 @@ def open_books(
         mark=np.zeros((streams, 5), np.int64),
         bus_of=np.array(bus_of, np.int64),
         channel_of=channel_of,
+        writes_to=writes_to,
         head=np.zeros((buses, streams), np.int64),
         settled=np.zeros((streams, n), np.int64),
         pending=np.zeros((streams, n), np.int64),
         fresh=np.zeros((streams, n), np.int64),
         wrong=np.zeros((streams, n), np.int64),
+        behind=np.zeros((streams, n), np.int64),
+        behind_at=np.zeros((streams, n), np.int64),
+        doubt=np.zeros((streams, n), np.int64),
+        suspect=np.tile(np.array([0, UNSEEN]), (n, 1)),
         label=np.zeros((streams, n, answers), np.int64),
         answer=np.zeros((streams, n, answers, words), np.uint64),
         answer_code=np.zeros((streams, n, answers), np.uint8),

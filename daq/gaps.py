@@ -5,11 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.books import AMBIGUOUS, LOST, NO_SYNC, WRONG_LENGTH
+from daq.books import AMBIGUOUS, LOST, NO_SYNC, WRONG_LENGTH, WRONG_MAPPING
 from daq.recording import Gap
 
 SYNC_LOST = "SYNC not received"
-REASONS = {NO_SYNC: SYNC_LOST, LOST: "lost", WRONG_LENGTH: "wrong length", AMBIGUOUS: "ambiguous order"}
+REASONS = {
+    NO_SYNC: SYNC_LOST,
+    LOST: "lost",
+    WRONG_LENGTH: "wrong length",
+    WRONG_MAPPING: "mapping changed",
+    AMBIGUOUS: "ambiguous order",
+}
 
 
 class OpenGaps:

@@ -9,7 +9,10 @@ from daq.sink import Sink
 from drivers.master import DriveEvent
 from drivers.receiver import BusEvent
 
-COUNTED = ("emcy", "heartbeat_lost", "rebooted", "bus_down", "bus_off")
+COUNTED = ("emcy", "heartbeat_lost", "rebooted", "mapping_changed", "bus_down", "bus_off", "sync_stopped")
+SYNC_STOPPED_S = 0.2
+"""A master whose SYNC does not come for so long, and ``SYNC_STOPPED`` periods, has stopped."""
+SYNC_STOPPED = 20
 
 
 class Happenings:
@@ -35,6 +38,8 @@ class Happenings:
         self.triggers: tuple[str, ...] = () if trigger is None else trigger.events
         self._assembler, self._sink, self._say = assembler, sink, say
         self._told: set[tuple[str, str]] = set()
+        self._patience = max(SYNC_STOPPED_S, SYNC_STOPPED * order.session.sync_period)
+        self._sync_before, self._sync_came, self._stopped = -1, 0.0, False
 
     def of_drive(self, event: DriveEvent) -> None:
         """A drive reported something.
@@ -51,7 +56,7 @@ class Happenings:
         self._say(event.text)
         if kind in self.triggers:
             self._sink.trigger()
-        if kind in ("heartbeat_lost", "rebooted") or (kind == "emcy" and event.code != 0):
+        if kind in ("heartbeat_lost", "rebooted", "mapping_changed") or (kind == "emcy" and event.code != 0):
             self._stop_moving(event.text)
 
     def of_bus(self, event: BusEvent) -> None:
@@ -72,6 +77,23 @@ class Happenings:
             self._sink.trigger()
         if event.kind in ("bus_down", "bus_off"):
             self._stop_moving(event.text)
+
+    def look_for_sync(self, now: float) -> None:
+        """Tell when SYNC of another master stops, and when it is back; ``now`` in seconds."""
+        last, silent = self._assembler.last_sync, now - self._sync_came
+        if last == self._sync_before:
+            if last >= 0 and not self._stopped and silent > self._patience:
+                self._stopped = True
+                self.counts["sync_stopped"] += 1
+                self._note(f"no SYNC for {silent:.1f} s")
+            return
+        if self._stopped:
+            self._note(f"SYNC is back after {silent:.1f} s")
+        self._sync_before, self._sync_came, self._stopped = last, now, False
+
+    def _note(self, text: str) -> None:
+        self._sink.mark("note", self._sync, text)
+        self._say(text)
 
     def look_for_other_mappings(self) -> None:
         """Tell once of every TPDO that has another length than its mapping says."""

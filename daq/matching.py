@@ -44,11 +44,15 @@ from daq.books import (
     UNSEEN,
     WINDOW,
     WRONG_LENGTH,
+    WRONG_MAPPING,
     Books,
     Decided,
 )
 from daq.numbering import advance
 from daq.settling import settle_all, slot_of
+from drivers.objects import PDOS, SDO_DOWNLOAD, TPDO_COMMUNICATION, TPDO_MAPPING
+
+EVER = int(np.iinfo(np.int64).max)
 
 
 @njit(cache=True, nogil=True)
@@ -123,6 +127,16 @@ def _skip_silent(b: Books, bus: int, k: int, t_ns: int, period_ns: int, overflow
 
 
 @njit(cache=True, nogil=True)
+def _notice_write(b: Books, j: int, request: Any, t_ns: int) -> None:
+    """An SDO request to the drive of a joint: one that writes what its TPDOs hold makes them suspect from now on."""
+    index = np.int64((request >> np.uint64(8)) & np.uint64(0xFFFF))
+    writes = np.int64((request >> np.uint64(5)) & np.uint64(7)) == SDO_DOWNLOAD
+    if writes and TPDO_COMMUNICATION <= index < TPDO_MAPPING + PDOS and t_ns > b.suspect[j, 1]:
+        b.suspect[j, 0] = t_ns
+        b.suspect[j, 1] = EVER
+
+
+@njit(cache=True, nogil=True)
 def count_sync(
     count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
     bus: int, longest: int, b: Books,
@@ -169,6 +183,9 @@ def match(
                 _skip_silent(b, bus, k, t_ns[i], period_ns, overflow, out)
             continue
         channel = b.channel_of[bus, identifier] if identifier < b.channel_of.shape[1] else np.int64(-1)
+        if channel < 0 and identifier < b.channel_of.shape[1] and b.writes_to[bus, identifier] >= 0:
+            _notice_write(b, b.writes_to[bus, identifier], data[i, 0], t_ns[i])
+            continue
         if channel < 0:
             b.counts[FRAMES_UNKNOWN] += 1
             continue
@@ -186,6 +203,8 @@ def match(
             for w in range(words):
                 b.answer[s, j, slot, w] = data[i, w]
             b.answer_code[s, j, slot] = RECEIVED if right else WRONG_LENGTH
+            if b.suspect[j, 0] <= t_ns[i] < b.suspect[j, 1]:
+                b.answer_code[s, j, slot] = WRONG_MAPPING
             b.label[s, j, slot] = b.head[bus, s] - 1
             b.pending[s, j] += 1
             b.fresh[s, j] += 1

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from configs import ConfigError, RobotConfig, SessionConfig, Trajectory, load_robot, load_session, load_trajectory
 from daq.sniffing import sniff
-from daq.streams import CapturedStream, bus_numbers, captured_streams
+from daq.streams import CapturedStream, bus_numbers, captured_streams, node_ids
 from drivers.bus_load import check_fits
 from drivers.frames import Filter
-from drivers.objects import COB_MASK, COB_SYNC
+from drivers.objects import COB_MASK, COB_SDO_REQUEST, COB_SYNC
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,17 @@ class Order:
         """Number of the bus of each joint, in the robot's order."""
         return bus_numbers(self.session, self.robot)
 
+    @property
+    def overheard(self) -> tuple[int, ...]:
+        """Nodes of the joints' drives, in the robot's order; none where they are configured by others."""
+        return () if self.listen_only else node_ids(self.session, self.robot)
+
     def filters(self, bus: int) -> list[Filter]:
-        """What the capture wants to see of a bus: SYNC and the TPDOs of its drives."""
-        wanted = [COB_SYNC]
+        """What the capture wants to see of a bus: SYNC, the TPDOs of its drives, and what others write to these."""
+        wanted = [
+            COB_SYNC,
+            *(COB_SDO_REQUEST + n for n, b in zip(self.overheard, self.bus_of, strict=False) if b == bus),
+        ]
         for stream in self.streams:
             wanted += [cob for cob, b in zip(stream.bus.cob_ids, self.bus_of, strict=True) if b == bus]
         return [(can_id, COB_MASK) for can_id in wanted]

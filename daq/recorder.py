@@ -62,6 +62,7 @@ class Recorder:
             overflow,
             1 if order.producing else None,
             bus_of=order.bus_of,
+            nodes=order.overheard,
         )
         self._assembler.warm_up(receiver.warm_up())
         self._jitters = [SyncJitter(period_ns, overflow) for _ in receiver.channels]
@@ -74,6 +75,7 @@ class Recorder:
         self._save = save
         self._fed = -math.inf
         self._refused: float | None = None
+        self._suspect: dict[str, tuple[int, int]] = {}
 
     def start(self, stack: ExitStack) -> None:
         """Configure and enable the drives, and start SYNC; whatever was started is stopped when the stack unwinds."""
@@ -85,6 +87,9 @@ class Recorder:
         self._say(f"configuring {len(session.drives)} drives on {', '.join(self._receiver.channels)}")
         self._master.configure()
         # Whoever else produces SYNC also moves the arm.
+        now = time.time_ns()
+        for joint in order.robot.joints:
+            self._assembler.suspect(joint.name, now, now)
         self._master.start(enable=order.producing)
         if order.trajectory is not None:
             by_joint = dict(zip((d.joint for d in session.drives), self._master.positions(), strict=True))
@@ -172,6 +177,11 @@ class Recorder:
 
     def _drain(self) -> int:
         total = 0
+        if self._master is not None and self._master.suspect is not self._suspect:
+            before, self._suspect = self._suspect, self._master.suspect
+            for joint, span in self._suspect.items():
+                if before.get(joint) != span:
+                    self._assembler.suspect(joint, *span)
         for bus, frames, dropped in self._receiver.drain():
             sent = self._producer.sent if self._producer is not None else None
             self._jitters[bus].take(frames)
@@ -188,6 +198,8 @@ class Recorder:
         """Look after buses, SYNC and drives; what fails while we move the arm ends the capture."""
         for happened in self._receiver.events():
             self._happenings.of_bus(happened)
+        if not self._order.producing:
+            self._happenings.look_for_sync(time.monotonic())
         self._obey()
         try:
             if self._producer is not None:

@@ -11,9 +11,11 @@ from daq.books import (
     BEHIND,
     EMITTED,
     HOLE,
+    LENGTH,
     NO_SYNC,
     PACK,
     PATIENCE,
+    RECEIVED,
     SIZE,
     TOP,
     TPDO_DUPLICATE,
@@ -32,13 +34,61 @@ def slot_of(b: Books, s: int, u: int) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _seen(b: Books, s: int, j: int, u: int) -> bool:
+    """Whether the SYNC of row ``u`` was received on the bus of a joint."""
+    return bool(b.row_t[s, slot_of(b, s, u), b.kind[s, PACK] - 1, b.bus_of[j]] != UNSEEN)
+
+
+@njit(cache=True, nogil=True)
 def _place(b: Books, s: int, j: int, u: int, i: int) -> None:
     slot = slot_of(b, s, u)
     for w in range(b.answer.shape[3]):
         b.row_data[s, slot, j, w] = b.answer[s, j, i, w]
-    b.row_code[s, slot, j] = b.answer_code[s, j, i]
-    if b.label[s, j, i] > u and b.row_t[s, slot, b.kind[s, PACK] - 1, b.bus_of[j]] != UNSEEN:
+    b.row_code[s, slot, j] = b.answer_code[s, j, i] if u >= b.doubt[s, j] else AMBIGUOUS
+    if b.label[s, j, i] > u and _seen(b, s, j, u):
         b.counts[TPDO_LATE] += 1
+
+
+@njit(cache=True, nogil=True)
+def _same(b: Books, s: int, j: int, i: int, k: int) -> bool:
+    """Whether two answers of a drive have the same bytes."""
+    same = b.answer_code[s, j, i] == b.answer_code[s, j, k]
+    for w in range(-(-b.kind[s, LENGTH] // 8)):
+        # What stands behind the data of a short frame is no part of it.
+        unused = np.uint64(8 * max(0, 8 * w + 8 - b.kind[s, LENGTH]))
+        same = same and ((b.answer[s, j, i, w] ^ b.answer[s, j, k, w]) << unused) == 0
+    return bool(same)
+
+
+@njit(cache=True, nogil=True)
+def _without_repeats(b: Books, s: int, j: int, owed: int) -> None:
+    """More answers than SYNCs: frames that were sent twice are dropped; where they cannot be told, all are in doubt."""
+    count = b.pending[s, j]
+    b.counts[TPDO_DUPLICATE] += count - owed
+    unlike = 0
+    for i in range(count):
+        if i == 0 or not _same(b, s, j, i, i - 1):
+            unlike += 1
+    if unlike != owed and unlike > 1:
+        b.doubt[s, j] = max(b.doubt[s, j], b.settled[s, j] + owed)
+    elif unlike == owed:
+        kept = 0
+        for i in range(count):
+            if i == 0 or not _same(b, s, j, i, i - 1):
+                b.label[s, j, kept] = b.label[s, j, i]
+                b.answer_code[s, j, kept] = b.answer_code[s, j, i]
+                for w in range(b.answer.shape[3]):
+                    b.answer[s, j, kept, w] = b.answer[s, j, i, w]
+                kept += 1
+    b.pending[s, j] = owed
+
+
+@njit(cache=True, nogil=True)
+def _was_behind(b: Books, s: int, j: int, rows: int) -> None:
+    """A drive owed the answers to so many SYNCs at once."""
+    if rows >= b.behind[s, j] or b.head[b.bus_of[j], s] - b.behind_at[s, j] > 2 * b.kind[s, WINDOW]:
+        b.behind[s, j] = rows
+        b.behind_at[s, j] = b.head[b.bus_of[j], s]
 
 
 @njit(cache=True, nogil=True)
@@ -46,15 +96,17 @@ def _settle(b: Books, s: int, j: int, final: bool) -> None:
     """Close the books of one TPDO of one drive: match what is certain, give up what is older than the window."""
     head = b.head[b.bus_of[j], s]
     owed = head - b.settled[s, j]
+    if b.pending[s, j] > owed:
+        _without_repeats(b, s, j, owed)
     count = b.pending[s, j]
-    if count > owed:
-        b.counts[TPDO_DUPLICATE] += count - owed
-        count = owed
-        b.pending[s, j] = owed
     b.fresh[s, j] = 0
     if count == owed:
         for i in range(count):
+            if b.label[s, j, i] > b.settled[s, j] + i and _seen(b, s, j, b.label[s, j, i]):
+                _was_behind(b, s, j, owed)
             _place(b, s, j, b.settled[s, j] + i, i)
+        if b.mark[s, HOLE] and b.settled[s, j] < b.mark[s, HOLE] + b.kind[s, WINDOW] // 4:
+            _give_up_refilled(b, s, j, count)
         b.settled[s, j] = head
         b.pending[s, j] = 0
         return
@@ -62,22 +114,64 @@ def _settle(b: Books, s: int, j: int, final: bool) -> None:
     if not (late or owed > b.kind[s, PATIENCE] or final):
         return
     keep = head if final else head - b.kind[s, WINDOW]
-    u = head
+    u, twice = head, False
     for i in range(count - 1, -1, -1):
         u = min(b.label[s, j, i], u - 1)
         keep = max(keep, u + 1)
         _place(b, s, j, u, i)
+        # A frame sent twice looks like two late answers, which move those before them.
+        twice = u < b.label[s, j, i] and (
+            twice or (b.label[s, j, i] == b.label[s, j, i + 1] and _same(b, s, j, i, i + 1))
+        )
+        if twice:
+            b.row_code[s, slot_of(b, s, u), j] = AMBIGUOUS
+    _give_up_doubtful(b, s, j, count)
+    b.pending[s, j] = 0
+    b.settled[s, j] = keep
+
+
+@njit(cache=True, nogil=True)
+def _give_up_refilled(b: Books, s: int, j: int, count: int) -> None:
+    """As many answers as SYNCs, where frames were missing lately, may be one lost and a later one sent twice."""
+    repeated, unlike = -1, False
+    for i in range(1, count):
+        if b.label[s, j, i] == b.label[s, j, i - 1] and _same(b, s, j, i, i - 1):
+            repeated = i
+    for i in range(1, repeated + 1):
+        unlike = unlike or not _same(b, s, j, i, i - 1)
+    for i in range(repeated + 1 if unlike else 0):
+        b.row_code[s, slot_of(b, s, b.settled[s, j] + i), j] = AMBIGUOUS
+
+
+@njit(cache=True, nogil=True)
+def _give_up_doubtful(b: Books, s: int, j: int, count: int) -> None:
+    """Of answers taken as prompt where one was lost, those that need not have been."""
     # Answers that came in a burst after a silence: with one of them lost, none can be told from the next.
     previous = b.settled[s, j] - 1
     for i in range(count):
         label = b.label[s, j, i]
         if i + 1 < count and b.label[s, j, i + 1] == label:
+            if _seen(b, s, j, label):
+                _was_behind(b, s, j, label - previous)
             for v in range(previous + 1, label + 1):
                 b.row_code[s, slot_of(b, s, v), j] = AMBIGUOUS
         else:
             previous = label
-    b.pending[s, j] = 0
-    b.settled[s, j] = keep
+    # A drive that was behind lately may have been so again when an answer was lost: then those after it are late ones.
+    if b.head[b.bus_of[j], s] - b.behind_at[s, j] > 2 * b.kind[s, WINDOW]:
+        b.behind[s, j] = 0
+    previous = b.settled[s, j] - 1
+    for i in range(count):
+        label = b.label[s, j, i]
+        if i + 1 < count and b.label[s, j, i + 1] == label:
+            # With a burst it has caught up.
+            b.doubt[s, j] = min(b.doubt[s, j], label + 1)
+        elif b.behind[s, j] > 1 and label > previous + 1:
+            b.doubt[s, j] = max(b.doubt[s, j], label + b.behind[s, j] - 1)
+        for v in range(max(previous + 1, b.settled[s, j]), min(label + 1, b.doubt[s, j])):
+            if b.row_code[s, slot_of(b, s, v), j] == RECEIVED:
+                b.row_code[s, slot_of(b, s, v), j] = AMBIGUOUS
+        previous = label
 
 
 @njit(cache=True, nogil=True)

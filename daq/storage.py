@@ -33,7 +33,9 @@ def open_series(
 
     def begin(path: Path, part: int) -> RecordingWriter:
         facts = metadata | {"part": str(part)}
-        rate, chunk_ns = 1.0 / session.sync_period, options.chunk_ms * 1_000_000
+        # What is still in the kernel, and on the way to the disk, is lost with the chunk.
+        chunk_ns = round(max(options.chunk_ms - 2.5 * options.drain_ms, options.chunk_ms / 4) * 1e6)
+        rate = 1.0 / session.sync_period
         return RecordingWriter(path, robot, session, rate, layouts, facts, chunk_ns)
 
     max_bytes = None if options.rotate_mb is None else round(options.rotate_mb * 1e6)

@@ -90,6 +90,26 @@ def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
         _map_stop(sdo, od.stop_rpdo(session.setpoints.rpdo))
 
 
+def mapping_differs(sdo: DriveSdo, session: SessionConfig) -> str | None:
+    """What a drive has mapped otherwise than the session wants, in words; ``None`` if nothing.
+
+    Raises
+    ------
+    ConfigError
+        If the drive does not answer.
+    """
+    for name, stream in session.streams.items():
+        entries = od.TpdoLayout.of(stream.objects, f"streams.{name}", stream.pack, sdo.fd).entries
+        communication, mapping = (base + stream.tpdo - 1 for base in (od.TPDO_COMMUNICATION, od.TPDO_MAPPING))
+        expected = [(mapping, 0, len(entries), "B"), *((mapping, k + 1, e, "I") for k, e in enumerate(entries))]
+        expected.append((communication, 2, max(stream.every, stream.pack), "B"))
+        expected.append((communication, 1, od.tpdo_cob(stream.tpdo, sdo.drive.node_id), "I"))
+        for index, sub, value, code in expected:
+            if (found := sdo.read(index, sub, code)) != value:
+                return f"object {index:04X}h:{sub} is {found:X}h instead of {value:X}h"
+    return None
+
+
 def _map_stop(sdo: DriveSdo, rpdo: int) -> None:
     """Have the controlword (6040h) in an RPDO that acts when it arrives: what stops a drive faster than SDO can.
 

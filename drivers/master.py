@@ -8,6 +8,7 @@ import logging
 import queue
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -20,7 +21,7 @@ from drivers import objects as od
 from drivers.emcy import emcy_text
 from drivers.enabling import POLL_INTERVAL, enable_drive, stand_still, state_of
 from drivers.frames import BusDown
-from drivers.mapping import check_drive, map_drive
+from drivers.mapping import check_drive, map_drive, mapping_differs
 from drivers.network import NodeNetwork
 from drivers.objects import Control, DriveState, NmtCommand, NmtState
 from drivers.sdo import DriveSdo
@@ -34,7 +35,17 @@ HEARTBEATS_MISSED = 3
 HEARTBEAT_MARGIN = 0.1
 """What the host may be late on top, s."""
 
-EventKind = Literal["emcy", "heartbeat_lost", "heartbeat_back", "nmt_state", "rebooted", "configured", "failed"]
+AGAIN_S = 0.5
+"""A drive that could not be configured again is tried again after this, s."""
+
+QUIET_S = 0.2
+"""A mapping that others change is put right when they have written nothing for so long, s."""
+
+NEVER = 2**63 - 1
+
+EventKind = Literal[
+    "emcy", "heartbeat_lost", "heartbeat_back", "nmt_state", "rebooted", "mapping_changed", "configured", "failed"
+]
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +68,8 @@ class DriveMaster:
     """The master of the drives of one session; use it in a ``with`` block.
 
     ``configure()``, then ``start()``, then ``supervise()`` every now and then, and ``stop()`` at the end. A drive that
-    boots again after ``start()`` is configured, started and enabled once more by itself.
+    boots again after ``start()``, or whose PDO mapping somebody else changes, is configured, started and enabled once
+    more by itself. Until then its TPDOs are not what the session says, which ``suspect`` tells.
 
     Parameters
     ----------
@@ -80,8 +92,13 @@ class DriveMaster:
         self._events: queue.SimpleQueue[DriveEvent] = queue.SimpleQueue()
         self._nmt: dict[str, int] = {}
         self._beat: dict[str, float] = {}
+        self._stamp: dict[str, float] = {}
+        self._limit = HEARTBEATS_MISSED * session.heartbeat_ms * 1e-3 + HEARTBEAT_MARGIN
         self._lost: set[str] = set()
         self._reviving: dict[str, threading.Thread] = {}
+        self.suspect: dict[str, tuple[int, int]] = {}
+        """From when on, and until when (ns, UTC), the TPDOs of joints are not to be trusted; a new one per change."""
+        self._written: dict[str, float] = {}
         self._started = False
         self._enabled = False
         self._networks: dict[str, NodeNetwork] = {}
@@ -98,6 +115,7 @@ class DriveMaster:
         sdo = DriveSdo(node, drive, self._session)
         node.emcy.add_callback(lambda emcy: self._on_emcy(sdo, emcy))
         node.nmt.add_heartbeat_callback(lambda state: self._on_heartbeat(sdo, state))
+        self._network_of(drive).overhear(drive.node_id, lambda index, t_ns: self._on_others(sdo, index, t_ns))
         return sdo
 
     def _network_of(self, drive: DriveNode) -> NodeNetwork:
@@ -161,11 +179,10 @@ class DriveMaster:
         alive = {channel: network.revive() for channel, network in self._networks.items()}
         if not any(alive.values()):
             raise BusDown(f"bus {', '.join(alive)}: went down")
-        limit = HEARTBEATS_MISSED * self._session.heartbeat_ms * 1e-3 + HEARTBEAT_MARGIN
         for sdo in self._drives if self._started else ():
             joint = sdo.drive.joint
             silent = time.monotonic() - self._beat[joint]
-            if silent > limit and joint not in self._lost:
+            if silent > self._limit and joint not in self._lost:
                 self._lost.add(joint)
                 self._report("heartbeat_lost", sdo, time.time_ns(), f"no heartbeat for {silent:.2f} s")
         events = []
@@ -246,7 +263,13 @@ class DriveMaster:
     def _on_heartbeat(self, sdo: DriveSdo, state: int) -> None:
         joint = sdo.drive.joint
         before = self._nmt.get(joint)
-        self._nmt[joint], self._beat[joint] = state, time.monotonic()
+        stamp = sdo.node.nmt.timestamp or 0.0
+        silent = stamp - self._stamp.get(joint, stamp)
+        self._nmt[joint], self._beat[joint], self._stamp[joint] = state, time.monotonic(), stamp
+        if self._started and silent > self._limit and joint not in self._lost:
+            # Lost and back between two looks.
+            self._lost.add(joint)
+            self._report("heartbeat_lost", sdo, time.time_ns(), f"no heartbeat for {silent:.2f} s")
         if joint in self._lost:
             self._lost.discard(joint)
             self._report("heartbeat_back", sdo, time.time_ns(), "heartbeat is back")
@@ -254,30 +277,95 @@ class DriveMaster:
             return
         if state == NmtState.BOOT_UP:
             self._report("rebooted", sdo, time.time_ns(), "has booted again", state)
-            if joint not in self._reviving:
-                thread = threading.Thread(target=self._revive, args=(sdo,), name=f"revive {joint}", daemon=True)
-                self._reviving[joint] = thread
-                thread.start()
+            self._distrust(sdo, time.time_ns())
+            self._begin(self._revive, sdo)
         elif state != before:
             self._report("nmt_state", sdo, time.time_ns(), f"NMT state is {_nmt_name(state)}", state)
+            if state == NmtState.OPERATIONAL and before is not None:
+                self._begin(self._verify, sdo)
+
+    def _on_others(self, sdo: DriveSdo, index: int, t_ns: int) -> None:
+        """Somebody else writes to a drive: if it is what its TPDOs hold, that is not what we asked for any more."""
+        if not self._started or not od.TPDO_COMMUNICATION <= index < od.TPDO_MAPPING + od.PDOS:
+            return
+        joint = sdo.drive.joint
+        self._written[joint] = time.monotonic()
+        if self.suspect.get(joint, (0, 0))[1] != NEVER:
+            self._report("mapping_changed", sdo, t_ns, f"somebody else changes its PDO mapping (object {index:04X}h)")
+            self._distrust(sdo, t_ns)
+        self._begin(self._revive, sdo)
+
+    def _distrust(self, sdo: DriveSdo, since_ns: int) -> None:
+        if self.suspect.get(sdo.drive.joint, (0, 0))[1] != NEVER:
+            self.suspect = {**self.suspect, sdo.drive.joint: (since_ns, NEVER)}
+
+    def _begin(self, work: Callable[[DriveSdo], None], sdo: DriveSdo) -> None:
+        """Do something with a drive in a thread of its own, which SDO may keep waiting; nothing twice at once."""
+        joint = sdo.drive.joint
+        if joint not in self._reviving:
+            thread = threading.Thread(target=work, args=(sdo,), name=f"revive {joint}", daemon=True)
+            self._reviving[joint] = thread
+            thread.start()
+
+    def _verify(self, sdo: DriveSdo) -> None:
+        """Look whether a drive that somebody else has started still sends what the session wants."""
+        since, difference = time.time_ns(), None
+        try:
+            difference = mapping_differs(sdo, self._session)
+        except ArmidentError as error:
+            log.debug("%s", error)
+        finally:
+            self._reviving.pop(sdo.drive.joint, None)
+        if difference is not None:
+            self._report("mapping_changed", sdo, since, f"its PDO mapping was changed: {difference}")
+            self._distrust(sdo, since)
+            self._begin(self._revive, sdo)
 
     def _revive(self, sdo: DriveSdo) -> None:
-        """Configure and start a drive that has booted again; in a thread of its own, which SDO may keep waiting."""
+        """Configure and start a drive that has booted again, or that somebody else has configured otherwise."""
+        joint, told = sdo.drive.joint, False
+        try:
+            while self._started:
+                try:
+                    if self._configured_again(sdo):
+                        break
+                except ArmidentError as error:
+                    if not told:
+                        self._report("failed", sdo, time.time_ns(), f"could not be configured again: {error}")
+                    told = True
+                time.sleep(AGAIN_S)
+            if self._started:
+                if joint in self.suspect:
+                    self.suspect = {**self.suspect, joint: (self.suspect[joint][0], time.time_ns())}
+                self._report("configured", sdo, time.time_ns(), "configured again, and started")
+        finally:
+            self._reviving.pop(joint, None)
+
+    def _configured_again(self, sdo: DriveSdo) -> bool:
+        """Configure and start a drive once more; ``False`` if its bus went down meanwhile, or somebody else wrote.
+
+        Raises
+        ------
+        ArmidentError
+            If the drive does not follow.
+        """
+        joint = sdo.drive.joint
+        while self._started and time.monotonic() - self._written.get(joint, 0.0) < QUIET_S:
+            time.sleep(POLL_INTERVAL)
+        begun = time.monotonic()
         try:
             check_drive(sdo, self._robot)
             map_drive(sdo, self._session)
             if not self._started:
-                return
+                return False
             self._command(NmtCommand.START, sdo)
             self._await_operational(sdo)
             if self._enabled:
                 stand_still(sdo)
                 enable_drive(sdo)
-            self._report("configured", sdo, time.time_ns(), "configured again, and started")
-        except ArmidentError as error:
-            self._report("failed", sdo, time.time_ns(), f"could not be configured again: {error}")
-        finally:
-            self._reviving.pop(sdo.drive.joint, None)
+        except BusDown:
+            return False
+        return self._written.get(joint, 0.0) < begun
 
 
 def _nmt_name(state: int) -> str:

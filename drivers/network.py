@@ -5,6 +5,7 @@ Filters in the kernel keep TPDO and SYNC away from canopen's socket: it costs te
 
 import logging
 import time
+from collections.abc import Callable
 from contextlib import suppress
 
 import can
@@ -64,7 +65,7 @@ class NodeNetwork:
             {"can_id": base + node, "can_mask": od.COB_MASK, "extended": False}
             for node in self._nodes
             # The full mask matters: EMCY is 80h + node, and any coarser one lets SYNC (80h) through.
-            for base in (od.COB_SDO_RESPONSE, od.COB_HEARTBEAT, od.COB_EMCY)
+            for base in (od.COB_SDO_RESPONSE, od.COB_SDO_REQUEST, od.COB_HEARTBEAT, od.COB_EMCY)
         ]
         if bus.interface == "socketcan":
             # Says what is wrong with the interface, and what to do about it.
@@ -86,6 +87,18 @@ class NodeNetwork:
             return self._network.add_node(drive.node_id, str(drive.eds))
         except Exception as error:
             raise ConfigError(f"{drive.eds}: not a valid EDS file: {error}") from error
+
+    def overhear(self, node_id: int, told: Callable[[int, int], None]) -> None:
+        """Have ``told`` called with object index and time (ns, UTC) of what others write to a drive over SDO.
+
+        Our own requests do not come back to the socket that sent them.
+        """
+
+        def heard(_: int, data: bytearray, timestamp: float) -> None:
+            if len(data) == 8 and data[0] >> 5 == od.SDO_DOWNLOAD:
+                told(int.from_bytes(data[1:3], "little"), round(timestamp * 1e9))
+
+        self._network.subscribe(od.COB_SDO_REQUEST + node_id, heard)
 
     def command(self, command: NmtCommand, node_id: int) -> None:
         """Send an NMT command to one node.

@@ -154,3 +154,5 @@ class RecordingSeries:
             writer.close({**counters, "writer.rows_lost": writer.lost_rows})
             return
         self._problem = f"{writer.path}: could not be finished"
+        if writer is not self._writer:
+            self._writer.take_over(writer)

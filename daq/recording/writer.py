@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -21,6 +22,7 @@ from daq.recording import mcap_format as mcap
 from daq.recording.layout import StreamLayout
 from daq.recording.model import Gap, Mark, Recording
 from daq.recording.summary import Summary
+from daq.recording.unwritten import Unwritten
 
 SCHEMA = "armident/recording/1"
 GAPS_TOPIC, MARKS_TOPIC = "/events/gaps", "/events/marks"
@@ -95,6 +97,8 @@ class RecordingWriter:
         self._topics = {topic: first + len(layouts) + k for k, topic in enumerate(_EVENTS)}
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
         self._parts: list[bytes] = []
+        self._unwritten = Unwritten({layout.name: layout.every for layout in layouts})
+        self._last_ns = 0
         self._indexes: dict[int, list[NDArray[np.uint64]]] = {}
         self._size = 0
         self._rows = 0
@@ -151,20 +155,37 @@ class RecordingWriter:
         rows = layout.pack(channel, sync, t_ns, raw)
         offsets = self._size + np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.itemsize)
         self._rows += len(rows)
+        # Rows may lie on both sides of a gap.
+        breaks = [0, *(np.flatnonzero(np.diff(sync) != layout.every) + 1).tolist(), len(sync)]
+        for begin, end in pairwise(breaks):
+            self._unwritten.gather(stream, int(sync[begin]), int(sync[end - 1]))
         self._gather(channel, t_ns, offsets, rows.tobytes())
+        self._flush_if_full()
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
         """Record gaps found at ``t_ns``."""
         for gap in gaps:
             self._event(GAPS_TOPIC, gap.first, t_ns, asdict(gap))
+            self._unwritten.events.append((GAPS_TOPIC, gap.first, asdict(gap)))
+        self._flush_if_full()
 
     def add_marks(self, marks: Sequence[Mark]) -> None:
         """Record marks."""
         for mark in marks:
             self._event(MARKS_TOPIC, mark.sync, mark.t_ns, asdict(mark))
+            self._unwritten.events.append((MARKS_TOPIC, mark.sync, asdict(mark)))
+        self._flush_if_full()
+
+    def take_over(self, other: "RecordingWriter") -> None:
+        """Tell what the file of another writer could not be told: rows and events that its disk did not take."""
+        self._unwritten.take_over(other._unwritten)
+        for topic, sync, entries in other._unwritten.events:
+            self._event(topic, sync, other._last_ns, entries)
 
     def flush(self) -> None:
         """Write what is gathered as a chunk and bring it to the disk."""
+        for gap in self._unwritten.gaps():
+            self._event(GAPS_TOPIC, gap.first, self._last_ns, asdict(gap))
         if not self._parts or self._span is None:
             return
         raw = b"".join(self._parts)
@@ -186,9 +207,13 @@ class RecordingWriter:
         except OSError as error:
             self.lost_rows += self._rows
             self.problem = f"{self.path}: {error.strerror}"
+            self._unwritten.failed()
         else:
             self._summary.add_chunk(place, counts)
+            self._unwritten.written()
         self._parts, self._indexes, self._size, self._rows, self._span = [], {}, 0, 0, None
+        for topic, sync, event in self._unwritten.events:
+            self._event(topic, sync, self._last_ns, event)
 
     def close(self, counters: Mapping[str, int]) -> None:
         """Write the rest, the counters and the summary; the file is complete afterwards.
@@ -199,6 +224,8 @@ class RecordingWriter:
             If the disk does not take the end of the file; what is there remains readable as a torn file.
         """
         try:
+            self.flush()
+            # A disk that did not take the last rows may take the word that they are missing.
             self.flush()
             self._add_check(self._add_metadata(COUNTERS, {key: str(value) for key, value in counters.items()}))
             self._append(self._summary.ending(self._position))
@@ -237,8 +264,10 @@ class RecordingWriter:
         low, high = int(t_ns.min()), int(t_ns.max())
         if self._span is not None:
             low, high = min(low, self._span[0]), max(high, self._span[1])
-        self._span = low, high
-        if high - low >= self._chunk_ns:
+        self._span, self._last_ns = (low, high), high
+
+    def _flush_if_full(self) -> None:
+        if self._span is not None and self._span[1] - self._span[0] >= self._chunk_ns:
             self.flush()
 
     def _add_metadata(self, name: str, entries: Mapping[str, str]) -> bytes:

@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 
 from configs import ConfigError
-from daq.recording import Recording, RecordingSeries, RecordingWriter, StreamLayout, heal_recording, read_recording
+from daq.recording import (
+    Mark,
+    Recording,
+    RecordingSeries,
+    RecordingWriter,
+    StreamLayout,
+    heal_recording,
+    read_recording,
+)
 from daq.recording.retention import Janitor, prune
 from tests.unit.test_daq_recording import make_recording
 
@@ -101,6 +109,7 @@ def test_where_no_new_file_can_be_begun_the_old_one_goes_on(tmp_path: Path) -> N
 
 def test_a_full_disk_costs_rows_and_not_the_rest(tmp_path: Path) -> None:
     recording = make_recording(6000)
+    mark = Mark("note", 2500, int(recording.samples.t_ns[0]), "said while it was full")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     with RecordingSeries(beginner(recording), tmp_path, NAME) as series:
         third = recording.samples.sync.size // 3
@@ -109,6 +118,7 @@ def test_a_full_disk_costs_rows_and_not_the_rest(tmp_path: Path) -> None:
             if k == 1:
                 series.flush()
                 resource.setrlimit(resource.RLIMIT_FSIZE, (series.path.stat().st_size + 5_000, hard))
+                series.add_marks([mark])
             part = slice(k * third, (k + 1) * third)
             for first in range(k * third, (k + 1) * third, 100):
                 rows = slice(first, min(first + 100, part.stop))
@@ -126,6 +136,31 @@ def test_a_full_disk_costs_rows_and_not_the_rest(tmp_path: Path) -> None:
     assert kept[:third].all()
     assert kept[2 * third : 3 * third].all()
     np.testing.assert_array_equal(read.samples.raw["position"], samples.raw["position"][kept])
+    # What is not there is in the gap list, and what was said meanwhile is there.
+    gaps = [g for g in read.gaps if g.reason == "not written"]
+    numbers = samples.sync[: 3 * third]
+    covered = np.any([(numbers >= g.first) & (numbers <= g.last) for g in gaps], axis=0)
+    np.testing.assert_array_equal(covered, ~kept[: 3 * third])
+    assert mark in read.marks
+
+
+def test_a_file_that_could_not_be_finished_has_its_gaps_told_by_the_next(tmp_path: Path) -> None:
+    recording = make_recording(3000)
+    samples, begin = recording.samples, beginner(recording)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with begin(tmp_path / "1.mcap", 1) as full, begin(tmp_path / "2.mcap", 2) as following:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (full.path.stat().st_size, hard))
+        try:
+            full.append("samples", samples.sync[:100], samples.t_ns[:100], {n: v[:100] for n, v in samples.raw.items()})
+            with pytest.raises(ConfigError):
+                full.close({})
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        following.take_over(full)
+        following.close({})
+    gaps = read_recording(tmp_path / "2.mcap").gaps
+    assert {gap.reason for gap in gaps} == {"not written"}
+    assert [k for gap in gaps for k in range(gap.first, gap.last + 1)] == samples.sync[:100].tolist()
 
 
 def made(directory: Path, stamp: str, name: str = "tx40", suffix: str = ".mcap") -> Path:

@@ -1,0 +1,274 @@
+"""Faults of buses, drives, disk and host by the hundred: ``python -m tests.faults.bus --rounds 200 --seed 1``.
+
+Each round is a short capture at 1 kHz of six drives whose samples say which SYNC they answer, on one bus or two, with
+one to three faults at random times (the first of them by turns). An independent socket counts the SYNCs of the
+bus. Afterwards every SYNC has to be received or in the gap list, none twice, every value of its SYNC, and the faults
+named. Runs under ``python -m drivers.vcan``.
+"""
+
+import argparse
+import multiprocessing
+import os
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from configs import config_path, load_robot, load_session
+from daq.recording import read_recording
+from daq.recording.model import join_parts
+from drivers.vcan import ensure_vcan, remove_vcan
+from tests.faults.check import violations
+from tests.faults.farm import Farm
+from tests.faults.plan import FAULTS, Outcome, Room, chosen
+from tests.faults.recorder import Capture, Recorders, result, said, warm
+
+PERIOD_US = 1000
+DISK_BYTES = 3 << 20
+SMALL_BUFFER = 96 << 10
+"""Bytes of the kernel's buffer where it shall overrun."""
+LONGEST_S = 40.0
+SWITCH_S = 0.0005
+"""How long a thread may keep the others of its process waiting."""
+SLOW = {
+    "reboot": 0.9,
+    "mapped_shorter": 1.0,
+    "mapped_otherwise": 1.0,
+    "heartbeat": 0.5,
+    "sync_stops": 0.6,
+    "disk_full": 0.4,
+}
+"""What takes longer than others, s."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """How a round went."""
+
+    number: int
+    faults: list[str]
+    shape: str
+    syncs: int
+    rows: int
+    in_gaps: int
+    gaps: int
+    violations: list[str]
+    unnamed: list[str]
+    said: str = ""
+
+
+def session_file(
+    folder: Path, name: str, channels: Sequence[str], producing: bool, rotating: bool, period_us: int = PERIOD_US
+) -> Path:
+    """A session of six drives on some buses."""
+    source = config_path("tx40_replay.yaml")
+    data = yaml.safe_load(source.read_text())
+    data |= {"cell": name, "robot": str(source.parent / data["robot"]), "heartbeat_ms": 50, "sdo_timeout_s": 1.0}
+    data["sync"] = {"role": "producer" if producing else "consumer", "period_us": period_us, "counter": 240}
+    data["streams"]["demand"] = {"tpdo": 2, "every": 5, "objects": ["demand"]}
+    data["recording"] = {"rotate_minutes": 0.25 / 60} if rotating else {}
+    del data["bus"]
+    data["buses"] = [{"channel": channel, "bitrate": None} for channel in channels]
+    for i, drive in enumerate(data["drives"]):
+        drive |= {"eds": str(source.parent / drive["eds"]), "bus": channels[i * len(channels) // 6]}
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+class Lane:
+    """Rounds one after the other, on buses and a small disk of their own."""
+
+    def __init__(self, name: str, seed: int) -> None:
+        self._seed, self._name = seed, name
+        self._recorders = Recorders()
+        self._folder = Path(tempfile.mkdtemp(prefix="armident-faults-"))
+        self._disk = self._folder / "disk"
+        self._disk.mkdir()
+        size = f"size={DISK_BYTES}"
+        subprocess.run(["mount", "-t", "tmpfs", "-o", size, "disk", str(self._disk)], check=True)
+        self._channels = [f"{name}n{i}" for i in range(3)]
+        for channel in self._channels:
+            ensure_vcan(channel)
+        robot = load_robot("tx40.yaml")
+        self._farms = {}
+        for buses in (1, 2):
+            path = session_file(self._folder, f"{name}of{buses}", self._of(buses), True, False)
+            self._farms[buses] = Farm(load_session(path), robot)
+
+    def _of(self, buses: int) -> list[str]:
+        return self._channels[:1] if buses == 1 else self._channels[1:]
+
+    def close(self) -> None:
+        """Leave nothing behind."""
+        for farm in self._farms.values():
+            farm.close()
+        self._recorders.close()
+        subprocess.run(["umount", str(self._disk)], check=False)
+        for channel in self._channels:
+            remove_vcan(channel)
+        shutil.rmtree(self._folder)
+
+    def run(self, number: int, only: Sequence[str] = ()) -> Round:
+        """One round."""
+        rng = np.random.default_rng([self._seed, number])
+        faults, producing, buses = chosen(rng, number, only)
+        farm = self._farms[buses]
+        farm.master = not producing
+        seconds = 1.0 + max([SLOW.get(name, 0.0) for name in faults])
+        pids: list[int] = []
+        room = Room(rng, farm, seconds, self._disk, lambda: pids[0])
+        expected = {name: FAULTS[name](room) for name in faults}
+        syncs = round(seconds * 1e6 / PERIOD_US)
+        farm.prepare(room.orders, room.actions, None if producing else syncs)
+        path = session_file(self._folder, f"{self._name}r{number}", self._of(buses), producing, "rotation" in faults)
+        out, log = self._disk / f"r{number}", self._folder / f"r{number}"
+        out.mkdir()
+        small = SMALL_BUFFER if "kernel_drop" in faults else None
+        process = self._recorders.start(path, out, log, seconds if producing else None, small)
+        pids.append(process.pid)
+        try:
+            self._wait(process, farm, log, producing)
+        finally:
+            process.kill()
+            process.join()
+            seen, ledgers = farm.finish(), [list(lane.ledger) for lane in farm.lanes]
+        words = said(log)
+        if process.exitcode != 0:
+            what = [f"the capture ended with {process.exitcode}"]
+            return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words)
+        try:
+            paths, counters = result(log)
+            done = Outcome(join_parts([read_recording(p) for p in paths]), counters, words, len(paths))
+            wrong = violations(done, ledgers, seen, producing, "sync_stops" in faults)
+            unnamed = [name for name, named in expected.items() if not named(done)]
+            if done.recording.missing:
+                wrong.append(f"torn: {done.recording.missing}")
+        except Exception as error:
+            what = [f"{type(error).__name__}: {error}"]
+            return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words)
+        gaps = [g for g in done.recording.gaps if g.stream == "samples"]
+        covered = {k for g in gaps for k in range(g.first, g.last + 1)}
+        rows = done.recording.samples.sync.size
+        shutil.rmtree(out)
+        report = words if wrong or unnamed else ""
+        if report:
+            report += f"\n{counters}\n" + "\n".join(map(str, done.recording.gaps[:30]))
+        return Round(
+            number, faults, _shape(producing, buses), len(set().union(*ledgers)), rows, len(covered), len(gaps), wrong,
+            unnamed, report,
+        )  # fmt: skip
+
+    def _wait(self, process: Capture, farm: Farm, log: Path, producing: bool) -> None:
+        """Until the capture is over; a foreign master begins when it is ready, and ends before it."""
+        deadline = time.monotonic() + LONGEST_S
+        stopped = producing
+        since = None
+        while process.exitcode is None and time.monotonic() < deadline:
+            if farm.failed is not None:
+                raise farm.failed
+            if not producing and not farm.begun:
+                ready = farm.operational and "recording to" in said(log)
+                since = (since or time.monotonic()) if ready else None
+                if since is not None and time.monotonic() - since > 0.05:
+                    farm.released.set()
+            if not stopped and farm.done:
+                time.sleep(0.3)
+                os.kill(process.pid, signal.SIGINT)
+                stopped = True
+            time.sleep(0.02)
+
+
+def _shape(producing: bool, buses: int) -> str:
+    return f"{'own' if producing else 'foreign'} SYNC, {buses} bus{'es' if buses > 1 else ''}"
+
+
+def in_lanes(rounds: int, seed: int, lanes: int, only: Sequence[str] = ()) -> list[Round]:
+    """Rounds in several processes at once: most of their time is spent waiting."""
+    warm()
+    sys.setswitchinterval(SWITCH_S)
+    context = multiprocessing.get_context("fork")
+    numbers, done = context.Queue(), context.Queue()
+    for number in range(rounds):
+        numbers.put(number)
+    for _ in range(lanes):
+        numbers.put(None)
+
+    def work(name: str) -> None:
+        lane = Lane(name, seed)
+        try:
+            while (number := numbers.get()) is not None:
+                done.put(lane.run(number, only))
+        finally:
+            lane.close()
+
+    # Forked here, where there are no threads yet.
+    running = [context.Process(target=work, args=(f"f{os.getpid() % 10**6}x{i}",)) for i in range(lanes)]
+    for process in running:
+        process.start()
+    found: list[Round] = []
+    while len(found) < rounds and any(process.is_alive() for process in running):
+        with suppress(queue.Empty):
+            found.append(done.get(timeout=1.0))
+            if sys.stderr.isatty() or len(found) % 20 == 0:
+                print(f"{len(found)} of {rounds} rounds", file=sys.stderr, flush=True)
+    for process in running:
+        process.join()
+    return sorted(found, key=lambda r: r.number)
+
+
+def show(rounds: Sequence[Round]) -> int:
+    """Print the table by fault, and what was wrong; how many rounds that concerns."""
+    by_fault: dict[str, list[Round]] = defaultdict(list)
+    for one in rounds:
+        for name in one.faults:
+            by_fault[name].append(one)
+    line = "{:18} {:>7} {:>9} {:>9} {:>9} {:>7} {:>11} {:>9}"
+    print(line.format("fault", "rounds", "SYNCs", "rows", "in gaps", "gaps", "violations", "unnamed"))
+    for name in [*FAULTS, "all"]:
+        part = list(rounds) if name == "all" else by_fault[name]
+        sums = [sum(getattr(r, what) for r in part) for what in ("syncs", "rows", "in_gaps", "gaps")]
+        wrong = sum(1 for r in part if r.violations)
+        print(
+            line.format(
+                name, len(part), *sums, wrong, sum(len(r.unnamed) if name == "all" else name in r.unnamed for r in part)
+            )
+        )
+    bad = [r for r in rounds if r.violations or r.unnamed]
+    for r in bad:
+        print(f"\nround {r.number} ({r.shape}; {', '.join(r.faults)}):")
+        print(*(f"  {text}" for text in r.violations), *(f"  not named: {name}" for name in r.unnamed), sep="\n")
+        print("    " + r.said.replace("\n", "\n    "))
+    return len(bad)
+
+
+def main() -> int:
+    """Run the rounds and print the table; 1 if anything is wrong."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults.bus", description=__doc__)
+    parser.add_argument("--rounds", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--lanes", type=int, default=3, help="captures at once")
+    parser.add_argument("--only", action="append", default=[], choices=list(FAULTS), help="these faults alone")
+    options = parser.parse_args()
+    begin = time.monotonic()
+    rounds = in_lanes(options.rounds, options.seed, options.lanes, options.only)
+    bad = show(rounds)
+    print(
+        f"\n{len(rounds)} rounds in {time.monotonic() - begin:.0f} s, seed {options.seed}; {bad} with something wrong"
+    )
+    return int(bad > 0 or len(rounds) != options.rounds)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
