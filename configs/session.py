@@ -92,8 +92,9 @@ class Trigger(Frozen):
 class RecordingOptions(Frozen):
     """Where and how recordings are written, when a new file is begun, and how long files are kept.
 
-    With ``trigger`` only events are written. Without ``rotate_mb`` and ``rotate_minutes`` a capture is one file;
-    without ``keep_days`` and ``min_free_gb`` nothing is ever deleted.
+    ``look_hz`` samples per second are there in SI units too, for viewers (0: none). With ``trigger`` only events are
+    written. Without ``rotate_mb`` and ``rotate_minutes`` a capture is one file; without ``keep_days`` and
+    ``min_free_gb`` nothing is ever deleted.
     """
 
     directory: Path = Path("recordings")
@@ -103,6 +104,7 @@ class RecordingOptions(Frozen):
     rotate_minutes: Annotated[float, Field(gt=0)] | None = None
     keep_days: Annotated[float, Field(gt=0)] | None = None
     min_free_gb: Annotated[float, Field(gt=0)] | None = None
+    look_hz: Annotated[float, Field(ge=0, le=1000)] = 50.0
     trigger: Trigger | None = None
 
 

@@ -36,7 +36,7 @@ def open_series(
         # What is still in the kernel, and on the way to the disk, is lost with the chunk.
         chunk_ns = round(max(options.chunk_ms - 2.5 * options.drain_ms, options.chunk_ms / 4) * 1e6)
         rate = 1.0 / session.sync_period
-        return RecordingWriter(path, robot, session, rate, layouts, facts, chunk_ns)
+        return RecordingWriter(path, robot, session, rate, layouts, facts, chunk_ns, options.look_hz)
 
     max_bytes = None if options.rotate_mb is None else round(options.rotate_mb * 1e6)
     max_ns = None if options.rotate_minutes is None else round(options.rotate_minutes * 60e9)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from configs import ConfigError, RobotConfig, SessionConfig
 from daq.recording import mcap_format as mcap
 from daq.recording.layout import StreamLayout
+from daq.recording.looking import PREFIX, Look
 from daq.recording.model import Gap, Mark, Recording
 from daq.recording.summary import Summary
 from daq.recording.unwritten import Unwritten
@@ -63,6 +64,8 @@ class RecordingWriter:
         Facts worth keeping, stored in the file.
     chunk_ns
         Longest time a chunk spans, ns.
+    look_hz
+        Samples per second for looking, in SI units (`looking`); 0: none.
 
     Raises
     ------
@@ -79,6 +82,7 @@ class RecordingWriter:
         layouts: Sequence[StreamLayout],
         metadata: Mapping[str, str],
         chunk_ns: int = 100_000_000,
+        look_hz: float = 0.0,
     ) -> None:
         self.path = path
         self.lost_rows = 0
@@ -95,6 +99,12 @@ class RecordingWriter:
         first = 1 + zlib.crc32(repr(texts).encode()) % _MOST_CHANNELS
         self._layouts = {layout.name: (k, layout) for k, layout in enumerate(layouts, start=first)}
         self._topics = {topic: first + len(layouts) + k for k, topic in enumerate(_EVENTS)}
+        looks = [Look.at(layout, robot, sample_rate_hz, look_hz) for layout in layouts if look_hz > 0]
+        numbers = range(first + len(layouts) + len(_EVENTS), 2**16)
+        self._looks = {
+            look.layout.name[len(PREFIX) :]: (k, look)
+            for k, look in zip(numbers, (look for look in looks if look is not None), strict=False)
+        }
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
         self._parts: list[bytes] = []
         self._unwritten = Unwritten({layout.name: layout.every for layout in layouts})
@@ -113,6 +123,9 @@ class RecordingWriter:
             document = json.dumps({"type": "object", "properties": properties}).encode()
             schemas.append(mcap.schema(k, f"armident{topic.replace('/', '.')}", "jsonschema", document))
             channels.append(mcap.channel(k, k, topic, "json", {}))
+        for k, look in self._looks.values():
+            schemas.append(mcap.schema(k, look.layout.message_name, "protobuf", look.layout.descriptor))
+            channels.append(mcap.channel(k, k, look.layout.topic, "protobuf", look.metadata))
         self._summary = Summary(schemas, channels)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -160,6 +173,13 @@ class RecordingWriter:
         for begin, end in pairwise(breaks):
             self._unwritten.gather(stream, int(sync[begin]), int(sync[end - 1]))
         self._gather(channel, t_ns, offsets, rows.tobytes())
+        if stream in self._looks:
+            channel, look = self._looks[stream]
+            sync, t_ns, shown = look.of(sync, t_ns, raw)
+            if sync.size:
+                rows = look.layout.pack(channel, sync, t_ns, shown)
+                offsets = self._size + np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.itemsize)
+                self._gather(channel, t_ns, offsets, rows.tobytes())
         self._flush_if_full()
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
