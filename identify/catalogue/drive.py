@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import signal
 
 from identify.catalogue.effect import Effect, Linear, Place, Shape
 from identify.catalogue.motion import Motion
@@ -42,6 +43,23 @@ def _delay(motion: Motion, place: Place) -> Array:
 
 def _bandwidth(motion: Motion, place: Place) -> Array:
     return motion.of_motor(place.joint, motion.rate(motion.motor_torque[:, place.joint]))
+
+
+def _earlier(recorded: Array, dt: float, delay: float) -> Array:
+    """Recorded torques (N,) at the time that they belong to."""
+    t = dt * np.arange(recorded.size)
+    early: Array = np.interp(t + delay, t, recorded)
+    return early
+
+
+def _lagging(recorded: Array, dt: float, lag: float) -> Array:
+    """What a motor makes of the commands (N,) that are recorded: ``1 / (1 + lag s)``, from rest (Tustin)."""
+    if lag <= 0.0:
+        return recorded
+    ratio = 2.0 * lag / dt
+    b, a = np.array([1.0, 1.0]) / (1.0 + ratio), np.array([1.0, (1.0 - ratio) / (1.0 + ratio)])
+    late: Array = signal.lfilter(b, a, recorded, zi=recorded[:1] * (1.0 - b[0]))[0]
+    return late
 
 
 def _within_a_sample(values: Array, dt: float) -> bool:
@@ -102,6 +120,7 @@ EFFECTS = (
         linear=(Linear("delay", ("s", "s"), sign=1),),
         columns=_delay,
         predicts=True,
+        undo=_earlier,
         negligible=_within_a_sample,
         needs="quick changes of the torque",
         scope="motor",
@@ -116,6 +135,7 @@ EFFECTS = (
         linear=(Linear("lag", ("s", "s"), sign=1),),
         columns=_bandwidth,
         predicts=True,
+        undo=_lagging,
         negligible=_within_a_sample,
         needs="quick changes of the torque",
         scope="motor",

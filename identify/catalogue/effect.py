@@ -102,6 +102,10 @@ class Effect:
         recording, and there are no columns.
     predicts
         Whether the columns depend on the torques that the model predicts, and so on its parameters.
+    undo
+        ``(recorded, dt, value)`` to the torque (N,) that a motor really had where the recording says otherwise, for the
+        one linear parameter. The columns are derivatives of the model's torques then, which at measured signals hold
+        more noise than effect; a recording put right holds none that it did not have.
     sudden
         Whether it makes the arm leap, at instants that no simulation meets to the sample: columns at measured signals
         are their own instruments then, and have to explain more than feedback lets a term without merit explain.
@@ -127,6 +131,7 @@ class Effect:
     excitation: tuple[str, ...] = field(default=("reversals", "speeds"))
     rewires: bool = False
     predicts: bool = False
+    undo: Callable[[Array, float, float], Array] | None = None
     sudden: bool = False
     physical: Callable[[Array, Mapping[str, float]], bool] | None = None
     negligible: Callable[[Array, float], bool] | None = None

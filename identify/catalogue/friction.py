@@ -41,9 +41,16 @@ def films(motion: Motion, joint: int) -> Sequence[float]:
     return [float(v) for v in np.geomspace(least, most, 5)] if most > least else [least]
 
 
-def _stribeck(motion: Motion, place: Place, *, velocity: float) -> Array:
+def _stribeck(motion: Motion, place: Place, *, velocity: float, displacement: float = 0.0) -> Array:
     j = place.joint
-    return (np.exp(-((motion.qd[:, j] / velocity) ** 2)) * motion.sign[:, j])[:, None]
+    # So slow that the model's smoothed sign is only on its way, while a bristle has long been bent.
+    side = dahl(motion.q[:, j], displacement) if displacement > 0.0 else motion.sign[:, j]
+    return (np.exp(-((motion.qd[:, j] / velocity) ** 2)) * side)[:, None]
+
+
+def bristles(motion: Motion, joint: int) -> Sequence[float]:
+    """Displacements from three millionths of the joint's range of motion to a hundred times that."""
+    return [float(d) for d in motion.span[joint] * np.geomspace(3e-6, 3e-4, 4)]
 
 
 def _nonlinear_viscous(motion: Motion, place: Place, *, knee: float) -> Array:
@@ -159,7 +166,10 @@ EFFECTS = (
         says="extra friction at low speed that fades as the joint speeds up: poor or squeezed-out lubricant",
         reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
         linear=(Linear("fst", TORQUE, sign=1),),
-        shapes=(Shape("velocity", ("rad/s", "m/s"), speeds),),
+        shapes=(
+            Shape("velocity", ("rad/s", "m/s"), speeds),
+            Shape("displacement", ("rad", "m"), bristles, default=0.0),
+        ),
         columns=_stribeck,
         needs="slow motion in both directions",
         excitation=("slow", "reversals"),

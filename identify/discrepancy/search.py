@@ -15,7 +15,7 @@ from identify.discrepancy.regression import Fit, applied, fit
 from identify.discrepancy.retrial import in_its_loop, suspects
 from identify.discrepancy.screening import shortlist
 from identify.discrepancy.stanzas import added, stanza_number, without
-from identify.discrepancy.study import Study
+from identify.discrepancy.study import Study, loop_distance
 from identify.discrepancy.trial import Trial, judge
 from identify.discrepancy.whitening import rows_of_joints, whitened
 from identify.estimators.noise import ArModel
@@ -35,6 +35,10 @@ SHORTLIST = 15
 """Candidates that get a trial of their own."""
 LOOPS = 3
 """Loops in which the nonlinear parameters of one effect are sought."""
+PUT_RIGHT = 6
+"""Fits after which a recording that depends on how it is put right is left as it is."""
+SETTLED = 0.01
+"""Change of that, over what it is, that ends them."""
 MOST = 8
 """Most effects of one diagnosis."""
 
@@ -226,8 +230,9 @@ def _ranked(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 def nearer(one: State, other: State, material: float) -> bool:
     """Whether a model comes closer to the held-out torques than another, at measured or at simulated signals.
 
-    Both count: measured positions, differentiated once more for a delay or twice for an elastic joint, may bring more
-    noise than the effect has torque, and simulated ones are only as good as the loop.
+    Both count: measured positions, differentiated twice for an elastic joint, may bring more noise than the effect has
+    torque, and simulated ones are only as good as the loop. Where they alone are for it, the loop with the effect in it
+    must move more like the arm, too: what a model says of itself is no evidence.
 
     Parameters
     ----------
@@ -236,6 +241,8 @@ def nearer(one: State, other: State, material: float) -> bool:
     """
     if _power(one) < _power(other):
         return True
+    if not loop_distance(one.study.held) < loop_distance(other.study.held):
+        return False
     noise = one.fit.noise
     before = other.fit.errors(other.fit.theta, held=True)
     # Of the error at measured signals, less what of it the change at simulated ones explains: those know no noise.
@@ -281,7 +288,14 @@ def refit(study: Study, robot: RobotConfig, before: State | None) -> tuple[Study
         theta = np.concatenate([rigid.theta, np.zeros(model.e)])
     first = fit(changed, theta)
     moved = changed.resimulated(first.theta)
-    return (changed, first) if moved is changed else (moved, fit(moved, first.theta if model.e else None))
+    if moved is not changed:
+        first = fit(moved, first.theta if model.e else None)
+    undone = [model.base.names.index(term.names[0]) for term in model.terms if term.effect.undo]
+    for _ in range(PUT_RIGHT if undone else 0):
+        last, first = first, fit(moved, first.theta)
+        if np.allclose(first.theta[undone], last.theta[undone], rtol=SETTLED):
+            break
+    return moved, first
 
 
 def padded(before: State, model: ArmModel) -> Array:

@@ -153,12 +153,12 @@ class Study:
             )
 
         train = moved(self.train)
-        if not _distance(train) < _distance(self.train):
+        if not loop_distance(train) < loop_distance(self.train):
             return self
         return replace(self, train=train, held=moved(self.held))
 
 
-def _distance(stretches: Sequence[Stretch]) -> float:
+def loop_distance(stretches: Sequence[Stretch]) -> float:
     """Squared errors of the simulated velocities, each joint over its own measured ones, summed."""
     apart = sum(np.sum((s.simulated.qd - s.measured.qd) ** 2, axis=0) for s in stretches)
     size = sum(np.sum(s.measured.qd**2, axis=0) for s in stretches)
