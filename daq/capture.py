@@ -13,6 +13,7 @@ from pathlib import Path
 from configs import ArmidentError
 from configs.session import Bus
 from daq.facts import host_facts
+from daq.journal import Line, Voice
 from daq.order import Order, prepare
 from daq.publisher import Publisher
 from daq.recorder import Recorder
@@ -100,7 +101,7 @@ def capture(
         run.sink.announce(robot, session, rate, metadata)
         trigger = session.recording.trigger
         if trigger is None:
-            say(f"recording to {writer.path}")
+            say(Line(f"recording to {writer.path}", event="capture_start", file=writer.path))
         else:
             say(f"keeping the last {trigger.before_s:g} s; written on {', '.join(trigger.events)}")
         notifier.ready(f"{session.cell}: recording")
@@ -135,11 +136,9 @@ def run_capture(
     ArmidentError
         If the bus or a drive failed on the way; the file is finished then too.
     """
-
-    def say(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
-
+    say = Voice({})
     order = prepare(config, out, duration, listen_only, sniff_s, say)
+    say.fields = {"cell": order.session.cell, "robot": order.robot.name}
     stop, save = threading.Event(), threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: save.set())
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -147,7 +146,9 @@ def run_capture(
 
     done = capture(order, stop, say, save)
     rows, gaps = done.counters["samples.rows"], done.counters["samples.in_gaps"]
-    say(f"recorded {rows} samples, {gaps} in gaps, {done.counters['kernel_drops']} frames dropped by the kernel")
+    drops = done.counters["kernel_drops"]
+    text = f"recorded {rows} samples, {gaps} in gaps, {drops} frames dropped by the kernel"
+    say(Line(text, event="capture_end", rows=rows, rows_in_gaps=gaps, kernel_drops=drops))
     if as_json:
         files = [str(path) for path in done.paths]
         print(json.dumps({"recording": files[-1], "recordings": files, "counters": done.counters}))

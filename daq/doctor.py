@@ -1,6 +1,5 @@
 """Checks a machine and a session before a capture is started: what would fail, and what to do about it."""
 
-import ctypes
 import json
 import os
 import shutil
@@ -13,6 +12,7 @@ from typing import Literal
 
 from configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
 from configs.session import Bus
+from daq.clock import clock_state
 from daq.streams import captured_streams
 from daq.zenoh_keys.session import configuration, endpoints
 from drivers.bus_load import check_fits
@@ -24,8 +24,6 @@ Verdict = Literal["ok", "warning", "failed"]
 
 _LEAST_HOURS = 24.0
 """Hours of recording that the disk should have room for."""
-_TIME_ERROR, _UNSYNCHRONISED = 5, 0x0040
-"""What adjtimex(2) returns, or sets in its status, while nothing disciplines the clock."""
 
 
 @dataclass(frozen=True)
@@ -156,17 +154,16 @@ def _clock() -> Check:
     """Whether something disciplines the clock, and which source it has."""
     source = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     name = source.read_text().strip() if source.is_file() else "unknown"
-    buffer = ctypes.create_string_buffer(512)
-    state = ctypes.CDLL(None, use_errno=True).adjtimex(buffer)
-    # struct timex begins: unsigned modes, long offset, long freq, long maxerror, long esterror, int status.
-    status = ctypes.c_int.from_buffer(buffer, 40).value
-    if state < 0:
-        return Check("clock", "warning", f"source {name}; its state cannot be asked: {os.strerror(ctypes.get_errno())}")
-    if state == _TIME_ERROR or status & _UNSYNCHRONISED:
+    try:
+        state = clock_state()
+    except OSError as error:
+        return Check("clock", "warning", f"source {name}; its state cannot be asked: {error.strerror}")
+    if not state.synchronised:
         return Check(
             "clock", "warning", f"source {name}, not synchronised: run chrony, or times of several machines drift apart"
         )
-    return Check("clock", "ok", f"source {name}, synchronised")
+    error_ms, offset = state.error_us * 1e-3, state.offset_us
+    return Check("clock", "ok", f"source {name}, synchronised, {offset:+.1f} us off, error about {error_ms:.3g} ms")
 
 
 def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:

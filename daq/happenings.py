@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from configs import ArmidentError
 from daq.assembler import Assembler
+from daq.journal import Line
 from daq.order import Order
 from daq.sink import Sink
 from drivers.master import DriveEvent
@@ -36,7 +37,7 @@ class Happenings:
         """Whether the arm is moved: what fails then ends the capture."""
         trigger = order.session.recording.trigger
         self.triggers: tuple[str, ...] = () if trigger is None else trigger.events
-        self._assembler, self._sink, self._say = assembler, sink, say
+        self._order, self._assembler, self._sink, self._say = order, assembler, sink, say
         self._told: set[tuple[str, str]] = set()
         self._patience = max(SYNC_STOPPED_S, SYNC_STOPPED * order.session.sync_period)
         self._sync_before, self._sync_came, self._stopped = -1, 0.0, False
@@ -53,7 +54,8 @@ class Happenings:
         if kind in self.counts:
             self.counts[kind] += 1
         self._sink.mark(kind if kind in ("emcy", "heartbeat_lost") else "note", self._sync, event.text)
-        self._say(event.text)
+        about = {"event": kind, "axis": event.joint, "node": event.node_id, "sync": self._sync}
+        self._say(Line(event.text, **about, code=event.code or None))
         if kind in self.triggers:
             self._sink.trigger()
         if kind in ("heartbeat_lost", "rebooted", "mapping_changed") or (kind == "emcy" and event.code != 0):
@@ -72,7 +74,8 @@ class Happenings:
         if event.kind in ("bus_down", "bus_up"):
             self._assembler.silence(event.bus, event.kind == "bus_down")
         self._sink.mark("note", self._sync, event.text)
-        self._say(event.text)
+        channel = self._order.session.all_buses[event.bus].channel
+        self._say(Line(event.text, event=event.kind, bus=channel, sync=self._sync))
         if "bus" in self.triggers:
             self._sink.trigger()
         if event.kind in ("bus_down", "bus_off"):
@@ -101,7 +104,7 @@ class Happenings:
             self._told.add((stream, joint))
             text = f"{joint}: TPDO of {stream} has another length than mapped; was its mapping changed?"
             self._sink.mark("note", self._sync, text)
-            self._say(f"warning: {text}")
+            self._say(Line(f"warning: {text}", event="mapping", axis=joint, stream=stream, sync=self._sync))
 
     @property
     def _sync(self) -> int:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from daq.assembler import Assembler
+from daq.clock import clock_state
 from daq.jitter import SyncJitter, worst
 from daq.metrics import Metrics, Value
 from daq.order import Order
@@ -72,6 +73,7 @@ class Health:
             "disk_free_bytes": free_space(self._order.directory),
             "blocks_dropped": self._publisher.dropped,
             "events_dropped": self._publisher.events_dropped,
+            **_clock(),
             **events,
         }
         for name, value in worst(self._jitters).items():
@@ -90,3 +92,17 @@ class Health:
         elif lost == before and not self._writing:
             self._say(f"writing again; {lost} rows were not written")
         self._writing = lost == before
+
+
+def _clock() -> dict[str, Value]:
+    """The state of the system clock, which stamps the frames where their hardware does not."""
+    try:
+        state = clock_state()
+    except OSError:
+        return {}
+    return {
+        "clock_synchronised": int(state.synchronised),
+        "clock_offset_us": round(state.offset_us, 3),
+        "clock_error_us": round(state.error_us, 1),
+        "clock_largest_error_us": round(state.largest_error_us, 1),
+    }
