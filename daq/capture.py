@@ -10,16 +10,17 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from configs import ArmidentError
+from configs import ArmidentError, SessionConfig
 from configs.session import Bus
 from daq.facts import host_facts
 from daq.journal import Line, Voice
 from daq.order import Order, prepare
 from daq.publisher import Publisher
 from daq.recorder import Recorder
-from daq.recording import Mark
+from daq.recording import Mark, RecordingSeries, TriggeredSeries
+from daq.reload import Change, Reloader
 from daq.sink import Sink
-from daq.storage import capture_stamp, kept_tidy, open_series
+from daq.storage import Tidiness, capture_stamp, limits, open_series
 from daq.systemd import Notifier
 from daq.zenoh_keys import Keys
 from drivers.frames import FrameBus
@@ -40,7 +41,11 @@ class Captured:
 
 
 def capture(
-    order: Order, stop: threading.Event, say: Callable[[str], None], save: threading.Event | None = None
+    order: Order,
+    stop: threading.Event,
+    say: Callable[[str], None],
+    save: threading.Event | None = None,
+    reload: threading.Event | None = None,
 ) -> Captured:
     """Run one capture from the first SDO to the finished file.
 
@@ -54,6 +59,8 @@ def capture(
         Takes lines that tell how it goes.
     save
         Set it to have the last seconds written, where only events are.
+    reload
+        Set it to have the configuration read again, where the order has a file.
 
     Returns
     -------
@@ -78,7 +85,7 @@ def capture(
         notifier = stack.enter_context(closing(Notifier()))
         writer = open_series(session, robot, order.streams, order.directory, name, metadata)
         stack.callback(writer.__exit__, None, None, None)
-        stack.enter_context(kept_tidy(session.recording, order.directory, robot.name, say))
+        tidiness = stack.enter_context(Tidiness(session.recording, order.directory, robot.name, say))
         try:
             if session.all_buses[0].interface == "udp_multicast":
                 say(NOTE)
@@ -98,6 +105,10 @@ def capture(
         except BaseException:
             writer.abort()
             raise
+        if order.config is not None:
+            changes = (run.health.change, publisher.change, _exchange_limits(writer, tidiness))
+            reloader = stack.enter_context(closing(Reloader(order.config, order, changes, say)))
+            _connect(run, reloader, reload or threading.Event(), notifier, session.cell)
         run.sink.announce(robot, session, rate, metadata)
         trigger = session.recording.trigger
         if trigger is None:
@@ -112,6 +123,33 @@ def capture(
         if writer.problem is not None:
             say(f"warning: {writer.lost_rows} rows not written: {writer.problem}")
         return Captured(tuple(writer.paths), counters, tuple(run.sink.marks), trouble)
+
+
+def _exchange_limits(writer: RecordingSeries | TriggeredSeries, tidiness: Tidiness) -> Change:
+    """Changes when files are full, and how long they are kept."""
+
+    def change(session: SessionConfig) -> None:
+        writer.limit(*limits(session.recording))
+        tidiness.options = session.recording
+
+    return change
+
+
+def _connect(run: Recorder, reloader: Reloader, asked: threading.Event, notifier: Notifier, cell: str) -> None:
+    """Have a capture read its configuration again when it is asked to, by signal or by command."""
+
+    def ask() -> None:
+        notifier.reloading()
+        reloader.ask()
+        notifier.ready(f"{cell}: recording")
+
+    def between() -> None:
+        if asked.is_set():
+            asked.clear()
+            ask()
+        reloader.apply()
+
+    run.reload, run.between = ask, between
 
 
 def _opener(bus: Bus, number: int, order: Order) -> Callable[[], FrameBus]:
@@ -139,12 +177,13 @@ def run_capture(
     say = Voice({})
     order = prepare(config, out, duration, listen_only, sniff_s, say)
     say.fields = {"cell": order.session.cell, "robot": order.robot.name}
-    stop, save = threading.Event(), threading.Event()
+    stop, save, reload = threading.Event(), threading.Event(), threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: save.set())
+    signal.signal(signal.SIGHUP, lambda *_: reload.set())
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
 
-    done = capture(order, stop, say, save)
+    done = capture(order, stop, say, save, reload)
     rows, gaps = done.counters["samples.rows"], done.counters["samples.in_gaps"]
     drops = done.counters["kernel_drops"]
     text = f"recorded {rows} samples, {gaps} in gaps, {drops} frames dropped by the kernel"

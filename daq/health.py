@@ -1,8 +1,11 @@
 """How a capture does, once a second: on Zenoh, for Prometheus, and in words where the disk refuses."""
 
+import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 
+from configs import SessionConfig
+from configs.session import MetricsOptions
 from daq.assembler import Assembler
 from daq.clock import clock_state
 from daq.jitter import SyncJitter, worst
@@ -40,16 +43,41 @@ class Health:
         self._order, self._assembler, self._receiver, self._jitters = order, assembler, receiver, jitters
         self._sink, self._publisher, self._say = sink, publisher, say
         self._metrics: Metrics | None = None
+        self._served = order.session.metrics
         self._frames_before = self._lost_rows = 0
         self._writing = True
 
     def serve(self, stack: ExitStack) -> None:
         """Serve metrics where the session asks for it, until the stack unwinds."""
-        options, session = self._order.session.metrics, self._order.session
-        if options.port is not None:
-            labels = {"cell": session.cell, "robot": self._order.robot.name}
-            self._metrics = stack.enter_context(Metrics(options.address, options.port, labels))
-            self._say(f"metrics on http://{options.address}:{self._metrics.port}/metrics")
+        stack.callback(self._exchange, None)
+        self._exchange(self._opened(self._served))
+
+    def change(self, session: SessionConfig) -> None:
+        """Serve metrics where a changed session asks for it.
+
+        Raises
+        ------
+        ConfigError
+            If the port cannot be had; they are served where they were then.
+        """
+        if session.metrics != self._served:
+            fresh = self._opened(session.metrics)
+            # Closing waits for the server's thread.
+            threading.Thread(target=self._exchange, args=(fresh,), name="metrics", daemon=True).start()
+            self._served = session.metrics
+
+    def _opened(self, options: MetricsOptions) -> Metrics | None:
+        if options.port is None:
+            return None
+        labels = {"cell": self._order.session.cell, "robot": self._order.robot.name}
+        metrics = Metrics(options.address, options.port, labels)
+        self._say(f"metrics on http://{options.address}:{metrics.port}/metrics")
+        return metrics
+
+    def _exchange(self, fresh: Metrics | None) -> None:
+        old, self._metrics = self._metrics, fresh
+        if old is not None:
+            old.close()
 
     def report(self, seconds: float, events: dict[str, int]) -> None:
         """Say how the last ``seconds`` were; ``events`` are counts since the start."""
@@ -79,8 +107,9 @@ class Health:
         for name, value in worst(self._jitters).items():
             health[f"sync_jitter_{name.replace('.', '_')}_us"] = round(value, 1)
         self._publisher.health(health)
-        if self._metrics is not None:
-            self._metrics.update(health)
+        metrics = self._metrics
+        if metrics is not None:
+            metrics.update(health)
         self._publisher.status({"state": "recording", "sync": self._assembler.last_sync})
 
     def _tell_of_disk(self) -> None:

@@ -23,6 +23,8 @@ class Order:
     directory: Path
     duration: float | None = None
     listen_only: bool = False
+    config: str | Path | None = None
+    """The file of the session, where it may be read again."""
 
     @property
     def producing(self) -> bool:
@@ -79,4 +81,5 @@ def prepare(
         trajectory = load_trajectory(session.setpoints.trajectory)
         trajectory.check(robot, str(session.setpoints.trajectory))
     directory = out if out is not None else session.recording.directory
-    return Order(session, robot, captured_streams(session, robot), trajectory, directory, duration, listen_only)
+    streams, again = captured_streams(session, robot), None if sniff_s is not None else config
+    return Order(session, robot, streams, trajectory, directory, duration, listen_only, again)

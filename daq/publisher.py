@@ -66,6 +66,11 @@ class Publisher:
         """Blocks waiting."""
         return self._waiting
 
+    def change(self, session: SessionConfig) -> None:
+        """Take over what may change of a session: the length of the queue, and whether commands are obeyed."""
+        self._limit = session.zenoh.queue_blocks
+        self.commands.allowed = session.zenoh.commands
+
     def offer(self, block: Block) -> None:
         """Queue a block, or drop it where the queue is full; never waits for a listener."""
         with self._ready:

@@ -67,12 +67,16 @@ class Recorder:
         self._assembler.warm_up(receiver.warm_up())
         self._jitters = [SyncJitter(period_ns, overflow) for _ in receiver.channels]
         self._happenings = Happenings(order, self._assembler, sink, say)
-        self._health = Health(order, self._assembler, receiver, self._jitters, sink, publisher, say)
+        self.health = Health(order, self._assembler, receiver, self._jitters, sink, publisher, say)
         self._producer: SyncProducer | KernelSync | None = None
         self._master: DriveMaster | None = None
         self._motion: Motion | None = None
         self._span: tuple[int, int] | None = None
         self._save = save
+        self.between: Callable[[], None] = lambda: None
+        """Called between two looks at the bus."""
+        self.reload: Callable[[], None] = lambda: None
+        """Called when somebody asks for the configuration to be read again."""
         self._fed = -math.inf
         self._refused: float | None = None
         self._suspect: dict[str, tuple[int, int]] = {}
@@ -80,7 +84,7 @@ class Recorder:
     def start(self, stack: ExitStack) -> None:
         """Configure and enable the drives, and start SYNC; whatever was started is stopped when the stack unwinds."""
         order, session = self._order, self._order.session
-        self._health.serve(stack)
+        self.health.serve(stack)
         if order.listen_only:
             return
         self._master = stack.enter_context(DriveMaster(session, order.robot))
@@ -169,7 +173,7 @@ class Recorder:
             now = time.monotonic()
             if now - reported >= HEALTH_S:
                 self._happenings.look_for_other_mappings()
-                self._health.report(now - reported, self._happenings.counts)
+                self.health.report(now - reported, self._happenings.counts)
                 reported = now
             if deadline is not None and now > deadline and self._assembler.last_sync < 0:
                 names = ", ".join(self._receiver.channels)
@@ -221,7 +225,11 @@ class Recorder:
         if self._save.is_set():
             self._save.clear()
             asked.append(Command("save", "SIGUSR1"))
+        self.between()
         for command in asked:
+            if command.name == "reload":
+                self.reload()
+                continue
             if command.name == "stop":
                 self._say("stopped by a command")
                 self._stop.set()

@@ -1,4 +1,4 @@
-"""Commands to a running capture over Zenoh: save what was just recorded, set a mark, stop."""
+"""Commands to a running capture over Zenoh: save what was just recorded, set a mark, reload, stop."""
 
 import queue
 import time
@@ -10,7 +10,7 @@ import zenoh
 from configs import ArmidentError, ConfigError, DataError, SessionConfig
 from daq.zenoh_keys import Keys, open_session
 
-CommandName = Literal["save", "mark", "stop"]
+CommandName = Literal["save", "mark", "reload", "stop"]
 COMMANDS: tuple[CommandName, ...] = get_args(CommandName)
 _LONGEST_TEXT = 500
 _MOST_WAITING = 32
@@ -42,7 +42,7 @@ class Commands:
 
     def __init__(self, zenoh_session: zenoh.Session, keys: Keys, allowed: bool) -> None:
         self._waiting: queue.SimpleQueue[Command] = queue.SimpleQueue()
-        self._allowed = allowed
+        self.allowed = allowed
         self._queryable = zenoh_session.declare_queryable(keys.command("*"), self._answer)
 
     def pending(self) -> list[Command]:
@@ -58,7 +58,7 @@ class Commands:
             known = next((command for command in COMMANDS if command == name), None)
             # Nothing is made of what a query carries before it is known to be wanted.
             size = 0 if query.payload is None else len(query.payload)
-            if not self._allowed:
+            if not self.allowed:
                 query.reply_err("commands are not enabled: zenoh.commands in the session configuration")
             elif known is None:
                 query.reply_err(f"no command {name[:40]!r}; there are {', '.join(COMMANDS)}")

@@ -2,9 +2,9 @@
 
 import datetime
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Self
 
 from configs import RobotConfig, SessionConfig
 from configs.session import RecordingOptions
@@ -38,8 +38,7 @@ def open_series(
         rate = 1.0 / session.sync_period
         return RecordingWriter(path, robot, session, rate, layouts, facts, chunk_ns, options.look_hz)
 
-    max_bytes = None if options.rotate_mb is None else round(options.rotate_mb * 1e6)
-    max_ns = None if options.rotate_minutes is None else round(options.rotate_minutes * 60e9)
+    max_bytes, max_ns = limits(options)
     if options.trigger is None:
         return RecordingSeries(begin, directory, name, max_bytes, max_ns)
 
@@ -49,6 +48,13 @@ def open_series(
 
     before, after = (round(seconds * 1e9) for seconds in (options.trigger.before_s, options.trigger.after_s))
     return TriggeredSeries(event, before, after)
+
+
+def limits(options: RecordingOptions) -> tuple[int | None, int | None]:
+    """Bytes and ns at which a file is full."""
+    max_bytes = None if options.rotate_mb is None else round(options.rotate_mb * 1e6)
+    max_ns = None if options.rotate_minutes is None else round(options.rotate_minutes * 60e9)
+    return max_bytes, max_ns
 
 
 def free_space(directory: Path) -> int | None:
@@ -65,16 +71,35 @@ def capture_stamp(now: datetime.datetime) -> str:
     return f"{now:%Y%m%dT%H%M%S}-{now.microsecond // 1000:03d}Z"
 
 
-@contextmanager
-def kept_tidy(options: RecordingOptions, directory: Path, robot: str, say: Callable[[str], None]) -> Iterator[None]:
-    """Delete old recordings of a robot meanwhile, if the options say so."""
-    if options.keep_days is None and options.min_free_gb is None:
-        yield
-        return
-    least = None if options.min_free_gb is None else options.min_free_gb * 1e9
+class Tidiness:
+    """Deletes old recordings of a robot meanwhile, if the options say so; use it in a ``with`` block.
 
-    def look() -> list[Path]:
-        return prune(directory, robot, datetime.datetime.now(datetime.UTC), options.keep_days, least)
+    Parameters
+    ----------
+    options
+        How long recordings are kept, and how much space is left; may be exchanged at any time.
+    directory, robot
+        Whose recordings.
+    say
+        Takes lines.
+    """
 
-    with closing(Janitor(look, say)):
-        yield
+    def __init__(self, options: RecordingOptions, directory: Path, robot: str, say: Callable[[str], None]) -> None:
+        self.options = options
+        self._directory, self._robot = directory, robot
+        self._janitor = Janitor(self._look, say)
+
+    def _look(self) -> list[Path]:
+        options = self.options
+        if options.keep_days is None and options.min_free_gb is None:
+            return []
+        least = None if options.min_free_gb is None else options.min_free_gb * 1e9
+        return prune(self._directory, self._robot, datetime.datetime.now(datetime.UTC), options.keep_days, least)
+
+    def __enter__(self) -> Self:
+        """Begin to look."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop looking."""
+        self._janitor.close()

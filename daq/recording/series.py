@@ -71,6 +71,10 @@ class RecordingSeries:
         """What went wrong last, in words."""
         return self._writer.problem or self._problem
 
+    def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
+        """Change when a file is full."""
+        self._max_bytes, self._max_ns = max_bytes, max_ns
+
     def turn(self, t_ns: int) -> Path | None:
         """Begin a new file if the last is full at ``t_ns``, the time of the rows to come; the one that was finished."""
         if self._since is None:

@@ -53,6 +53,13 @@ class TriggeredSeries:
         self._not_before: int | None = None
         self._lost_before = 0
         self._problem: str | None = None
+        self._limits: tuple[int | None, int | None] | None = None
+
+    def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
+        """Change when a file of an event is full."""
+        self._limits = max_bytes, max_ns
+        if self._series is not None:
+            self._series.limit(max_bytes, max_ns)
 
     @property
     def path(self) -> Path | None:
@@ -158,6 +165,8 @@ class TriggeredSeries:
         except ConfigError as error:
             self._problem, self._not_before = str(error), t_ns + RETRY_NS
             return
+        if self._limits is not None:
+            series.limit(*self._limits)
         self._events += 1
         self._series, self._not_before = series, None
         for entry in self._kept:
