@@ -2,10 +2,12 @@
 
 import datetime
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+import sqlalchemy as sa
 from typer.testing import CliRunner
 
 from configs import ConfigError
@@ -40,7 +42,16 @@ def call(*arguments: str) -> tuple[int, str, str]:
 
 @pytest.fixture
 def url(tmp_path: Path) -> str:
-    return f"sqlite:///{tmp_path}/h.sqlite"
+    """An empty database: SQLite, or the PostgreSQL that ARMIDENT_TEST_POSTGRES names, whose tables are dropped."""
+    given = os.environ.get("ARMIDENT_TEST_POSTGRES")
+    if given is None:
+        return f"sqlite:///{tmp_path}/h.sqlite"
+    engine = sa.create_engine(given)
+    tables = sa.MetaData()
+    tables.reflect(engine)
+    tables.drop_all(engine)
+    engine.dispose()
+    return given
 
 
 def test_a_result_is_kept_once_and_comes_back_as_it_was(url: str, tmp_path: Path) -> None:

@@ -1,0 +1,65 @@
+"""A capture on a real bus takes over a changed configuration, refuses another, and loses no SYNC over either."""
+
+import json
+import os
+import signal
+import subprocess
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.recording import join_parts, read_recording
+from tests.integration.test_capture_vcan import robot, run, session_file, wait_for_file
+
+__all__ = ["robot"]
+pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
+
+COUNTED = ("samples.expected", "samples.rows", "samples.in_gaps", "kernel_drops")
+
+
+def told(process: "subprocess.Popen[str]", word: str) -> Iterator[str]:
+    """Lines of stderr up to one with a word."""
+    assert process.stderr is not None
+    for line in process.stderr:
+        yield line
+        if word in line:
+            return
+
+
+@pytest.mark.usefixtures("robot")
+def test_no_sync_is_lost_over_a_reload(vcan_bus: str, tmp_path: Path) -> None:
+    plain = {"setpoints": None, "sync": {"role": "producer", "period_us": 1000, "counter": 240}}
+    session_file(tmp_path, vcan_bus, "reloaded", **plain)
+    process = run("capture", "--config", tmp_path / "reloaded.yaml", "--out", tmp_path / "out", "--json")
+    wait_for_file(tmp_path / "out", 50_000, process)
+
+    session_file(tmp_path, vcan_bus, "reloaded", **plain, recording={"rotate_minutes": 0.01}, metrics={"port": 0})
+    os.kill(process.pid, signal.SIGHUP)
+    lines = list(told(process, "reloaded"))
+    assert lines[-1].endswith("reloaded.yaml: metrics.port, recording.rotate_minutes\n")
+    (address,) = [line.split()[-1] for line in lines if line.startswith("metrics on")]
+
+    session_file(tmp_path, vcan_bus, "reloaded", **(plain | {"heartbeat_ms": 77}))
+    os.kill(process.pid, signal.SIGHUP)
+    *_, refused = told(process, "not reloaded")
+    assert refused.endswith("reloaded.yaml: heartbeat_ms: cannot change while it is captured\n")
+
+    wait_for_file(tmp_path / "out", 50_000, process)
+    directly = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    deadline = 100
+    while deadline and b"armident_clock_synchronised" not in directly.open(address, timeout=10).read():
+        deadline -= 1
+    assert deadline
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=200)
+    assert process.returncode == 0, err
+    document = json.loads(out)
+    recording = join_parts([read_recording(path) for path in document["recordings"]])
+    expected, rows, gaps, drops = (document["counters"][name] for name in COUNTED)
+    assert expected == rows == document["counters"]["sync_sent"]
+    assert gaps == drops == 0
+    assert len(document["recordings"]) > 1
+    assert np.array_equal(recording.samples.sync, np.arange(rows))
