@@ -314,12 +314,10 @@ class DriveMaster:
             difference = mapping_differs(sdo, self._session)
         except ArmidentError as error:
             log.debug("%s", error)
-        finally:
-            self._reviving.pop(sdo.drive.joint, None)
         if difference is not None:
             self._report("mapping_changed", sdo, since, f"its PDO mapping was changed: {difference}")
             self._distrust(sdo, since)
-            self._begin(self._revive, sdo)
+        self._end(sdo)
 
     def _revive(self, sdo: DriveSdo) -> None:
         """Configure and start a drive that has booted again, or that somebody else has configured otherwise."""
@@ -339,7 +337,13 @@ class DriveMaster:
                     self.suspect = {**self.suspect, joint: (self.suspect[joint][0], time.time_ns())}
                 self._report("configured", sdo, time.time_ns(), "configured again, and started")
         finally:
-            self._reviving.pop(joint, None)
+            self._end(sdo)
+
+    def _end(self, sdo: DriveSdo) -> None:
+        """Be done with a drive, unless its mapping is not what it should be by now."""
+        self._reviving.pop(sdo.drive.joint, None)
+        if self._started and self.suspect.get(sdo.drive.joint, (0, 0))[1] == NEVER:
+            self._begin(self._revive, sdo)
 
     def _configured_again(self, sdo: DriveSdo) -> bool:
         """Configure and start a drive once more; ``False`` if its bus went down meanwhile, or somebody else wrote.

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import can
 import canopen
 from canopen.nmt import NmtSlave
 from canopen.objectdictionary import ODArray
@@ -111,6 +112,13 @@ class Nmt(NmtSlave):
     def resume(self) -> None:
         """Start the heartbeat (1017h)."""
         self.start_heartbeat(int.from_bytes(self._local_node.get_data(HEARTBEAT_PRODUCER, 0), "little"))
+
+    def stop_heartbeat(self) -> None:
+        """Stop the heartbeat, also where the bus that it was on is closed by now."""
+        try:
+            super().stop_heartbeat()
+        except (can.CanError, OSError):
+            self._send_task = None
 
     def halt(self) -> None:
         """Stop the heartbeat."""

@@ -31,7 +31,7 @@ from daq.recording.model import join_parts
 from drivers.vcan import ensure_vcan, remove_vcan
 from tests.faults.check import violations
 from tests.faults.farm import Farm
-from tests.faults.plan import FAULTS, Outcome, Room, chosen
+from tests.faults.plan import FAULTS, HANDFUL, Outcome, Plan, Room, chosen
 from tests.faults.recorder import Capture, Recorders, result, said, warm
 
 PERIOD_US = 1000
@@ -48,6 +48,7 @@ SLOW = {
     "heartbeat": 0.5,
     "sync_stops": 0.6,
     "disk_full": 0.4,
+    "rotation": 0.5,
 }
 """What takes longer than others, s."""
 
@@ -69,14 +70,21 @@ class Round:
 
 
 def session_file(
-    folder: Path, name: str, channels: Sequence[str], producing: bool, rotating: bool, period_us: int = PERIOD_US
+    folder: Path,
+    name: str,
+    channels: Sequence[str],
+    producing: bool,
+    rotating: bool,
+    period_us: int = PERIOD_US,
+    demand: bool = True,
 ) -> Path:
     """A session of six drives on some buses."""
     source = config_path("tx40_replay.yaml")
     data = yaml.safe_load(source.read_text())
     data |= {"cell": name, "robot": str(source.parent / data["robot"]), "heartbeat_ms": 50, "sdo_timeout_s": 1.0}
     data["sync"] = {"role": "producer" if producing else "consumer", "period_us": period_us, "counter": 240}
-    data["streams"]["demand"] = {"tpdo": 2, "every": 5, "objects": ["demand"]}
+    if demand:
+        data["streams"]["demand"] = {"tpdo": 2, "every": 5, "objects": ["demand"]}
     data["recording"] = {"rotate_minutes": 0.25 / 60} if rotating else {}
     del data["bus"]
     data["buses"] = [{"channel": channel, "bitrate": None} for channel in channels]
@@ -120,10 +128,10 @@ class Lane:
             remove_vcan(channel)
         shutil.rmtree(self._folder)
 
-    def run(self, number: int, only: Sequence[str] = ()) -> Round:
-        """One round."""
+    def run(self, number: int, plan: Plan | None = None, only: Sequence[str] = ()) -> Round:
+        """One round: as planned, or at random."""
         rng = np.random.default_rng([self._seed, number])
-        faults, producing, buses = chosen(rng, number, only)
+        faults, producing, buses = chosen(rng, number, only) if plan is None else plan
         farm = self._farms[buses]
         farm.master = not producing
         seconds = 1.0 + max([SLOW.get(name, 0.0) for name in faults])
@@ -194,7 +202,7 @@ def _shape(producing: bool, buses: int) -> str:
     return f"{'own' if producing else 'foreign'} SYNC, {buses} bus{'es' if buses > 1 else ''}"
 
 
-def in_lanes(rounds: int, seed: int, lanes: int, only: Sequence[str] = ()) -> list[Round]:
+def in_lanes(rounds: int, seed: int, lanes: int, plans: Sequence[Plan] = (), only: Sequence[str] = ()) -> list[Round]:
     """Rounds in several processes at once: most of their time is spent waiting."""
     warm()
     sys.setswitchinterval(SWITCH_S)
@@ -209,7 +217,7 @@ def in_lanes(rounds: int, seed: int, lanes: int, only: Sequence[str] = ()) -> li
         lane = Lane(name, seed)
         try:
             while (number := numbers.get()) is not None:
-                done.put(lane.run(number, only))
+                done.put(lane.run(number, plans[number] if plans else None, only))
         finally:
             lane.close()
 
@@ -258,16 +266,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.faults.bus", description=__doc__)
     parser.add_argument("--rounds", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--lanes", type=int, default=3, help="captures at once")
+    parser.add_argument("--lanes", type=int, default=2, help="captures at once")
+    parser.add_argument("--handful", action="store_true", help="a few rounds that have every fault once")
     parser.add_argument("--only", action="append", default=[], choices=list(FAULTS), help="these faults alone")
     options = parser.parse_args()
     begin = time.monotonic()
-    rounds = in_lanes(options.rounds, options.seed, options.lanes, options.only)
+    plans = HANDFUL if options.handful else ()
+    wanted = len(plans) or options.rounds
+    rounds = in_lanes(wanted, options.seed, options.lanes, plans, options.only)
     bad = show(rounds)
     print(
         f"\n{len(rounds)} rounds in {time.monotonic() - begin:.0f} s, seed {options.seed}; {bad} with something wrong"
     )
-    return int(bad > 0 or len(rounds) != options.rounds)
+    return int(bad > 0 or len(rounds) != wanted)
 
 
 if __name__ == "__main__":

@@ -237,7 +237,7 @@ class Farm:
             seen = []
             for lane in self.lanes:
                 assert lane.witness is not None
-                seen.append(_drained(lane.witness))
+                seen.append(drained(lane.witness))
                 lane.witness.close()
                 lane.witness = None
             return seen
@@ -390,7 +390,8 @@ class Farm:
             if lane.was_down:
                 elapsed = (stamp - lane.stamp) / (self._period * 1e9)
                 step += COUNTER * max(0, round((elapsed - step) / COUNTER))
-                lane.was_down = False
+                # What had come before it went down is read when it is back.
+                lane.was_down = step == 1
         lane.last += step
         lane.counter, lane.stamp = counter, stamp
         lane.ledger.append(lane.last)
@@ -520,7 +521,7 @@ def _value(index: int, k: int, j: int, size: int, word: int) -> bytes:
     return int(value).to_bytes(size, "little", signed=value < 0)
 
 
-def _drained(witness: RawSocket) -> NDArray[np.int64]:
+def drained(witness: RawSocket) -> NDArray[np.int64]:
     """All that a socket has: time and counter of each SYNC (N, 2)."""
     batch, found = frames(4096), []
     while True:

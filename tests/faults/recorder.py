@@ -76,10 +76,16 @@ class Recorders:
         answering.close()
 
     def start(
-        self, session: Path, out: Path, log: Path, duration: float | None = None, receive_buffer: int | None = None
+        self,
+        session: Path,
+        out: Path,
+        log: Path,
+        duration: float | None = None,
+        receive_buffer: int | None = None,
+        listen_only: bool = False,
     ) -> Capture:
         """Begin a capture; what it prints goes to ``log`` with ``.out`` and ``.err`` added."""
-        return Capture(self._ask((session, out, log, duration, receive_buffer)), self._ask)
+        return Capture(self._ask((session, out, log, duration, receive_buffer, listen_only)), self._ask)
 
     def _ask(self, what: Any) -> Any:
         self._asking.send(what)
@@ -128,7 +134,9 @@ def result(log: Path) -> tuple[list[Path], dict[str, int]]:
     return [Path(path) for path in document["recordings"]], document["counters"]
 
 
-def _record(session: Path, out: Path, log: Path, duration: float | None, receive_buffer: int | None) -> None:
+def _record(
+    session: Path, out: Path, log: Path, duration: float | None, receive_buffer: int | None, listen_only: bool
+) -> None:
     for number, suffix in ((1, ".out"), (2, ".err")):
         descriptor = os.open(log.with_suffix(suffix), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         os.dup2(descriptor, number)
@@ -138,7 +146,7 @@ def _record(session: Path, out: Path, log: Path, duration: float | None, receive
         assert RawSocket.__init__.__kwdefaults__ is not None
         RawSocket.__init__.__kwdefaults__["receive_buffer"] = receive_buffer
     try:
-        run_capture(str(session), out, duration, False, True)
+        run_capture(str(session), out, duration, listen_only, True)
     except ArmidentError as error:
         print(f"armident: {error}", file=sys.stderr, flush=True)
         os._exit(error.exit_code)

@@ -1,0 +1,156 @@
+"""An hour in minutes: ``python -m tests.faults.hour --hours 1``.
+
+A capture gets the frames of six drives at 5 kHz as fast as it takes them, from a bus that makes them up: recorder,
+matching, files (turned over, and deleted when they are finished), Zenoh and health are the real ones. Prints its memory
+all along. Needs no vcan.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import tempfile
+import threading
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+import daq.capture
+from configs import ArmidentError
+from configs.session import Bus
+from daq.order import prepare
+from drivers.frames import Frames, frames
+from drivers.objects import COB_SYNC
+from tests.faults.bus import session_file
+from tests.faults.sender import COUNTER, current_of, position_of
+from tests.faults.soak import memory_mb
+
+RATE_HZ = 5000
+BLOCK = 500
+"""SYNCs in one go: with six answers each less than a batch."""
+
+
+class MadeUp:
+    """A bus on which six drives answer ``count`` SYNCs at once."""
+
+    channel, dropped, fd, stamps, up, bound = "made-up", 0, False, "software", True, True
+
+    def __init__(self, count: int) -> None:
+        self.sent, self._count = 0, count
+        self._begin_ns = time.time_ns()
+        self._block = frames(7 * BLOCK).reshape(BLOCK, 7)
+        self._block["can_id"] = [COB_SYNC, *range(0x181, 0x187)]
+        self._block["length"] = [1, *[8] * 6]
+        self._asked = 0
+
+    def receive(self, batch: Frames) -> int:
+        """The frames of the next SYNCs; none every now and then, as a bus that has been read empty."""
+        self._asked += 1
+        n = min(BLOCK, self._count - self.sent)
+        if not n or self._asked % 2 == 0:
+            return 0
+        k = self.sent + np.arange(n)[:, None]
+        block = self._block[:n]
+        block["t_ns"] = self._begin_ns + k * (10**9 // RATE_HZ)
+        block["data"][:, 0, 0] = k[:, 0] % COUNTER + 1
+        words = block["data"].view("<i4")
+        words[:, 1:, 0] = position_of(k, np.arange(6))
+        words[:, 1:, 1] = current_of(k, np.arange(6))
+        batch[: 7 * n] = block.reshape(-1)
+        self.sent += n
+        return 7 * n
+
+    def poll(self, timeout: float) -> bool:
+        """There always is something."""
+        return True
+
+    def send(self, frames: Frames) -> int:
+        """Nobody listens."""
+        return frames.size
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+
+def main() -> int:
+    """Run it; 1 if anything is missing, or memory grew by more than 5 % after the first quarter."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults.hour", description=__doc__)
+    parser.add_argument("--hours", type=float, default=1.0)
+    options = parser.parse_args()
+    count = round(options.hours * 3600 * RATE_HZ)
+    memory = Path("/dev/shm")
+    folder = Path(tempfile.mkdtemp(prefix="armident-hour-", dir=memory if memory.is_dir() else None))
+    try:
+        session = session_file(folder, "hour", ["vcan0"], False, False, 10**6 // RATE_HZ, demand=False)
+        text = session.read_text().replace("recording: {}", "recording: {rotate_mb: 20, drain_ms: 1}")
+        session.write_text(text)
+        order = replace(prepare(session, folder / "out", None, True))
+        return watched(order, MadeUp(count), count, folder)
+    finally:
+        shutil.rmtree(folder)
+
+
+def watched(order: daq.capture.Order, bus: MadeUp, count: int, folder: Path) -> int:
+    """Capture in this process while another thread looks at memory and makes room."""
+
+    def open_bus(config: Bus, **_: object) -> MadeUp:
+        return bus
+
+    stop, ended = threading.Event(), threading.Event()
+    memory: list[tuple[float, float]] = []
+    deleted: set[Path] = set()
+
+    def look() -> None:
+        step = count / 40
+        while not ended.wait(0.05):
+            if bus.sent >= len(memory) * step:
+                memory.append((bus.sent / RATE_HZ / 60, memory_mb(os.getpid())))
+            files = sorted((folder / "out").glob("*.mcap"))
+            for path in files[:-2]:
+                with suppress(OSError):
+                    path.unlink()
+                deleted.add(path)
+            if bus.sent >= count:
+                time.sleep(0.5)
+                stop.set()
+
+    # The one thing that is not real: where the frames come from.
+    setattr(daq.capture, "open_bus", open_bus)  # noqa: B010
+    watcher = threading.Thread(target=look)
+    watcher.start()
+    begin, cpu = time.monotonic(), time.process_time()
+    try:
+        done = daq.capture.capture(order, stop, lambda line: None)
+    finally:
+        ended.set()
+        watcher.join()
+    if done.trouble is not None:
+        raise ArmidentError(str(done.trouble))
+    wall, used = time.monotonic() - begin, time.process_time() - cpu
+    rows = done.counters["samples.rows"]
+    print(
+        f"{count} SYNCs, {7 * count} frames ({count / RATE_HZ / 60:.1f} min) in {wall:.0f} s, CPU {used:.0f} s;",
+        end=" ",
+    )
+    print(f"rows {rows}, in gaps {done.counters['samples.in_gaps']}, files {len(done.paths)}")
+    print(
+        "memory, MB, at minute: " + ", ".join(f"{m:.1f} ({at:.0f})" for at, m in memory[:: max(1, len(memory) // 10)])
+    )
+    settled = memory[len(memory) // 4][1]
+    print(json.dumps({"settled_mb": settled, "end_mb": memory[-1][1], "most_mb": max(m for _, m in memory)}))
+    return int(rows != count or memory[-1][1] > 1.05 * settled)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

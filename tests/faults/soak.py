@@ -1,0 +1,112 @@
+"""A long capture under full load: ``python -m tests.faults.soak --seconds 600``.
+
+Six buses with SYNC and a drive each at 5 kHz, sent by one process from prepared frames (a virtual arm beside it is more
+than a guest with one CPU can do), recorded by ``armident capture --listen-only``. Afterwards every SYNC that was
+sent has to be a row with the values of its SYNC. Prints rows, gaps, drops, CPU and memory over time. Runs under
+``python -m drivers.vcan``.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from daq.recording import read_recording
+from drivers.vcan import ensure_vcan, remove_vcan
+from tests.faults.bus import session_file
+from tests.faults.sender import FAILED, SHIFTED, WORST_NS, Sender, current_of, position_of
+
+ARMIDENT = [sys.executable, "-c", "from daq.cli import main; main()"]
+LOOK_S = 10.0
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def memory_mb(pid: int) -> float:
+    """Resident memory of a process, MB."""
+    (line,) = [line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS")]
+    return int(line.split()[1]) / 1024
+
+
+def cpu_s(pid: int) -> float:
+    """CPU time of a process so far, s."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def soak(seconds: float, rate_hz: int, folder: Path, channels: list[str]) -> int:
+    """Record for so long; 1 if anything is missing."""
+    period_us = 10**6 // rate_hz
+    session = session_file(folder, "soak", channels, False, False, period_us, demand=False)
+    count = round(seconds * rate_hz)
+    with Sender(channels, period_us, count) as sender:
+        options = ["--config", str(session), "--out", str(folder / "out"), "--listen-only", "--json"]
+        capture = subprocess.Popen(
+            [*ARMIDENT, "capture", *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert capture.stderr is not None
+        while "recording to" not in (line := capture.stderr.readline()):
+            if not line:
+                raise RuntimeError("the capture ended")
+        time.sleep(1.0)
+        begin, before = time.monotonic(), cpu_s(capture.pid)
+        sender.go()
+        memory = []
+        while sender.sent < count:
+            time.sleep(min(LOOK_S, seconds / 5))
+            memory.append(memory_mb(capture.pid))
+        wall = time.monotonic() - begin
+        time.sleep(2.0)
+        used = cpu_s(capture.pid) - before
+        capture.send_signal(signal.SIGINT)
+        out, err = capture.communicate(timeout=120)
+        late_ms, shifted, failed = sender.control[WORST_NS] / 1e6, sender.control[SHIFTED], sender.control[FAILED]
+    print(err.strip())
+    document = json.loads(out)
+    counters = document["counters"]
+    recording = read_recording(document["recording"])
+    samples = recording.samples
+    k, joints = samples.sync[:, None], np.arange(6)
+    wrong = int(np.count_nonzero(samples.raw["position"] != position_of(k, joints)))
+    wrong += int(np.count_nonzero(samples.raw["current"] != current_of(k, joints)))
+    size = Path(document["recording"]).stat().st_size
+    print(f"{count} SYNCs at {rate_hz} Hz on {len(channels)} buses in {wall:.1f} s, {12 * count} frames;")
+    print(f"  sender: worst lateness {late_ms:.1f} ms, grid moved {shifted} times, {failed} refused")
+    print(f"  rows {samples.sync.size}, in gaps {counters['samples.in_gaps']}, gaps {len(recording.gaps)},", end=" ")
+    print(f"kernel drops {counters['kernel_drops']}, SYNCs missing {counters['sync_missing']}, wrong values {wrong}")
+    share, each = 100 * used / wall, 1e6 * used / (12 * count)
+    print(f"  CPU of the capture {used:.1f} s: {share:.1f} % of one, {each:.2f} us a frame")
+    at = f"{memory[0]:.1f} MB at first, {max(memory):.1f} at most, {memory[-1]:.1f} at the end"
+    print(f"  memory {at}; file {size / 1e6:.0f} MB")
+    lost = count - samples.sync.size
+    return int(lost != 0 or wrong != 0 or counters["kernel_drops"] != 0)
+
+
+def main() -> int:
+    """Run it; 1 if anything is missing."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults.soak", description=__doc__)
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--rate", type=int, default=5000, help="SYNCs per second")
+    parser.add_argument("--buses", type=int, default=6)
+    options = parser.parse_args()
+    channels = [f"soak{i}" for i in range(options.buses)]
+    for channel in channels:
+        ensure_vcan(channel)
+    folder = Path(tempfile.mkdtemp(prefix="armident-soak-"))
+    try:
+        return soak(options.seconds, options.rate, folder, channels)
+    finally:
+        shutil.rmtree(folder)
+        for channel in channels:
+            remove_vcan(channel)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

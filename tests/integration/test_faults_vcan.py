@@ -1,0 +1,26 @@
+"""A few rounds of what ``python -m tests.faults.bus`` and ``tests.faults.kill`` do by the hundred."""
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.faults.plan import FAULTS, HANDFUL
+
+pytestmark = [pytest.mark.vcan, pytest.mark.timeout(280)]
+
+
+def run(*arguments: str) -> str:
+    """The output of a command that finds nothing wrong."""
+    done = subprocess.run([sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=270)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_every_sync_is_accounted_for_whatever_goes_wrong() -> None:
+    assert sorted(name for faults, *_ in HANDFUL for name in faults) == sorted(FAULTS)
+    assert "0 with something wrong" in run("tests.faults.bus", "--handful", "--lanes", "2")
+
+
+def test_a_kill_costs_a_tenth_of_a_second_at_most_and_every_file_heals() -> None:
+    assert "0 with something wrong" in run("tests.faults.kill", "--rounds", "6")
