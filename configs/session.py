@@ -47,6 +47,16 @@ class Sync(Frozen):
     source: Literal["loop", "kernel"] = "loop"
 
 
+class Temperature(Frozen):
+    """Where a drive has its temperature: an object, its type, degrees Celsius per unit; asked every ``every_s``."""
+
+    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]
+    subindex: Annotated[int, Field(ge=0, le=255)] = 0
+    type: Literal["int8", "uint8", "int16", "uint16", "int32", "uint32"] = "int16"
+    scale: Positive = 1.0
+    every_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
+
+
 class DriveNode(Frozen):
     """One CANopen node and the joint whose motor it drives; ``bus`` is its channel, where there are several."""
 
@@ -54,6 +64,7 @@ class DriveNode(Frozen):
     node_id: Annotated[int, Field(ge=1, le=127)]
     eds: Path
     bus: str | None = None
+    temperature: Temperature | None = None
 
 
 class Stream(Frozen):

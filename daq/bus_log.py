@@ -191,7 +191,11 @@ def _read(path: Path) -> _Log:
         raise DataError(f"{path}: not a readable {path.suffix[1:]} log (after {done} frames): {said(error)}") from error
     if not parts:
         raise DataError(f"{path}: no frames in it")
-    return _Log(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), tuple(numbers), foreign)
+    read = np.concatenate([part[0] for part in parts])
+    early = np.flatnonzero(read["t_ns"] < 0)
+    if early.size:
+        raise DataError(f"{path}: frame {early[0] + 1} has a time of {read['t_ns'][early[0]] * 1e-9:.6g} s")
+    return _Log(read, np.concatenate([p[1] for p in parts]), tuple(numbers), foreign)
 
 
 class _BlfReader(can.BLFReader):

@@ -44,6 +44,8 @@ class Health:
         self._sink, self._publisher, self._say = sink, publisher, say
         self._metrics: Metrics | None = None
         self._served = order.session.metrics
+        self.temperatures: Callable[[], dict[str, float]] = dict
+        """Gives the temperature of each joint's drive, degrees Celsius, where it is known."""
         self._frames_before = self._lost_rows = 0
         self._writing = True
 
@@ -102,6 +104,7 @@ class Health:
             "blocks_dropped": self._publisher.dropped,
             "events_dropped": self._publisher.events_dropped,
             **_clock(),
+            **{f"temperature_{joint}_c": round(celsius, 2) for joint, celsius in self.temperatures().items()},
             **events,
         }
         for name, value in worst(self._jitters).items():

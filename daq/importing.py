@@ -267,7 +267,7 @@ def _bad_line(path: Path, delimiter: str | None, columns: int, skip: int) -> str
                 return f"{path}: line {number} has {len(words)} columns, expected {columns}"
             for k, word in enumerate(words, start=1):
                 if not _is_number(word):
-                    return f"{path}: line {number}, column {k}: expected a number, found {word.strip()!r}"
+                    return f"{path}: line {number}, column {k}: expected a number, found {word.strip()!r:.80}"
     return None
 
 

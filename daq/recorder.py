@@ -24,6 +24,7 @@ from drivers.frames import BusDown
 from drivers.master import DriveMaster
 from drivers.receiver import Receiver
 from drivers.sync import SyncProducer
+from drivers.temperature import TemperaturePoll
 
 HEALTH_S = 1.0
 REST_S = 0.01
@@ -70,6 +71,7 @@ class Recorder:
         self.health = Health(order, self._assembler, receiver, self._jitters, sink, publisher, say)
         self._producer: SyncProducer | KernelSync | None = None
         self._master: DriveMaster | None = None
+        self._temperatures: TemperaturePoll | None = None
         self._motion: Motion | None = None
         self._span: tuple[int, int] | None = None
         self._save = save
@@ -95,6 +97,8 @@ class Recorder:
         for joint in order.robot.joints:
             self._assembler.suspect(joint.name, now, now)
         self._master.start(enable=order.producing)
+        self._temperatures = stack.enter_context(TemperaturePoll(self._master.drives))
+        self.health.temperatures = self._temperatures.celsius
         if order.trajectory is not None:
             by_joint = dict(zip((d.joint for d in session.drives), self._master.positions(), strict=True))
             actual = np.array([by_joint[joint.name] for joint in order.robot.joints], dtype=np.int64)
@@ -246,6 +250,8 @@ class Recorder:
 
     def _come_to_rest(self, early: bool) -> None:
         """Stop the arm, then SYNC, take the last answers and disable the drives; never raises."""
+        if self._temperatures is not None:
+            self._temperatures.stop()
         with suppress(ArmidentError):
             if self._master is not None and early and self._motion is not None:
                 self._master.quick_stop()

@@ -190,6 +190,11 @@ class DriveMaster:
             events.append(self._events.get())
         return events
 
+    @property
+    def drives(self) -> tuple[DriveSdo, ...]:
+        """The drives over SDO, in the order of the session's."""
+        return tuple(self._drives)
+
     def positions(self) -> list[int]:
         """Position actual values (6064h) over SDO, counts, in the order of the session's drives."""
         return [sdo.read(od.POSITION_ACTUAL, 0, "i") for sdo in self._drives]

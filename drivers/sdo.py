@@ -2,6 +2,7 @@
 
 import logging
 import struct
+import threading
 
 import can
 import canopen
@@ -43,6 +44,8 @@ class DriveSdo:
         self.emcy_texts = session.emcy_texts
         self._bus = session.bus_of(drive)
         self._timeout = node.sdo.RESPONSE_TIMEOUT = session.sdo_timeout_s
+        # An SDO channel has one transfer at a time.
+        self._lock = threading.RLock()
 
     def read(self, index: int, sub: int, code: str) -> int:
         """Read an object; ``code`` is its type as ``struct`` names it (``B``, ``h``, ``I``).
@@ -55,7 +58,8 @@ class DriveSdo:
             If the bus is down.
         """
         try:
-            data = self._upload(index, sub, struct.calcsize("<" + code))
+            with self._lock:
+                data = self._upload(index, sub, struct.calcsize("<" + code))
         except SdoAbortedError as error:
             raise ConfigError(f"{self.who}: refuses to read {_name(index, sub)}: {_abort(error)}") from error
         except SdoCommunicationError as error:
@@ -65,6 +69,23 @@ class DriveSdo:
         except (can.CanError, OSError) as error:
             raise self._down(error) from error
         return int(struct.unpack("<" + code, data)[0])
+
+    def poll(self, index: int, sub: int, code: str, answer_s: float) -> int | None:
+        """Read an object where nobody else is at it, and wait for so long at most; ``None`` where somebody is.
+
+        Raises
+        ------
+        ConfigError, BusDown
+            As `read` does.
+        """
+        if not self._lock.acquire(blocking=False):
+            return None
+        try:
+            self.node.sdo.RESPONSE_TIMEOUT = min(answer_s, self._timeout)
+            return self.read(index, sub, code)
+        finally:
+            self.node.sdo.RESPONSE_TIMEOUT = self._timeout
+            self._lock.release()
 
     def _upload(self, index: int, sub: int, size: int) -> bytes:
         """The first ``size`` bytes of an object; some drives send four of smaller ones."""
@@ -92,7 +113,8 @@ class DriveSdo:
             If the bus is down.
         """
         try:
-            self.node.sdo.download(index, sub, struct.pack("<" + code, value))
+            with self._lock:
+                self.node.sdo.download(index, sub, struct.pack("<" + code, value))
         except SdoAbortedError as error:
             raise ConfigError(f"{self.who}: refuses {_name(index, sub)} = {value:X}h: {_abort(error)}") from error
         except SdoCommunicationError as error:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs import ArmidentError, ConfigError, load_session
+from configs.session import Temperature
 from daq.assembler import Assembler, TpdoStream
 from daq.sniffing import survey
 from drivers import objects as od
@@ -169,16 +170,19 @@ class LyingDrive:
 WISHES = ((od.DEVICE_TYPE, 0, "I", 0x20192), (od.POSITION_ACTUAL, 0, "i", -123456), (od.MODE_DISPLAY, 0, "b", 8))
 
 
-@cache
-def _drive() -> tuple[LyingDrive, DriveSdo]:
-    session = load_session("tx40_cell.yaml").model_copy(update={"sdo_timeout_s": SILENCE_S})
+def new_drive(timeout_s: float = SILENCE_S, temperature: Temperature | None = None) -> tuple[LyingDrive, DriveSdo]:
+    """The first drive of the shipped cell, honest for as long as it has no script, and our side of it."""
+    session = load_session("tx40_cell.yaml").model_copy(update={"sdo_timeout_s": timeout_s})
     session = session.model_copy(update={"bus": session.bus.model_copy(update={"interface": "udp_multicast"})})
     network = canopen.Network()
-    drive = session.drives[0]
+    drive = session.drives[0].model_copy(update={"temperature": temperature})
     node = network.add_node(drive.node_id, str(drive.eds))
     liar = LyingDrive(network, drive.node_id, {})
     network.bus = cast(Any, liar)
     return liar, DriveSdo(node, drive, session)
+
+
+_drive = cache(new_drive)
 
 
 def _check_sdo(data: bytes, _: Path) -> bool:

@@ -4,12 +4,15 @@ import json
 import os
 import signal
 import subprocess
+import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from daq.recording import join_parts, read_recording
 from tests.integration.test_capture_vcan import robot, run, session_file, wait_for_file
@@ -31,7 +34,11 @@ def told(process: "subprocess.Popen[str]", word: str) -> Iterator[str]:
 
 @pytest.mark.usefixtures("robot")
 def test_no_sync_is_lost_over_a_reload(vcan_bus: str, tmp_path: Path) -> None:
-    plain = {"setpoints": None, "sync": {"role": "producer", "period_us": 1000, "counter": 240}}
+    plain: dict[str, Any] = {"setpoints": None, "sync": {"role": "producer", "period_us": 1000, "counter": 240}}
+    data = yaml.safe_load(session_file(tmp_path, vcan_bus, "reloaded", **plain).read_text())
+    # The virtual drives have no thermometer; the mode of operation (6061h) is 8, in a unit of five degrees 40.
+    warm = {"index": 0x6061, "type": "int8", "scale": 5.0, "every_s": 1.0}
+    plain["drives"] = [drive | {"temperature": warm} for drive in data["drives"]]
     session_file(tmp_path, vcan_bus, "reloaded", **plain)
     process = run("capture", "--config", tmp_path / "reloaded.yaml", "--out", tmp_path / "out", "--json")
     wait_for_file(tmp_path / "out", 50_000, process)
@@ -50,9 +57,11 @@ def test_no_sync_is_lost_over_a_reload(vcan_bus: str, tmp_path: Path) -> None:
     wait_for_file(tmp_path / "out", 50_000, process)
     directly = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     deadline = 100
-    while deadline and b"armident_clock_synchronised" not in directly.open(address, timeout=10).read():
+    while deadline and b"temperature_joint_6_c" not in (page := directly.open(address, timeout=10).read()):
         deadline -= 1
-    assert deadline
+        time.sleep(0.1)
+    assert b'armident_temperature_joint_1_c{cell="reloaded",robot="tx40"} 40.0' in page
+    assert b"armident_clock_synchronised" in page
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
