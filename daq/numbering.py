@@ -7,10 +7,18 @@ from numba import njit
 
 from daq.books import BORROWED, COUNTER, ORIGIN, SYNC, TIME, UNSEEN
 
+_EARLY = 0.25
+"""By how much of a turn of the counter the time between two SYNCs may be too short, as their stamps say."""
 _DISORDER = 8
 """A SYNC counter that goes back by less than this is a repeated SYNC, not a long gap."""
 _MISALIGNED = 2.0
 """SYNCs of equal counters on two buses that are farther apart than so many periods are not the same SYNC."""
+
+
+@njit(cache=True, nogil=True)
+def turns_in(periods: float, overflow: int) -> int:
+    """Whole turns of the counter in a time: SYNCs come late, when their master was held up, but not too early."""
+    return int(np.floor(periods / overflow + _EARLY))
 
 
 @njit(cache=True, nogil=True)
@@ -20,7 +28,7 @@ def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longes
     Known modulo ``overflow``; whole turns of the counter are told from ``elapsed`` periods, up to ``longest``.
     """
     step = (counter - previous) % overflow
-    turns = int(np.rint((elapsed - step) / overflow))
+    turns = turns_in(elapsed - step, overflow)
     if turns > 0 and step + turns * overflow <= longest:
         return int(step + turns * overflow)
     if turns < 0 and step >= overflow - _DISORDER:
@@ -60,7 +68,7 @@ def advance(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overf
     elif counter >= 0 and state[bus, COUNTER] >= 0 and state[bus, BORROWED]:
         # What had waited on this bus may be older than what others had meanwhile.
         step = (counter - state[bus, COUNTER]) % overflow
-        step += int(overflow * np.rint((elapsed - step) / overflow))
+        step += overflow * turns_in(elapsed - step, overflow)
     elif counter >= 0 and state[bus, COUNTER] >= 0:
         step = sync_step(counter, state[bus, COUNTER], elapsed, overflow, longest)
     elif counter < 0 and state.shape[0] > 1:

@@ -90,3 +90,18 @@ def test_what_was_written_before_it_was_confirmed_is_no_change() -> None:
     assembler.push(rows)
     assembler.finish(3)
     assert assembler.counters["samples.rows"] == 3
+
+
+def test_a_master_that_is_held_up_for_half_a_turn_of_its_counter_has_sent_none_in_between() -> None:
+    assembler = Assembler(STREAMS, ("a", "b"), PERIOD)
+    batch = frames(40)
+    k = np.arange(40)
+    batch["can_id"], batch["length"] = 0x80, 1
+    batch["data"][:, 0] = k % 240 + 1
+    batch["t_ns"] = T0 + k * PERIOD + np.where(k >= 20, 170, 0) * PERIOD
+    assembler.push(batch)
+    assert assembler.last_sync == 39
+    batch["data"][:, 0] = (k + 40 + 240) % 240 + 1
+    batch["t_ns"] = T0 + (k + 40 + 240 + 170) * PERIOD
+    assembler.push(batch)
+    assert assembler.last_sync == 39 + 240 + 40
