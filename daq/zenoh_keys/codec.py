@@ -7,6 +7,7 @@ endian, row by row.
 
 import json
 import math
+import re
 import struct
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,6 +25,7 @@ from daq.recording.model import gap_from, mark_from
 VERSION = 1
 EVENT_SCHEMA = "armident/event/1"
 _MAGIC = b"ARMB"
+_CAPTURE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 _NEEDED: dict[str, dict[str, type | tuple[type, ...]]] = {
     "experiment_start": {
         "capture": str, "sample_rate_hz": (int, float), "robot": dict, "session": dict, "layouts": list,
@@ -128,6 +130,9 @@ def decode_event(data: bytes) -> dict[str, Any]:
     for key, kinds in needed.items():
         if key not in event or not isinstance(event[key], kinds) or isinstance(event[key], bool):
             raise DataError(f"an event {event['kind']} whose {key!r} is missing or cannot be understood")
+    # Listeners name files after it.
+    if "capture" in needed and not _CAPTURE.fullmatch(event["capture"]):
+        raise DataError(f"an event of a capture named {event['capture']!r:.60}")
     return event
 
 

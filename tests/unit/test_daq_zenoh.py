@@ -130,6 +130,21 @@ def test_missing_blocks_are_said() -> None:
     assert assemble(start, made[:-2], end).missing == "2 of 8 blocks did not arrive"
 
 
+@pytest.mark.parametrize("name", ["../../etc/x", "/tmp/x", "", ".x", "a/b", "a\x00b", 5, "x" * 300])
+def test_a_capture_whose_name_is_no_file_name_is_refused(name: object) -> None:
+    start, end = events(cell("a"), 1)
+    for event in (start, end):
+        with pytest.raises(DataError, match="capture"):
+            decode_event(json.dumps(event | {"capture": name}).encode())
+
+
+@pytest.mark.parametrize("lacking", ["blocks", "counters", "gaps", "marks", "paths", "capture"])
+def test_an_end_that_lacks_something_is_refused(lacking: str) -> None:
+    _, end = events(cell("a"), 1)
+    with pytest.raises(DataError, match=f"experiment_end whose '{lacking}' is missing"):
+        decode_event(json.dumps({key: value for key, value in end.items() if key != lacking}).encode())
+
+
 def test_blocks_of_another_capture_are_refused() -> None:
     start, end = events(cell("a"), 1)
     with pytest.raises(DataError, match="different captures"):
