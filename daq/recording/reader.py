@@ -23,8 +23,8 @@ from daq.recording.rows import Rows
 from daq.recording.writer import CHECK, COUNTERS, GAPS_TOPIC, MARKS_TOPIC, SCHEMA
 
 _LARGEST_CHUNK = 1 << 28
-_LEAST_ROW = 2
-"""Least share of a compressed file that a row takes, bytes."""
+_LEAST_ROW, _MOST_RESERVED = 2, 1 << 25
+"""Least share of a compressed file that a row takes, bytes, and rows that room is made for before they come."""
 _WORKERS, _CHUNKS_AHEAD = 2, 16
 _LET_GO = 1 << 26
 HEALED = "armident.healed"
@@ -109,7 +109,7 @@ def _read(path: Path, mapped: mmap.mmap) -> Recording:
     if bytes(data[: len(mcap.MAGIC)]) != mcap.MAGIC:
         raise DataError(f"{path}: not a recording (not an MCAP file)")
     # No row takes less of a file than this, so that a file cannot have us reserve what it has no room for.
-    content = _Content(counts=message_counts(data), most_rows=len(data) // _LEAST_ROW)
+    content = _Content(counts=message_counts(data), most_rows=min(len(data) // _LEAST_ROW, _MOST_RESERVED))
     let_go = 0
     try:
         with ThreadPoolExecutor(_WORKERS, "zstd") as pool:

@@ -2,6 +2,10 @@
 
 import json
 import resource
+import struct
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +27,7 @@ from daq.recording import (
     read_recording,
     write_recording,
 )
+from daq.recording import mcap_format as mcap
 
 T0 = 1_700_000_000_000_000_000
 
@@ -246,3 +251,87 @@ def test_a_full_disk_keeps_the_file_whole_and_counts_the_loss(tmp_path: Path) ->
     rows = sum(s.sync.size for s in read.streams.values())
     assert rows + writer.lost_rows == sum(s.sync.size for s in recording.streams.values())
     assert read.missing is None
+
+
+def with_chunks(data: bytes, change: Callable[[bytearray], None]) -> bytes:
+    """A recording whose chunk records were changed, all lengths made right again."""
+    out = bytearray(mcap.MAGIC)
+    for opcode, _, body in mcap.records(memoryview(data), len(mcap.MAGIC)):
+        content = bytearray(body)
+        if opcode == mcap.CHUNK:
+            change(content)
+        out += mcap.record(opcode, bytes(content))
+    return bytes(out) + mcap.MAGIC
+
+
+def test_sizes_that_a_file_claims_are_no_reason_to_reserve_memory(tmp_path: Path) -> None:
+    write_chunked(make_recording(2000), tmp_path / "r.mcap").close({})
+    data = (tmp_path / "r.mcap").read_bytes()
+    for size in (2**28, 2**31, 2**40, 2**63, 2**64 - 1):
+        forged = with_chunks(data, lambda content, size=size: struct.pack_into("<Q", content, 16, size))  # type: ignore[misc]
+        (tmp_path / "f.mcap").write_bytes(forged)
+        tracemalloc.start()
+        read = read_recording(tmp_path / "f.mcap")
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert read.samples.sync.size == 0
+        assert read.missing is not None
+        assert read.missing.count("is damaged and left out") > 10
+        assert peak < 20e6
+
+
+def test_a_recording_that_lies_about_its_number_of_rows_is_read_all_the_same(tmp_path: Path) -> None:
+    recording = make_recording(2000)
+    write_chunked(recording, tmp_path / "r.mcap").close({})
+    data = (tmp_path / "r.mcap").read_bytes()
+    place = next(at for op, at, _ in mcap.records(memoryview(data), len(mcap.MAGIC)) if op == mcap.STATISTICS)
+    forged = bytearray(data)
+    # The counts by channel are the last of the statistics: make the first of them enormous, and the checksum none.
+    struct.pack_into("<Q", forged, place + mcap.RECORD_HEAD.size + 46 + 2, 2**60)
+    struct.pack_into("<I", forged, len(forged) - len(mcap.MAGIC) - 4, 0)
+    (tmp_path / "f.mcap").write_bytes(forged)
+    read = read_recording(tmp_path / "f.mcap")
+    assert read.sha256 == recording.sha256
+    assert read.missing is not None
+    assert f"2000 messages of topic /samples where {2**60} were written" in read.missing
+
+
+@pytest.mark.parametrize("at", ["robot", "scale", "sample_rate_hz"])
+def test_a_flipped_bit_in_the_head_is_found(at: str, tmp_path: Path) -> None:
+    """What rows mean stands there once, and chunks have checksums of their own alone."""
+    write_chunked(make_recording(300), tmp_path / "r.mcap").close({})
+    data = bytearray((tmp_path / "r.mcap").read_bytes())
+    word = {"robot": b'"torque":', "scale": b'"scale": [', "sample_rate_hz": b"sample_rate_hz"}[at]
+    data[data.index(word) + len(word) + 4] ^= 0x01
+    (tmp_path / "r.mcap").write_bytes(data)
+    with pytest.raises(DataError, match="are not what was written"):
+        read_recording(tmp_path / "r.mcap")
+
+
+def test_counters_that_were_damaged_are_left_out_and_said(tmp_path: Path) -> None:
+    recording = make_recording(300)
+    write_chunked(recording, tmp_path / "r.mcap").close({"frames": 12345})
+    data = (tmp_path / "r.mcap").read_bytes().replace(b"12345", b"12346")
+    (tmp_path / "r.mcap").write_bytes(data)
+    read = read_recording(tmp_path / "r.mcap")
+    assert read.sha256 == recording.sha256
+    assert read.counters == {}
+    assert "is damaged and left out" in str(read.missing)
+
+
+def test_a_chunk_of_another_recording_is_not_taken_for_one_of_this(tmp_path: Path) -> None:
+    one, other = make_recording(300, seed=1), make_recording(300, seed=2)
+    write_chunked(one, tmp_path / "1.mcap").close({})
+    write_chunked(replace(other, metadata={"host": "y"}), tmp_path / "2.mcap").close({})
+    parts = [(tmp_path / name).read_bytes() for name in ("1.mcap", "2.mcap")]
+    chunks = [
+        [(at, at + 9 + len(body)) for op, at, body in mcap.records(memoryview(part), 8) if op == mcap.CHUNK]
+        for part in parts
+    ]
+    (begin, end), (first, last) = chunks[0][1], chunks[1][1]
+    (tmp_path / "x.mcap").write_bytes(parts[0][:begin] + parts[1][first:last] + parts[0][end:])
+    read = read_recording(tmp_path / "x.mcap")
+    assert "that this file has not" in str(read.missing)
+    rows = np.isin(one.samples.sync, read.samples.sync)
+    assert 0 < rows.sum() < 300
+    assert np.array_equal(read.samples.raw["position"], one.samples.raw["position"][rows])
