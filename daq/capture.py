@@ -179,7 +179,9 @@ def run_capture(
     say.fields = {"cell": order.session.cell, "robot": order.robot.name}
     stop, save, reload = threading.Event(), threading.Event(), threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: save.set())
-    signal.signal(signal.SIGHUP, lambda *_: reload.set())
+    # A terminal that is closed says the same as a service manager that wants a reload.
+    hung_up = stop if sys.stdin is not None and sys.stdin.isatty() else reload
+    signal.signal(signal.SIGHUP, lambda *_: hung_up.set())
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
 

@@ -31,14 +31,15 @@ def capture(
 
 
 def command(
-    name: Annotated[str, typer.Argument(help="save, mark or stop.")],
+    name: Annotated[str, typer.Argument(help="save, mark, reload or stop.")],
     text: Annotated[str, typer.Argument(help="What a mark says.")] = "",
     config: Annotated[str, typer.Option("--config", help="Session configuration of the capture.")] = "tx40_cell.yaml",
 ) -> None:
-    """Ask a running capture for something: save what was just recorded, set a mark, or stop.
+    """Ask a running capture for something: save what was just recorded, set a mark, reload its session, or stop.
 
     The session of the capture has to allow it (zenoh.commands: true). `save` is for sessions with recording.trigger,
     which keep only what happens around events; `systemctl kill -s USR1` asks for the same without Zenoh.
+    `reload` reads the session again, as `systemctl reload` does: what can change without losing a sample does.
 
     Example: armident command mark "gripper changed" --config cell.yaml
     """
