@@ -33,6 +33,21 @@ def test_commands_arrive_in_order_with_their_texts() -> None:
         assert commands.pending() == []
 
 
+def test_commands_that_a_capture_does_not_look_at_do_not_heap_up() -> None:
+    cell = session(True)
+    with open_session(cell, "capture") as own:
+        commands = Commands(own, Keys(cell.cell, "tx40"), True)
+        with open_session(cell, "observer") as flooding:
+            querier = flooding.declare_querier(Keys(cell.cell, "tx40").command("mark"), timeout=5.0)
+            until = time.monotonic() + 10
+            while not querier.matching_status and time.monotonic() < until:
+                time.sleep(0.01)
+            refused = [reply.err for _ in range(100) for reply in querier.get(payload=b"x")]
+        assert len(commands.pending()) == 32
+        assert bytes(next(err for err in refused if err is not None).payload) == b"32 commands are waiting already"
+        assert commands.pending() == []
+
+
 def test_a_capture_that_does_not_allow_them_refuses() -> None:
     cell = session(False)
     with open_session(cell, "capture") as own:

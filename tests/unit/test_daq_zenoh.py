@@ -195,6 +195,22 @@ def test_a_full_queue_drops_blocks_and_counts_them() -> None:
     assert elapsed < 1.0
 
 
+def test_events_that_nobody_takes_are_bounded_and_of_health_the_last_waits() -> None:
+    session = cell("many_events")
+    publisher = Publisher(session, Keys(session.cell, "tx40"))
+    # Who holds the queue keeps the thread that sends from it, as a listener does that holds up a put.
+    with publisher._ready:
+        for k in range(6000):
+            publisher.event(b"{}")
+            publisher.health({"k": k})
+        assert publisher.events_dropped >= 6000 - 4097
+        assert len(publisher._queue) <= 4096
+        assert list(publisher._latest.values()) == [b'{"k": 5999}']
+    publisher.close()
+    assert not publisher._queue
+    assert not publisher._latest
+
+
 def test_a_second_capture_of_a_cell_is_refused() -> None:
     session = cell("twice")
     with open_session(session, "capture"), pytest.raises(ConfigError, match="another capture"):
