@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from configs import DataError, RobotConfig
-from identify.catalogue.wiring import rewired
+from identify.catalogue.recorded import put_right
 from identify.closed_loop import RELEVANT, closed_loop, velocity_error
 from identify.estimators.diagnostics import diagnose_estimate
 from identify.estimators.essential import essential_parameters
@@ -78,7 +78,7 @@ def _identify(
     warnings: list[str] = []
 
     clock.enter("model", 0.0)
-    experiments = rewired(experiments, robot)
+    experiments = put_right(experiments, robot)
     model = ArmModel.from_config(robot)
     dt = experiments[0].dt
     bandwidth = options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)

@@ -9,6 +9,7 @@ from configs import ConfigError, RobotConfig
 from configs.robot import Effect as Stanza
 from identify.catalogue.effect import Effect, Linear, Place
 from identify.catalogue.motion import Motion
+from identify.catalogue.recorded import of_recording
 from identify.catalogue.registry import known
 
 Array = NDArray[np.float64]
@@ -56,7 +57,7 @@ class Term:
 
 
 def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
-    """Terms of a robot's effects, in their order; exchanges of signals are none.
+    """Terms of a robot's effects, in their order; what is put right in the recordings is none.
 
     Raises
     ------
@@ -67,7 +68,7 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
     taken: dict[str, int] = {}
     for k, stanza in enumerate(robot.effects):
         effect = known(stanza.effect)
-        if effect.rewires:
+        if of_recording(stanza):
             continue
         where = f"effects[{k}]: {stanza.effect} of {stanza.joint}"
         place = place_of(stanza, effect, robot, where)

@@ -147,7 +147,10 @@ def candidates(workshop: Workshop) -> Iterator[Candidate]:
     for effect in catalogue().values():
         if effect.rewires or effect.numbers is not None:
             continue
+        right = {names.index(stanza.joint) for stanza in study.recorded if stanza.effect == effect.name}
         for place in places(effect, study.robot.n):
+            if place.joint in right:
+                continue
             if effect.scope == "pair" and frozenset((place.joint, place.other)) in coupled:
                 continue
             there = present.get((effect.name, place.joint, place.other), [])

@@ -205,7 +205,8 @@ def _diagnose(
         robot=with_values(final),
         t=_continued([s.t for s in held]),
         measured=np.concatenate([s.y for s in held]),
-        before=_predicted(first),
+        # Residuals of the recordings as they were, drawn on them as they have been put right.
+        before=_predicted(first) + np.concatenate([s.y - f.y for s, f in zip(held, first.study.held, strict=True)]),
         after=_predicted(final),
         q=_sampled(final, "q"),
         qd=_sampled(final, "qd"),

@@ -9,16 +9,17 @@ from scipy import special
 from configs import RobotConfig
 from configs.robot import Effect as Stanza
 from identify.catalogue.effect import Effect
+from identify.catalogue.recorded import of_recording
 from identify.catalogue.registry import catalogue, known
 from identify.catalogue.terms import place_of
-from identify.discrepancy.candidates import places
+from identify.discrepancy.candidates import Candidate, places
 from identify.discrepancy.experiment import recommended_experiment
 from identify.discrepancy.numbers import NumbersFinding
 from identify.discrepancy.precision import standard_deviations
 from identify.discrepancy.regression import relative_errors
 from identify.discrepancy.search import Search, Settings, State, with_values
 from identify.discrepancy.stanzas import without
-from identify.discrepancy.trial import CLOSE
+from identify.discrepancy.trial import CLOSE, judge
 from identify.discrepancy.where import Disagreement
 from identify.discrepancy.wiring_check import WiringFinding
 from identify.document import Alternative, Finding, Gap, Invisible
@@ -43,9 +44,19 @@ def described(search: Search, first: State, final: State, left: Sequence[Disagre
     deviations = dict(zip(_terms(final), standard_deviations(final), strict=True))
     findings: list[Finding] = []
     for k in range(own, len(stanzas)):
+        if of_recording(stanzas[k]):
+            deviations[k] = _still_missing(final, stanzas[k])
         rest = search.state(without(final.study.robot, k), final)
         findings.append(_finding(rest, final, stanzas[k], deviations.get(k, {}), left, search.settings))
     return findings
+
+
+def _still_missing(final: State, stanza: Stanza) -> dict[str, float]:
+    """Standard deviation of what a recording was put right by: that of the next to nothing that is still missing."""
+    effect = known(stanza.effect)
+    place = place_of(stanza, effect, final.study.robot, stanza.effect)
+    rest = judge(final.fit, Candidate(effect, place, ((),)), (), final.workshop)
+    return {} if rest is None else {effect.linear[0].name: float(rest.std[0])}
 
 
 def _finding(
@@ -217,7 +228,7 @@ def experiment_to_separate(findings: Sequence[Finding]) -> str | None:
 
 def _terms(state: State) -> list[int]:
     """Numbers of the stanzas that are terms."""
-    return [k for k, stanza in enumerate(state.study.robot.effects) if not known(stanza.effect).rewires]
+    return [k for k, stanza in enumerate(state.study.robot.effects) if not of_recording(stanza)]
 
 
 def _units(effect: Effect, prismatic: bool) -> dict[str, str]:

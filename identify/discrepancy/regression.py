@@ -18,8 +18,6 @@ from identify.estimators.regression import require_excitation
 Array = NDArray[np.float64]
 
 MAX_AR_ORDER = 30
-LEAST_UNDONE = 1e-3
-"""Sampling periods from which on a recording can be rid of a delay without rounding."""
 PASSES = 3
 """Between parameters and noise models; a fourth changes neither visibly."""
 
@@ -308,10 +306,7 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
             study.rigid[key] = signals, made
         rigid = study.rigid[key][1]
         if study.model.e:
-            columns = study.model.term_regressor(study.motion(signals, theta))
-            if kind == "measured" and theta is not None:
-                _undo(columns, study, stretch, theta)
-            terms = study.decimation(columns)
+            terms = study.decimation(study.model.term_regressor(study.motion(signals, theta)))
             if out:
                 first = out[0].shape[2] - study.model.e
                 sudden = np.flatnonzero([t.effect.sudden for t in study.model.terms for _ in t.names])
@@ -319,21 +314,6 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
             rigid = np.concatenate([rigid, terms], axis=2)
         out.append(rigid)
     return out[0], out[1]
-
-
-def _undo(columns: Array, study: Study, stretch: Stretch, theta: Array) -> None:
-    """Columns (N, n, e) of effects that a recording can be rid of: what that changes, instead of derivatives."""
-    model = study.model
-    recorded = stretch.torque @ np.linalg.inv(study.robot.transmission_matrix)
-    first = len(model.base.names) - model.e
-    for term in model.terms:
-        if term.effect.undo is None:
-            continue
-        place = model.base.names.index(term.names[0])
-        value, motor = float(theta[place]), term.place.joint
-        if value > LEAST_UNDONE * study.dt:
-            change = (recorded[:, motor] - term.effect.undo(recorded[:, motor], study.dt, value)) / value
-            columns[:, :, place - first] = change[:, None] * study.robot.transmission_matrix[motor]
 
 
 def applied(columns: Array, values: Array) -> Array:

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from configs import DataError
 from identify.discrepancy.candidates import Workshop
 from identify.discrepancy.regression import Fit
 from identify.discrepancy.regression import fit as fitted
@@ -43,11 +44,24 @@ def in_its_loop(fit: Fit, trial: Trial) -> Trial | None:
     """
     study, candidate = fit.study, trial.candidate
     robot = added(study.robot, trial)
-    theta = np.concatenate([trial.beside, trial.kept])
-    whole = replace(study, robot=robot, model=ArmModel.from_config(robot))
-    moved = whole.resimulated(theta)
-    if moved is whole:
-        return None
+    if candidate.effect.undo is not None:
+        try:
+            moved = study.of_robot(robot)
+        except DataError:
+            return None
+        if not moved.moves_more_like_the_arm_than(study, held=False):
+            return None
+        # The torques stay as they are recorded: what is judged is what they lack.
+        pairs = [(study.train, moved.train), (study.held, moved.held)]
+        train, held = (
+            tuple(replace(s, simulated=m.simulated) for s, m in zip(old, new, strict=True)) for old, new in pairs
+        )
+        moved = replace(study, train=train, held=held)
+    else:
+        whole = replace(study, robot=robot, model=ArmModel.from_config(robot))
+        moved = whole.resimulated(np.concatenate([trial.beside, trial.kept]))
+        if moved is whole:
+            return None
     again = fitted(replace(study, train=moved.train, held=moved.held), fit.theta)
     bench = Workshop(again.study, again.theta)
     calm = again.renoised(noise_beyond_shapes(again, bench))

@@ -14,8 +14,8 @@ from identify.discrepancy.candidates import Workshop, candidates
 from identify.discrepancy.regression import Fit, applied, fit
 from identify.discrepancy.retrial import in_its_loop, suspects
 from identify.discrepancy.screening import shortlist
-from identify.discrepancy.stanzas import added, stanza_number, without
-from identify.discrepancy.study import Study, loop_distance
+from identify.discrepancy.stanzas import added, stanza_number, valued, without
+from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial, judge
 from identify.discrepancy.whitening import rows_of_joints, whitened
 from identify.estimators.noise import ArModel
@@ -35,10 +35,10 @@ SHORTLIST = 15
 """Candidates that get a trial of their own."""
 LOOPS = 3
 """Loops in which the nonlinear parameters of one effect are sought."""
-PUT_RIGHT = 6
-"""Fits after which a recording that depends on how it is put right is left as it is."""
+ROUNDS = 5
+"""Most times that a recording is put right for one finding, each time by what was still missing."""
 SETTLED = 0.01
-"""Change of that, over what it is, that ends them."""
+"""Part still missing that ends them."""
 MOST = 8
 """Most effects of one diagnosis."""
 
@@ -186,9 +186,32 @@ class Search:
                     break
                 trial = again
         try:
-            return self.state(added(state.study.robot, trial), state)
+            robot = added(state.study.robot, trial)
+            return self.state(robot if effect.undo is None else self._put_right(robot, state, trial), state)
         except DataError:
             return None
+
+    def _put_right(self, robot: RobotConfig, state: State, trial: Trial) -> RobotConfig:
+        """With the value in its last stanza that leaves nothing more of it to find (Newton's method).
+
+        Raises
+        ------
+        DataError
+            If there is no such value that physics allows.
+        """
+        value = float(trial.values[0])
+        for _ in range(ROUNDS):
+            study, found = refit(self.study, robot, state)
+            rest = judge(found, trial.candidate, trial.shapes, Workshop(study, found.theta))
+            if rest is None:
+                break
+            value += float(rest.values[0])
+            if not trial.candidate.effect.allows(np.array([value]), rest.std, {}):
+                raise DataError(f"{trial.candidate.effect.name}: the recording cannot be put right")
+            robot = valued(robot, trial.candidate.effect.linear[0].name, value)
+            if abs(float(rest.values[0])) < SETTLED * abs(value):
+                break
+        return robot
 
     def _pruned(self, state: State, own: int) -> State:
         """Without effects that the ones found later have made superfluous; those of the configuration stay."""
@@ -239,9 +262,13 @@ def nearer(one: State, other: State, material: float) -> bool:
     material
         Share of the power of a joint's whitened error by which it must be closer where only simulated signals show it.
     """
+    closer = one.study.moves_more_like_the_arm_than(other.study, held=True)
+    if one.study.recorded != other.study.recorded:
+        # A torque put right by a filter has less noise, whether it was wrong or not.
+        return closer
     if _power(one) < _power(other):
         return True
-    if not loop_distance(one.study.held) < loop_distance(other.study.held):
+    if not closer:
         return False
     noise = one.fit.noise
     before = other.fit.errors(other.fit.theta, held=True)
@@ -277,24 +304,19 @@ def refit(study: Study, robot: RobotConfig, before: State | None) -> tuple[Study
     DataError
         If the motion does not determine the parameters of the model.
     """
-    model = ArmModel.from_config(robot)
-    changed = replace(study, robot=robot, model=model)
+    changed = study.of_robot(robot)
+    model = changed.model
     theta: Array | None = None
     if before is not None:
         theta = padded(before, model)
     elif any(term.effect.predicts for term in model.terms):
         bare = robot.model_copy(update={"effects": ()})
-        rigid = fit(replace(study, robot=bare, model=ArmModel.from_config(bare)))
+        rigid = fit(replace(changed, robot=bare, model=ArmModel.from_config(bare)))
         theta = np.concatenate([rigid.theta, np.zeros(model.e)])
     first = fit(changed, theta)
     moved = changed.resimulated(first.theta)
     if moved is not changed:
         first = fit(moved, first.theta if model.e else None)
-    undone = [model.base.names.index(term.names[0]) for term in model.terms if term.effect.undo]
-    for _ in range(PUT_RIGHT if undone else 0):
-        last, first = first, fit(moved, first.theta)
-        if np.allclose(first.theta[undone], last.theta[undone], rtol=SETTLED):
-            break
     return moved, first
 
 

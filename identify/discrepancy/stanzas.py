@@ -1,7 +1,7 @@
 """Robot configurations with the findings of a search as stanzas."""
 
 from configs import RobotConfig
-from identify.catalogue.registry import known
+from identify.catalogue.recorded import of_recording
 from identify.catalogue.terms import stanza_of
 from identify.discrepancy.trial import Trial
 
@@ -13,6 +13,13 @@ def added(robot: RobotConfig, trial: Trial) -> RobotConfig:
     contained = tuple(p.name for p, there in zip(effect.linear, trial.contained, strict=True) if there)
     stanza = stanza_of(effect, trial.candidate.place, robot, parameters, contained)
     return robot.model_copy(update={"effects": (*robot.effects, stanza)})
+
+
+def valued(robot: RobotConfig, name: str, value: float) -> RobotConfig:
+    """The robot with another value of a parameter of its last stanza."""
+    last = robot.effects[-1]
+    changed = last.model_copy(update={"parameters": {**last.parameters, name: value}})
+    return robot.model_copy(update={"effects": (*robot.effects[:-1], changed)})
 
 
 def without(robot: RobotConfig, stanza: int) -> RobotConfig:
@@ -27,5 +34,5 @@ def values_of(trial: Trial) -> dict[str, float]:
 
 
 def stanza_number(robot: RobotConfig, term: int) -> int:
-    """Stanza of a robot's term: exchanges of signals are stanzas, but no terms."""
-    return [k for k, stanza in enumerate(robot.effects) if not known(stanza.effect).rewires][term]
+    """Stanza of a robot's term: what is put right in recordings is a stanza, but no term."""
+    return [k for k, stanza in enumerate(robot.effects) if not of_recording(stanza)][term]

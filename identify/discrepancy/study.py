@@ -7,15 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs import DataError, RobotConfig
+from configs.robot import Effect as Stanza
 from identify.catalogue.motion import Motion
-from identify.catalogue.wiring import rewired
+from identify.catalogue.recorded import of_recording, put_right
+from identify.catalogue.registry import known
 from identify.closed_loop import closed_loop
 from identify.estimators.auxiliary import AuxiliaryModel
 from identify.estimators.idim_ls import idim_ls
 from identify.experiment import Experiment
 from identify.methods import decimation_of
 from identify.model.arm import ArmModel
-from identify.options import Options
+from identify.options import CONTROLLERS, Options
 from identify.preparation import aligned_torque, equations, least_rows
 from identify.signals.bandwidth import motion_bandwidth
 from identify.signals.decimate import Decimation, design
@@ -89,6 +91,10 @@ class Study:
         That loop, of the rigid arm as least squares have it.
     thinning
         From the recorded to the working rate.
+    sources
+        Recordings for training and for validation, as they are.
+    signals
+        Derivatives of their positions at the recorded rate.
     rigid
         Regressors that all models of the study share, made once (see `identify.discrepancy.regression.regressors`).
     """
@@ -103,10 +109,42 @@ class Study:
     loop: str
     auxiliary: AuxiliaryModel
     thinning: Decimation
+    sources: tuple[Sequence[Experiment], Sequence[Experiment]]
+    signals: tuple[Derivatives, ...]
     warnings: tuple[str, ...] = ()
     rigid: dict[tuple[int, tuple[str, ...]], tuple[Derivatives, Array]] = field(
         default_factory=dict, repr=False, compare=False
     )
+
+    @property
+    def recorded(self) -> tuple[Stanza, ...]:
+        """Stanzas by which the recordings have been put right."""
+        return tuple(stanza for stanza in self.robot.effects if of_recording(stanza))
+
+    def of_robot(self, robot: RobotConfig) -> "Study":
+        """The same recordings for another model, put right anew where its stanzas say other things of them.
+
+        Raises
+        ------
+        DataError
+            If no closed loop can be simulated with them.
+        """
+        changed = replace(self, robot=robot, model=ArmModel.from_config(robot))
+        if changed.recorded == self.recorded:
+            return changed
+        wiring = [[s for s in study.recorded if known(s.effect).rewires] for study in (self, changed)]
+        return build_study(*self.sources, robot, self.signals if wiring[0] == wiring[1] else None)
+
+    def moves_more_like_the_arm_than(self, other: "Study", *, held: bool) -> bool:
+        """Whether the simulated loop is a better likeness of the arm than that of another study of the same recordings.
+
+        One whose controller was identified is, beside a stand-in: that follows the measured motion whatever the arm.
+        """
+        ours, theirs = self.loop in CONTROLLERS, other.loop in CONTROLLERS
+        if ours != theirs:
+            return ours
+        one, two = (study.held if held else study.train for study in (self, other))
+        return _distance(one) < _distance(two)
 
     @property
     def sample(self) -> float:
@@ -153,19 +191,24 @@ class Study:
             )
 
         train = moved(self.train)
-        if not loop_distance(train) < loop_distance(self.train):
+        if not _distance(train) < _distance(self.train):
             return self
         return replace(self, train=train, held=moved(self.held))
 
 
-def loop_distance(stretches: Sequence[Stretch]) -> float:
+def _distance(stretches: Sequence[Stretch]) -> float:
     """Squared errors of the simulated velocities, each joint over its own measured ones, summed."""
     apart = sum(np.sum((s.simulated.qd - s.measured.qd) ** 2, axis=0) for s in stretches)
     size = sum(np.sum(s.measured.qd**2, axis=0) for s in stretches)
     return float(np.sum(apart / np.maximum(size, 1e-300)))
 
 
-def build_study(training: Sequence[Experiment], validation: Sequence[Experiment], robot: RobotConfig) -> Study:
+def build_study(
+    training: Sequence[Experiment],
+    validation: Sequence[Experiment],
+    robot: RobotConfig,
+    known_signals: Sequence[Derivatives] | None = None,
+) -> Study:
     """Differentiate, simulate, split and filter the experiments.
 
     Parameters
@@ -174,13 +217,15 @@ def build_study(training: Sequence[Experiment], validation: Sequence[Experiment]
         Experiments to fit; without ``validation`` their last part is held out.
     validation
         Experiments to judge by, or none.
+    known_signals
+        Derivatives of the positions of both, if they have been made.
 
     Raises
     ------
     DataError
         If rates differ, or the motion is too short or does not determine the parameters of the model.
     """
-    experiments = rewired([*training, *validation], robot)
+    experiments = put_right([*training, *validation], robot)
     dt = experiments[0].dt
     if any(abs(e.dt - dt) > 1e-9 * dt for e in experiments):
         raise DataError("the recordings have different sampling rates; diagnose them separately")
@@ -191,7 +236,9 @@ def build_study(training: Sequence[Experiment], validation: Sequence[Experiment]
     factor = max(1, int(1.0 / (dt * WORKING_RATE * cutoff)))
     first = design(dt, 0.4 / (dt * factor), factor) if factor > 1 else design(dt, 0.5 / dt, 1)
     second = design(dt * factor, cutoff)
-    signals = [replace(differentiate(e.q, dt, bandwidth_hz=bandwidth), start=e.start) for e in experiments]
+    signals = known_signals or [
+        replace(differentiate(e.q, dt, bandwidth_hz=bandwidth), start=e.start) for e in experiments
+    ]
     simulated, loop, auxiliary, warnings = _simulated(model, experiments, signals, bandwidth)
     train: list[Stretch] = []
     held: list[Stretch] = []
@@ -210,8 +257,9 @@ def build_study(training: Sequence[Experiment], validation: Sequence[Experiment]
             into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span))
     duration = max(e.start + dt * e.q.shape[0] for e in experiments)
     return Study(
-        robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first, tuple(warnings)
-    )
+        robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first,
+        (training, validation), tuple(signals), tuple(warnings),
+    )  # fmt: skip
 
 
 def _simulated(

@@ -16,7 +16,8 @@ from scipy import linalg, optimize, stats
 
 from configs import DataError, RobotConfig
 from configs.robot import Effect as Stanza
-from identify.catalogue.wiring import SIGNALS, exchanges, rewired
+from identify.catalogue.recorded import put_right
+from identify.catalogue.wiring import SIGNALS, exchanges
 from identify.experiment import Experiment
 from identify.methods import decimation_of
 from identify.model.arm import ArmModel
@@ -231,7 +232,7 @@ def find_wiring(experiments: Sequence[Experiment], robot: RobotConfig) -> Wiring
     DataError
         If the sampling rates differ.
     """
-    bench = _bench(rewired(experiments, robot), robot)
+    bench = _bench(put_right(experiments, robot), robot)
     plain = robot.model_copy(update={"effects": ()})
     hypotheses = list(_singles(plain))
     position, torque = np.eye(robot.n), np.eye(robot.n)

@@ -54,7 +54,7 @@ def test_viscous_friction_as_a_term_moves_the_simulated_arm_like_that_of_the_mod
     more = theta.copy()
     more[model.base.names.index("fv2")] += 2.0
     expected = simulate(model, more, controller, q_ref, DT)
-    stanza = Effect(effect="nonlinear_viscous_friction", joint="joint_2", parameters={"exponent": 1.0})
+    stanza = Effect(effect="nonlinear_viscous_friction", joint="joint_2", parameters={"knee": 100.0})
     extended = ArmModel.from_config(with_effects(robot, stanza))
     # The term's parameter is the torque at the joint's top speed.
     found = simulate_with_terms(
