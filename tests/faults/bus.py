@@ -49,6 +49,8 @@ SLOW = {
     "sync_stops": 0.6,
     "disk_full": 0.4,
     "rotation": 0.5,
+    "kernel_drop": 0.6,
+    "held_up": 0.4,
 }
 """What takes longer than others, s."""
 
