@@ -20,6 +20,8 @@ from tests.fuzz.targets import TARGETS
 STUCK_S = 60.0
 """A process that has not begun another input for so long is killed, s."""
 NOTE_S = 0.25
+FOUND = 3
+"""What the process of the inputs returns where it found something."""
 
 
 def main() -> int:
@@ -59,7 +61,7 @@ def _child(target: Target, seconds: float, seed: int, state: Path) -> int:
                 print(f"FOUND {target.name}: {result.where[:300]}\n  kept as {result.keep()}", flush=True)
                 print("    " + result.trace.rstrip().replace("\n", "\n    "), file=sys.stderr, flush=True)
     print(f"{target.name}: {count} inputs in {seconds:.0f} s, {accepted} accepted, {len(seen)} findings", flush=True)
-    return int(bool(seen))
+    return FOUND if seen else 0
 
 
 def _kind(found: Finding) -> str:
@@ -76,13 +78,20 @@ def _supervise(target: Target, seconds: float, seed: int) -> int:
         with tempfile.NamedTemporaryFile(prefix="fuzz-state-") as state:
             command = [sys.executable, "-m", "tests.fuzz", "--target", target.name, "--seconds", str(left)]
             process = subprocess.Popen([*command, "--seed", str(seed), "--child", state.name])
+            # By our own clock, not the file's: that one may be set meanwhile. To begin with there is much to compile.
+            begun, last = os.stat(state.name).st_mtime_ns, (0, time.monotonic() + STUCK_S)
             while process.poll() is None:
                 time.sleep(NOTE_S)
-                if time.time() - os.stat(state.name).st_mtime > STUCK_S:
+                touched = os.stat(state.name).st_mtime_ns
+                if touched not in (last[0], begun):
+                    last = touched, time.monotonic()
+                if time.monotonic() - last[1] > STUCK_S:
                     process.send_signal(signal.SIGKILL)
                     process.wait()
-            if process.returncode in (0, 1):
-                return found + process.returncode
+            if process.returncode in (0, FOUND):
+                return found + (process.returncode == FOUND)
+            if process.returncode == 1:
+                raise SystemExit(f"{target.name}: the inputs could not be made")
             raw = Path(state.name).read_bytes()
             data = raw[8 : 8 + int.from_bytes(raw[:8], "little")]
             kept = Finding(target.name, data, "", "").keep()

@@ -203,7 +203,8 @@ def _spoil_node(rng: random.Random, tree: Any) -> None:
         case 2 if isinstance(node, dict):
             node[rng.choice(WORDS)] = node.pop(key)
         case 3 if isinstance(node[key], int | float):
-            node[key] = rng.choice((-node[key], 0, node[key] * 1e9, node[key] * 1e-9, 10**400, *EDGES))
+            number = node[key] if abs(node[key]) < 10**300 else 1
+            node[key] = rng.choice((-number, 0, number * 1e9, number * 1e-9, 10**400, *EDGES))
         case 4 if isinstance(node, list):
             node.insert(key, copy.deepcopy(node[key]))
         case _:
