@@ -40,7 +40,8 @@ def test_no_sync_is_lost_over_a_reload(vcan_bus: str, tmp_path: Path) -> None:
     warm = {"index": 0x6061, "type": "int8", "scale": 5.0, "every_s": 1.0}
     plain["drives"] = [drive | {"temperature": warm} for drive in data["drives"]]
     session_file(tmp_path, vcan_bus, "reloaded", **plain)
-    process = run("capture", "--config", tmp_path / "reloaded.yaml", "--out", tmp_path / "out", "--json")
+    arguments = "--config", tmp_path / "reloaded.yaml", "--out", tmp_path / "out", "--json"
+    process = run("capture", *arguments, stdin=subprocess.DEVNULL)
     wait_for_file(tmp_path / "out", 50_000, process)
 
     session_file(tmp_path, vcan_bus, "reloaded", **plain, recording={"rotate_minutes": 0.01}, metrics={"port": 0})
