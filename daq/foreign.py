@@ -1,7 +1,86 @@
-"""Files of other tools: what their readers say of a damaged one, in our words."""
+"""Files of other tools: what their readers say of a damaged one, in our words, and readers that damage takes down."""
+
+import faulthandler
+import json
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+LONGEST_S = 120.0
+"""How long a reader in a process of its own may take, s."""
+_REFUSED = 3
 
 
 def said(error: Exception) -> str:
     """What a reader of others says, in one line and not too long; its name where it says nothing."""
     text = " ".join("".join(c if c.isprintable() else " " for c in str(error)).split())
     return text[:200] if text else type(error).__name__
+
+
+def apart(read: Callable[[], Mapping[str, Any]], longest_s: float = LONGEST_S) -> dict[str, NDArray[Any]]:
+    """The arrays of real numbers that a reader returns; it runs in a process of its own, which may crash.
+
+    Raises
+    ------
+    ValueError
+        With what the reader says, or how its process ended.
+    """
+    with tempfile.TemporaryFile() as file:
+        process = os.fork()
+        if process == 0:
+            os._exit(_read_into(file, read))
+        status = _wait(process, longest_s)
+        file.seek(0)
+        if status == _REFUSED:
+            raise ValueError(file.read().decode(errors="replace"))
+        if status != 0:
+            raise ValueError(f"its reader ended with {'no result' if status > 0 else signal.Signals(-status).name}")
+        names = json.loads(file.readline())
+        return {name: np.load(file, allow_pickle=False) for name in names}
+
+
+def _read_into(file: IO[bytes], read: Callable[[], Mapping[str, Any]]) -> int:
+    """What the process of a reader does: its arrays, or what it says, go into a file; the status it ends with."""
+    # That it crashes is told by the one who waits for it.
+    faulthandler.disable()
+    try:
+        try:
+            found = {
+                name: value
+                for name, value in read().items()
+                if isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and value.size
+            }
+            file.write(json.dumps(list(found)).encode() + b"\n")
+            for value in found.values():
+                np.save(file, value, allow_pickle=False)
+            file.flush()
+            return 0
+        except Exception as error:  # whatever readers of others raise
+            file.seek(0)
+            file.truncate()
+            file.write(said(error).encode(errors="replace"))
+            file.flush()
+            return _REFUSED
+    except BaseException:  # nothing of this process may run on
+        return 1
+
+
+def _wait(process: int, longest_s: float) -> int:
+    """The exit status of a process, negative for a signal; it is killed when it takes too long."""
+    until = time.monotonic() + longest_s
+    pause = 1e-4
+    while True:
+        done, status = os.waitpid(process, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() > until:
+            os.kill(process, signal.SIGKILL)
+            until = float("inf")
+        time.sleep(pause)
+        pause = min(2 * pause, 0.05)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs import ConfigError, DataError, RobotConfig
-from daq.foreign import said
+from daq.foreign import apart, said
 from daq.polled import on_clock
 from daq.recording import Field, Recording, Stream
 from daq.recording.model import Quantity, Side
@@ -182,16 +182,21 @@ def _parquet(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: not a readable Parquet file: {said(error)}") from error
 
 
-def _mat(path: Path) -> dict[str, Any]:
+def _mat(path: Path) -> dict[str, NDArray[Any]]:
     from scipy.io import loadmat
 
+    def read() -> dict[str, Any]:
+        try:
+            arrays: dict[str, Any] = loadmat(path)
+        except NotImplementedError as error:
+            raise ValueError("MAT version 7.3 is not read; save it with -v7") from error
+        return arrays
+
     try:
-        arrays: dict[str, Any] = loadmat(path)
-    except NotImplementedError as error:
-        raise DataError(f"{path}: MAT version 7.3 is not read; save it with -v7") from error
-    except Exception as error:  # whatever scipy and zlib say of a damaged file
+        # Some damaged files take scipy's reader down.
+        return apart(read)
+    except (OSError, ValueError) as error:
         raise DataError(f"{path}: not a readable MAT file: {said(error)}") from error
-    return arrays
 
 
 def _numeric(arrays: Mapping[str, Any]) -> Table:
