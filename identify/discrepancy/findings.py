@@ -17,7 +17,8 @@ from identify.discrepancy.experiment import recommended_experiment
 from identify.discrepancy.numbers import NumbersFinding
 from identify.discrepancy.precision import standard_deviations
 from identify.discrepancy.regression import relative_errors
-from identify.discrepancy.search import Search, Settings, State, with_values
+from identify.discrepancy.retrial import in_loop_of
+from identify.discrepancy.search import Search, State, nearer, with_values
 from identify.discrepancy.stanzas import without
 from identify.discrepancy.trial import CLOSE, judge
 from identify.discrepancy.where import Disagreement
@@ -47,7 +48,7 @@ def described(search: Search, first: State, final: State, left: Sequence[Disagre
         if of_recording(stanzas[k]):
             deviations[k] = _still_missing(final, stanzas[k])
         rest = search.state(without(final.study.robot, k), final)
-        findings.append(_finding(rest, final, stanzas[k], deviations.get(k, {}), left, search.settings))
+        findings.append(_finding(search, rest, final, stanzas[k], deviations.get(k, {}), left))
     return findings
 
 
@@ -60,16 +61,24 @@ def _still_missing(final: State, stanza: Stanza) -> dict[str, float]:
 
 
 def _finding(
-    rest: State, final: State, stanza: Stanza, std: dict[str, float], left: Sequence[Disagreement], settings: Settings
+    search: Search, rest: State, final: State, stanza: Stanza, std: dict[str, float], left: Sequence[Disagreement]
 ) -> Finding:
-    study = final.study
+    study, material = final.study, search.settings.material
     effect = known(stanza.effect)
     place = place_of(stanza, effect, study.robot, stanza.effect)
     trials = [t for t in rest.trials if not t.forbidden]
     mine = next((t for t in trials if t.candidate.key == (effect.name, place.joint, place.other)), None)
     rivals = [t for t in trials if t is not mine]
     # Only what could have been found in its place takes confidence from a finding.
-    serious = [t for t in rest.passing(settings) if t is not mine]
+    serious = [t for t in rest.passing(search.settings) if t is not mine]
+    if mine is not None and effect.undo is not None:
+        # With torques that belong to other positions no loop is the arm's own, and scores in it mean little: rivals are
+        # those that come as near to the recordings when they are in the model.
+        mine = in_loop_of(study, rest.fit, mine.candidate) or mine
+        others = [(t, search.with_trial(rest, t)) for t in serious]
+        serious = [
+            t for t, other in others if other and nearer(other, rest, material) and not nearer(final, other, material)
+        ]
     # Rows of other joints, which a change goes along with, are no part of what it is a share of.
     share = 0.0 if mine is None else min(mine.share, 1.0)
     scores = [] if mine is None else [mine.score, *(t.score for t in serious)]

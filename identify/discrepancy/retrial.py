@@ -12,12 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from configs import DataError
-from identify.discrepancy.candidates import Workshop
+from identify.discrepancy.candidates import Candidate, Workshop
 from identify.discrepancy.regression import Fit
 from identify.discrepancy.regression import fit as fitted
 from identify.discrepancy.screening import noise_beyond_shapes
 from identify.discrepancy.shaping import instrumented
 from identify.discrepancy.stanzas import added
+from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial, judge, refined, screened
 from identify.model.arm import ArmModel
 
@@ -51,18 +52,24 @@ def in_its_loop(fit: Fit, trial: Trial) -> Trial | None:
             return None
         if not moved.moves_more_like_the_arm_than(study, held=False):
             return None
-        # The torques stay as they are recorded: what is judged is what they lack.
-        pairs = [(study.train, moved.train), (study.held, moved.held)]
-        train, held = (
-            tuple(replace(s, simulated=m.simulated) for s, m in zip(old, new, strict=True)) for old, new in pairs
-        )
-        moved = replace(study, train=train, held=held)
     else:
         whole = replace(study, robot=robot, model=ArmModel.from_config(robot))
         moved = whole.resimulated(np.concatenate([trial.beside, trial.kept]))
         if moved is whole:
             return None
-    again = fitted(replace(study, train=moved.train, held=moved.held), fit.theta)
+    return in_loop_of(moved, fit, candidate)
+
+
+def in_loop_of(moved: Study, fit: Fit, candidate: Candidate) -> Trial | None:
+    """A candidate beside the model of a fit, with the simulated motion of another study of the same recordings.
+
+    The torques stay as they are in the fit: what is judged is what they lack.
+    """
+    pairs = [(fit.study.train, moved.train), (fit.study.held, moved.held)]
+    train, held = (
+        tuple(replace(s, simulated=m.simulated) for s, m in zip(own, other, strict=True)) for own, other in pairs
+    )
+    again = fitted(replace(fit.study, train=train, held=held), fit.theta)
     bench = Workshop(again.study, again.theta)
     calm = again.renoised(noise_beyond_shapes(again, bench))
     look = screened(calm, candidate, bench)
