@@ -6,9 +6,7 @@ import pytest
 from identify.catalogue.registry import known
 
 
-@pytest.mark.parametrize(
-    ("value", "knee", "allowed"), [(-5.0, 0.02, False), (5.0, 0.02, True), (-5.0, 0.3, True)]
-)
+@pytest.mark.parametrize(("value", "knee", "allowed"), [(-5.0, 0.02, False), (5.0, 0.02, True), (-5.0, 0.3, True)])
 def test_friction_does_not_fall_from_standstill(value: float, knee: float, allowed: bool) -> None:
     effect = known("nonlinear_viscous_friction")
     assert effect.allows(np.array([value]), np.array([0.1]), {"knee": knee}) is allowed
