@@ -1,6 +1,7 @@
 """The identification worker: from the samples and events on Zenoh to a published result."""
 
 import json
+import math
 import queue
 import signal
 import sys
@@ -23,6 +24,9 @@ from identify.service import identify_recording, write_identification
 
 MAX_WAITING_S = 10.0
 """How long after its end event an experiment waits for blocks that are still on their way."""
+MOST_BYTES = 1 << 30
+"""Of samples that wait in memory for the end of their capture, an hour of six axes at 5 kHz: a longer one is read from
+its file."""
 HISTORY_BLOCKS = 100_000
 """How much a late worker asks the capture's cache for: all there is."""
 
@@ -31,19 +35,45 @@ HISTORY_BLOCKS = 100_000
 class Assembly:
     """One capture as it comes in, events and blocks in any order.
 
-    The estimator shape of a stream: ``block`` and ``event`` take what arrives, ``complete`` says whether all of it is
-    there, ``recording`` is the result.
+    ``add`` takes blocks, ``complete`` says whether nothing more needs waiting for, ``recording`` is the result.
+
+    Parameters
+    ----------
+    capture
+        Its name.
+    start, end
+        Its events.
+    most_bytes
+        Samples in memory from which on none are kept: what a capture that goes on for months sends, or somebody who
+        pretends to be one.
     """
 
     capture: str
     start: Mapping[str, Any] | None = None
     end: Mapping[str, Any] | None = None
+    most_bytes: int = MOST_BYTES
     blocks: dict[int, Block] = field(default_factory=dict)
+    last_ns: int = -1
+    too_long: bool = False
+    _bytes: int = 0
+
+    def add(self, block: Block) -> None:
+        """Keep a block, unless there are too many."""
+        self.last_ns = max(self.last_ns, int(block.t_ns[-1])) if block.t_ns.size else self.last_ns
+        if self.too_long or block.sequence in self.blocks:
+            return
+        self.blocks[block.sequence] = block
+        self._bytes += block.nbytes
+        if self._bytes > self.most_bytes:
+            self.too_long = True
+            self.blocks.clear()
 
     @property
     def complete(self) -> bool:
-        """Whether both events and every block have arrived."""
-        return self.start is not None and self.end is not None and len(self.blocks) >= int(self.end["blocks"])
+        """Whether both events and every block have arrived, or need not."""
+        if self.start is None or self.end is None:
+            return False
+        return self.too_long or len(self.blocks) >= int(self.end["blocks"])
 
     def recording(self) -> Recording:
         """Return the recording from the stream, or from its file where the stream lacks blocks.
@@ -55,14 +85,17 @@ class Assembly:
         """
         if self.start is None or self.end is None:
             raise DataError(f"capture {self.capture}: its {'start' if self.start is None else 'end'} was never heard")
-        recording = assemble(self.start, self.blocks.values(), self.end)
-        if recording.missing is None:
-            return recording
+        missing: str | None = "it is too long to be kept in memory"
+        if not self.too_long:
+            recording = assemble(self.start, self.blocks.values(), self.end)
+            missing = recording.missing
+            if missing is None:
+                return recording
         paths = [Path(path) for path in self.end["paths"]]
         absent = [str(path) for path in paths if not path.is_file()]
         if absent or not paths:
             where = f"its file {absent[0]} is not here" if absent else "it was not written to a file"
-            raise DataError(f"capture {self.capture}: {recording.missing}, and {where}")
+            raise DataError(f"capture {self.capture}: {missing}, and {where}")
         return join_parts([read_recording(path) for path in paths])
 
 
@@ -87,7 +120,8 @@ class Worker:
         self._ready: queue.Queue[Assembly | None] = queue.Queue()
         self._results: queue.Queue[int] = queue.Queue()
         self._current: Assembly | None = None
-        self._early: dict[int, Block] = {}
+        self._early = Assembly("", most_bytes=MOST_BYTES)
+        self._refused = 0
         self._finished_ns = -1
         self._done: set[str] = set()
         self._timer: threading.Timer | None = None
@@ -131,7 +165,7 @@ class Worker:
         try:
             event = decode_event(bytes(sample.payload))
         except DataError as error:
-            print(f"armident: warning: {error}", file=sys.stderr)
+            self._refuse(error)
             return
         if event["kind"] not in ("experiment_start", "experiment_end"):
             return
@@ -140,7 +174,7 @@ class Worker:
             if capture in self._done:
                 return
             if self._current is None or self._current.capture != capture:
-                self._current = Assembly(capture)
+                self._current = Assembly(capture, most_bytes=MOST_BYTES)
             if event["kind"] == "experiment_start":
                 self._current.start = event
                 self._status("recording", capture=capture)
@@ -155,24 +189,28 @@ class Worker:
         try:
             block = decode_block(bytes(sample.payload))
         except DataError as error:
-            print(f"armident: warning: {error}", file=sys.stderr)
+            self._refuse(error)
             return
         with self._lock:
             if block.t_ns.size and int(block.t_ns[-1]) <= self._finished_ns:
                 return
-            if self._current is None:
-                self._early[block.sequence] = block
-            else:
-                self._current.blocks[block.sequence] = block
+            (self._early if self._current is None else self._current).add(block)
             self._hand_over_if_complete()
+
+    def _refuse(self, error: DataError) -> None:
+        """Say that something else than samples or events came, and the tenth and hundredth time how often."""
+        self._refused += 1
+        if math.log10(self._refused).is_integer():
+            times = f" ({self._refused} times)" if self._refused > 1 else ""
+            print(f"armident: warning: {error}{times}", file=sys.stderr)
 
     def _hand_over_if_complete(self) -> None:
         current = self._current
         if current is None:
             return
-        if self._early:
-            current.blocks.update(self._early)
-            self._early.clear()
+        for block in self._early.blocks.values():
+            current.add(block)
+        self._early = Assembly("", most_bytes=MOST_BYTES)
         if current.complete:
             self._finish(current)
 
@@ -187,7 +225,7 @@ class Worker:
             self._timer = None
         self._done.add(assembly.capture)
         # A straggler of this capture must not be taken for a block of the next: blocks carry times, not names.
-        self._finished_ns = max((int(b.t_ns[-1]) for b in assembly.blocks.values() if b.t_ns.size), default=-1)
+        self._finished_ns = assembly.last_ns
         self._current = None
         self._ready.put(assembly)
 
@@ -214,7 +252,7 @@ class Worker:
 
     def _identify(self, assembly: Assembly) -> int:
         recording = assembly.recording()
-        source = "stream" if assembly.complete else "file"
+        source = "stream" if assembly.complete and not assembly.too_long else "file"
         print(f"worker: {recording.samples.sync.size} samples from the {source}, identifying", flush=True)
 
         def progress(stage: str, share: float) -> None:

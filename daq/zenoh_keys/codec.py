@@ -51,6 +51,11 @@ class Block:
     t_ns: NDArray[np.int64]
     raw: dict[str, NDArray[Any]]
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of its samples."""
+        return self.sync.nbytes + self.t_ns.nbytes + sum(values.nbytes for values in self.raw.values())
+
 
 def encode_block(block: Block) -> bytes:
     """The bytes of a block."""

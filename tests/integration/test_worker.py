@@ -113,6 +113,40 @@ def test_stream_and_file_give_the_same_numbers_to_the_last_bit(
     assert answered.parameters == streamed.parameters
 
 
+def test_a_capture_too_long_for_the_memory_is_read_from_its_file(
+    captured: Recording,
+    session: SessionConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("identify.worker.MOST_BYTES", 10 * next(blocks_of(captured)).nbytes)
+    with Worker(session, captured.robot, tmp_path) as worker:
+        publish(captured, session)
+        assert worker.result(LONGEST_S) == 0
+    assert "samples from the file, identifying" in capfd.readouterr().out
+    document = load_document(tmp_path / "tx40-test.identification" / "identification.json", IdentificationDocument)
+    assert document.recording.sha256 == captured.sha256
+
+
+def test_garbage_is_told_once_and_then_by_tens(
+    captured: Recording, session: SessionConfig, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    keys = Keys(session.cell, captured.robot.name)
+    with Worker(session, captured.robot, tmp_path) as worker, open_session(session, "observer") as observer:
+        until = time.monotonic() + 10.0
+        told = ""
+        while "(10 times)" not in told and time.monotonic() < until:
+            for _ in range(5):
+                observer.put(keys.samples, b"no block")
+            time.sleep(0.1)
+            told += capfd.readouterr().err
+        publish(captured, session)
+        assert worker.result(LONGEST_S) == 0
+    assert told.count("warning") == told.count("times)") + 1
+    assert "(10 times)" in told
+
+
 def test_a_block_that_never_comes_is_fetched_from_the_file(
     captured: Recording, session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
