@@ -111,7 +111,7 @@ def diagnose_command(
 ) -> int:
     """Carry out ``armident diagnose``; ``chosen`` are the fields of its `Settings`; returns the exit code."""
     from identify.discrepancy.diagnose import diagnose
-    from identify.discrepancy.search import Settings
+    from identify.discrepancy.state import Settings
     from identify.report.diagnosis import diagnosis_report
     from identify.terminal import diagnosis_table, progress, warn
 

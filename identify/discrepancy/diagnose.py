@@ -20,8 +20,9 @@ from identify.discrepancy.findings import (
 )
 from identify.discrepancy.numbers import stale_numbers
 from identify.discrepancy.regression import relative_errors
-from identify.discrepancy.search import Search, Settings, State, with_values
+from identify.discrepancy.search import Search
 from identify.discrepancy.simulated import SimulatedErrors, simulated_errors
+from identify.discrepancy.state import Settings, State, with_values
 from identify.discrepancy.study import Study, build_study
 from identify.discrepancy.where import Disagreement, beyond_noise, survey, where
 from identify.discrepancy.wiring_check import WiringFinding, find_wiring

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from identify.discrepancy.findings import described
-from identify.discrepancy.search import MOST, Search, State, nearer, places_of
+from identify.discrepancy.search import MOST, Search
 from identify.discrepancy.stanzas import without
+from identify.discrepancy.state import State, nearer, places_of
 from identify.discrepancy.trial import CLOSE
 from identify.discrepancy.where import Disagreement, Survey, unexplained
 from identify.document import Finding

@@ -18,8 +18,9 @@ from identify.discrepancy.numbers import NumbersFinding
 from identify.discrepancy.precision import standard_deviations
 from identify.discrepancy.regression import relative_errors
 from identify.discrepancy.retrial import in_loop_of
-from identify.discrepancy.search import Search, State, nearer, with_values
+from identify.discrepancy.search import Search
 from identify.discrepancy.stanzas import without
+from identify.discrepancy.state import State, nearer, with_values
 from identify.discrepancy.trial import CLOSE, judge
 from identify.discrepancy.where import Disagreement
 from identify.discrepancy.wiring_check import WiringFinding

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from identify.catalogue.terms import Term
 from identify.discrepancy.candidates import Workshop
 from identify.discrepancy.regression import Fit
-from identify.discrepancy.search import State
+from identify.discrepancy.state import State
 from identify.discrepancy.trial import newey_west
 from identify.estimators.noise import ArModel
 

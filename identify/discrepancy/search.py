@@ -1,36 +1,25 @@
 """One step after the other: add the effect that predicts unseen data best, take out what is no longer needed."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from configs import DataError, RobotConfig
-from configs.robot import Effect as Stanza
-from identify.catalogue.terms import Term
 from identify.discrepancy.candidates import Workshop, candidates
-from identify.discrepancy.regression import Fit, applied, fit
 from identify.discrepancy.retrial import in_its_loop, suspects
 from identify.discrepancy.screening import shortlist
 from identify.discrepancy.stanzas import added, stanza_number, valued, without
+from identify.discrepancy.state import Places, Settings, State, accident, nearer, places_of, refit
 from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial, judge
-from identify.discrepancy.whitening import rows_of_joints, whitened
-from identify.estimators.noise import ArModel
-from identify.model.arm import ArmModel
 
 Array = NDArray[np.float64]
-Places = tuple[tuple[str, str, str], ...]
 
-HELD_OUT_LEVEL = 0.05
-"""The held-out data alone must speak for a finding at this level, whatever the training data say."""
+
 NEEDED = 0.01
 """Chance of its estimate by accident above which an effect found earlier is taken out again."""
-FEEDBACK = 0.05
-"""Share of a joint's held-out residual power that an effect must explain which is its own instrument: feedback lets the
-motion follow the disturbances, so that terms without merit explain a percent or two."""
 SHORTLIST = 15
 """Candidates that get a trial of their own."""
 LOOPS = 3
@@ -41,58 +30,6 @@ SETTLED = 0.01
 """Part still missing that ends them."""
 MOST = 8
 """Most effects of one diagnosis."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What a user may choose of a diagnosis.
-
-    Parameters
-    ----------
-    false_alarms
-        Chance that a plant without a missing effect is said to have one, over all tests of a diagnosis.
-    material
-        Share of a joint's held-out residual power that an effect must explain to be worth a finding.
-    """
-
-    false_alarms: float = 0.01
-    material: float = 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """The model as far as it has come, and how every candidate would do beside it.
-
-    Parameters
-    ----------
-    trials
-        Of the candidates that looked best, best first; those with a sign that physics forbids are among them.
-    tests
-        Number of candidates that they were chosen from.
-    hidden
-        Candidates that the model contains or the motion does not excite.
-    """
-
-    study: Study
-    fit: Fit
-    workshop: Workshop
-    trials: tuple[Trial, ...]
-    tests: int
-    hidden: frozenset[tuple[str, int, int | None]]
-
-    def passing(self, settings: Settings) -> list[Trial]:
-        """Trials that a finding may come from, best first."""
-        level = settings.false_alarms / max(self.tests, 1)
-        return [
-            t
-            for t in self.trials
-            if not t.forbidden
-            and t.p_value < level
-            and t.p_held < HELD_OUT_LEVEL
-            and t.gain > 0
-            and t.share >= max(settings.material, FEEDBACK if t.candidate.effect.sudden else 0.0)
-            and not (t.candidate.effect.negligible and t.candidate.effect.negligible(t.values, self.study.sample))
-        ]
 
 
 @dataclass
@@ -248,104 +185,3 @@ class Search:
 
 def _ranked(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     return tuple(sorted(trials, key=lambda t: -t.score))
-
-
-def nearer(one: State, other: State, material: float) -> bool:
-    """Whether a model comes closer to the held-out torques than another, at measured or at simulated signals.
-
-    Both count: measured positions, differentiated twice for an elastic joint, may bring more noise than the effect has
-    torque, and simulated ones are only as good as the loop. Where they alone are for it, the loop with the effect in it
-    must move more like the arm, too: what a model says of itself is no evidence.
-
-    Parameters
-    ----------
-    material
-        Share of the power of a joint's whitened error by which it must be closer where only simulated signals show it.
-    """
-    closer = one.study.moves_more_like_the_arm_than(other.study, held=True)
-    if one.study.recorded != other.study.recorded:
-        # A torque put right by a filter has less noise, whether it was wrong or not.
-        return closer
-    if _power(one) < _power(other):
-        return True
-    if not closer:
-        return False
-    noise = one.fit.noise
-    before = other.fit.errors(other.fit.theta, held=True)
-    # Of the error at measured signals, less what of it the change at simulated ones explains: those know no noise.
-    after = [e - c for e, c in zip(before, _change(other, one), strict=True)]
-    was, now = (_whitened_power(e, noise) for e in (before, after))
-    return bool(now.sum() < was.sum() and np.any(now < (1 - material) * was))
-
-
-def _power(state: State) -> float:
-    """Squared norm of the held-out errors at measured signals."""
-    return float(sum(np.sum(e**2) for e in state.fit.errors(state.fit.theta, held=True)))
-
-
-def _change(before: State, after: State) -> list[Array]:
-    """Change of the held-out torques at simulated signals from one model to another, (M, n) of every stretch."""
-    pairs = zip(before.fit.equations.held, after.fit.equations.held, strict=True)
-    return [applied(z1, after.fit.theta) - applied(z0, before.fit.theta) for (_, z0, _), (_, z1, _) in pairs]
-
-
-def _whitened_power(errors: Sequence[Array], noise: Sequence[ArModel]) -> Array:
-    """Squared norm of every joint's errors, whitened, (n,)."""
-    white = whitened(errors, noise)
-    joints = rows_of_joints([e.shape[0] for e in errors], noise)
-    return np.array([float(white[rows] @ white[rows]) for rows in joints])
-
-
-def refit(study: Study, robot: RobotConfig, before: State | None) -> tuple[Study, Fit]:
-    """The data with the model of a robot, and its fit.
-
-    Raises
-    ------
-    DataError
-        If the motion does not determine the parameters of the model.
-    """
-    changed = study.of_robot(robot)
-    model = changed.model
-    theta: Array | None = None
-    if before is not None:
-        theta = padded(before, model)
-    elif any(term.effect.predicts for term in model.terms):
-        bare = robot.model_copy(update={"effects": ()})
-        rigid = fit(replace(changed, robot=bare, model=ArmModel.from_config(bare)))
-        theta = np.concatenate([rigid.theta, np.zeros(model.e)])
-    first = fit(changed, theta)
-    moved = changed.resimulated(first.theta)
-    if moved is not changed:
-        first = fit(moved, first.theta if model.e else None)
-    return moved, first
-
-
-def padded(before: State, model: ArmModel) -> Array:
-    """Rigid parameters of an earlier fit, zeros for the terms, (b,)."""
-    rigid = before.fit.theta[: before.study.model.base.b - before.study.model.e]
-    return np.concatenate([rigid, np.zeros(model.e)])
-
-
-def accident(state: State, term: Term) -> float:
-    """Chance that the linear parameters of a term are all zero (Wald test)."""
-    names = state.study.model.base.names
-    own = [names.index(name) for name in term.names]
-    values, covariance = state.fit.theta[own], state.fit.covariance[np.ix_(own, own)]
-    return float(stats.chi2.sf(values @ np.linalg.pinv(covariance) @ values, len(own)))
-
-
-def with_values(state: State, shapes: Mapping[int, Mapping[str, float]] | None = None) -> RobotConfig:
-    """The robot with the estimated values in its stanzas."""
-    stanzas: list[Stanza] = list(state.study.robot.effects)
-    for k, term in enumerate(state.study.model.terms):
-        number = stanza_number(state.study.robot, k)
-        own = [state.study.model.base.names.index(name) for name in term.names]
-        linear = zip((p.name for p in term.linear), state.fit.theta[own], strict=True)
-        found = {**term.shapes, **{name: float(value) for name, value in linear}, **dict((shapes or {}).get(k, {}))}
-        stanzas[number] = stanzas[number].model_copy(update={"parameters": found})
-    return state.study.robot.model_copy(update={"effects": tuple(stanzas)})
-
-
-def places_of(state: State) -> Places:
-    """What the model of a state has beyond the rigid one, and where, whatever the values and the order."""
-    return tuple(sorted((e.effect, e.joint, e.other or "") for e in state.study.robot.effects))

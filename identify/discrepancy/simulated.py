@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.discrepancy.search import State
+from identify.discrepancy.state import State
 from identify.estimators.auxiliary import AuxiliaryModel
 from identify.preparation import aligned_torque
 

@@ -11,7 +11,8 @@ import json, resource, time
 from configs import config_path, load_robot, load_trajectory
 from identify.discrepancy.candidates import candidates
 from identify.discrepancy.diagnose import diagnose
-from identify.discrepancy.search import Search, Settings
+from identify.discrepancy.search import Search
+from identify.discrepancy.state import Settings
 from identify.discrepancy.study import build_study
 from identify.from_recording import experiments_from_recording
 from identify.options import Options

@@ -10,7 +10,8 @@ from threadpoolctl import threadpool_limits
 
 from configs import RobotConfig, Trajectory, load_robot, load_trajectory
 from configs.scenario import HiddenEffect, Scenario
-from identify.discrepancy.search import Search, Settings
+from identify.discrepancy.search import Search
+from identify.discrepancy.state import Settings
 from identify.discrepancy.study import build_study
 from identify.from_recording import experiments_from_recording
 from virtual_robot.offline import simulate_recording

@@ -9,7 +9,8 @@ from scipy.io import loadmat
 from configs import RobotConfig, load_robot
 from identify.discrepancy.diagnose import Diagnosis, diagnose
 from identify.discrepancy.findings import gap_of
-from identify.discrepancy.search import Search, Settings
+from identify.discrepancy.search import Search
+from identify.discrepancy.state import Settings
 from identify.discrepancy.study import build_study
 from identify.document import Gap
 from identify.experiment import Experiment
