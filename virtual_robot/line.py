@@ -9,7 +9,7 @@ import can
 import canopen
 import numpy as np
 
-from configs import ArmidentError, ConfigError
+from configs import ConfigError
 from configs.session import Bus
 from drivers.frames import BusDown, frames
 from drivers.objects import COB_MASK, COB_NMT, COB_SDO_REQUEST, COB_SYNC
@@ -23,7 +23,7 @@ PDO_FILTERS = ((0x180, 0x780), (0x200, 0x700), (0x300, 0x700), (0x400, 0x700), (
 """Identifiers 180h to 57Fh, which PDOs may have; a socket does not receive what it sends itself."""
 BATCH = 1024
 REOPEN_S = 0.1
-"""How often a bus that is down is tried again."""
+"""How often a bus that is down is looked at."""
 
 
 class Line:
@@ -66,7 +66,8 @@ class Line:
         """Canopen's own bus, to which the kernel passes NMT commands and SDO requests only."""
         wanted = [COB_NMT, *(COB_SDO_REQUEST + drive.node_id for drive in self.drives)]
         filters = [{"can_id": can_id, "can_mask": COB_MASK, "extended": False} for can_id in wanted]
-        # A bus that goes down ends canopen's receive thread; it is connected anew when the bus is back.
+        # Whoever takes the error keeps canopen's receive thread alive: its socket and the kernel's heartbeats work
+        # again by themselves when the bus is back.
         network.listeners[0].on_error = lambda error: None
         try:
             network.connect(interface=self.config.interface, channel=self.config.channel, can_filters=filters)
@@ -112,7 +113,7 @@ class Line:
             try:
                 self._at, self._count = 0, self.receive(wait=False)
             except BusDown:
-                self.down, self._count = True, 0
+                self._lose()
             at = np.flatnonzero(self.batch["can_id"][: self._count] == COB_SYNC)
             counters = np.where(self.batch["length"][at] > 0, self.batch["data"][at, 0], 0)
             stamps = self.batch["t_ns"][at]
@@ -137,27 +138,23 @@ class Line:
             try:
                 self.bus.send(self._outbox[: self._queued])
             except BusDown:
-                self.down = True
+                self._lose()
             self._queued = 0
+
+    def _lose(self) -> None:
+        """The bus is down. What came before is not answered any more: drives queue no answers for a bus that is off."""
+        self.down, self._tried = True, time.monotonic()
+        self._syncs, self._at, self._count = [], 0, 0
+        with suppress(BusDown):
+            while self.receive(wait=False) == BATCH:
+                pass
 
     def _is_back(self) -> bool:
         if time.monotonic() - self._tried < REOPEN_S:
             return False
         self._tried = time.monotonic()
-        if not self.bus.up:
-            return False
-        for drive in self.drives:
-            drive.nmt.halt()
-        with suppress(Exception):  # canopen raises here again what ended its receive thread
-            self._network.disconnect()
-        try:
-            self._connected(self._network)
-        except ArmidentError:
-            return False
-        for drive in self.drives:
-            drive.nmt.resume()
-        self.down = False
-        return True
+        self.down = not self.bus.up
+        return not self.down
 
     def close(self) -> None:
         """Take the drives off the bus."""

@@ -21,7 +21,7 @@ from identify.discrepancy.retrial import in_loop_of
 from identify.discrepancy.search import Search
 from identify.discrepancy.stanzas import without
 from identify.discrepancy.state import State, nearer, with_values
-from identify.discrepancy.trial import CLOSE, judge
+from identify.discrepancy.trial import CLOSE, Trial, judge
 from identify.discrepancy.where import Disagreement
 from identify.discrepancy.wiring_check import WiringFinding
 from identify.document import Alternative, Finding, Gap, Invisible
@@ -82,7 +82,7 @@ def _finding(
         ]
     # Rows of other joints, which a change goes along with, are no part of what it is a share of.
     share = 0.0 if mine is None else min(mine.share, 1.0)
-    scores = [] if mine is None else [mine.score, *(t.score for t in serious)]
+    scores = [] if mine is None else [mine.score, *(_instead(t, final) for t in serious)]
     alone = 0.0 if mine is None else float(np.exp(mine.score - special.logsumexp(scores)))
     close = [] if mine is None else [score for score in scores if abs(score - mine.score) < CLOSE]
     among = float(np.exp(special.logsumexp(close) - special.logsumexp(scores))) if close else 0.0
@@ -114,9 +114,20 @@ def _finding(
             "std": std,
             "units": _units(effect, study.robot.joints[joint].type == "prismatic"),
             "confidence_with_equals": among * explained,
-            "ambiguous_with": [t.candidate.effect.name for t in serious if mine and t.score > mine.score - CLOSE],
+            "ambiguous_with": [
+                t.candidate.effect.name for t in serious if mine and _instead(t, final) > mine.score - CLOSE
+            ],
         },
     )
+
+
+def _instead(rival: Trial, final: State) -> float:
+    """Score of a rival in place of a finding: less what it scores beside the finding, too.
+
+    What both together explain is no reason to doubt either.
+    """
+    beside = [t.score for t in final.trials if t.candidate.key == rival.candidate.key and not t.forbidden]
+    return rival.score - max([0.0, *beside])
 
 
 def miswired(wiring: WiringFinding, robot: RobotConfig) -> list[Finding]:
