@@ -5,6 +5,7 @@ it costs tens of microseconds per frame and must never see the hot path.
 """
 
 import logging
+import math
 import queue
 import threading
 import time
@@ -91,10 +92,9 @@ class DriveMaster:
         self._robot = robot
         self._events: queue.SimpleQueue[DriveEvent] = queue.SimpleQueue()
         self._nmt: dict[str, int] = {}
-        self._beat: dict[str, float] = {}
-        self._stamp: dict[str, float] = {}
         self._limit = HEARTBEATS_MISSED * session.heartbeat_ms * 1e-3 + HEARTBEAT_MARGIN
         self._lost: set[str] = set()
+        self._looked, self._held_up = math.inf, False
         self._reviving: dict[str, threading.Thread] = {}
         self.suspect: dict[str, tuple[int, int]] = {}
         """From when on, and until when (ns, UTC), the TPDOs of joints are not to be trusted; a new one per change."""
@@ -152,6 +152,8 @@ class DriveMaster:
             self._command(NmtCommand.START, sdo)
         for sdo in self._drives:
             self._await_operational(sdo)
+        for network in self._networks.values():
+            network.heartbeats.begin()
         self._started = True
         if not enable:
             return
@@ -179,12 +181,8 @@ class DriveMaster:
         alive = {channel: network.revive() for channel, network in self._networks.items()}
         if not any(alive.values()):
             raise BusDown(f"bus {', '.join(alive)}: went down")
-        for sdo in self._drives if self._started else ():
-            joint = sdo.drive.joint
-            silent = time.monotonic() - self._beat[joint]
-            if silent > self._limit and joint not in self._lost:
-                self._lost.add(joint)
-                self._report("heartbeat_lost", sdo, time.time_ns(), f"no heartbeat for {silent:.2f} s")
+        if self._started:
+            self._judge_heartbeats()
         events = []
         while not self._events.empty():
             events.append(self._events.get())
@@ -256,6 +254,25 @@ class DriveMaster:
     def _command(self, command: NmtCommand, sdo: DriveSdo) -> None:
         self._network_of(sdo.drive).command(command, sdo.drive.node_id)
 
+    def _judge_heartbeats(self) -> None:
+        """Tell whose heartbeats stay away, and whose are back, by when they came (CiA 301: heartbeat event)."""
+        before, self._looked = self._looked, time.monotonic()
+        for network in self._networks.values():
+            network.heartbeats.read()
+        # A host that was held up may have held up its interface, too: it looks once more before it says who is missing.
+        self._held_up = self._looked - before > HEARTBEAT_MARGIN and not self._held_up
+        for sdo in self._drives:
+            joint, node = sdo.drive.joint, sdo.drive.node_id
+            heartbeats = self._network_of(sdo.drive).heartbeats
+            silent, ended = heartbeats.silent(node), heartbeats.ended(node)
+            if joint not in self._lost and (ended > self._limit or (silent > self._limit and not self._held_up)):
+                self._lost.add(joint)
+                missed = max(ended, silent)
+                self._report("heartbeat_lost", sdo, time.time_ns(), f"no heartbeat for {missed:.2f} s")
+            if joint in self._lost and silent <= self._limit:
+                self._lost.discard(joint)
+                self._report("heartbeat_back", sdo, time.time_ns(), "heartbeat is back")
+
     def _report(self, kind: EventKind, sdo: DriveSdo, t_ns: int, text: str, code: int = 0) -> None:
         drive = sdo.drive
         self._events.put(DriveEvent(kind, drive.joint, drive.node_id, t_ns, f"{sdo.who}: {text}", code))
@@ -268,16 +285,7 @@ class DriveMaster:
     def _on_heartbeat(self, sdo: DriveSdo, state: int) -> None:
         joint = sdo.drive.joint
         before = self._nmt.get(joint)
-        stamp = sdo.node.nmt.timestamp or 0.0
-        silent = stamp - self._stamp.get(joint, stamp)
-        self._nmt[joint], self._beat[joint], self._stamp[joint] = state, time.monotonic(), stamp
-        if self._started and silent > self._limit and joint not in self._lost:
-            # Lost and back between two looks.
-            self._lost.add(joint)
-            self._report("heartbeat_lost", sdo, time.time_ns(), f"no heartbeat for {silent:.2f} s")
-        if joint in self._lost:
-            self._lost.discard(joint)
-            self._report("heartbeat_back", sdo, time.time_ns(), "heartbeat is back")
+        self._nmt[joint] = state
         if not self._started:
             return
         if state == NmtState.BOOT_UP:

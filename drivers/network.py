@@ -16,6 +16,7 @@ from configs.errors import ArmidentError, ConfigError
 from configs.session import Bus, DriveNode
 from drivers import objects as od
 from drivers.frames import BusDown
+from drivers.heartbeats import Heartbeats
 from drivers.objects import NmtCommand
 from drivers.socketcan import RawSocket
 
@@ -54,7 +55,13 @@ class NodeNetwork:
         self.bus, self._nodes = bus, [drive.node_id for drive in drives]
         self.down = False
         self._tried = 0.0
-        self._network = canopen.Network(bus=self._open())
+        first = self._open()
+        try:
+            self.heartbeats = Heartbeats(bus, self._nodes)
+        except BaseException:
+            first.shutdown()
+            raise
+        self._network = canopen.Network(bus=first)
         self._network.NOTIFIER_CYCLE = 0.05
         self._network.listeners = [_QuietListener(self._network)]
         self._network.connect()
@@ -152,6 +159,7 @@ class NodeNetwork:
 
     def close(self) -> None:
         """Leave the bus."""
+        self.heartbeats.close()
         try:
             self._network.disconnect()
         except Exception as error:  # canopen raises here again what ended its receive thread

@@ -22,7 +22,7 @@ from virtual_robot.node import Drive
 PDO_FILTERS = ((0x180, 0x780), (0x200, 0x700), (0x300, 0x700), (0x400, 0x700), (0x500, 0x780))
 """Identifiers 180h to 57Fh, which PDOs may have; a socket does not receive what it sends itself."""
 BATCH = 1024
-REOPEN_S = 0.1
+REOPEN_S = 0.02
 """How often a bus that is down is looked at."""
 
 
@@ -143,11 +143,13 @@ class Line:
 
     def _lose(self) -> None:
         """The bus is down. What came before is not answered any more: drives queue no answers for a bus that is off."""
-        self.down, self._tried = True, time.monotonic()
         self._syncs, self._at, self._count = [], 0, 0
-        with suppress(BusDown):
-            while self.receive(wait=False) == BATCH:
-                pass
+        # The error is told once more if it was sending that found it.
+        for _ in range(2):
+            with suppress(BusDown):
+                while self.receive(wait=False) == BATCH:
+                    pass
+        self.down, self._tried = not self.bus.up, time.monotonic()
 
     def _is_back(self) -> bool:
         if time.monotonic() - self._tried < REOPEN_S:

@@ -267,12 +267,9 @@ class Farm:
             return
         set_link(lane.line.config.channel, True)
         lane.up = True
-        lane.line.down, lane.line._tried = True, 0.0
-        # SDO and heartbeats come back meanwhile, answers at once.
         if isinstance(lane.line.bus, RawSocket):
             # The first to send would be told once more that it was down.
             lane.line.bus._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-        self.beside(lane.line._is_back)
 
     def inject(self, bus: int, out: Frames) -> None:
         """Somebody else sends frames."""
