@@ -11,7 +11,6 @@ from configs import DataError
 from daq.books import (
     COUNT_NAMES,
     COUNTER,
-    HOLE,
     ORIGIN,
     RECEIVED,
     SYNC,
@@ -33,6 +32,10 @@ __all__ = ["LATE_S", "SYNC_LOST", "UNSENT", "Assembler", "Batch", "Rows", "TpdoS
 
 LATE_S = 4.0
 """A drive that owes an answer for longer than this while others have answered has lost it, s."""
+IN_STEP_S = 0.05
+"""The same where it answers every SYNC again, or none at all, beside a drive that owes nothing, s.
+
+Rows wait in memory for so long, and a kill costs those that do."""
 PATIENCE_S = 120.0
 """The same where all drives are behind and no frame is known to be missing: a busy host can hold up virtual drives.
 
@@ -127,11 +130,11 @@ class Assembler:
         for j, node in enumerate(nodes):
             writes_to[where[j], COB_SDO_REQUEST + node] = j
         self._shapes = [stream.shape for stream in streams]
-        window, patience = (
+        window, patience, short = (
             [max(_FEWEST_LATE, int(seconds * 1e9 / period_ns) // shape.every) for shape in self._shapes]
-            for seconds in (LATE_S, PATIENCE_S)
+            for seconds in (LATE_S, PATIENCE_S, IN_STEP_S)
         )
-        self._books = open_books(self._shapes, window, patience, where, channel_of, writes_to)
+        self._books = open_books(self._shapes, window, patience, short, where, channel_of, writes_to)
         self._slack = int(self._books.slack[0])
         if first_counter is not None:
             self._books.state[:, COUNTER] = (first_counter - 1) % overflow
@@ -203,7 +206,7 @@ class Assembler:
             longest = 0
         syncs = _count_sync(*arguments, longest, self._books)
         if dropped:
-            self._books.mark[:, HOLE] = self._books.mark[:, TOP] + syncs + 1
+            self._books.hole[bus] = self._books.mark[:, TOP] + syncs + 1
         out = room_for(self._books, syncs)
         _match(*arguments, longest, self._books, out)
         if self._books.counts[SYNC_MISALIGNED] >= _MISALIGNED:
@@ -236,7 +239,7 @@ class Assembler:
         """Compile the loops for frames like these, so that no SYNC waits for the compiler."""
         few = [_FEWEST_LATE] * len(self._shapes)
         nobody = np.full((self._lossy.size, 1), -1, np.int64)
-        scratch = open_books(self._shapes, few, few, self._books.bus_of.tolist(), nobody, nobody)
+        scratch = open_books(self._shapes, few, few, few, self._books.bus_of.tolist(), nobody, nobody)
         arguments = (*_columns(frames), *self._timing, 0)
         out = room_for(scratch, _count_sync(*arguments, self._longest, scratch))
         _match(*arguments, self._longest, scratch, out)

@@ -17,12 +17,21 @@ UNSEEN = int(np.iinfo(np.int64).min)
 SYNC, COUNTER, TIME, ORIGIN, BORROWED = 0, 1, 2, 3, 4
 
 # Columns of Books.kind: every how many SYNCs a frame is due, its samples, their bytes, its bytes, and for how many rows
-# an answer may be late: where others are not, and where all are.
-EVERY, PACK, SIZE, LENGTH, WINDOW, PATIENCE = range(6)
+# an answer may be late: where its drive has not been in step since, where all are late, and where it is in step again
+# beside others.
+EVERY, PACK, SIZE, LENGTH, WINDOW, PATIENCE, SHORT = range(7)
 
 # Columns of Books.mark, ordinals of each stream: rows asked for, row in the first slot of the ring, last row at which
-# all joints owed, last before which a frame is known to be missing, rows given out.
-TOP, BASE, BEHIND, HOLE, EMITTED = range(5)
+# all joints owed, rows given out.
+TOP, BASE, BEHIND, EMITTED = range(4)
+
+# Columns of Books.pace, per stream and joint: answers less rows at the drive's best lately, the row at which that was
+# reached, for how many rows in a row it has stood there, for how many nothing has been owed, the row at which this was
+# counted last, and whether answers to rows that were given up may still come.
+BEST, BEST_AT, STOOD, CALM, PACED, UNSURE = range(6)
+
+IN_STEP = 8
+"""A drive whose balance stands for so many rows answers each of them."""
 
 COUNT_NAMES = (
     "sync_seen",
@@ -52,8 +61,8 @@ class Books(NamedTuple):
     open the ring begins anew, so that memory is only touched where answers are late. ``head`` counts the rows that the
     SYNCs of a bus have asked for, ``TOP`` of ``mark`` those of the bus that is ahead. A bus may be ``slack`` SYNCs
     behind another one before it is taken for silent. ``behind`` is how many answers a drive has owed at once lately,
-    and at which row (``behind_at``); what is placed before row ``doubt`` is not certain. TPDOs that came in the time
-    ``suspect`` (n, 2) were mapped by others.
+    and at which row (``behind_at``); what is placed before row ``doubt`` is not certain. Before row ``hole`` of a bus a
+    frame is known to be missing on it. TPDOs that came in the time ``suspect`` (n, 2) were mapped by others.
     """
 
     state: NDArray[np.int64]
@@ -66,6 +75,8 @@ class Books(NamedTuple):
     channel_of: NDArray[np.int64]
     writes_to: NDArray[np.int64]
     head: NDArray[np.int64]
+    hole: NDArray[np.int64]
+    pace: NDArray[np.int64]
     settled: NDArray[np.int64]
     pending: NDArray[np.int64]
     fresh: NDArray[np.int64]
@@ -106,6 +117,7 @@ def open_books(
     shapes: Sequence[Shape],
     window: list[int],
     patience: list[int],
+    short: list[int],
     bus_of: Sequence[int],
     channel_of: NDArray[np.int64],
     writes_to: NDArray[np.int64],
@@ -125,14 +137,19 @@ def open_books(
         recent=np.full((buses, RECENT), UNSEEN, np.int64),
         counts=np.zeros(len(COUNT_NAMES), np.int64),
         kind=np.array(
-            [[s.every, s.pack, s.size, s.length, w, p] for s, w, p in zip(shapes, window, patience, strict=True)],
+            [
+                [s.every, s.pack, s.size, s.length, w, p, few]
+                for s, w, p, few in zip(shapes, window, patience, short, strict=True)
+            ],
             np.int64,
         ),
-        mark=np.zeros((streams, 5), np.int64),
+        mark=np.zeros((streams, 4), np.int64),
         bus_of=np.array(bus_of, np.int64),
         channel_of=channel_of,
         writes_to=writes_to,
         head=np.zeros((buses, streams), np.int64),
+        hole=np.zeros((buses, streams), np.int64),
+        pace=np.tile(np.array([UNSEEN, 0, 0, 0, 0, 0]), (streams, n, 1)),
         settled=np.zeros((streams, n), np.int64),
         pending=np.zeros((streams, n), np.int64),
         fresh=np.zeros((streams, n), np.int64),

@@ -24,7 +24,6 @@ from daq.books import (
     EVERY,
     FRAMES,
     FRAMES_UNKNOWN,
-    HOLE,
     LENGTH,
     LOST,
     ORIGIN,
@@ -83,7 +82,7 @@ def _miss(b: Books, bus: int, first: int, until: int, out: Decided) -> None:
     streams = b.kind.shape[0]
     before = b.head[bus].copy()
     for s in range(streams):
-        b.mark[s, HOLE] = max(b.mark[s, HOLE], b.head[bus, s] + (until - first) // b.kind[s, EVERY] + 1)
+        b.hole[bus, s] = max(b.hole[bus, s], b.head[bus, s] + (until - first) // b.kind[s, EVERY] + 1)
         if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2:
             settle_all(b, bus, s, False, out)
     for k in range(first, until):
@@ -124,6 +123,8 @@ def _skip_silent(b: Books, bus: int, k: int, t_ns: int, period_ns: int, overflow
             b.state[other, COUNTER] = (b.state[other, ORIGIN] + until - 1) % overflow
         for s in range(b.kind.shape[0]):
             settle_all(b, other, s, True, out)
+            # All rows of the hole are settled: on those behind it the bus was up.
+            b.hole[other, s] = min(b.hole[other, s], b.head[other, s])
 
 
 @njit(cache=True, nogil=True)

@@ -9,18 +9,25 @@ from daq.books import (
     AMBIGUOUS,
     BASE,
     BEHIND,
+    BEST,
+    BEST_AT,
+    CALM,
     EMITTED,
-    HOLE,
+    IN_STEP,
     LENGTH,
     NO_SYNC,
+    PACED,
     PACK,
     PATIENCE,
     RECEIVED,
+    SHORT,
     SIZE,
+    STOOD,
     TOP,
     TPDO_DUPLICATE,
     TPDO_LATE,
     UNSEEN,
+    UNSURE,
     WINDOW,
     Books,
     Decided,
@@ -92,32 +99,84 @@ def _was_behind(b: Books, s: int, j: int, rows: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _settle(b: Books, s: int, j: int, final: bool) -> None:
-    """Close the books of one TPDO of one drive: match what is certain, give up what is older than the window."""
+def _keep_pace(b: Books, s: int, j: int) -> None:
+    """See how a drive keeps up: how far its answers are behind the rows at its best, and for how long it stays there."""
     head = b.head[b.bus_of[j], s]
+    balance = b.pending[s, j] - (head - b.settled[s, j])
+    best = b.pace[s, j, BEST]
+    if balance > best or (balance < best and head - b.pace[s, j, BEST_AT] > b.kind[s, SHORT]):
+        b.pace[s, j, BEST], b.pace[s, j, BEST_AT], b.pace[s, j, STOOD] = balance, head, 0
+    if b.pace[s, j, PACED] == head:
+        return
+    b.pace[s, j, PACED] = head
+    b.pace[s, j, STOOD] = b.pace[s, j, STOOD] + 1 if balance == b.pace[s, j, BEST] else 0
+    b.pace[s, j, CALM] = b.pace[s, j, CALM] + 1 if balance == 0 and not b.pace[s, j, UNSURE] else 0
+
+
+@njit(cache=True, nogil=True)
+def _close(b: Books, s: int, j: int, until: int, unsure: bool) -> None:
+    """The rows before ``until`` are settled, all answers taken; whether some may still come to rows given up."""
+    b.settled[s, j], b.pending[s, j] = until, 0
+    b.pace[s, j, BEST], b.pace[s, j, STOOD], b.pace[s, j, UNSURE] = UNSEEN, 0, int(unsure)
+
+
+@njit(cache=True, nogil=True)
+def _drop_first(b: Books, s: int, j: int, count: int) -> None:
+    """The first answers are to rows that were given up; where frames were sent twice nobody can say how many are."""
+    for i in range(1, b.pending[s, j]):
+        if _same(b, s, j, i, i - 1):
+            b.doubt[s, j] = max(b.doubt[s, j], b.settled[s, j] + b.pending[s, j] - count)
+    b.pending[s, j] -= count
+    b.counts[TPDO_LATE] += count
+    for i in range(b.pending[s, j]):
+        b.label[s, j, i] = b.label[s, j, i + count]
+        b.answer_code[s, j, i] = b.answer_code[s, j, i + count]
+        for w in range(b.answer.shape[3]):
+            b.answer[s, j, i, w] = b.answer[s, j, i + count, w]
+
+
+@njit(cache=True, nogil=True)
+def _settle(b: Books, s: int, j: int, final: bool, witness: bool) -> None:
+    """Close the books of one TPDO of one drive: match what is certain, give up what nobody answers any more."""
+    bus = b.bus_of[j]
+    head, unsure = b.head[bus, s], b.pace[s, j, UNSURE] != 0
     owed = head - b.settled[s, j]
-    if b.pending[s, j] > owed:
+    if b.pending[s, j] > owed and not unsure:
         _without_repeats(b, s, j, owed)
-    count = b.pending[s, j]
     b.fresh[s, j] = 0
-    if count == owed:
-        for i in range(count):
+    balance, stood = b.pending[s, j] - owed, b.pace[s, j, STOOD]
+    # Where answers to rows given up may come in between, as many as SYNCs prove nothing before they keep step.
+    if (balance == 0 and not unsure) or (balance >= 0 and unsure and stood >= IN_STEP):
+        if balance > 0:
+            _drop_first(b, s, j, balance)
+        for i in range(owed):
             if b.label[s, j, i] > b.settled[s, j] + i and _seen(b, s, j, b.label[s, j, i]):
                 _was_behind(b, s, j, owed)
             _place(b, s, j, b.settled[s, j] + i, i)
-        if b.mark[s, HOLE] and b.settled[s, j] < b.mark[s, HOLE] + b.kind[s, WINDOW] // 4:
-            _give_up_refilled(b, s, j, count)
-        b.settled[s, j] = head
-        b.pending[s, j] = 0
+        if b.settled[s, j] < b.hole[bus, s]:
+            _give_up_refilled(b, s, j, owed)
+        _close(b, s, j, head, False)
         return
+    count = b.pending[s, j]
+    last = b.label[s, j, count - 1] + 1 if count else b.settled[s, j]
+    # It answers every SYNC, and no better than that while others owe nothing: what it still owes is lost.
+    in_step = balance < 0 and stood >= IN_STEP and head - b.pace[s, j, BEST_AT] >= b.kind[s, SHORT]
+    in_step = in_step and (witness or b.settled[s, j] < b.hole[bus, s])
+    silent = witness and head - last > 2 * b.kind[s, SHORT]
     late = owed > b.kind[s, WINDOW] and head - b.mark[s, BEHIND] > b.kind[s, WINDOW]
-    if not (late or owed > b.kind[s, PATIENCE] or final):
+    if not (late or owed > b.kind[s, PATIENCE] or final or in_step or silent):
         return
+    if balance > 0:
+        _drop_first(b, s, j, balance)
+        count -= balance
     keep = head if final else head - b.kind[s, WINDOW]
-    u, twice = head, False
+    if silent:
+        keep = max(keep, head - 2 * b.kind[s, SHORT])
+    keep = max(keep, b.settled[s, j])
+    u, twice, answered = head, False, b.settled[s, j]
     for i in range(count - 1, -1, -1):
         u = min(b.label[s, j, i], u - 1)
-        keep = max(keep, u + 1)
+        answered = max(answered, u + 1)
         _place(b, s, j, u, i)
         # A frame sent twice looks like two late answers, which move those before them.
         twice = u < b.label[s, j, i] and (
@@ -126,8 +185,8 @@ def _settle(b: Books, s: int, j: int, final: bool) -> None:
         if twice:
             b.row_code[s, slot_of(b, s, u), j] = AMBIGUOUS
     _give_up_doubtful(b, s, j, count)
-    b.pending[s, j] = 0
-    b.settled[s, j] = keep
+    # A drive answers in order: behind an answer none can come to what is before it.
+    _close(b, s, j, max(keep, answered), keep > answered or (unsure and not in_step))
 
 
 @njit(cache=True, nogil=True)
@@ -217,16 +276,24 @@ def _emit(b: Books, s: int, end: int, out: Decided) -> None:
 def settle_all(b: Books, bus: int, s: int, final: bool, out: Decided) -> None:
     """Close the books of the drives on one bus, and give out what all drives have settled."""
     n = b.settled.shape[1]
-    oldest, all_owe = b.head[bus, s], n > 1
+    all_owe, whole = n > 1, True
+    here = calm_here = calm = 0
     for j in range(n):
-        oldest = min(oldest, b.settled[s, j])
+        if b.bus_of[j] == bus:
+            _keep_pace(b, s, j)
+            here += 1
         all_owe = all_owe and b.settled[s, j] + b.pending[s, j] < b.head[b.bus_of[j], s]
-    if all_owe and oldest >= b.mark[s, HOLE]:
+        whole = whole and b.settled[s, j] >= b.hole[b.bus_of[j], s]
+        if b.pace[s, j, CALM] >= IN_STEP:
+            calm += 1
+            calm_here += b.bus_of[j] == bus
+    if all_owe and whole:
         b.mark[s, BEHIND] = b.head[bus, s]
     end = b.mark[s, TOP]
     for j in range(n):
         if b.bus_of[j] == bus:
-            _settle(b, s, j, final)
+            # Who owes nothing shows that neither the host nor the bus is behind.
+            _settle(b, s, j, final, calm_here > 0 if here > 1 else calm > 0)
         end = min(end, b.settled[s, j])
     if end > b.mark[s, EMITTED]:
         _emit(b, s, end, out)

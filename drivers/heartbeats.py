@@ -1,7 +1,7 @@
-"""The heartbeats of the drives on one bus, by the kernel's stamps: who has been silent, and for how long."""
+"""Heartbeats of the drives (CiA 301, section 7.2.8.3.2) by the kernel's stamps: who has been silent, and for how long."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -13,13 +13,12 @@ from drivers.objects import COB_HEARTBEAT, COB_MASK
 from drivers.udp import open_bus
 
 BATCH = 256
+HELD_UP_S = 0.1
+"""Whoever looks less often than this was held up."""
 
 
-class Heartbeats:
-    """Heartbeat consumer (CiA 301, section 7.2.8.3.2) with a socket of its own.
-
-    When a heartbeat came says the kernel, not when somebody found the time to look at it: what waits in the
-    socket is read before any drive is judged. Boot-up messages count, too.
+class HeartbeatSocket:
+    """The heartbeats on one bus, boot-up messages among them, in a socket of its own.
 
     Parameters
     ----------
@@ -40,46 +39,79 @@ class Heartbeats:
         self._config, self._nodes = bus, tuple(nodes)
         self._bus = self._open()
         self._batch = frames(BATCH)
-        self._last = dict.fromkeys(self._nodes, time.monotonic())
-        self._ended = dict.fromkeys(self._nodes, 0.0)
 
     def _open(self) -> FrameBus:
         classic = self._config.model_copy(update={"fd": False, "data_bitrate": None})
         return open_bus(classic, filters=[(COB_HEARTBEAT + node, COB_MASK) for node in self._nodes])
 
-    def begin(self) -> None:
-        """Wait for all drives from now on."""
-        self.read()
-        self._last = dict.fromkeys(self._nodes, time.monotonic())
-
-    def read(self) -> None:
-        """Take what has come; a bus that is down, or was removed, has nothing until it is back."""
-        self._ended = dict.fromkeys(self._nodes, 0.0)
+    def read(self) -> list[tuple[int, float]]:
+        """Node and time (s, of the monotonic clock) of what has come; nothing while the bus is down or removed."""
         if not self._bus.bound:
             with suppress(ArmidentError):
                 fresh = self._open()
                 self._bus.close()
                 self._bus = fresh
+        found: list[tuple[int, float]] = []
         with suppress(BusDown):
             while (got := self._bus.receive(self._batch)) > 0:
-                self._take(got)
-
-    def _take(self, got: int) -> None:
-        # Stamps are wall clock time, which may be set: only their age at this moment is used.
-        ages = (time.time_ns() - self._batch["t_ns"][:got]) * 1e-9
-        came = time.monotonic() - np.maximum(ages, 0.0)
-        for node, at in zip((self._batch["can_id"][:got] - COB_HEARTBEAT).tolist(), came.tolist(), strict=True):
-            self._ended[node] = max(self._ended[node], at - self._last[node])
-            self._last[node] = max(self._last[node], at)
-
-    def silent(self, node: int) -> float:
-        """How long ago a drive's last heartbeat came, s."""
-        return time.monotonic() - self._last[node]
-
-    def ended(self, node: int) -> float:
-        """The longest silence of a drive that ended with a heartbeat taken by the last :meth:`read`, s; 0: none did."""
-        return self._ended[node]
+                # Stamps are wall clock time, which may be set: only their age at this moment is used.
+                ages = (time.time_ns() - self._batch["t_ns"][:got]) * 1e-9
+                came = time.monotonic() - np.maximum(ages, 0.0)
+                nodes = self._batch["can_id"][:got] - COB_HEARTBEAT
+                found += zip(nodes.tolist(), came.tolist(), strict=True)
+        return found
 
     def close(self) -> None:
         """Release the socket."""
         self._bus.close()
+
+
+class Silences:
+    """How long each drive has been silent, and was until its last heartbeat.
+
+    A machine that was held up as a whole stamps late what came meanwhile, or has lost it. So where the consumer was
+    held up, the stretch of that time in which no drive at all was heard is nobody's silence, once for each silence.
+
+    Parameters
+    ----------
+    drives
+        Who is waited for.
+    now
+        From when on, s.
+    """
+
+    def __init__(self, drives: Iterable[str], now: float) -> None:
+        self._last = dict.fromkeys(drives, now)
+        self._ended = dict.fromkeys(self._last, 0.0)
+        self._excused: set[str] = set()
+        self._looked = now
+
+    def look(self, heartbeats: Iterable[tuple[str, float]], now: float) -> None:
+        """Take the heartbeats (drive, time in s) that have come since the last look."""
+        self._ended = dict.fromkeys(self._last, 0.0)
+        before, self._looked = self._looked, now
+        ordered = sorted(heartbeats, key=lambda beat: beat[1])
+        times = [before, *(min(max(at, before), now) for _, at in ordered), now]
+        k = max(range(len(times) - 1), key=lambda i: times[i + 1] - times[i])
+        pause = times[k + 1] - times[k]
+        held_up = now - before > HELD_UP_S and pause > HELD_UP_S
+        self._take(ordered[:k])
+        for drive in self._last if held_up else ():
+            if drive not in self._excused:
+                self._excused.add(drive)
+                self._last[drive] += pause
+        self._take(ordered[k:])
+
+    def _take(self, heartbeats: Iterable[tuple[str, float]]) -> None:
+        for drive, at in heartbeats:
+            self._ended[drive] = max(self._ended[drive], at - self._last[drive])
+            self._last[drive] = max(self._last[drive], at)
+            self._excused.discard(drive)
+
+    def lasts(self, drive: str) -> float:
+        """How long the drive has been silent by the last look, s."""
+        return self._looked - self._last[drive]
+
+    def ended(self, drive: str) -> float:
+        """The longest silence of the drive that ended with a heartbeat of the last look, s; 0: none did."""
+        return self._ended[drive]

@@ -5,7 +5,6 @@ it costs tens of microseconds per frame and must never see the hot path.
 """
 
 import logging
-import math
 import queue
 import threading
 import time
@@ -22,6 +21,7 @@ from drivers import objects as od
 from drivers.emcy import emcy_text
 from drivers.enabling import POLL_INTERVAL, enable_drive, stand_still, state_of
 from drivers.frames import BusDown
+from drivers.heartbeats import Silences
 from drivers.mapping import check_drive, map_drive, mapping_differs
 from drivers.network import NodeNetwork
 from drivers.objects import Control, DriveState, NmtCommand, NmtState
@@ -94,7 +94,8 @@ class DriveMaster:
         self._nmt: dict[str, int] = {}
         self._limit = HEARTBEATS_MISSED * session.heartbeat_ms * 1e-3 + HEARTBEAT_MARGIN
         self._lost: set[str] = set()
-        self._looked, self._held_up = math.inf, False
+        self._joints = {(session.bus_of(d).channel, d.node_id): d.joint for d in session.drives}
+        self._silences: Silences | None = None
         self._reviving: dict[str, threading.Thread] = {}
         self.suspect: dict[str, tuple[int, int]] = {}
         """From when on, and until when (ns, UTC), the TPDOs of joints are not to be trusted; a new one per change."""
@@ -152,8 +153,8 @@ class DriveMaster:
             self._command(NmtCommand.START, sdo)
         for sdo in self._drives:
             self._await_operational(sdo)
-        for network in self._networks.values():
-            network.heartbeats.begin()
+        self._heard()
+        self._silences = Silences(self._joints.values(), time.monotonic())
         self._started = True
         if not enable:
             return
@@ -181,8 +182,8 @@ class DriveMaster:
         alive = {channel: network.revive() for channel, network in self._networks.items()}
         if not any(alive.values()):
             raise BusDown(f"bus {', '.join(alive)}: went down")
-        if self._started:
-            self._judge_heartbeats()
+        if self._started and self._silences is not None:
+            self._judge(self._silences)
         events = []
         while not self._events.empty():
             events.append(self._events.get())
@@ -254,22 +255,26 @@ class DriveMaster:
     def _command(self, command: NmtCommand, sdo: DriveSdo) -> None:
         self._network_of(sdo.drive).command(command, sdo.drive.node_id)
 
-    def _judge_heartbeats(self) -> None:
-        """Tell whose heartbeats stay away, and whose are back, by when they came (CiA 301: heartbeat event)."""
-        before, self._looked = self._looked, time.monotonic()
-        for network in self._networks.values():
-            network.heartbeats.read()
-        # A host that was held up may have held up its interface, too: it looks once more before it says who is missing.
-        self._held_up = self._looked - before > HEARTBEAT_MARGIN and not self._held_up
+    def _heard(self) -> list[tuple[str, float]]:
+        """Joint and time of the heartbeats that have come since the last call."""
+        return [
+            (self._joints[channel, node], at)
+            for channel, network in self._networks.items()
+            for node, at in network.heartbeats.read()
+        ]
+
+    def _judge(self, silences: Silences) -> None:
+        """Tell whose heartbeats stay away, and whose are back, by when they came and not by when they are looked at."""
+        # What waits in the sockets is read before anybody is said to be missing.
+        heard = self._heard()
+        silences.look(heard, time.monotonic())
         for sdo in self._drives:
-            joint, node = sdo.drive.joint, sdo.drive.node_id
-            heartbeats = self._network_of(sdo.drive).heartbeats
-            silent, ended = heartbeats.silent(node), heartbeats.ended(node)
-            if joint not in self._lost and (ended > self._limit or (silent > self._limit and not self._held_up)):
+            joint = sdo.drive.joint
+            lasts, ended = silences.lasts(joint), silences.ended(joint)
+            if joint not in self._lost and max(lasts, ended) > self._limit:
                 self._lost.add(joint)
-                missed = max(ended, silent)
-                self._report("heartbeat_lost", sdo, time.time_ns(), f"no heartbeat for {missed:.2f} s")
-            if joint in self._lost and silent <= self._limit:
+                self._report("heartbeat_lost", sdo, time.time_ns(), f"no heartbeat for {max(lasts, ended):.2f} s")
+            if joint in self._lost and lasts <= self._limit:
                 self._lost.discard(joint)
                 self._report("heartbeat_back", sdo, time.time_ns(), "heartbeat is back")
 

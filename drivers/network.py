@@ -16,7 +16,7 @@ from configs.errors import ArmidentError, ConfigError
 from configs.session import Bus, DriveNode
 from drivers import objects as od
 from drivers.frames import BusDown
-from drivers.heartbeats import Heartbeats
+from drivers.heartbeats import HeartbeatSocket
 from drivers.objects import NmtCommand
 from drivers.socketcan import RawSocket
 
@@ -57,7 +57,7 @@ class NodeNetwork:
         self._tried = 0.0
         first = self._open()
         try:
-            self.heartbeats = Heartbeats(bus, self._nodes)
+            self.heartbeats = HeartbeatSocket(bus, self._nodes)
         except BaseException:
             first.shutdown()
             raise

@@ -147,7 +147,7 @@ EFFECTS = (
         says="the measured position has an error that repeats with the turn: an encoder disc mounted off centre",
         reference="Armstrong 1998, Mechanism and Machine Theory; de Silva 2007, Sensors and Actuators, chapter 5",
         linear=(Linear("ecc", ("rad", "m")), Linear("ecs", ("rad", "m"))),
-        shapes=(Shape("harmonic", ("per rad of the joint", "rad/m"), rounds, continuous=False),),
+        shapes=(Shape("harmonic", ("per rad of the joint", "rad/m"), rounds, continuous=(False, True)),),
         columns=_eccentricity,
         predicts=True,
         needs="fast motion over a wide range",

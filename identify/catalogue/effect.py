@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from configs import RobotConfig
 from identify.catalogue.motion import Motion
 
 Array = NDArray[np.float64]
@@ -53,7 +54,8 @@ class Shape:
     grid
         Values worth trying on a motion of a joint, increasing, in the unit of the parameter.
     continuous
-        Whether values between those of the grid make sense; a harmonic is a whole number.
+        Whether values between those of the grid make sense, for a revolute and for a prismatic joint; a harmonic of a
+        turn is a whole number, and nobody has said where on its travel a screw turns round.
     default
         What a robot configuration means that does not give it; ``None``: it must.
     """
@@ -61,7 +63,7 @@ class Shape:
     name: str
     unit: tuple[str, str]
     grid: Callable[[Motion, int], Sequence[float]]
-    continuous: bool = True
+    continuous: tuple[bool, bool] = (True, True)
     default: float | None = None
 
 
@@ -147,6 +149,11 @@ class Effect:
             p.sign * value >= -DOUBT * doubt and p.bounds[0] - DOUBT * doubt <= value <= p.bounds[1] + DOUBT * doubt
             for p, value, doubt in zip(self.linear, values, std, strict=True)
         )
+
+    def refinable(self, robot: RobotConfig, place: "Place") -> tuple[bool, ...]:
+        """Which of the nonlinear parameters may lie between the values of their grids at a place."""
+        prismatic = robot.joints[place.joint].type == "prismatic"
+        return tuple(shape.continuous[prismatic] for shape in self.shapes)
 
     def torque(self, motion: Motion, place: "Place", shapes: Mapping[str, float]) -> Array:
         """Columns of all joints, shape (N, n, k)."""

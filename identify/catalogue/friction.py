@@ -221,7 +221,7 @@ EFFECTS = (
         says="dry friction differs from one position of the joint to another: a bent shaft, a tight spot, uneven wear",
         reference="Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators",
         linear=(Linear("fpc", TORQUE), Linear("fps", TORQUE)),
-        shapes=(Shape("period", ("rad", "m"), turns, continuous=False),),
+        shapes=(Shape("period", ("rad", "m"), turns, continuous=(False, True)),),
         columns=_position_dependent,
         needs="a wide range of joint positions, passed in both directions",
         together=True,

@@ -25,7 +25,7 @@ def described(effect: Effect) -> dict[str, Any]:
         "says": effect.says,
         "scope": effect.scope,
         "parameters": [{"name": p.name, "unit": list(p.unit), "sign": p.sign} for p in effect.linear],
-        "shapes": [{"name": s.name, "unit": list(s.unit), "continuous": s.continuous} for s in effect.shapes],
+        "shapes": [{"name": s.name, "unit": list(s.unit), "continuous": list(s.continuous)} for s in effect.shapes],
         "needs": effect.needs,
         "reference": effect.reference,
     }

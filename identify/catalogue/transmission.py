@@ -110,7 +110,7 @@ EFFECTS = (
         says="a torque ripple that repeats with the motor angle: magnets of the motor, or an eccentric gear",
         reference="Petrovic et al. 2000, IEEE Trans. Power Electronics 15(6); Gandhi et al. 2002, ICRA",
         linear=(Linear("cgc", ("N m", "N")), Linear("cgs", ("N m", "N"))),
-        shapes=(Shape("harmonic", ("per rad of the motor", "rad/m"), harmonics, continuous=False),),
+        shapes=(Shape("harmonic", ("per rad of the motor", "rad/m"), harmonics, continuous=(False, True)),),
         columns=_cogging,
         needs="slow motion over several motor turns",
         scope="motor",

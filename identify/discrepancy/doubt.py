@@ -24,7 +24,7 @@ class Outcome:
     state
         The model with what convinces.
     findings, considered
-        What was added to the model, and what was taken out again or never convinced.
+        What was added to the model, that first which most speaks for; and what was taken out again or never convinced.
     left
         Dependences of the residual of that model.
     """
@@ -64,7 +64,8 @@ def convincing(search: Search, first: State, final: State, seen: Survey) -> Outc
         search.progress(f"taking out {findings[worst].effect}")
         final = _without(search, first, final, worst, been)
         been.add(places_of(final))
-    return Outcome(final, tuple(findings), _unique(considered, findings), tuple(left))
+    ordered = sorted(findings, key=lambda finding: -float(finding.evidence["score"] or 0.0))
+    return Outcome(final, tuple(ordered), _unique(considered, ordered), tuple(left))
 
 
 def _confidence(finding: Finding) -> float:

@@ -116,7 +116,7 @@ class Search:
         and in that which these make.
         """
         effect = trial.candidate.effect
-        if effect.predicts and not effect.sudden and any(shape.continuous for shape in effect.shapes):
+        if effect.predicts and not effect.sudden and any(effect.refinable(state.study.robot, trial.candidate.place)):
             for _ in range(LOOPS):
                 again = in_its_loop(state.fit, trial)
                 if again is None or again.forbidden or again.score < trial.score:

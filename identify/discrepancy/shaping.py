@@ -38,9 +38,9 @@ def instrumented(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Sha
     found = shapes
     if not candidate.effect.predicts:
         return found
-    for k, shape in enumerate(candidate.effect.shapes):
+    for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
         values = np.array(sorted({grid[k][1] for grid in candidate.grid}))
-        if not shape.continuous or values.size < 2:
+        if not free or values.size < 2:
             continue
         at = int(np.argmin(np.abs(np.log(values / found[k][1]))))
         low, high = float(values[max(at - 1, 0)]), float(values[min(at + 1, values.size - 1)])

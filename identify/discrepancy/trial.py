@@ -286,9 +286,9 @@ def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array
 def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[float, Shapes]) -> Shapes:
     """Shapes between those of the grid, one continuous parameter after the other, on a logarithmic scale."""
     found = best
-    for k, shape in enumerate(candidate.effect.shapes):
+    for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
         values = sorted({grid[k][1] for grid in candidate.grid})
-        if not shape.continuous or len(values) < 2:
+        if not free or len(values) < 2:
             continue
         at = int(np.argmin(np.abs(np.array(values) - found[1][k][1])))
         low, high = values[max(at - 1, 0)], values[min(at + 1, len(values) - 1)]

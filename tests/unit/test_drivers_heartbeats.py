@@ -1,102 +1,60 @@
-"""When heartbeats came is told by their stamps, however late they are looked at."""
+"""Who has been silent is told by when heartbeats came, however late they are looked at."""
 
-import time
-from typing import Any
-
-import numpy as np
 import pytest
 
-from configs.session import Bus
-from drivers import heartbeats as module
-from drivers.frames import BusDown, Frames, frames
-from drivers.heartbeats import Heartbeats
+from drivers.heartbeats import Silences
+
+BEATS = 0.1
 
 
-class Waiting:
-    """A bus on which frames wait."""
-
-    bound = True
-
-    def __init__(self) -> None:
-        self.batches: list[list[tuple[int, float]]] = []
-        self.down = False
-
-    def receive(self, batch: Frames) -> int:
-        """Node and age (s) of each heartbeat, as frames."""
-        if self.down:
-            self.down = False
-            raise BusDown("bus: went down")
-        if not self.batches:
-            return 0
-        taken = self.batches.pop(0)
-        some = frames(len(taken))
-        some["can_id"] = [0x700 + node for node, _ in taken]
-        some["t_ns"] = [time.time_ns() - round(age * 1e9) for _, age in taken]
-        batch[: len(taken)] = some
-        return len(taken)
-
-    def close(self) -> None:
-        """Nothing to release."""
+def beats(drive: str, first: float, last: float) -> list[tuple[str, float]]:
+    """A heartbeat every 0.1 s from ``first`` to ``last``."""
+    return [(drive, first + BEATS * k) for k in range(round((last - first) / BEATS) + 1)]
 
 
-@pytest.fixture
-def bus(monkeypatch: pytest.MonkeyPatch) -> Waiting:
-    waiting = Waiting()
-    monkeypatch.setattr(module, "open_bus", lambda *_, **__: waiting)
-    return waiting
+def looked(silences: Silences, until: float, since: float = 0.0, step: float = 0.02) -> None:
+    """Look all the time, and hear nobody."""
+    for k in range(1, round((until - since) / step) + 1):
+        silences.look([], since + step * k)
 
 
-def consumer(bus: Waiting, began: float) -> Heartbeats:
-    """Of nodes 1 and 2, both heard ``began`` seconds ago."""
-    heartbeats = Heartbeats(Bus(channel="vcan0"), (1, 2))
-    bus.batches = [[(1, began), (2, began)]]
-    heartbeats._last = dict.fromkeys((1, 2), time.monotonic() - began)
-    heartbeats.read()
-    return heartbeats
+def test_heartbeats_that_waited_while_nobody_looked_are_no_silence() -> None:
+    silences = Silences("ab", 0.0)
+    silences.look([*beats("a", 0.1, 1.9), *beats("b", 0.05, 1.95)], 2.0)
+    assert silences.ended("a") == pytest.approx(0.1)
+    assert silences.lasts("b") == pytest.approx(0.05)
 
 
-def test_heartbeats_that_waited_while_nobody_looked_are_no_silence(bus: Waiting) -> None:
-    heartbeats = consumer(bus, 2.0)
-    bus.batches = [[(1, 2.0 - 0.1 * k) for k in range(1, 20)]]
-    heartbeats.read()
-    assert heartbeats.silent(1) == pytest.approx(0.1, abs=0.05)
-    assert heartbeats.ended(1) == pytest.approx(0.1, abs=0.05)
-    assert heartbeats.silent(2) == pytest.approx(2.0, abs=0.05)
-    assert heartbeats.ended(2) == 0.0
+def test_a_drive_that_was_silent_while_others_were_heard_is_told_whoever_was_held_up() -> None:
+    silences = Silences("ab", 0.0)
+    silences.look([("a", 0.1), ("a", 0.9), *beats("b", 0.05, 1.05)], 1.1)
+    assert silences.ended("a") == pytest.approx(0.8)
+    silences.look(beats("b", 1.15, 2.05), 2.1)
+    assert silences.ended("a") == 0.0
+    assert silences.lasts("a") == pytest.approx(1.2, abs=0.11)
 
 
-def test_a_silence_between_two_looks_is_told(bus: Waiting) -> None:
-    heartbeats = consumer(bus, 2.0)
-    bus.batches = [[(1, 1.9), (1, 1.0)], [(1, 0.9)]]
-    heartbeats.read()
-    assert heartbeats.ended(1) == pytest.approx(0.9, abs=0.05)
-    heartbeats.read()
-    assert heartbeats.ended(1) == 0.0
+def test_a_drive_that_stays_away_is_told_in_time() -> None:
+    silences = Silences("a", 0.0)
+    looked(silences, 0.44)
+    assert silences.lasts("a") == pytest.approx(0.44)
 
 
-def test_a_clock_that_is_set_makes_nobody_silent(bus: Waiting, monkeypatch: pytest.MonkeyPatch) -> None:
-    heartbeats = consumer(bus, 0.1)
-    real = time.time_ns
-    for step in (3_600_000_000_000, -3_600_000_000_000):
-        monkeypatch.setattr(time, "time_ns", lambda step=step: real() + step)
-        bus.batches = [[(1, 0.05), (2, 0.05)]]
-        heartbeats.read()
-        assert heartbeats.ended(1) < 0.2
-        assert heartbeats.silent(1) < 0.2
+@pytest.mark.parametrize("heard", [[], [("a", 1.0), ("b", 1.0)]])
+def test_a_machine_that_stood_still_as_a_whole_has_missed_nobody(heard: list[tuple[str, float]]) -> None:
+    """Whether the heartbeats of that time are stamped when it goes on, or have not come yet."""
+    silences = Silences("ab", 0.0)
+    silences.look([("a", 0.15), ("b", 0.2)], 0.22)
+    silences.look(heard, 1.01)
+    for drive in "ab":
+        assert max(silences.ended(drive), silences.lasts(drive)) < 0.2
+    # Who is really gone is missed all the same.
+    looked(silences, 1.45, since=1.01)
+    assert silences.lasts("a") > 0.4
 
 
-def test_a_bus_that_is_down_has_nothing_to_tell(bus: Waiting) -> None:
-    heartbeats = consumer(bus, 1.0)
-    bus.down = True
-    heartbeats.read()
-    assert heartbeats.silent(1) == pytest.approx(1.0, abs=0.05)
-    bus.batches = [[(1, 0.0)]]
-    heartbeats.read()
-    assert heartbeats.silent(1) == pytest.approx(0.0, abs=0.05)
-
-
-def test_beginning_forgets_what_was_before(bus: Waiting) -> None:
-    heartbeats = consumer(bus, 5.0)
-    heartbeats.begin()
-    silences: Any = [heartbeats.silent(node) for node in (1, 2)]
-    assert np.max(silences) < 0.1
+def test_a_machine_that_stands_still_again_and_again_misses_who_is_gone() -> None:
+    silences = Silences("a", 0.0)
+    for k in range(1, 5):
+        silences.look([], 0.3 * k)
+    assert silences.lasts("a") == pytest.approx(0.9)
