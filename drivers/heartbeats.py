@@ -1,4 +1,4 @@
-"""Heartbeats of the drives (CiA 301, section 7.2.8.3.2) by the kernel's stamps: who has been silent, and for how long."""
+"""Heartbeats (CiA 301, section 7.2.8.3.2) by the kernel's stamps: which drive has been silent, and for how long."""
 
 import time
 from collections.abc import Iterable, Sequence
