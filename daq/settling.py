@@ -100,7 +100,7 @@ def _was_behind(b: Books, s: int, j: int, rows: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _keep_pace(b: Books, s: int, j: int) -> None:
-    """See how a drive keeps up: how far its answers are behind the rows at its best, and for how long it stays there."""
+    """See how a drive keeps up: how far it is behind the rows at its best, and for how long it stays there."""
     head = b.head[b.bus_of[j], s]
     balance = b.pending[s, j] - (head - b.settled[s, j])
     best = b.pace[s, j, BEST]
