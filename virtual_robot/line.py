@@ -66,9 +66,13 @@ class Line:
         """Canopen's own bus, to which the kernel passes NMT commands and SDO requests only."""
         wanted = [COB_NMT, *(COB_SDO_REQUEST + drive.node_id for drive in self.drives)]
         filters = [{"can_id": can_id, "can_mask": COB_MASK, "extended": False} for can_id in wanted]
+
         # Whoever takes the error keeps canopen's receive thread alive: its socket and the kernel's heartbeats work
-        # again by themselves when the bus is back.
-        network.listeners[0].on_error = lambda error: None
+        # again by themselves when the bus is back. An error that is kept would end every SDO transfer from then on.
+        def forget(error: Exception) -> None:
+            network.notifier.exception = None
+
+        network.listeners[0].on_error = forget
         try:
             network.connect(interface=self.config.interface, channel=self.config.channel, can_filters=filters)
         except (OSError, can.CanError) as error:
