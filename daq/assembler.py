@@ -32,8 +32,8 @@ __all__ = ["LATE_S", "SYNC_LOST", "UNSENT", "Assembler", "Batch", "Rows", "TpdoS
 
 LATE_S = 4.0
 """A drive that owes an answer for longer than this while others have answered has lost it, s."""
-IN_STEP_S = 0.05
-"""The same where it answers every SYNC again, or none at all, beside a drive that owes nothing, s.
+IN_STEP_S = 0.02
+"""The same where it answers every SYNC again beside a drive that owes nothing, s; twice that if it answers none at all.
 
 Rows wait in memory for so long, and a kill costs those that do."""
 PATIENCE_S = 120.0

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from daq.books import BORROWED, COUNTER, ORIGIN, SYNC, TIME, UNSEEN
+from daq.books import BORROWED, COUNTER, ORIGIN, RECENT, SYNC, TIME, UNSEEN
 
 _EARLY = 0.25
 """By how much of a turn of the counter the time between two SYNCs may be too short, as their stamps say."""
@@ -37,7 +37,7 @@ def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longes
 
 
 @njit(cache=True, nogil=True)
-def _begin(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
+def _begin(state: Any, recent: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
     """The first SYNC of a bus: number 0, or what those of another bus say; the step to it, 0 for one before number 0.
 
     Less than 0 where counters of the buses do not agree.
@@ -50,7 +50,12 @@ def _begin(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overfl
         if counter >= 0 and state[other, COUNTER] >= 0:
             step = (counter - state[other, COUNTER]) % overflow
             ahead = int(step + overflow * np.rint((elapsed - step) / overflow))
-            if abs(elapsed - ahead) > _MISALIGNED:
+            apart = abs(elapsed - ahead)
+            k = state[other, SYNC] + ahead
+            if ahead <= 0 <= k and ahead > -RECENT and recent[other, k % RECENT] != UNSEEN:
+                # Known when the other bus had it: a master that was held up since does not matter.
+                apart = abs(t_ns - recent[other, k % RECENT]) / period_ns
+            if apart > _MISALIGNED:
                 return -1
         state[bus, ORIGIN] = state[other, ORIGIN]
         return int(max(0, state[other, SYNC] + ahead + 1))
@@ -60,11 +65,13 @@ def _begin(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overfl
 
 
 @njit(cache=True, nogil=True)
-def advance(state: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int) -> int:
+def advance(
+    state: Any, recent: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int
+) -> int:
     """By how many SYNCs a bus advances with this one, after which ``state`` says so; nothing changes if it does not."""
     elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != UNSEEN else 0.0
     if state[bus, SYNC] < 0 and state[bus, COUNTER] < 0:
-        step = _begin(state, bus, counter, t_ns, period_ns, overflow)
+        step = _begin(state, recent, bus, counter, t_ns, period_ns, overflow)
     elif counter >= 0 and state[bus, COUNTER] >= 0 and state[bus, BORROWED]:
         # What had waited on this bus may be older than what others had meanwhile.
         step = (counter - state[bus, COUNTER]) % overflow
