@@ -282,7 +282,7 @@ class Recorder:
             if self._drain():
                 until = time.monotonic() + LATE_S
             owed = self._assembler.owed
-            if owed == 0 or time.monotonic() > until:
+            if owed <= 0 or time.monotonic() > until:
                 return
             if not told and owed * self._period > TELL_BEHIND_S:
                 self._say(f"the drives are {owed * self._period:.1f} s behind: waiting for their answers")

@@ -91,6 +91,11 @@ class Sink:
         samples = batch.rows["samples"]
         if samples.sync.size:
             self._writer.turn(int(samples.t_ns[0]))
+            self.last_ns = self.last_ns or int(samples.t_ns[0])
+        if batch.gaps:
+            # Before the rows behind them: a file that ends in the middle says what is missing in what it has.
+            self.gaps += batch.gaps
+            self._writer.add_gaps(batch.gaps, self.last_ns)
         for stream in self._streams:
             rows = batch.rows[stream.bus.name]
             if rows.sync.size == 0:
@@ -105,8 +110,6 @@ class Sink:
                 self.last_sync, self.last_ns = int(rows.sync[-1]), int(rows.t_ns[-1])
                 self._place_marks(False, rows)
         if batch.gaps:
-            self.gaps += batch.gaps
-            self._writer.add_gaps(batch.gaps, self.last_ns)
             found = [asdict(gap) for gap in batch.gaps]
             self._publisher.event(encode_event("gaps", {"capture": self._capture, "gaps": found}))
 

@@ -1,10 +1,10 @@
 """Captures killed at random moments: ``python -m tests.faults.kill --rounds 200``.
 
 Each round captures what six drives send at 1 to 5 kHz and is ended by SIGKILL, every fifth with files that are turned
-over all the time. By the kill an independent socket on the bus has heard some SYNCs; those that the files do not
-account for afterwards are what it cost, at most 100 ms of them. Every file opens torn, is healed by
-``heal_recording``, and says the same as before; other MCAP readers then open it too. Runs under
-``python -m drivers.vcan``.
+over all the time, every third with a drive that does not answer now and then. By the kill an independent socket on the
+bus has heard some SYNCs; those that the files do not account for afterwards are what it cost, at most 100 ms of them.
+Every file opens torn, is healed by ``heal_recording``, and says the same as before; other MCAP readers then open it
+too. Runs under ``python -m drivers.vcan``.
 """
 
 import argparse
@@ -47,6 +47,7 @@ class Kill:
     number: int
     rate_hz: int
     files: int
+    lossy: bool
     heard: int
     """SYNCs that an independent socket had received when the signal was sent."""
     kept: int
@@ -73,13 +74,14 @@ class Lane:
         """One round."""
         rng = np.random.default_rng([self._seed, number])
         rate = int(rng.choice(RATES_HZ))
+        lossy = rate // 7 if number % 3 == 2 else 0
         path = session_file(
             self._folder, f"{self._name}k{number}", [self._name], False, number % 5 == 4, 10**6 // rate, demand=False
         )
         out, log = self._folder / f"k{number}", self._folder / f"k{number}.log"
         with (
             RawSocket(self._name, filters=[(COB_SYNC, COB_MASK)]) as witness,
-            Sender([self._name], 10**6 // rate) as sender,
+            Sender([self._name], 10**6 // rate, lossy=lossy) as sender,
         ):
             capture = self._recorders.start(path, out, log, listen_only=True)
             deadline = time.monotonic() + LONGEST_WAIT_S
@@ -106,7 +108,7 @@ class Lane:
         if lost_ms > MOST_LOST_MS:
             wrong.append(f"{lost_ms:.1f} ms lost")
         shutil.rmtree(out)
-        return Kill(number, rate, len(files), heard.size, kept, lost_ms, wrong)
+        return Kill(number, rate, len(files), lossy > 0, heard.size, kept, lost_ms, wrong)
 
     def _checked(self, files: list[Path], heard: NDArray[np.int64], wrong: list[str]) -> int:
         """How many of the SYNCs heard the files account for, as found torn, and the same when healed."""
@@ -171,16 +173,17 @@ def show(kills: Sequence[Kill]) -> int:
     """Print what was lost, by rate, and what was wrong; how many rounds that concerns."""
     line = "{:>8} {:>7} {:>7} {:>11} {:>11} {:>9} {:>9} {:>11}"
     print(line.format("rate", "rounds", "files", "SYNCs", "median ms", "p90 ms", "max ms", "violations"))
-    for rate in (*RATES_HZ, 0):
-        part = [kill for kill in kills if rate in (0, kill.rate_hz)]
+    for rate in (*RATES_HZ, "lossy", "all"):
+        part = [kill for kill in kills if rate in ("all", kill.rate_hz) or (rate == "lossy" and kill.lossy)]
         if part:
             lost = np.array([kill.lost_ms for kill in part])
             figures = [f"{x:.1f}" for x in (np.median(lost), np.quantile(lost, 0.9), lost.max())]
             heard, files = sum(k.heard for k in part), sum(k.files for k in part)
-            print(line.format(rate or "all", len(part), files, heard, *figures, sum(1 for k in part if k.violations)))
+            print(line.format(rate, len(part), files, heard, *figures, sum(1 for k in part if k.violations)))
     bad = [kill for kill in kills if kill.violations]
     for kill in bad:
-        print(f"round {kill.number} ({kill.rate_hz} Hz, {kill.files} files): {'; '.join(kill.violations)}")
+        kind = f"{kill.rate_hz} Hz, {kill.files} files{', lossy' if kill.lossy else ''}"
+        print(f"round {kill.number} ({kind}): {'; '.join(kill.violations)}")
     return len(bad)
 
 

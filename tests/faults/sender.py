@@ -32,7 +32,7 @@ def current_of(sync: Any, joint: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _send(descriptors, address, body, first, joints, period, count, control):  # type: ignore[no-untyped-def]
+def _send(descriptors, address, body, first, joints, period, count, lossy, control):  # type: ignore[no-untyped-def]
     spec = np.zeros(2, dtype=np.int64)
     base = monotonic_ns(spec) + period
     k = 0
@@ -51,6 +51,8 @@ def _send(descriptors, address, body, first, joints, period, count, control):  #
                 body[row, 3] = (k * 31 + joints[row] * 1009) % 32749
         for b in range(descriptors.size):
             count_here = first[b + 1] - first[b]
+            if lossy and k % lossy == lossy - 1 and b == descriptors.size - 1:
+                count_here -= 1
             if send_messages(descriptors[b], address + 64 * first[b], count_here, ATTEMPTS, spec):
                 control[FAILED] += 1
         k += 1
@@ -68,13 +70,15 @@ class Sender:
         SYNC period.
     count
         How many SYNCs.
+    lossy
+        Every so many SYNCs the last drive does not answer; 0: it always does.
     """
 
-    def __init__(self, channels: Sequence[str], period_us: int, count: int = 2**40) -> None:
+    def __init__(self, channels: Sequence[str], period_us: int, count: int = 2**40, lossy: int = 0) -> None:
         context = multiprocessing.get_context("fork")
         shared = context.RawArray("q", 7)
         self.control: NDArray[np.int64] = np.frombuffer(shared, np.int64)
-        arguments = list(channels), period_us, count, self.control
+        arguments = list(channels), period_us, count, lossy, self.control
         self._process = context.Process(target=_work, args=arguments, daemon=True)
 
     def __enter__(self) -> Self:
@@ -115,7 +119,7 @@ class Sender:
         self._process.join()
 
 
-def _work(channels: list[str], period_us: int, count: int, control: NDArray[np.int64]) -> None:
+def _work(channels: list[str], period_us: int, count: int, lossy: int, control: NDArray[np.int64]) -> None:
     sockets = [RawSocket(channel, filters=()) for channel in channels]
     rows: list[tuple[int, int, int]] = []
     first = [0]
@@ -129,8 +133,8 @@ def _work(channels: list[str], period_us: int, count: int, control: NDArray[np.i
     joints = np.array([j for *_, j in rows], np.int64)
     descriptors = np.array([socket.fileno() for socket in sockets], np.int64)
     fixed = descriptors, messages.address, messages.body.view(np.int32), np.array(first, np.int64), joints
-    _send(*fixed, period_us * 1000, 0, control)
+    _send(*fixed, period_us * 1000, 0, lossy, control)
     control[READY] = 1
     while not control[GO]:
         time.sleep(0.001)
-    _send(*fixed, period_us * 1000, count, control)
+    _send(*fixed, period_us * 1000, count, lossy, control)
