@@ -34,6 +34,9 @@ class Motion:
         Standard or base parameters by which torques are predicted, (p,) or (b,); ``None`` while there are none.
     duration
         Of all recordings together, s: what a slow change is measured in.
+    lead
+        Samples at the front that are there for what has a memory (a gap, a bristle, a swinging link) only: of columns
+        made of the motion they are cut off.
     """
 
     model: "ArmModel"
@@ -45,6 +48,7 @@ class Motion:
     theta: Array | None = None
     duration: float = 0.0
     sharp: bool = False
+    lead: int = 0
     _slopes: dict[tuple[int, bool], tuple[Array, Array, Array]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )

@@ -80,20 +80,22 @@ def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
 def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
     """Way, speed and acceleration (N,) of a link against its motor under ``pull`` (N,), caught at half a gap.
 
-    Impacts are plastic; speeds and accelerations are the differences of the way, so that none of it is lost.
+    Leapfrog; impacts are plastic. Speeds and accelerations are differences of the way to either side, so that none of
+    it is lost and none is late.
     """
     way, rate, acceleration = np.zeros(pull.size), np.zeros(pull.size), np.zeros(pull.size)
-    x = 0.5 * gap if pull[0] > 0.0 else -0.5 * gap
+    way[0] = 0.5 * gap if pull[0] > 0.0 else -0.5 * gap
     v = 0.0
-    for k in range(pull.size):
+    for k in range(pull.size - 1):
         before = v
         v += dt * pull[k]
-        if x + dt * v > 0.5 * gap:
-            v = (0.5 * gap - x) / dt
-        elif x + dt * v < -0.5 * gap:
-            v = (-0.5 * gap - x) / dt
-        x += dt * v
-        way[k], rate[k], acceleration[k] = x, v, (v - before) / dt
+        if way[k] + dt * v > 0.5 * gap:
+            v = (0.5 * gap - way[k]) / dt
+        elif way[k] + dt * v < -0.5 * gap:
+            v = (-0.5 * gap - way[k]) / dt
+        way[k + 1] = way[k] + dt * v
+        rate[k] = 0.5 * (before + v)
+        acceleration[k] = (v - before) / dt
     return way, rate, acceleration
 
 

@@ -89,7 +89,7 @@ class Workshop:
         """A stretch as effects see it."""
         key = (id(stretch), kind)
         if key not in self._motions:
-            self._motions[key] = self.study.motion(getattr(stretch, kind), self.theta)
+            self._motions[key] = self.study.motion(stretch, kind, self.theta)
         return self._motions[key]
 
     def band(
@@ -115,7 +115,7 @@ class Workshop:
 
     def _filtered(self, effect: Effect, place: Place, shapes: Shapes, motion: Motion) -> Array:
         """Columns in the band of the comparison; joints that the effect leaves alone are not filtered."""
-        columns = effect.columns(motion, place, **dict(shapes))
+        columns = effect.columns(motion, place, **dict(shapes))[motion.lead :]
         if columns.ndim == 3:
             return self.study.decimation(columns)
         own = self.study.decimation(columns)

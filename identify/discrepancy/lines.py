@@ -67,7 +67,7 @@ def residuals(study: Study, stretches: Sequence[Stretch], theta: Array) -> list[
     for s in stretches:
         predicted = model.inverse_dynamics(theta, s.measured.q, s.measured.qd, s.measured.qdd)
         if model.terms:
-            predicted = predicted + model.term_regressor(study.motion(s.measured, theta)) @ theta[-model.e :]
+            predicted = predicted + study.terms(s, "measured", theta) @ theta[-model.e :]
         found.append(s.torque - predicted)
     return found
 

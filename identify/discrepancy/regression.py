@@ -306,7 +306,7 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
             study.rigid[key] = signals, made
         rigid = study.rigid[key][1]
         if study.model.e:
-            terms = study.decimation(study.model.term_regressor(study.motion(signals, theta)))
+            terms = study.decimation(study.terms(stretch, kind, theta))
             if out:
                 first = out[0].shape[2] - study.model.e
                 sudden = np.flatnonzero([t.effect.sudden for t in study.model.terms for _ in t.names])

@@ -57,6 +57,9 @@ class Stretch:
         Its samples in that experiment, (N,).
     span
         The same after the thinning.
+    before
+        Measured and simulated motion that came before, where the experiment did not begin here: what has a memory
+        begins there.
     """
 
     measured: Derivatives
@@ -67,7 +70,22 @@ class Stretch:
     experiment: int
     rows: NDArray[np.int64]
     span: slice
+    before: tuple[Derivatives, Derivatives] | None = None
 
+    def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "Stretch":
+        """With another simulation of the whole experiment, at its sampling period ``dt``."""
+        simulated = replace(_at(motion, self.rows, dt, factor), start=self.simulated.start)
+        if self.before is None:
+            return replace(self, simulated=simulated)
+        measured, old = self.before
+        earlier = np.arange(self.rows[0] - factor * old.q.shape[0], self.rows[0], factor)
+        return replace(
+            self, simulated=simulated, before=(measured, replace(_at(motion, earlier, dt, factor), start=old.start))
+        )
+
+
+KINDS = ("measured", "simulated")
+"""Of the motion of a stretch."""
 
 STIFF_LOOP = 1.5
 """Squared error of the motion of a stand-in's loop over that without the model's terms up to which it is no worse."""
@@ -160,11 +178,19 @@ class Study:
         """Names of the joints."""
         return [joint.name for joint in self.robot.joints]
 
-    def motion(self, signals: Derivatives, theta: Array | None, model: ArmModel | None = None) -> Motion:
-        """Signals as effects see them."""
-        return Motion(
-            model or self.model, signals.q, signals.qd, signals.qdd, self.dt, signals.start, theta, self.duration
-        )
+    def motion(self, stretch: Stretch, kind: str, theta: Array | None) -> Motion:
+        """A stretch as effects see it, ``measured`` or ``simulated``; with what came before."""
+        parts: list[Derivatives] = [getattr(stretch, kind)]
+        if stretch.before is not None:
+            parts.insert(0, stretch.before[KINDS.index(kind)])
+        q, qd, qdd = (np.concatenate([getattr(p, name) for p in parts]) for name in ("q", "qd", "qdd"))
+        lead = q.shape[0] - parts[-1].q.shape[0]
+        return Motion(self.model, q, qd, qdd, self.dt, parts[0].start, theta, self.duration, lead=lead)
+
+    def terms(self, stretch: Stretch, kind: str, theta: Array | None) -> Array:
+        """Columns (N, n, e) of the model's terms along a stretch."""
+        motion = self.motion(stretch, kind, theta)
+        return self.model.term_regressor(motion)[motion.lead :]
 
     def resimulated(self, theta: Array) -> "Study":
         """The study with the motion that the closed loop makes with its model, terms included, at these parameters.
@@ -189,10 +215,7 @@ class Study:
         motions = {k: _seen(runs[k].q, measured, dt) for k, measured in cut.items()}
 
         def moved(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
-            return tuple(
-                replace(s, simulated=replace(_at(motions[s.experiment], s.rows, dt, factor), start=s.simulated.start))
-                for s in stretches
-            )
+            return tuple(s.resimulated(motions[s.experiment], dt, factor) for s in stretches)
 
         train = moved(self.train)
         # A stand-in follows the measured motion whatever the arm: there it must only not be led astray.
@@ -259,8 +282,10 @@ def build_study(
             rows = kept[span]
             y = second(torque[span])
             t = e.start + dt * (rows[0] + factor * second.instants(rows.size))
+            earlier = _earlier(kept, rows)
+            before = None if earlier.size == 0 else (_at(s, earlier, dt, factor), _at(z, earlier, dt, factor))
             measured, noiseless = _at(s, rows, dt, factor), _at(z, rows, dt, factor)
-            into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span))
+            into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span, before))
     duration = max(e.start + dt * e.q.shape[0] for e in experiments)
     return Study(
         robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first,
@@ -307,6 +332,12 @@ def _at(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: int) -
         dt * factor,
         signals.start + dt * float(rows[0]),
     )
+
+
+def _earlier(kept: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """As many samples before a stretch as it has itself, if there are."""
+    first = int(np.searchsorted(kept, rows[0]))
+    return kept[max(first - rows.size, 0) : first]
 
 
 def _continued(experiments: Sequence[Experiment]) -> list[Experiment]:

@@ -16,7 +16,7 @@ CONTACT_HZ = 100.0
 """Frequency of motor against link in the contact of a gap, unless the scenario gives its stiffness."""
 MOTOR_SHARE = 0.3
 """Share of the motor in a joint's inertia where the robot's parameters do not tell them apart."""
-ROUNDING = 0.02
+ROUNDING = 0.004
 """Way over which a contact closes, of the gap, to either side of its edge."""
 
 
