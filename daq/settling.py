@@ -276,22 +276,40 @@ def _emit(b: Books, s: int, end: int, out: Decided) -> None:
 def settle_all(b: Books, bus: int, s: int, final: bool, out: Decided) -> None:
     """Close the books of the drives on one bus, and give out what all drives have settled."""
     n = b.settled.shape[1]
+    head = b.head[bus, s]
+    slot = (head - 1 - b.mark[s, BASE]) % b.row_sync.shape[1]
     all_owe, whole = n > 1, True
     here = calm_here = calm = 0
     for j in range(n):
         if b.bus_of[j] == bus:
-            _keep_pace(b, s, j)
             here += 1
+            # The one answer to the one SYNC: done here, as a call that hands over the books costs more than all of it.
+            if (
+                b.pending[s, j] == 1
+                and b.settled[s, j] == head - 1
+                and not b.pace[s, j, UNSURE]
+                and head > b.hole[bus, s]
+            ):
+                for w in range(b.answer.shape[3]):
+                    b.row_data[s, slot, j, w] = b.answer[s, j, 0, w]
+                b.row_code[s, slot, j] = b.answer_code[s, j, 0] if head > b.doubt[s, j] else AMBIGUOUS
+                b.settled[s, j], b.pending[s, j], b.fresh[s, j] = head, 0, 0
+                b.pace[s, j, BEST], b.pace[s, j, STOOD] = UNSEEN, 0
+                if b.pace[s, j, PACED] != head:
+                    b.pace[s, j, PACED] = head
+                    b.pace[s, j, CALM] += 1
+            else:
+                _keep_pace(b, s, j)
         all_owe = all_owe and b.settled[s, j] + b.pending[s, j] < b.head[b.bus_of[j], s]
         whole = whole and b.settled[s, j] >= b.hole[b.bus_of[j], s]
         if b.pace[s, j, CALM] >= IN_STEP:
             calm += 1
             calm_here += b.bus_of[j] == bus
     if all_owe and whole:
-        b.mark[s, BEHIND] = b.head[bus, s]
+        b.mark[s, BEHIND] = head
     end = b.mark[s, TOP]
     for j in range(n):
-        if b.bus_of[j] == bus:
+        if b.bus_of[j] == bus and (b.settled[s, j] < head or b.pending[s, j]):
             # Who owes nothing shows that neither the host nor the bus is behind.
             _settle(b, s, j, final, calm_here > 0 if here > 1 else calm > 0)
         end = min(end, b.settled[s, j])
