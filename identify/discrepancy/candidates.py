@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from identify.catalogue.effect import Effect, Place
 from identify.catalogue.motion import Motion
 from identify.catalogue.registry import catalogue
-from identify.discrepancy.study import Stretch, Study
+from identify.discrepancy.stretch import Stretch
+from identify.discrepancy.study import Study
 from identify.discrepancy.whitening import whitened
 from identify.estimators.noise import ArModel
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from identify.discrepancy.study import Stretch, Study
+from identify.discrepancy.stretch import Stretch
+from identify.discrepancy.study import Study
 from identify.discrepancy.whitening import ar_models, summed_backwards, whitened
 from identify.estimators.filtering import filter_columns
 from identify.estimators.noise import ArModel

@@ -67,7 +67,8 @@ def in_loop_of(moved: Study, fit: Fit, candidate: Candidate) -> Trial | None:
     """
     pairs = [(fit.study.train, moved.train), (fit.study.held, moved.held)]
     train, held = (
-        tuple(replace(s, simulated=m.simulated, before=m.before) for s, m in zip(own, other, strict=True)) for own, other in pairs
+        tuple(replace(s, simulated=m.simulated, before=m.before) for s, m in zip(own, other, strict=True))
+        for own, other in pairs
     )
     again = fitted(replace(fit.study, train=train, held=held), fit.theta)
     bench = Workshop(again.study, again.theta)

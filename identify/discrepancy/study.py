@@ -12,6 +12,7 @@ from identify.catalogue.motion import Motion
 from identify.catalogue.recorded import of_recording, put_right
 from identify.catalogue.registry import known
 from identify.closed_loop import closed_loop
+from identify.discrepancy.stretch import KINDS, Stretch, at_rows, distance, rows_before
 from identify.estimators.auxiliary import AuxiliaryModel
 from identify.estimators.idim_ls import idim_ls
 from identify.experiment import Experiment
@@ -34,58 +35,6 @@ BAND = 5.0
 WORKING_RATE = 20.0
 """Rate at which effects are evaluated, over the frequency up to which model and data are compared."""
 
-
-@dataclass(frozen=True)
-class Stretch:
-    """One uninterrupted stretch of motion at the working rate, SI, joint side.
-
-    Parameters
-    ----------
-    measured
-        Smoothed positions and their derivatives.
-    simulated
-        The same motion without noise, of the simulated closed loop: instruments.
-    y
-        Torques (M, n) in the band of the comparison.
-    torque
-        The same at the working rate, with all they hold beyond that band, (N, n).
-    t
-        Their instants, s, (M,).
-    experiment
-        Number of the experiment that it is cut from.
-    rows
-        Its samples in that experiment, (N,).
-    span
-        The same after the thinning.
-    before
-        Measured and simulated motion that came before, where the experiment did not begin here: what has a memory
-        begins there.
-    """
-
-    measured: Derivatives
-    simulated: Derivatives
-    y: Array
-    torque: Array
-    t: Array
-    experiment: int
-    rows: NDArray[np.int64]
-    span: slice
-    before: tuple[Derivatives, Derivatives] | None = None
-
-    def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "Stretch":
-        """With another simulation of the whole experiment, at its sampling period ``dt``."""
-        simulated = replace(_at(motion, self.rows, dt, factor), start=self.simulated.start)
-        if self.before is None:
-            return replace(self, simulated=simulated)
-        measured, old = self.before
-        earlier = np.arange(self.rows[0] - factor * old.q.shape[0], self.rows[0], factor)
-        return replace(
-            self, simulated=simulated, before=(measured, replace(_at(motion, earlier, dt, factor), start=old.start))
-        )
-
-
-KINDS = ("measured", "simulated")
-"""Of the motion of a stretch."""
 
 STIFF_LOOP = 1.5
 """Squared error of the motion of a stand-in's loop over that without the model's terms up to which it is no worse."""
@@ -166,7 +115,7 @@ class Study:
         if ours != theirs:
             return ours
         one, two = (study.held if held else study.train for study in (self, other))
-        return _distance(one) < _distance(two)
+        return distance(one) < distance(two)
 
     @property
     def sample(self) -> float:
@@ -219,17 +168,10 @@ class Study:
 
         train = moved(self.train)
         # A stand-in follows the measured motion whatever the arm: there it must only not be led astray.
-        bound = _distance(self.train) * (1.0 if self.loop in CONTROLLERS else STIFF_LOOP)
-        if not _distance(train) < bound:
+        bound = distance(self.train) * (1.0 if self.loop in CONTROLLERS else STIFF_LOOP)
+        if not distance(train) < bound:
             return self
         return replace(self, train=train, held=moved(self.held))
-
-
-def _distance(stretches: Sequence[Stretch]) -> float:
-    """Squared errors of the simulated velocities, each joint over its own measured ones, summed."""
-    apart = sum(np.sum((s.simulated.qd - s.measured.qd) ** 2, axis=0) for s in stretches)
-    size = sum(np.sum(s.measured.qd**2, axis=0) for s in stretches)
-    return float(np.sum(apart / np.maximum(size, 1e-300)))
 
 
 def build_study(
@@ -282,9 +224,9 @@ def build_study(
             rows = kept[span]
             y = second(torque[span])
             t = e.start + dt * (rows[0] + factor * second.instants(rows.size))
-            earlier = _earlier(kept, rows)
-            before = None if earlier.size == 0 else (_at(s, earlier, dt, factor), _at(z, earlier, dt, factor))
-            measured, noiseless = _at(s, rows, dt, factor), _at(z, rows, dt, factor)
+            earlier = rows_before(kept, rows)
+            before = None if earlier.size == 0 else (at_rows(s, earlier, dt, factor), at_rows(z, earlier, dt, factor))
+            measured, noiseless = at_rows(s, rows, dt, factor), at_rows(z, rows, dt, factor)
             into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span, before))
     duration = max(e.start + dt * e.q.shape[0] for e in experiments)
     return Study(
@@ -320,24 +262,6 @@ def _seen(q: Array, measured: Derivatives, dt: float) -> Derivatives:
     """
     assert measured.nvr is not None
     return replace(differentiate(q, dt, nvr=measured.nvr[:, 0]), start=measured.start)
-
-
-def _at(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: int) -> Derivatives:
-    """Signals at some of their samples."""
-    return Derivatives(
-        np.ascontiguousarray(signals.q[rows]),
-        np.ascontiguousarray(signals.qd[rows]),
-        np.ascontiguousarray(signals.qdd[rows]),
-        signals.nvr,
-        dt * factor,
-        signals.start + dt * float(rows[0]),
-    )
-
-
-def _earlier(kept: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """As many samples before a stretch as it has itself, if there are."""
-    first = int(np.searchsorted(kept, rows[0]))
-    return kept[max(first - rows.size, 0) : first]
 
 
 def _continued(experiments: Sequence[Experiment]) -> list[Experiment]:

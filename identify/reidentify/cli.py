@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from identify.reidentify.asked import Asked
+
 
 def reidentify(
     config: Annotated[
@@ -43,13 +45,14 @@ def reidentify(
 
     Example: armident reidentify --config cell.yaml --store sqlite:///history.sqlite
     """
+    asked = Asked(config, baseline, store, out, false_alarms, scheduler, workers)
     if recordings is None:
         from identify.reidentify.run import reidentify_command
 
-        code = reidentify_command(config, baseline, store, out, false_alarms, scheduler, workers, as_json=json)
+        code = reidentify_command(asked, as_json=json)
     else:
         from identify.reidentify.fleet import fleet_command
 
-        code = fleet_command(recordings, config, baseline, store, out, false_alarms, scheduler, workers, as_json=json)
+        code = fleet_command(recordings, asked, as_json=json)
     if code:
         raise typer.Exit(code)

@@ -16,6 +16,7 @@ from identify.document import IdentificationDocument, from_json, load_document, 
 from identify.drift import Drift, compare
 from identify.history import History
 from identify.options import Options
+from identify.reidentify.asked import Asked
 from identify.reidentify.verdict import told
 from identify.service import identify_recording, write_identification
 
@@ -48,18 +49,7 @@ class Row:
     identification: str | None = None
 
 
-def fleet_command(
-    pattern: str,
-    config: Path | None,
-    baseline: Path | None,
-    store: str,
-    out: Path | None,
-    false_alarms: float,
-    scheduler: str | None,
-    workers: int | None,
-    *,
-    as_json: bool,
-) -> int:
+def fleet_command(pattern: str, asked: Asked, *, as_json: bool) -> int:
     """Carry out ``armident reidentify --recordings``; the exit code.
 
     Recordings are judged in the order of their names. Each is compared with the baseline, or with the first run of its
@@ -73,16 +63,18 @@ def fleet_command(
     paths = [Path(name).resolve() for name in sorted(glob.glob(pattern, recursive=True))]
     if not paths:
         raise ConfigError(f"--recordings {pattern}: no such file")
-    robot = None if config is None else load_robot(config)
-    known = None if baseline is None else load_document(baseline, IdentificationDocument)
-    history = History(store)
+    robot = None if asked.config is None else load_robot(asked.config)
+    known = None if asked.baseline is None else load_document(asked.baseline, IdentificationDocument)
+    history = History(asked.store)
     rows: list[Row] = []
     # Of each robot one baseline for all: an older recording that comes later must not take its place.
     baselines: dict[str, IdentificationDocument] = {}
-    with cluster(scheduler, workers) as client:
-        futures = [client.submit(identify_one, str(path), robot, _folder(path, out), pure=False) for path in paths]
+    with cluster(asked.scheduler, asked.workers) as client:
+        futures = [
+            client.submit(identify_one, str(path), robot, _folder(path, asked.out), pure=False) for path in paths
+        ]
         for path, future in zip(paths, futures, strict=True):
-            row = _judged(path, future, history, known, baselines, false_alarms)
+            row = _judged(path, future, history, known, baselines, asked.false_alarms)
             future.release()
             rows.append(row)
             # One line as soon as it is known: a fleet takes hours.

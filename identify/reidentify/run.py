@@ -27,6 +27,7 @@ from identify.model.arm import ArmModel
 from identify.moves import motion_of
 from identify.options import Options
 from identify.prior import prior_from
+from identify.reidentify.asked import Asked
 from identify.reidentify.baseline import Baseline, baseline_of
 from identify.reidentify.play import Say, Start, play, start_process
 from identify.reidentify.publish import Announcer
@@ -65,17 +66,7 @@ class Outcome:
     findings: tuple[str, ...] = ()
 
 
-def reidentify_command(
-    config: Path | None,
-    baseline: Path | None,
-    store: str,
-    out: Path | None,
-    false_alarms: float,
-    scheduler: str | None,
-    workers: int | None,
-    *,
-    as_json: bool,
-) -> int:
+def reidentify_command(asked: Asked, *, as_json: bool) -> int:
     """Carry out ``armident reidentify`` without ``--recordings``; the exit code.
 
     Raises
@@ -84,12 +75,12 @@ def reidentify_command(
         Before anything moves: if configuration, trajectory, baseline or history are wrong. Later: if bus, drives or
         guard end the motion, or the recording cannot be identified.
     """
-    for option, given in (("--scheduler", scheduler), ("--workers", workers)):
+    for option, given in (("--scheduler", asked.scheduler), ("--workers", asked.workers)):
         if given is not None:
             raise ConfigError(f"{option}: needs --recordings")
-    if config is None:
+    if asked.config is None:
         raise ConfigError("--config: give the session of the cell, or --recordings")
-    job = prepare(config, baseline, store, out, false_alarms)
+    job = prepare(asked.config, asked.baseline, asked.store, asked.out, asked.false_alarms)
 
     def say(line: str) -> None:
         print(f"reidentify: {line}", file=sys.stderr, flush=True)

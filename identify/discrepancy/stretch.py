@@ -1,0 +1,88 @@
+"""Uninterrupted stretches of motion that a model is fitted to or judged by."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.signals.differentiate import Derivatives
+
+Array = NDArray[np.float64]
+
+KINDS = ("measured", "simulated")
+"""Of the motion of a stretch."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One uninterrupted stretch of motion at the working rate, SI, joint side.
+
+    Parameters
+    ----------
+    measured
+        Smoothed positions and their derivatives.
+    simulated
+        The same motion without noise, of the simulated closed loop: instruments.
+    y
+        Torques (M, n) in the band of the comparison.
+    torque
+        The same at the working rate, with all they hold beyond that band, (N, n).
+    t
+        Their instants, s, (M,).
+    experiment
+        Number of the experiment that it is cut from.
+    rows
+        Its samples in that experiment, (N,).
+    span
+        The same after the thinning.
+    before
+        Measured and simulated motion that came before, where the experiment did not begin here: what has a memory
+        begins there.
+    """
+
+    measured: Derivatives
+    simulated: Derivatives
+    y: Array
+    torque: Array
+    t: Array
+    experiment: int
+    rows: NDArray[np.int64]
+    span: slice
+    before: tuple[Derivatives, Derivatives] | None = None
+
+    def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "Stretch":
+        """With another simulation of the whole experiment, at its sampling period ``dt``."""
+        simulated = replace(at_rows(motion, self.rows, dt, factor), start=self.simulated.start)
+        if self.before is None:
+            return replace(self, simulated=simulated)
+        measured, old = self.before
+        earlier = np.arange(self.rows[0] - factor * old.q.shape[0], self.rows[0], factor)
+        return replace(
+            self, simulated=simulated, before=(measured, replace(at_rows(motion, earlier, dt, factor), start=old.start))
+        )
+
+
+def at_rows(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: int) -> Derivatives:
+    """Signals at some of their samples."""
+    return Derivatives(
+        np.ascontiguousarray(signals.q[rows]),
+        np.ascontiguousarray(signals.qd[rows]),
+        np.ascontiguousarray(signals.qdd[rows]),
+        signals.nvr,
+        dt * factor,
+        signals.start + dt * float(rows[0]),
+    )
+
+
+def rows_before(kept: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """As many samples before a stretch as it has itself, if there are."""
+    first = int(np.searchsorted(kept, rows[0]))
+    return kept[max(first - rows.size, 0) : first]
+
+
+def distance(stretches: Sequence[Stretch]) -> float:
+    """Squared errors of the simulated velocities, each joint over its own measured ones, summed."""
+    apart = sum(np.sum((s.simulated.qd - s.measured.qd) ** 2, axis=0) for s in stretches)
+    size = sum(np.sum(s.measured.qd**2, axis=0) for s in stretches)
+    return float(np.sum(apart / np.maximum(size, 1e-300)))
