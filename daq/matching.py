@@ -2,11 +2,15 @@
 
 A TPDO carries no number, only an order: each drive answers its SYNCs one after the other. So per drive and TPDO,
 SYNCs and answers are matched first to first. As long as a drive owes nothing when the books are closed (at the next
-SYNC of its bus) the match is certain, however late the answers came. A drive that owes while another has answered, for
-longer than a window of SYNCs, has lost something; then every answer is taken as prompt (the latest SYNC it can belong
-to), and where answers also came in bursts the matter is undecidable and the samples in question are given up as
-``AMBIGUOUS``, never guessed. While all drives owe at every SYNC and no frame is known to be missing, the buses are
-behind and nothing is lost: then the window is ``patience`` SYNCs.
+SYNC of its bus) the match is certain, however late the answers came. A drive that answers every SYNC again and still
+owes while another on its bus owes nothing has lost something, and so has one that stays silent beside such another, or
+owes for longer than a window of SYNCs. Then every answer is taken as prompt (the latest SYNC it can belong to), and
+where answers also came in bursts the matter is undecidable and the samples in question are given up as ``AMBIGUOUS``,
+never guessed. While all drives owe at every SYNC and no frame is known to be missing, the buses are behind and nothing
+is lost: then the window is ``patience`` SYNCs.
+
+Answers to rows that were given up, of a drive that was silent or a bus that was off, may come all the same. So until
+such a drive keeps step for some SYNCs, as many answers as SYNCs prove nothing; the first ones too many are then those.
 
 Several buses carry the same SYNC numbers: a row is one SYNC of all axes. Where SYNC is not ours the buses are aligned
 by its counter and the time at which it came. A bus on which no SYNC comes while others go on is silent: its SYNCs are

@@ -284,7 +284,7 @@ CONSUMER = (kernel_drop, sync_missing, sync_stops)
 FAULTS = {fault.__name__: fault for fault in (*ANY, *PRODUCER, *CONSUMER)}
 EXCLUSIVE = (
     {"sync_stops", "kernel_drop", "held_up", "bus_down"},
-    # A drive that owes an answer keeps rows in memory for up to four seconds: the disk is not asked.
+    # A drive that owes an answer keeps rows in memory: the disk is not asked.
     *(
         {"disk_full", name}
         for name in (
