@@ -229,8 +229,12 @@ def held_up(room: Room) -> Expected:
 
 def _stopped(room: Room) -> None:
     begin, length = room.at(1.2), float(room.rng.uniform(0.1, 0.3))
-    room.actions.append((begin, lambda: os.kill(room.pid(), signal.SIGSTOP)))
-    room.actions.append((begin + length, lambda: os.kill(room.pid(), signal.SIGCONT)))
+
+    def stop() -> None:
+        os.kill(room.pid(), signal.SIGSTOP)
+        room.farm.later(length, lambda: os.kill(room.pid(), signal.SIGCONT))
+
+    room.actions.append((begin, stop))
 
 
 def sync_missing(room: Room) -> Expected:

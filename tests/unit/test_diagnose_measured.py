@@ -2,57 +2,34 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from scipy.io import loadmat
 
-from configs import RobotConfig, load_robot
-from identify.discrepancy.diagnose import Diagnosis, diagnose
+from configs import load_robot
+from identify.discrepancy.diagnose import Diagnosis
 from identify.discrepancy.findings import gap_of
 from identify.discrepancy.search import Search
 from identify.discrepancy.state import Settings
 from identify.discrepancy.study import build_study
 from identify.document import Gap
-from identify.experiment import Experiment
-
-FORCE_PER_VOLT = 35.15065
-STANDSTILL_S = 7.5
-TX40_DT = 2e-4
+from tests.statistics.measured import MACHINES, tx40
 
 
-def emps(shared_data: Path, name: str) -> Experiment:
-    file = shared_data / "emps" / name
-    if not file.is_file():
-        pytest.skip(f"no {file.name} in the measured data")
-    data = {k: v.astype(float).reshape(-1, 1) for k, v in loadmat(file).items() if not k.startswith("__")}
-    return Experiment(q=data["qm"], tau=FORCE_PER_VOLT * data["vir"], q_ref=data["qg"], dt=1e-3)
+def diagnosed(shared_data: Path, name: str, folder: str) -> Diagnosis:
+    if not (shared_data / folder).is_dir():
+        pytest.skip(f"no {folder} folder in the measured data")
+    return MACHINES[name][1](shared_data).diagnosed()
 
 
 @pytest.fixture(scope="module")
 def worn_screw(shared_data: Path) -> Diagnosis:
     """EMPS, found on one recording and judged on the other."""
-    training, unseen = (emps(shared_data, name) for name in ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"))
-    return diagnose([training], [unseen], load_robot("emps"))
-
-
-def tx40(shared_data: Path, robot: RobotConfig) -> Experiment:
-    folder = shared_data / "tx40"
-    if not folder.is_dir():
-        pytest.skip("no tx40 folder in the measured data")
-    q, tau = (
-        np.loadtxt(folder / name, delimiter=",", skiprows=1)[: round(STANDSTILL_S / TX40_DT)]
-        for name in ("pos_read_data.csv", "curr_data.csv")
-    )
-    ratios = robot.transmission_matrix
-    q = np.ascontiguousarray(np.linalg.solve(ratios, q.T).T)
-    return Experiment(q=q, tau=tau @ ratios, q_ref=None, dt=TX40_DT)
+    return diagnosed(shared_data, "emps_pulses", "emps")
 
 
 @pytest.fixture(scope="module")
 def uncoupled_wrist(shared_data: Path) -> Diagnosis:
     """TX40 whose model does not know that motor 6 turns with joint 5, too."""
-    robot = load_robot("tx40").model_copy(update={"couplings": ()})
-    return diagnose([tx40(shared_data, robot)], [], robot)
+    return diagnosed(shared_data, "tx40_uncoupled", "tx40")
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +80,12 @@ def test_the_wrist_coupling_closes_the_gap_of_joints_5_and_6(
         for found, known in zip((gap.train.after, unseen.after), coupled_wrist, strict=True):
             assert found.by_joint[joint] < 1.02 * known.by_joint[joint]
         assert unseen.after.by_joint[joint] < 0.55 * unseen.before.by_joint[joint]
+
+
+def test_the_cogging_of_a_rolling_motor_is_named_and_closes_the_gap_of_another_roll(shared_data: Path) -> None:
+    document = diagnosed(shared_data, "motor", "cogging_laas").document
+    finding = document.findings[0]
+    assert (finding.effect, finding.joint) == ("cogging_torque", "joint_1")
+    # The slots of the motor: twelve ripples a turn, which a spectrum of the second recording shows, too.
+    assert finding.parameters["harmonic"] == 12.0
+    assert document.gap.validation.after.all < 0.5 * document.gap.validation.before.all

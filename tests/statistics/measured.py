@@ -1,0 +1,191 @@
+"""What a diagnosis finds in measured machines, with the defaults that every robot gets.
+
+``python -m tests.statistics.measured`` diagnoses every recording of ``../shared/data`` (``ARMIDENT_SHARED_DATA`` names
+another folder) and prints what it states, how far the held-out error falls, and what it leaves unexplained; with names
+(``tx40 panda``) only those.
+"""
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import loadmat
+
+from configs import RobotConfig, load_robot
+from configs.loading import parse
+from daq.importing import import_recording
+from identify.discrepancy.diagnose import Diagnosis, diagnose
+from identify.experiment import Experiment
+from identify.from_recording import experiments_from_recording
+from tests.conftest import REPOSITORY
+
+FORCE_PER_VOLT = 35.15065
+STANDSTILL_S = 7.5
+TX40_DT = 2e-4
+
+MOTOR = """
+schema: armident/robot/1
+name: rolling_motor
+description: one brushless motor without load; torques in amperes
+gravity: [0.0, 0.0, 0.0]
+joints:
+  - name: joint_1
+    type: revolute
+    mdh: {alpha: 0.0, d: 0.0, theta: 0.0, r: 0.0}
+    limits: {position: [-1000.0, 1000.0], velocity: 100.0, acceleration: 1000.0, torque: 1.0}
+    drive: {signal: current, gain: 1.0, rated: 1.0, counts_per_unit: 100000}
+    rotor_inertia: false
+transmission: [[1.0]]
+friction: {sign_smoothing: 10.0}
+"""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Recordings of one machine: those to learn from, those to judge by (or the last third of the former)."""
+
+    robot: RobotConfig
+    training: tuple[Experiment, ...]
+    validation: tuple[Experiment, ...] = ()
+
+    def diagnosed(self) -> Diagnosis:
+        """With the defaults."""
+        return diagnose(self.training, self.validation, self.robot)
+
+
+def emps(data: Path, name: str) -> Experiment:
+    """EMPS, force in N."""
+    file = loadmat(data / "emps" / name)
+    columns = {k: v.astype(float).reshape(-1, 1) for k, v in file.items() if not k.startswith("__")}
+    return Experiment(q=columns["qm"], tau=FORCE_PER_VOLT * columns["vir"], q_ref=columns["qg"], dt=1e-3)
+
+
+def tx40(data: Path, robot: RobotConfig) -> Experiment:
+    """Staubli TX40 until it stands still, joint side."""
+    q, tau = (
+        np.loadtxt(data / "tx40" / name, delimiter=",", skiprows=1)[: round(STANDSTILL_S / TX40_DT)]
+        for name in ("pos_read_data.csv", "curr_data.csv")
+    )
+    ratios = robot.transmission_matrix
+    q = np.ascontiguousarray(np.linalg.solve(ratios, q.T).T)
+    return Experiment(q=q, tau=tau @ ratios, q_ref=None, dt=TX40_DT)
+
+
+def kuka(data: Path, robot: RobotConfig, number: int) -> Experiment:
+    """KUKA LWR4+, torques of its link-side sensors."""
+    file = data / "kuka_lwr4" / f"measurements_{number}.npz"
+    recording = import_recording(file, robot, rate_hz=200.0, names={"demand": "-"})
+    (experiment,), _ = experiments_from_recording(recording, robot)
+    return experiment
+
+
+def panda(data: Path, robot: RobotConfig) -> tuple[Experiment, ...]:
+    """Franka Panda, torques of its link-side sensors."""
+    positions, torques = (data / "panda" / f"exciting_traj_{name}.txt" for name in ("positions", "torques"))
+    recording = import_recording(positions, robot, effort=torques, rate_hz=1000.0, polled=True)
+    return tuple(experiments_from_recording(recording, robot)[0])
+
+
+def motor(data: Path, name: str) -> Experiment:
+    """A brushless motor that rolls at constant speed; its rows are even, their time stamps are a host's."""
+    columns = np.genfromtxt(data / "cogging_laas" / name, delimiter=",", skip_header=1)
+    return Experiment(q=columns[:, 1:2].copy(), tau=columns[:, 3:4].copy(), q_ref=None, dt=1e-3)
+
+
+def _emps(data: Path, training: str, validation: str | None) -> Measured:
+    held = () if validation is None else (emps(data, validation),)
+    return Measured(load_robot("emps"), (emps(data, training),), held)
+
+
+def _tx40(data: Path, *, coupled: bool) -> Measured:
+    robot = load_robot("tx40")
+    seen = tx40(data, robot)
+    return Measured(robot if coupled else robot.model_copy(update={"couplings": ()}), (seen,))
+
+
+def _kuka(data: Path, held: int | None) -> Measured:
+    robot = load_robot("kuka_lwr4")
+    every = {k: kuka(data, robot, k) for k in (1, 2, 3)}
+    validation = () if held is None else (every.pop(held),)
+    return Measured(robot, tuple(every.values()), validation)
+
+
+def _panda(data: Path) -> Measured:
+    robot = load_robot("panda")
+    return Measured(robot, panda(data, robot))
+
+
+def _motor(data: Path) -> Measured:
+    robot = parse(MOTOR, RobotConfig, "rolling motor")
+    return Measured(robot, (motor(data, "rolling_data1.txt"),), (motor(data, "rolling_data2.txt"),))
+
+
+MACHINES: dict[str, tuple[str, Callable[[Path], Measured]]] = {
+    "emps": ("EMPS, its last third held out", lambda data: _emps(data, "DATA_EMPS.mat", None)),
+    "emps_pulses": ("EMPS, judged by the pulses", lambda data: _emps(data, "DATA_EMPS.mat", "DATA_EMPS_PULSES.mat")),
+    "pulses_emps": ("EMPS pulses, judged by the other", lambda d: _emps(d, "DATA_EMPS_PULSES.mat", "DATA_EMPS.mat")),
+    "tx40": ("TX40", lambda data: _tx40(data, coupled=True)),
+    "tx40_uncoupled": ("TX40, its model without couplings", lambda data: _tx40(data, coupled=False)),
+    "kuka": ("KUKA LWR4+, last thirds held out", lambda data: _kuka(data, None)),
+    "kuka_1": ("KUKA LWR4+, judged by recording 1", lambda data: _kuka(data, 1)),
+    "kuka_2": ("KUKA LWR4+, judged by recording 2", lambda data: _kuka(data, 2)),
+    "kuka_3": ("KUKA LWR4+, judged by recording 3", lambda data: _kuka(data, 3)),
+    "panda": ("Panda", _panda),
+    "motor": ("rolling motor, judged by another roll", _motor),
+}
+"""Title, and how it is loaded."""
+
+
+def said(found: Diagnosis) -> list[str]:
+    """Lines that tell a diagnosis."""
+    document = found.document
+    gap = document.gap.validation
+    lines = [f"{document.verdict}; held-out error {gap.before.all:.2f} -> {gap.after.all:.2f} %"]
+    if found.simulated is not None:
+        torque = found.simulated.torque_before, found.simulated.torque_after
+        lines.append("torques of the simulated loop, error by joint " + " -> ".join(_each(t) for t in torque) + " %")
+    for f in document.findings:
+        where = f.joint if f.other is None else f"{f.joint} and {f.other}"
+        values = ", ".join(
+            f"{k} {v:.4g}" + (f" +- {f.evidence['std'][k]:.2g}" if k in f.evidence.get("std", {}) else "")
+            for k, v in f.parameters.items()
+        )
+        gap_of_joint = f"{f.gap_before:.2f} -> {f.gap_after:.2f} %"
+        lines.append(f"  {f.effect} of {where}, confidence {f.confidence:.2f}, {gap_of_joint}: {values}")
+    if document.considered:
+        lines.append("  considered: " + ", ".join(f"{f.effect} of {f.joint}" for f in document.considered))
+    for u in document.unexplained:
+        lines.append(f"  unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % varies with {u.varies_with}")
+    return lines
+
+
+def _each(values: NDArray[np.float64]) -> str:
+    return " ".join(f"{v:.2f}" for v in values)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.statistics.measured", description=__doc__)
+    parser.add_argument("names", nargs="*", choices=[*MACHINES, []], help="machines; default: all")
+    names = parser.parse_args().names or list(MACHINES)
+    data = Path(os.environ.get("ARMIDENT_SHARED_DATA") or REPOSITORY.parent / "shared" / "data")
+    if not data.is_dir():
+        print(f"the measured data are not here (looked in {data}; ARMIDENT_SHARED_DATA names another folder)")
+        return 2
+    for name in names:
+        title, load = MACHINES[name]
+        machine = load(data)
+        begin = time.process_time()
+        found = machine.diagnosed()
+        print(f"{name}: {title} ({time.process_time() - begin:.0f} s of CPU)", flush=True)
+        print("\n".join(f"  {line}" for line in said(found)), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
