@@ -39,6 +39,7 @@ class HeartbeatSocket:
         self._config, self._nodes = bus, tuple(nodes)
         self._bus = self._open()
         self._batch = frames(BATCH)
+        self._gone = False
 
     def _open(self) -> FrameBus:
         classic = self._config.model_copy(update={"fd": False, "data_bitrate": None})
@@ -46,19 +47,22 @@ class HeartbeatSocket:
 
     def read(self) -> list[tuple[int, float]]:
         """Node and time (s, of the monotonic clock) of what has come; nothing while the bus is down or removed."""
-        if not self._bus.bound:
+        if self._gone:
             with suppress(ArmidentError):
                 fresh = self._open()
                 self._bus.close()
-                self._bus = fresh
+                self._bus, self._gone = fresh, False
         found: list[tuple[int, float]] = []
-        with suppress(BusDown):
+        try:
             while (got := self._bus.receive(self._batch)) > 0:
                 # Stamps are wall clock time, which may be set: only their age at this moment is used.
                 ages = (time.time_ns() - self._batch["t_ns"][:got]) * 1e-9
                 came = time.monotonic() - np.maximum(ages, 0.0)
                 nodes = self._batch["can_id"][:got] - COB_HEARTBEAT
                 found += zip(nodes.tolist(), came.tolist(), strict=True)
+        except BusDown:
+            # A socket whose interface was removed has lost it for good.
+            self._gone = not self._bus.bound
         return found
 
     def close(self) -> None:
@@ -84,12 +88,13 @@ class Silences:
         self._last = dict.fromkeys(drives, now)
         self._ended = dict.fromkeys(self._last, 0.0)
         self._excused: set[str] = set()
-        self._looked = now
+        self.looked = now
+        """When this was asked last, s."""
 
     def look(self, heartbeats: Iterable[tuple[str, float]], now: float) -> None:
         """Take the heartbeats (drive, time in s) that have come since the last look."""
         self._ended = dict.fromkeys(self._last, 0.0)
-        before, self._looked = self._looked, now
+        before, self.looked = self.looked, now
         ordered = sorted(heartbeats, key=lambda beat: beat[1])
         times = [before, *(min(max(at, before), now) for _, at in ordered), now]
         k = max(range(len(times) - 1), key=lambda i: times[i + 1] - times[i])
@@ -110,7 +115,7 @@ class Silences:
 
     def lasts(self, drive: str) -> float:
         """How long the drive has been silent by the last look, s."""
-        return self._looked - self._last[drive]
+        return self.looked - self._last[drive]
 
     def ended(self, drive: str) -> float:
         """The longest silence of the drive that ended with a heartbeat of the last look, s; 0: none did."""

@@ -36,6 +36,9 @@ HEARTBEATS_MISSED = 3
 HEARTBEAT_MARGIN = 0.1
 """What the host may be late on top, s."""
 
+LOOK_S = 0.02
+"""How often heartbeats are looked at, s."""
+
 AGAIN_S = 0.5
 """A drive that could not be configured again is tried again after this, s."""
 
@@ -265,6 +268,8 @@ class DriveMaster:
 
     def _judge(self, silences: Silences) -> None:
         """Tell whose heartbeats stay away, and whose are back, by when they came and not by when they are looked at."""
+        if time.monotonic() - silences.looked < LOOK_S:
+            return
         # What waits in the sockets is read before anybody is said to be missing.
         heard = self._heard()
         silences.look(heard, time.monotonic())
