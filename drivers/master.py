@@ -174,8 +174,8 @@ class DriveMaster:
     def supervise(self) -> list[DriveEvent]:
         """Return what has happened since the last call: EMCY, lost and returned heartbeats, NMT states, reboots.
 
-        Never waits. A bus that went down is opened again when it is back; the heartbeats of its drives are lost
-        meanwhile.
+        Never waits. A bus that went down is opened again when it is back; while others are up, the heartbeats of its
+        drives are lost meanwhile.
 
         Raises
         ------

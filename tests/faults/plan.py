@@ -169,7 +169,11 @@ def heartbeat(room: Room) -> Expected:
     """A drive's heartbeat stops and returns."""
     j = room.joint()
     room.actions.append((room.at(0.8), lambda: room.farm.silent(j, 0.45)))
-    return lambda done: done.counters["heartbeat_lost"] > 0 and done.marked("no heartbeat for", "heartbeat is back")
+    # Nobody is silent for as long as the only bus is down.
+    return lambda done: (
+        _was_down(done)
+        or (done.counters["heartbeat_lost"] > 0 and done.marked("no heartbeat for", "heartbeat is back"))
+    )
 
 
 def reboot(room: Room) -> Expected:
