@@ -302,7 +302,9 @@ def settle_all(b: Books, bus: int, s: int, final: bool, out: Decided) -> None:
                 _keep_pace(b, s, j)
         all_owe = all_owe and b.settled[s, j] + b.pending[s, j] < b.head[b.bus_of[j], s]
         whole = whole and b.settled[s, j] >= b.hole[b.bus_of[j], s]
-        if b.pace[s, j, CALM] >= IN_STEP:
+        # Buses are read one after the other: what another one was like before, or has become since, says nothing.
+        begun, ended = b.pace[s, j, PACED] - b.pace[s, j, CALM], b.pace[s, j, PACED]
+        if begun <= head - IN_STEP and ended >= head - 1:
             calm += 1
             calm_here += b.bus_of[j] == bus
     if all_owe and whole:

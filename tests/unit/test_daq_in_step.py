@@ -148,6 +148,23 @@ def test_after_an_outage_what_is_late_is_matched_and_what_is_stale_is_dropped(st
     assert {g.reason for g in bench.gaps} == ({"lost", SYNC_LOST} if stale else {SYNC_LOST})
 
 
+@pytest.mark.parametrize("burst", [0, 60])
+def test_drives_that_are_late_on_buses_of_their_own_are_no_witnesses_against_each_other(burst: int) -> None:
+    """All stop for 150 SYNCs, and the host with them: each bus is read for so long at once."""
+    stream = TpdoStream("samples", 1, (0x181, 0x181, 0x181), 8)
+    assembler = Assembler((stream,), ("a", "b", "c"), PERIOD_NS, bus_of=(0, 1, 2))
+    parts = []
+    for k in range(1000):
+        stopped = 400 <= k < 550
+        out = [(0x181, i) for i in range(400, 551)] if k == 550 else [(0x181, k)]
+        parts.append(frames_of(k, [] if stopped else out))
+    for first, last in ((0, 380), (380, 550 + burst), (550 + burst, 1000)):
+        for bus in range(3):
+            assembler.push(np.concatenate(parts[first:last]), sent=1000, bus=bus)
+    assembler.finish(1000)
+    assert assembler.counters["samples.rows"] == 1000
+
+
 def test_what_is_missing_on_one_bus_casts_no_doubt_on_another() -> None:
     """Joint a stands still and is late in a burst just after an outage of bus 2."""
     bench = Bench(buses=2)
