@@ -11,6 +11,9 @@ from identify.catalogue.motion import Motion
 
 Array = NDArray[np.float64]
 
+NEAREST_KNEE = 0.98
+"""Share of the knee's torque beyond which currents are taken to grow no faster: simulated torques may pass it."""
+
 
 def _gain(motion: Motion, place: Place) -> Array:
     return motion.of_motor(place.joint, motion.motor_torque[:, place.joint])
@@ -28,13 +31,30 @@ def _gain_numbers(motion: Motion, place: Place) -> Array:
     return motion.theta[: motion.model.base.b, None].copy()
 
 
-def _saturation(motion: Motion, place: Place) -> Array:
-    """The first term of any odd curve beyond the straight line: the share lost grows with the square of the torque."""
+def _saturation(motion: Motion, place: Place, *, knee: float = 0.0) -> Array:
+    """The first term of any odd curve beyond the straight line: the share lost grows with the square of the torque.
+
+    With a knee by as much more as currents grow that give ``torque = current / sqrt(1 + (current / knee)^2)``.
+    """
     j = place.joint
-    torque, ratios = motion.motor_torque[:, j], motion.model.robot.transmission_matrix[j]
+    torque, ratio = motion.motor_torque[:, j], _gear(motion, j)
     # By the limit of the joint, so that the parameter is the same in every motion.
-    most = motion.model.robot.joints[j].limits.torque / float(np.abs(ratios).max())
-    return motion.of_motor(j, torque * (torque / most) ** 2)
+    loss = torque * (torque * ratio / motion.model.robot.joints[j].limits.torque) ** 2
+    if knee > 0.0:
+        share = np.minimum((torque * ratio / knee) ** 2, NEAREST_KNEE**2)
+        loss = loss * np.where(share > 0.0, 2.0 * (1.0 / np.sqrt(1.0 - share) - 1.0) / np.maximum(share, 1e-12), 1.0)
+    return motion.of_motor(j, loss)
+
+
+def _knees(motion: Motion, joint: int) -> Sequence[float]:
+    """Torques of the joint at which its motor could give no more: from just above those of the motion."""
+    most = float(np.abs(motion.motor_torque[:, joint]).max()) * _gear(motion, joint)
+    return [share * max(most, 1e-9) for share in (1.03, 1.15, 1.4, 2.0, 4.0)]
+
+
+def _gear(motion: Motion, joint: int) -> float:
+    """Turns of a motor for one of its own joint."""
+    return float(np.abs(motion.model.robot.transmission_matrix[joint]).max())
 
 
 def _delay(motion: Motion, place: Place) -> Array:
@@ -102,10 +122,11 @@ EFFECTS = (
     Effect(
         name="drive_gain_saturation",
         title="a torque constant that falls with current",
-        says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost "
-        "at the joint's torque limit",
+        says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost at the "
+        "joint's torque limit as far as it grows with the square of the torque, knee the torque that is never reached",
         reference="Leonhard 2001, Control of Electrical Drives, chapter 5",
         linear=(Linear("gain_loss", ("", ""), sign=1),),
+        shapes=(Shape("knee", ("N m", "N"), _knees, default=0.0),),
         columns=_saturation,
         predicts=True,
         needs="small and large torques",

@@ -259,6 +259,16 @@ def test_saturation_grows_with_the_cube_of_the_torque(axis: Motion) -> None:
     np.testing.assert_allclose(found, current - tau, rtol=2e-3, atol=1e-9)
 
 
+def test_a_knee_bends_the_saturation_to_its_end(axis: Motion) -> None:
+    tau = axis.torque[:, 0]
+    knee = 1.1 * np.abs(tau).max()
+    loss = axis.model.robot.joints[0].limits.torque ** 2 / (2 * knee**2)
+    found = loss * columns("drive_gain_saturation", axis, knee=knee)[:, 0, 0]
+    np.testing.assert_allclose(found, tau / np.sqrt(1 - (tau / knee) ** 2) - tau, rtol=1e-6, atol=1e-9)
+    # Simulated torques may pass the knee; currents stay finite.
+    assert np.isfinite(columns("drive_gain_saturation", axis, knee=0.5 * knee)).all()
+
+
 def test_the_loss_at_the_torque_limit_is_the_same_in_every_motion(arm: Motion) -> None:
     half = replace(arm, q=arm.q[:700], qd=arm.qd[:700], qdd=arm.qdd[:700])
     for joint in range(6):
