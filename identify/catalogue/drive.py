@@ -122,8 +122,8 @@ EFFECTS = (
     Effect(
         name="drive_gain_saturation",
         title="a torque constant that falls with current",
-        says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost at "
-        "the joint's torque limit as far as it grows with the square of the torque, knee the torque never reached",
+        says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost "
+        "at the joint's torque limit as far as it grows with the square of the torque, knee the torque never reached",
         reference="Leonhard 2001, Control of Electrical Drives, chapter 5",
         linear=(Linear("gain_loss", ("", ""), sign=1),),
         shapes=(Shape("knee", ("N m", "N"), _knees, default=0.0),),
