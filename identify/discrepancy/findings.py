@@ -20,7 +20,7 @@ from identify.discrepancy.regression import relative_errors
 from identify.discrepancy.retrial import in_loop_of
 from identify.discrepancy.search import Search
 from identify.discrepancy.stanzas import without
-from identify.discrepancy.state import State, nearer, with_values
+from identify.discrepancy.state import State, nearer, power_put_right, with_values
 from identify.discrepancy.trial import CLOSE, Trial, judge
 from identify.discrepancy.where import Disagreement
 from identify.discrepancy.wiring_check import WiringFinding
@@ -75,13 +75,17 @@ def _finding(
     if mine is not None and effect.undo is not None:
         # With torques that belong to other positions no loop is the arm's own, and scores in it mean little: rivals are
         # those that come as near to the recordings when they are in the model.
-        mine = in_loop_of(study, rest.fit, mine.candidate) or mine
+        again = in_loop_of(study, rest.fit, mine.candidate)
+        mine = again if again is not None and again.score > mine.score else mine
         others = [(t, search.with_trial(rest, t)) for t in serious]
         serious = [
             t for t, other in others if other and nearer(other, rest, material) and not nearer(final, other, material)
         ]
     # Rows of other joints, which a change goes along with, are no part of what it is a share of.
     share = 0.0 if mine is None else min(mine.share, 1.0)
+    if mine is not None and effect.undo is not None:
+        was, now = power_put_right(rest, final), power_put_right(final, rest)
+        share = max(share, float(1.0 - now[place.joint] / was[place.joint]))
     scores = [] if mine is None else [mine.score, *(_instead(t, final) for t in serious)]
     alone = 0.0 if mine is None else float(np.exp(mine.score - special.logsumexp(scores)))
     close = [] if mine is None else [score for score in scores if abs(score - mine.score) < CLOSE]

@@ -9,14 +9,18 @@ from scipy import stats
 
 from configs import RobotConfig
 from configs.robot import Effect as Stanza
+from identify.catalogue.recorded import put_right
+from identify.catalogue.registry import known
 from identify.catalogue.terms import Term
 from identify.discrepancy.candidates import Workshop
+from identify.discrepancy.lines import residuals
 from identify.discrepancy.regression import Fit, applied, fit
 from identify.discrepancy.stanzas import stanza_number
 from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial
 from identify.discrepancy.whitening import rows_of_joints, whitened
 from identify.estimators.noise import ArModel
+from identify.experiment import Experiment
 from identify.model.arm import ArmModel
 
 Array = NDArray[np.float64]
@@ -88,6 +92,9 @@ def nearer(one: State, other: State, material: float) -> bool:
     torque, and simulated ones are only as good as the loop. Where they alone are for it, the loop with the effect in it
     must move more like the arm, too: what a model says of itself is no evidence.
 
+    Of recordings put right in two ways the loops tell which is right, and where they do not, the errors with both ways'
+    filters in either: a torque put right by a filter has less noise, whether it was wrong or not.
+
     Parameters
     ----------
     material
@@ -95,9 +102,15 @@ def nearer(one: State, other: State, material: float) -> bool:
     """
     closer = one.study.moves_more_like_the_arm_than(other.study, held=True)
     if one.study.recorded != other.study.recorded:
-        # A torque put right by a filter has less noise, whether it was wrong or not.
+        ours, theirs = one.study.recorded, other.study.recorded
+        differ = [s.joint for s in ours if s not in theirs] + [s.joint for s in theirs if s not in ours]
+        where = [one.study.joints.index(joint) for joint in differ]
+        if _wiring(one) == _wiring(other) and one.study.moves_as_much_like_the_arm_as(other.study, where, held=True):
+            was, now = power_put_right(other, one), power_put_right(one, other)
+            return bool(np.sum(np.log(now / was)) < 0.0 and np.any(now < (1 - material) * was))
         return closer
-    if _power(one) < _power(other):
+    # Relative to each other joint by joint: a wrist's errors are small beside those of a shoulder, or in other units.
+    if np.sum(np.log(_power(one))) < np.sum(np.log(_power(other))):
         return True
     if not closer:
         return False
@@ -109,9 +122,27 @@ def nearer(one: State, other: State, material: float) -> bool:
     return bool(now.sum() < was.sum() and np.any(now < (1 - material) * was))
 
 
-def _power(state: State) -> float:
-    """Squared norm of the held-out errors at measured signals."""
-    return float(sum(np.sum(e**2) for e in state.fit.errors(state.fit.theta, held=True)))
+def _power(state: State) -> Array:
+    """Squared norm of every joint's held-out errors at measured signals, (n,)."""
+    errors = np.concatenate(state.fit.errors(state.fit.theta, held=True))
+    return np.asarray(np.maximum(np.sum(errors**2, axis=0), 1e-300))
+
+
+def _wiring(state: State) -> list[Stanza]:
+    """Mistakes of wiring that the recordings have been put right by."""
+    return [stanza for stanza in state.study.recorded if known(stanza.effect).rewires]
+
+
+def power_put_right(state: State, other: State) -> Array:
+    """Squared norm of every joint's held-out errors, put right as the recordings of another state are, too, (n,)."""
+    study = state.study
+    late = tuple(stanza for stanza in other.study.recorded if not known(stanza.effect).rewires)
+    robot = study.robot.model_copy(update={"effects": late})
+    total = np.zeros(study.robot.n)
+    for e in residuals(study, study.held, state.fit.theta):
+        (done,) = put_right([Experiment(q=e, tau=e, q_ref=None, dt=study.dt)], robot)
+        total += np.sum(study.decimation(done.tau) ** 2, axis=0)
+    return np.maximum(total, 1e-300)
 
 
 def _change(before: State, after: State) -> list[Array]:

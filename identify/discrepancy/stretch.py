@@ -81,8 +81,8 @@ def rows_before(kept: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.
     return kept[max(first - rows.size, 0) : first]
 
 
-def distance(stretches: Sequence[Stretch]) -> float:
-    """Squared errors of the simulated velocities, each joint over its own measured ones, summed."""
+def distances(stretches: Sequence[Stretch]) -> Array:
+    """Squared errors of the simulated velocities of each joint over its own measured ones, (n,)."""
     apart = sum(np.sum((s.simulated.qd - s.measured.qd) ** 2, axis=0) for s in stretches)
     size = sum(np.sum(s.measured.qd**2, axis=0) for s in stretches)
-    return float(np.sum(apart / np.maximum(size, 1e-300)))
+    return np.asarray(apart / np.maximum(size, 1e-300))

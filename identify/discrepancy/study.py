@@ -12,7 +12,7 @@ from identify.catalogue.motion import Motion
 from identify.catalogue.recorded import of_recording, put_right
 from identify.catalogue.registry import known
 from identify.closed_loop import closed_loop
-from identify.discrepancy.stretch import KINDS, Stretch, at_rows, distance, rows_before
+from identify.discrepancy.stretch import KINDS, Stretch, at_rows, distances, rows_before
 from identify.estimators.auxiliary import AuxiliaryModel
 from identify.estimators.idim_ls import idim_ls
 from identify.experiment import Experiment
@@ -35,6 +35,9 @@ BAND = 5.0
 WORKING_RATE = 20.0
 """Rate at which effects are evaluated, over the frequency up to which model and data are compared."""
 
+
+ALIKE = 0.9
+"""Squared error of one loop's motion over that of another from which on they tell nothing."""
 
 STIFF_LOOP = 1.5
 """Squared error of the motion of a stand-in's loop over that without the model's terms up to which it is no worse."""
@@ -115,7 +118,14 @@ class Study:
         if ours != theirs:
             return ours
         one, two = (study.held if held else study.train for study in (self, other))
-        return distance(one) < distance(two)
+        return bool(distances(one).sum() < distances(two).sum())
+
+    def moves_as_much_like_the_arm_as(self, other: "Study", joints: Sequence[int], *, held: bool) -> bool:
+        """Whether the two simulated loops are so much alike at some joints that they do not tell which is better."""
+        if (self.loop in CONTROLLERS) != (other.loop in CONTROLLERS):
+            return False
+        one, two = (distances(study.held if held else study.train)[list(joints)].sum() for study in (self, other))
+        return bool(ALIKE < one / max(two, 1e-300) < 1.0 / ALIKE)
 
     @property
     def sample(self) -> float:
@@ -168,8 +178,8 @@ class Study:
 
         train = moved(self.train)
         # A stand-in follows the measured motion whatever the arm: there it must only not be led astray.
-        bound = distance(self.train) * (1.0 if self.loop in CONTROLLERS else STIFF_LOOP)
-        if not distance(train) < bound:
+        bound = distances(self.train).sum() * (1.0 if self.loop in CONTROLLERS else STIFF_LOOP)
+        if not distances(train).sum() < bound:
             return self
         return replace(self, train=train, held=moved(self.held))
 
