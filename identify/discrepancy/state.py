@@ -92,9 +92,6 @@ def nearer(one: State, other: State, material: float) -> bool:
     torque, and simulated ones are only as good as the loop. Where they alone are for it, the loop with the effect in it
     must move more like the arm, too: what a model says of itself is no evidence.
 
-    Of recordings put right in two ways the loops tell which is right, and where they do not, the errors with both ways'
-    filters in either: a torque put right by a filter has less noise, whether it was wrong or not.
-
     Parameters
     ----------
     material
@@ -102,13 +99,7 @@ def nearer(one: State, other: State, material: float) -> bool:
     """
     closer = one.study.moves_more_like_the_arm_than(other.study, held=True)
     if one.study.recorded != other.study.recorded:
-        ours, theirs = one.study.recorded, other.study.recorded
-        differ = [s.joint for s in ours if s not in theirs] + [s.joint for s in theirs if s not in ours]
-        where = [one.study.joints.index(joint) for joint in differ]
-        if _wiring(one) == _wiring(other) and one.study.moves_as_much_like_the_arm_as(other.study, where, held=True):
-            was, now = power_put_right(other, one), power_put_right(one, other)
-            return bool(np.sum(np.log(now / was)) < 0.0 and np.any(now < (1 - material) * was))
-        return closer
+        return closer or _recorded_right(one, other, material)
     # Relative to each other joint by joint: a wrist's errors are small beside those of a shoulder, or in other units.
     if np.sum(np.log(_power(one))) < np.sum(np.log(_power(other))):
         return True
@@ -128,9 +119,20 @@ def _power(state: State) -> Array:
     return np.asarray(np.maximum(np.sum(errors**2, axis=0), 1e-300))
 
 
-def _wiring(state: State) -> list[Stanza]:
-    """Mistakes of wiring that the recordings have been put right by."""
-    return [stanza for stanza in state.study.recorded if known(stanza.effect).rewires]
+def _recorded_right(one: State, other: State, material: float) -> bool:
+    """Whether recordings put right as in one state make smaller errors, where the loops hardly tell.
+
+    With the filters of both ways in either: a torque put right by a filter has less noise, whether it was wrong or not.
+    """
+    ours, theirs = one.study.recorded, other.study.recorded
+    differ = [s for s in ours if s not in theirs] + [s for s in theirs if s not in ours]
+    where = [one.study.joints.index(stanza.joint) for stanza in differ]
+    if any(known(stanza.effect).rewires for stanza in differ):
+        return False
+    if not one.study.moves_as_much_like_the_arm_as(other.study, where, held=True):
+        return False
+    was, now = power_put_right(other, one), power_put_right(one, other)
+    return bool(np.sum(np.log(now / was)) < 0.0 and np.any(now < (1 - material) * was))
 
 
 def power_put_right(state: State, other: State) -> Array:
