@@ -128,3 +128,14 @@ def test_identifying_with_the_effect_inside_brings_the_torque_error_down(
     # 0.4 of the 5.5 N m s/rad of table B.4.
     assert added.value == pytest.approx(0.4 * 5.5, abs=3 * added.std)
     assert added.unit == "N m s/rad"
+
+
+def test_a_slow_drive_is_found_where_the_simulated_loop_does_not_tell(
+    robot: RobotConfig, trajectory: Trajectory
+) -> None:
+    """The wrist's drives hardly follow their references, with and without the lag, in simulation as well."""
+    slow = HiddenEffect(effect="actuator_bandwidth", joint="joint_5", parameters={"time_constant": 0.032})
+    document = diagnosed(robot, trajectory, 2, slow).document
+    (finding,) = document.findings
+    assert (finding.effect, finding.joint) == ("actuator_bandwidth", "joint_5")
+    assert finding.gap_after < 0.8 * finding.gap_before
