@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from daq.assembler import IN_STEP_S, SYNC_LOST, Assembler, TpdoStream
+from daq.assembler import IN_STEP_S, SYNC_LOST, Assembler, Batch, TpdoStream
 from daq.recording import Gap
 from drivers.frames import Frames, frames
 
@@ -56,12 +56,12 @@ class Bench:
         """No more comes."""
         self._take(self.assembler.finish(sent))
 
-    def _take(self, batch: object) -> None:
-        rows = batch.rows["samples"]  # type: ignore[attr-defined]
+    def _take(self, batch: Batch) -> None:
+        rows = batch.rows["samples"]
         numbers = rows.data[:, :, :8].copy().view("<i8")[:, :, 0]
         assert np.all(numbers == rows.sync[:, None]), "a value is of another SYNC"
         self.sync += rows.sync.tolist()
-        self.gaps += batch.gaps  # type: ignore[attr-defined]
+        self.gaps += batch.gaps
 
     def missing(self, count: int) -> set[int]:
         """SYNCs without a row, of the first ``count``."""
