@@ -15,7 +15,10 @@ from daq.books import (
     RECEIVED,
     SYNC,
     SYNC_MISALIGNED,
+    TIME,
     TOP,
+    TORN,
+    UNSEEN,
     Decided,
     Shape,
     open_books,
@@ -204,11 +207,15 @@ class Assembler:
         if sent is not None and not self._lossy[bus]:
             # Our own SYNCs reach us unless the kernel drops them: time that passed is a producer held up, no loss.
             longest = 0
+        if dropped:
+            self._books.state[bus, TORN] = 2
         syncs = _count_sync(*arguments, longest, self._books)
         if dropped:
             self._books.hole[bus] = self._books.mark[:, TOP] + syncs + 1
         out = room_for(self._books, syncs)
         _match(*arguments, longest, self._books, out)
+        if dropped:
+            self.torn(bus)
         if self._books.counts[SYNC_MISALIGNED] >= _MISALIGNED:
             raise DataError(
                 f"bus {bus + 1}: its SYNC counter says another number than that of another bus at the same time; "
@@ -220,6 +227,11 @@ class Assembler:
         """Say that a bus is known to be down, or back: its drives owe nothing meanwhile, and the others go on."""
         self._books.slack[bus] = 0 if silent else self._slack
         self._lossy[bus] |= silent
+        self.torn(bus)
+
+    def torn(self, bus: int) -> None:
+        """Say that frames of a bus may be missing behind the last one, however its SYNC counter goes on."""
+        self._books.state[bus, TORN] = 1
 
     def suspect(self, joint: str, since_ns: int, until_ns: int) -> None:
         """Say that TPDOs of a joint that came in this time (ns, UTC) hold something else than the session says."""
@@ -227,6 +239,22 @@ class Assembler:
         if span[0] < span[1] and span[1] == EVER:
             since_ns = min(since_ns, int(span[0]))
         span[:] = since_ns, until_ns
+
+    def unseen(self, dropped: Sequence[int], now_ns: int) -> int:
+        """SYNCs that there may have been at most behind the last one.
+
+        Parameters
+        ----------
+        dropped
+            Frames of each bus that were lost behind the last one received, as the kernel knows.
+        now_ns
+            Time of the kernel's stamps, ns UTC.
+        """
+        numbers, times = self._books.state[:, SYNC], self._books.state[:, TIME]
+        known = times != UNSEEN
+        periods = np.maximum(0, now_ns - times[known]) // self._timing[1]
+        last = numbers[known] + np.minimum(np.asarray(dropped)[known], periods)
+        return int(max(0, last.max(initial=self.last_sync) - self.last_sync))
 
     def finish(self, sent: int | None = None) -> Batch:
         """No more frames come; ``sent`` SYNC were sent in all, if we know."""

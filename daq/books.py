@@ -12,9 +12,10 @@ LOST, RECEIVED, WRONG_LENGTH, AMBIGUOUS, NO_SYNC, WRONG_MAPPING = range(6)
 UNSEEN = int(np.iinfo(np.int64).min)
 """The time of a SYNC that was not received."""
 
-# Positions in Books.state, per bus: number, counter and time of the last SYNC, counter of SYNC 0, and whether the last
-# SYNC is one of other buses, which this one lacks.
-SYNC, COUNTER, TIME, ORIGIN, BORROWED = 0, 1, 2, 3, 4
+# Positions in Books.state, per bus: number, counter and time of the last SYNC, counter of SYNC 0, whether the last
+# SYNC is one of other buses, which this one lacks, and whether frames are known to be missing: 1 behind the last SYNC,
+# 2 somewhere among those that come now.
+SYNC, COUNTER, TIME, ORIGIN, BORROWED, TORN = 0, 1, 2, 3, 4, 5
 
 # Columns of Books.kind: every how many SYNCs a frame is due, its samples, their bytes, its bytes, and for how many rows
 # an answer may be late: where its drive has not been in step since, where all are late, and where it is in step again
@@ -132,7 +133,7 @@ def open_books(
     words = max(-(-shape.length // 8) for shape in shapes)
     pack = max(shape.pack for shape in shapes)
     return Books(
-        state=np.tile(np.array([-1, -1, UNSEEN, 1, 0]), (buses, 1)),
+        state=np.tile(np.array([-1, -1, UNSEEN, 1, 0, 0]), (buses, 1)),
         slack=np.full(buses, max(w * s.every for w, s in zip(window, shapes, strict=True)), np.int64),
         recent=np.full((buses, RECENT), UNSEEN, np.int64),
         counts=np.zeros(len(COUNT_NAMES), np.int64),

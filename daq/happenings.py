@@ -73,6 +73,8 @@ class Happenings:
             self.counts[event.kind] += 1
         if event.kind in ("bus_down", "bus_up"):
             self._assembler.silence(event.bus, event.kind == "bus_down")
+        if event.kind == "bus_off":
+            self._assembler.torn(event.bus)
         self._sink.mark("note", self._sync, event.text)
         channel = self._order.session.all_buses[event.bus].channel
         self._say(Line(event.text, event=event.kind, bus=channel, sync=self._sync))
@@ -97,6 +99,10 @@ class Happenings:
     def _note(self, text: str) -> None:
         self._sink.mark("note", self._sync, text)
         self._say(text)
+
+    def of_the_end(self, dropped: int, syncs: int) -> None:
+        """The kernel dropped frames behind the last one that was received, at most ``syncs`` SYNCs with them."""
+        self._note(f"{dropped} frames were dropped by the kernel at the end: up to {syncs} SYNCs may be missing there")
 
     def look_for_other_mappings(self) -> None:
         """Tell once of every TPDO that has another length than its mapping says."""

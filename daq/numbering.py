@@ -5,12 +5,14 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from daq.books import BORROWED, COUNTER, ORIGIN, RECENT, SYNC, TIME, UNSEEN
+from daq.books import BORROWED, COUNTER, ORIGIN, RECENT, SYNC, TIME, TORN, UNSEEN
 
 _EARLY = 0.25
 """By how much of a turn of the counter the time between two SYNCs may be too short, as their stamps say."""
 _DISORDER = 8
 """A SYNC counter that goes back by less than this is a repeated SYNC, not a long gap."""
+_ON_TIME, _DRIFT = 2.0, 1e-4
+"""By how many periods, and which share of the time since, SYNC comes earlier or later than its grid at most."""
 _MISALIGNED = 2.0
 """SYNCs of equal counters on two buses that are farther apart than so many periods are not the same SYNC."""
 
@@ -19,6 +21,14 @@ _MISALIGNED = 2.0
 def turns_in(periods: float, overflow: int) -> int:
     """Whole turns of the counter in a time: SYNCs come late, when their master was held up, but not too early."""
     return int(np.floor(periods / overflow + _EARLY))
+
+
+@njit(cache=True, nogil=True)
+def _was_held_up(counter: int, previous: int, elapsed: float, overflow: int) -> bool:
+    """Whether a counter that goes on without a seam is that of a master that was held up: not a time of whole turns."""
+    step = (counter - previous) % overflow
+    off = elapsed - step - turns_in(elapsed - step, overflow) * overflow
+    return bool(step == 1 and abs(off) > _ON_TIME + _DRIFT * elapsed)
 
 
 @njit(cache=True, nogil=True)
@@ -77,6 +87,8 @@ def advance(
         step = (counter - state[bus, COUNTER]) % overflow
         step += overflow * turns_in(elapsed - step, overflow)
     elif counter >= 0 and state[bus, COUNTER] >= 0:
+        if not state[bus, TORN] and _was_held_up(counter, state[bus, COUNTER], elapsed, overflow):
+            longest = 0
         step = sync_step(counter, state[bus, COUNTER], elapsed, overflow, longest)
     elif counter < 0 and state.shape[0] > 1:
         # Without a counter, time alone keeps the buses together.
@@ -87,6 +99,8 @@ def advance(
         state[bus, SYNC] += step
         state[bus, TIME] = t_ns
         state[bus, BORROWED] = 0
+        if state[bus, TORN] == 1:
+            state[bus, TORN] = 0
         if counter >= 0:
             state[bus, COUNTER] = counter
     return int(step)

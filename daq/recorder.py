@@ -82,6 +82,7 @@ class Recorder:
         self._fed = -math.inf
         self._refused: float | None = None
         self._suspect: dict[str, tuple[int, int]] = {}
+        self._unseen = 0
 
     def start(self, stack: ExitStack) -> None:
         """Configure and enable the drives, and start SYNC; whatever was started is stopped when the stack unwinds."""
@@ -130,6 +131,7 @@ class Recorder:
         counters = self._assembler.counters | self._happenings.counts
         counters["kernel_drops"] = self._receiver.dropped
         counters["error_frames"] = self._receiver.error_frames
+        counters["sync_unseen"] = self._unseen
         for name, value in worst(self._jitters).items():
             counters[f"sync_jitter_{name.replace('.', '_')}_us"] = round(value)
         if isinstance(self._producer, SyncProducer):
@@ -262,9 +264,18 @@ class Recorder:
             self._await_answers()
         if self._master is not None:
             self._master.stop()
-        sent = self._producer.sent if self._producer is not None else None
-        self.sink.take(self._assembler.finish(sent))
+        self.sink.take(self._assembler.finish(self._sent_in_all()))
         self._happenings.look_for_other_mappings()
+
+    def _sent_in_all(self) -> int | None:
+        """How many SYNCs there were: ours; of another master at most, where the kernel dropped the last frames."""
+        if self._producer is not None:
+            return self._producer.sent
+        dropped = self._receiver.dropped_behind
+        self._unseen = self._assembler.unseen(dropped, time.time_ns())
+        if self._unseen:
+            self._happenings.of_the_end(sum(dropped), self._unseen)
+        return self._assembler.last_sync + 1 + self._unseen
 
     def _rest(self, seconds: float) -> None:
         """Go on recording for so long."""

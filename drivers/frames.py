@@ -72,6 +72,10 @@ class FrameBus(Protocol):
         """Send all frames in order; the number of frames sent."""
         ...
 
+    def drops(self) -> int:
+        """Frames that were dropped so far, those behind the last one received among them."""
+        ...
+
     def close(self) -> None:
         """Release the bus; nothing happens the second time."""
         ...

@@ -87,7 +87,12 @@ class Receiver:
     @property
     def dropped(self) -> int:
         """Frames that the kernel dropped, of all buses."""
-        return sum(line.lost_before + line.bus.dropped for line in self._lines)
+        return sum(line.lost_before + line.bus.drops() for line in self._lines)
+
+    @property
+    def dropped_behind(self) -> tuple[int, ...]:
+        """Frames of each bus that the kernel dropped behind the last one received."""
+        return tuple(line.bus.drops() - line.bus.dropped for line in self._lines)
 
     @property
     def error_frames(self) -> int:
@@ -166,7 +171,7 @@ class Receiver:
                 fresh = line.open()
             except ArmidentError:
                 return
-            line.lost_before += line.bus.dropped
+            line.lost_before += line.bus.drops()
             line.bus.close()
             line.bus = fresh
         self._back(k, line)

@@ -46,6 +46,7 @@ SO_RCVBUFFORCE = 33
 SO_RCVTIMEO = 20
 MSG_WAITFORONE = 0x10000
 SO_RXQ_OVFL = 40
+SO_MEMINFO, MEMINFO_DROPS = 55, 8
 CAN_RAW_ERR_FILTER = 2
 CAN_RAW_FD_FRAMES = 5
 CAN_RAW_FILTER_MAX = 512
@@ -104,7 +105,9 @@ class RawSocket:
         self.fd = fd
         self._clock = InterfaceClock() if hardware and has_hardware_stamps(channel) else None
         self.dropped = 0
-        """Frames the kernel had to drop because the receive buffer was full, since the socket was opened."""
+        """Frames the kernel had to drop because the receive buffer was full, since the socket was opened.
+
+        As the last frame received says, which does not know of those dropped behind it."""
         try:
             self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except OSError as error:
@@ -223,6 +226,12 @@ class RawSocket:
             self.dropped += (int(control["drops"][-1]) - self.dropped) & 0xFFFFFFFF
         lengths[:] = messages.control.itemsize
         return int(got)
+
+    def drops(self) -> int:
+        """Frames the kernel dropped until now, those behind the last one received among them."""
+        info = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 4 * (MEMINFO_DROPS + 1))
+        (now,) = struct.unpack_from("I", info, 4 * MEMINFO_DROPS)
+        return self.dropped + ((int(now) - self.dropped) & 0xFFFFFFFF)
 
     def poll(self, timeout: float) -> bool:
         """Whether a frame arrived within ``timeout`` seconds.

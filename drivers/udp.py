@@ -118,6 +118,10 @@ class UdpBus:
                 raise BusDown(f"bus {self.channel}: {error}") from error
         return int(frames.size)
 
+    def drops(self) -> int:
+        """Always 0."""
+        return self.dropped
+
     def _next(self, timeout: float) -> can.Message | None:
         if self._ahead is not None:
             message, self._ahead = self._ahead, None

@@ -17,6 +17,8 @@ from tests.faults.farm import Farm, Orders
 
 SDO_STEP_S = 0.004
 BEHIND = 50
+DISK_LEFT = 1 << 18
+"""Bytes left on a disk that will be full: what a round writes until then, and more."""
 FIRST_S = 0.15
 """Faults begin so long after the first SYNC at the earliest."""
 
@@ -235,10 +237,17 @@ def _stopped(room: Room) -> None:
     begin, length = room.at(1.2), float(room.rng.uniform(0.1, 0.3))
 
     def stop() -> None:
-        os.kill(room.pid(), signal.SIGSTOP)
-        room.farm.later(length, lambda: os.kill(room.pid(), signal.SIGCONT))
+        status = Path(f"/proc/{room.pid()}/stat")
+        # A capture that failed is no more.
+        with suppress(FileNotFoundError, ProcessLookupError):
+            os.kill(room.pid(), signal.SIGSTOP)
+            # One that has not been obeyed yet would be called off by what follows.
+            while status.read_text().rpartition(")")[2].split()[0] not in "TZX":
+                time.sleep(0.001)
+            time.sleep(length)
+            os.kill(room.pid(), signal.SIGCONT)
 
-    room.actions.append((begin, stop))
+    room.actions.append((begin, lambda: room.farm.beside(stop)))
 
 
 def sync_missing(room: Room) -> Expected:
@@ -258,11 +267,13 @@ def sync_stops(room: Room) -> Expected:
 def disk_full(room: Room) -> Expected:
     """The disk is full for a while."""
     filler = room.disk / "filler"
-
     length = float(room.rng.uniform(0.3, 0.5))
+    # Most of it before the round, so that the rest is done in a moment.
+    free = os.statvfs(room.disk)
+    filler.write_bytes(bytes(max(0, free.f_bavail * free.f_frsize - DISK_LEFT)))
 
     def fill() -> None:
-        with filler.open("wb", buffering=0) as file:
+        with filler.open("ab", buffering=0) as file:
             for block in (1 << 16, 1 << 12, 1 << 9):
                 with suppress(OSError):
                     while file.write(bytes(block)) == block:

@@ -58,6 +58,18 @@ def test_every_dropped_frame_is_counted(vcan_bus: str) -> None:
         assert first.size + second.size + third.size + fourth.size + receiver.dropped == 1002
 
 
+def test_frames_dropped_behind_the_last_one_are_known_before_another_comes(vcan_bus: str) -> None:
+    with RawSocket(vcan_bus, filters=()) as sender, RawSocket(vcan_bus, receive_buffer=8192) as receiver:
+        assert receiver.drops() == 0
+        sender.send(numbered(500))
+        got = drain(receiver)
+        assert receiver.dropped == 0
+        assert receiver.drops() == 500 - got.size
+        sender.send(numbered(1))
+        drain(receiver)
+        assert receiver.drops() == receiver.dropped == 500 - got.size
+
+
 def test_the_kernel_filters_by_the_exact_identifier(vcan_bus: str) -> None:
     with RawSocket(vcan_bus, filters=()) as sender, RawSocket(vcan_bus, filters=[(0x80, 0x7FF)]) as receiver:
         for can_id in (0x80, 0x81, 0x181, 0x80):

@@ -1,0 +1,118 @@
+"""A SYNC counter wraps: what a pause in it means, and what may be missing behind the last frame."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from daq.assembler import SYNC_LOST, Assembler, TpdoStream
+from daq.recording import Gap
+from drivers.frames import Frames, frames
+
+PERIOD_NS = 200_000
+OVERFLOW = 240
+STREAM = TpdoStream("samples", 1, (0x181, 0x182), 8)
+T0 = 1_700_000_000_000_000_000
+
+
+class Listener:
+    """An assembler that hears another master, and the gaps it has told."""
+
+    def __init__(self) -> None:
+        self.assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, None)
+        self.gaps: list[Gap] = []
+
+    def push(self, part: Frames, dropped: bool = False) -> None:
+        """Take frames."""
+        self.gaps += self.assembler.push(part, dropped=dropped).gaps
+
+    def finish(self, sent: int | None = None) -> list[Gap]:
+        """No more frames come; all gaps."""
+        return [*self.gaps, *self.assembler.finish(sent).gaps]
+
+
+def outages(gaps: list[Gap]) -> list[tuple[int, int]]:
+    """First and last SYNC of what was not received; beside it, only the row before may be in doubt."""
+    missing = [(gap.first, gap.last) for gap in gaps if gap.reason == SYNC_LOST]
+    assert {gap.first for gap in gaps if gap.reason != SYNC_LOST} <= {first - 1 for first, _ in missing}
+    return missing
+
+
+def answered(numbers: list[int], late_ns: Callable[[int], int] = lambda k: 0) -> Frames:
+    """SYNCs of these numbers, each with its two answers."""
+    out = frames(3 * len(numbers))
+    k = np.array(numbers)
+    out["t_ns"] = np.repeat(T0 + k * PERIOD_NS + np.array([late_ns(int(i)) for i in k]), 3)
+    out["can_id"] = np.tile([0x80, 0x181, 0x182], k.size)
+    out["length"] = np.tile([1, 8, 8], k.size)
+    out["data"][::3, 0] = k % OVERFLOW + 1
+    return out
+
+
+@pytest.mark.parametrize("turns", [0.76, 1.1, 3.2])
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_master_that_was_held_up_has_sent_nothing_meanwhile(turns: float, cut: bool) -> None:
+    listener = Listener()
+    stall = round(turns * OVERFLOW) * PERIOD_NS
+    sent = answered(list(range(1000)), lambda k: stall if k >= 500 else 0)
+    for part in np.split(sent, [1500] if cut else []):
+        listener.push(part)
+    assert listener.finish() == []
+    counters = listener.assembler.counters
+    assert counters["samples.rows"] == counters["samples.expected"] == 1000
+
+
+@pytest.mark.parametrize("why", ["dropped", "down", "bus-off"])
+def test_whole_turns_are_missing_where_frames_are_known_to_be(why: str) -> None:
+    listener = Listener()
+    listener.push(answered(list(range(500))))
+    if why == "down":
+        listener.assembler.silence(0, True)
+        listener.assembler.silence(0, False)
+    elif why == "bus-off":
+        listener.assembler.torn(0)
+    listener.push(answered(list(range(500 + 2 * OVERFLOW, 1500))), dropped=why == "dropped")
+    assert outages(listener.finish()) == [(500, 500 + 2 * OVERFLOW - 1)]
+
+
+def test_an_outage_that_nobody_noticed_is_told_by_the_counter_and_its_length_by_the_time() -> None:
+    listener = Listener()
+    listener.push(answered([*range(500), *range(1217, 1500)]))
+    assert outages(listener.finish()) == [(500, 1216)]
+
+
+def test_what_is_known_to_be_missing_counts_for_the_next_sync_alone() -> None:
+    listener = Listener()
+    stall = round(1.1 * OVERFLOW) * PERIOD_NS
+    sent = answered(list(range(1000)), lambda k: stall if k >= 500 else 0)
+    listener.push(sent[:600], dropped=True)
+    listener.push(sent[600:])
+    assert listener.finish() == []
+
+
+@pytest.mark.parametrize(("dropped", "passed", "at_most"), [(0, 50, 0), (13, 50, 13), (700, 50, 50), (7, 0, 0)])
+def test_no_more_syncs_are_unseen_than_frames_were_dropped_or_periods_have_passed(
+    dropped: int, passed: int, at_most: int
+) -> None:
+    listener = Listener()
+    listener.push(answered(list(range(100))))
+    now = T0 + (99 + passed) * PERIOD_NS
+    assert listener.assembler.unseen([dropped], now) == at_most
+    gaps = listener.finish(100 + at_most)
+    assert Gap("samples", 100, 99 + at_most, None, SYNC_LOST) in gaps or not at_most
+    assert {k for gap in gaps for k in range(gap.first, gap.last + 1)} <= set(range(99, 100 + at_most))
+    assert listener.assembler.counters["samples.expected"] == 100 + at_most
+
+
+def test_nothing_is_unseen_before_the_first_sync() -> None:
+    assert Listener().assembler.unseen([40], T0) == 0
+
+
+def test_what_one_bus_had_to_drop_another_one_may_have_received() -> None:
+    assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, None, bus_of=(0, 1))
+    for bus, count in ((0, 100), (1, 90)):
+        both = answered(list(range(count)))
+        assembler.push(both[both["can_id"] != (0x182, 0x181)[bus]], bus=bus)
+    now = T0 + 130 * PERIOD_NS
+    assert assembler.unseen([0, 5], now) == 0
+    assert assembler.unseen([0, 30], now) == 20
