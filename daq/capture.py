@@ -20,7 +20,7 @@ from daq.recorder import Recorder
 from daq.recording import Mark, RecordingSeries, TriggeredSeries
 from daq.reload import Change, Reloader
 from daq.sink import Sink
-from daq.storage import Tidiness, capture_stamp, limits, open_series
+from daq.storage import Tidiness, capture_stamp, kept_around, limits, open_series
 from daq.systemd import Notifier
 from daq.zenoh_keys import Keys
 from drivers.frames import FrameBus
@@ -106,7 +106,7 @@ def capture(
             writer.abort()
             raise
         if order.config is not None:
-            changes = (run.health.change, publisher.change, _exchange_limits(writer, tidiness))
+            changes = (run.health.change, run.change, publisher.change, _exchange_limits(writer, tidiness))
             reloader = stack.enter_context(closing(Reloader(order.config, order, changes, say)))
             _connect(run, reloader, reload or threading.Event(), notifier, session.cell)
         run.sink.announce(robot, session, rate, metadata)
@@ -126,10 +126,12 @@ def capture(
 
 
 def _exchange_limits(writer: RecordingSeries | TriggeredSeries, tidiness: Tidiness) -> Change:
-    """Changes when files are full, and how long they are kept."""
+    """Changes when files are full, how long they are kept, and how much around an event."""
 
     def change(session: SessionConfig) -> None:
         writer.limit(*limits(session.recording))
+        if isinstance(writer, TriggeredSeries) and session.recording.trigger is not None:
+            writer.keep(*kept_around(session.recording.trigger))
         tidiness.options = session.recording
 
     return change

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from configs import ArmidentError
+from configs import ArmidentError, SessionConfig
 from daq.assembler import Assembler
 from daq.journal import Line
 from daq.order import Order
@@ -35,12 +35,17 @@ class Happenings:
         self.counts = dict.fromkeys(COUNTED, 0)
         self.moving = False
         """Whether the arm is moved: what fails then ends the capture."""
-        trigger = order.session.recording.trigger
-        self.triggers: tuple[str, ...] = () if trigger is None else trigger.events
+        self.triggers: tuple[str, ...] = ()
+        self.change(order.session)
         self._order, self._assembler, self._sink, self._say = order, assembler, sink, say
         self._told: set[tuple[str, str]] = set()
         self._patience = max(SYNC_STOPPED_S, SYNC_STOPPED * order.session.sync_period)
         self._sync_before, self._sync_came, self._stopped = -1, 0.0, False
+
+    def change(self, session: SessionConfig) -> None:
+        """Take over which events write a recording."""
+        trigger = session.recording.trigger
+        self.triggers = () if trigger is None else trigger.events
 
     def of_drive(self, event: DriveEvent) -> None:
         """A drive reported something.

@@ -8,7 +8,7 @@ from contextlib import ExitStack, suppress
 
 import numpy as np
 
-from configs import ArmidentError
+from configs import ArmidentError, SessionConfig
 from daq.assembler import LATE_S, Assembler
 from daq.happenings import Happenings
 from daq.health import Health
@@ -83,6 +83,7 @@ class Recorder:
         self._refused: float | None = None
         self._suspect: dict[str, tuple[int, int]] = {}
         self._unseen = 0
+        self._drain_s = session.recording.drain_ms * 1e-3
 
     def start(self, stack: ExitStack) -> None:
         """Configure and enable the drives, and start SYNC; whatever was started is stopped when the stack unwinds."""
@@ -113,6 +114,11 @@ class Recorder:
                 self._producer = SyncProducer(session.all_buses, *timing)
             self._producer.start()
             stack.callback(self._producer.stop)
+
+    def change(self, session: SessionConfig) -> None:
+        """Take over how often the buses are looked at, and what writes a recording."""
+        self._drain_s = session.recording.drain_ms * 1e-3
+        self._happenings.change(session)
 
     def record(self) -> ArmidentError | None:
         """Drain, match, write and publish until it is over; what ended it early, if something did."""
@@ -168,11 +174,11 @@ class Recorder:
         return wanted
 
     def _loop(self) -> None:
-        last, drain = self._last_wanted(), self._order.session.recording.drain_ms * 1e-3
+        last = self._last_wanted()
         due = reported = time.monotonic()
         deadline = None if self._order.duration is None else due + self._order.duration
         while not self._stop.is_set() and self._assembler.last_sync < last:
-            due = max(due + drain, time.monotonic())
+            due = max(due + self._drain_s, time.monotonic())
             time.sleep(max(0.0, due - time.monotonic()))
             self._drain()
             self._watch()

@@ -19,6 +19,8 @@ CHANGEABLE = (
     "recording.rotate_minutes",
     "recording.keep_days",
     "recording.min_free_gb",
+    "recording.drain_ms",
+    "recording.trigger.",
     "zenoh.queue_blocks",
     "zenoh.commands",
     "metrics.port",

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Self
 
 from configs import RobotConfig, SessionConfig
-from configs.session import RecordingOptions
+from configs.session import RecordingOptions, Trigger
 from daq.recording import RecordingSeries, RecordingWriter, TriggeredSeries
 from daq.recording.retention import Janitor, prune
 from daq.streams import CapturedStream
@@ -46,8 +46,12 @@ def open_series(
         now = capture_stamp(datetime.datetime.now(datetime.UTC))
         return RecordingSeries(begin, directory, f"{robot.name}-{now}", max_bytes, max_ns)
 
-    before, after = (round(seconds * 1e9) for seconds in (options.trigger.before_s, options.trigger.after_s))
-    return TriggeredSeries(event, before, after)
+    return TriggeredSeries(event, *kept_around(options.trigger))
+
+
+def kept_around(trigger: Trigger) -> tuple[int, int]:
+    """Time to keep before and after a trigger, ns."""
+    return round(trigger.before_s * 1e9), round(trigger.after_s * 1e9)
 
 
 def limits(options: RecordingOptions) -> tuple[int | None, int | None]:

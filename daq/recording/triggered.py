@@ -61,6 +61,10 @@ class TriggeredSeries:
         if self._series is not None:
             self._series.limit(max_bytes, max_ns)
 
+    def keep(self, before_ns: int, after_ns: int) -> None:
+        """Change how much is kept before and after a trigger from now on, ns."""
+        self._before_ns, self._after_ns = before_ns, after_ns
+
     @property
     def path(self) -> Path | None:
         """The file being written; ``None`` while nothing is."""

@@ -66,11 +66,26 @@ def test_what_can_change_does(tmp_path: Path) -> None:
     capture.reloader.close()
 
 
+def test_what_is_kept_around_an_event_changes_and_whether_only_events_are_written_does_not(tmp_path: Path) -> None:
+    path = tmp_path / "cell.yaml"
+    capture = Capture(cell(path, recording={"trigger": {"before_s": 5.0, "events": ["command"]}}))
+    cell(path, recording={"trigger": {"before_s": 8.0, "events": ["emcy"]}, "drain_ms": 10})
+    said = capture.reload()
+    assert said.endswith(": recording.drain_ms, recording.trigger.before_s, recording.trigger.events")
+    trigger = capture.taken[-1].recording.trigger
+    assert trigger is not None
+    assert (trigger.before_s, trigger.events) == (8.0, ("emcy",))
+    cell(path)
+    assert "recording.trigger: cannot change while it is captured" in capture.reload()
+    capture.reloader.close()
+
+
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
         ({"sync": {"period_us": 1000}}, "sync.period_us"),
         ({"recording": {"directory": "elsewhere", "rotate_mb": 5.0}}, "recording.directory"),
+        ({"recording": {"trigger": {"before_s": 5.0}}}, "recording.trigger: cannot change"),
         ({"zenoh": {"listen": ["tcp/127.0.0.1:7447"]}}, "zenoh.listen"),
         ({"streams": {"samples": {"tpdo": 1, "objects": ["position", "current"]}}}, "streams.samples.objects"),
         ({"heartbeat_ms": 50, "cell": "other"}, "cell, heartbeat_ms"),

@@ -29,10 +29,12 @@ def triggered(recording: Recording, folder: Path, **limits: int) -> TriggeredSer
     )
 
 
-def feed(series: TriggeredSeries, recording: Recording, triggers: list[int], step: int = 25) -> None:
-    """Append a recording in batches of SYNCs, triggers at the SYNC numbers given."""
+def feed(
+    series: TriggeredSeries, recording: Recording, triggers: list[int], step: int = 25, span: tuple[int, int] = (0, -1)
+) -> None:
+    """Append a recording, or a span of its rows, in batches of SYNCs, triggers at the SYNC numbers given."""
     samples = recording.samples
-    for first in range(0, samples.sync.size, step):
+    for first in range(span[0], samples.sync.size if span[1] < 0 else span[1], step):
         part = slice(first, first + step)
         series.turn(int(samples.t_ns[part][0]))
         rows = {name: values[part] for name, values in samples.raw.items()}
@@ -70,6 +72,20 @@ def test_an_event_is_written_with_what_came_before_and_after(tmp_path: Path) -> 
         assert [(g.first, m.sync) for g, m in zip(read.gaps, read.marks, strict=True)] == [(at, at)]
         kept = np.isin(recording.samples.sync, read.samples.sync)
         np.testing.assert_array_equal(read.samples.raw["position"], recording.samples.raw["position"][kept])
+
+
+def test_how_much_is_kept_can_change_while_it_is_captured(tmp_path: Path) -> None:
+    recording = make_recording(6000)
+    series = triggered(recording, tmp_path)
+    feed(series, recording, [1000], span=(0, 2000))
+    series.keep(2 * BEFORE_NS, AFTER_NS // 2)
+    feed(series, recording, [5000], span=(2000, -1))
+    series.close({})
+    (early, after), (late, short) = spans(series)
+    assert 450 <= early <= 525
+    assert 1300 <= after <= 1350
+    assert 3950 <= late <= 4025
+    assert 5150 <= short <= 5200
 
 
 def test_a_trigger_during_an_event_prolongs_it(tmp_path: Path) -> None:
