@@ -1,9 +1,11 @@
 """Writes recordings: MCAP, chunk by chunk, so that what is on the disk is always whole up to the last chunk."""
 
 import contextlib
+import errno
 import fcntl
 import json
 import os
+import secrets
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -127,9 +129,11 @@ class RecordingWriter:
             schemas.append(mcap.schema(k, look.layout.message_name, "protobuf", look.layout.descriptor))
             channels.append(mcap.channel(k, k, look.layout.topic, "protobuf", look.metadata))
         self._summary = Summary(schemas, channels)
+        # A file of this name has its head whole, whenever we are killed.
+        self._name = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            self._file = os.open(self._name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
             # Whoever heals torn recordings sees that this one is being written.
             with contextlib.suppress(OSError):
                 fcntl.flock(self._file, fcntl.LOCK_EX)
@@ -144,6 +148,7 @@ class RecordingWriter:
                     head += self._add_metadata(name, text)
             self._add_check(head)
             self._head_crc = zlib.crc32(head)
+            self._name = _published(self._name, path)
         except OSError as error:
             self.abort()
             raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
@@ -258,7 +263,7 @@ class RecordingWriter:
     def abort(self) -> None:
         """Leave nothing behind."""
         self._release()
-        self.path.unlink(missing_ok=True)
+        self._name.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         return self
@@ -353,6 +358,22 @@ def write_recording(recording: Recording, path: Path) -> None:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
     finally:
         writer.abort()
+
+
+def _published(temporary: Path, path: Path) -> Path:
+    """Give a file its name, which nothing may have yet; the name."""
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        # A file system without links.
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from None
+        temporary.rename(path)
+    else:
+        temporary.unlink()
+    return path
 
 
 def _version() -> str:

@@ -1,12 +1,14 @@
 """Recordings: what is written is what is read, by us and by anyone's MCAP reader."""
 
 import json
+import os
 import resource
 import struct
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -144,11 +146,16 @@ def test_the_stock_reader_finds_a_time_span_by_the_index(tmp_path: Path) -> None
     assert found[0][2].sequence == 100
 
 
-def write_chunked(recording: Recording, path: Path, chunk_ns: int = 20_000_000) -> RecordingWriter:
-    """As capture does: batches of some rows, many chunks; not yet closed."""
+def started(recording: Recording, path: Path, chunk_ns: int = 20_000_000) -> RecordingWriter:
+    """A file with its head."""
     joints = [j.name for j in recording.robot.joints]
     layouts = [StreamLayout.of(s, joints) for s in recording.streams.values()]
-    writer = RecordingWriter(path, recording.robot, recording.session, 5000.0, layouts, recording.metadata, chunk_ns)
+    return RecordingWriter(path, recording.robot, recording.session, 5000.0, layouts, recording.metadata, chunk_ns)
+
+
+def write_chunked(recording: Recording, path: Path, chunk_ns: int = 20_000_000) -> RecordingWriter:
+    """As capture does: batches of some rows, many chunks; not yet closed."""
+    writer = started(recording, path, chunk_ns)
     for first in range(0, int(recording.samples.sync[-1]) + 1, 50):
         for stream in recording.streams.values():
             part = (stream.sync >= first) & (stream.sync < first + 50)
@@ -234,6 +241,43 @@ def test_a_place_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot be written"):
         write_recording(make_recording(10), tmp_path / "file" / "r.mcap")
+
+
+def test_a_file_has_its_head_as_soon_as_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed while it writes the head, after one call of the system or another."""
+    recording, write = make_recording(10), os.write
+    left = 0
+
+    def killed(file: int, data: Any) -> int:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise KeyboardInterrupt
+        return write(file, data)
+
+    monkeypatch.setattr(os, "write", killed)
+    for calls in range(20):
+        left = calls
+        try:
+            started(recording, tmp_path / f"{calls}.mcap")
+        except KeyboardInterrupt:
+            assert not (tmp_path / f"{calls}.mcap").exists()
+        else:
+            break
+    assert 1 < calls < 19
+    assert read_recording(tmp_path / f"{calls}.mcap").samples.sync.size == 0
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_what_is_there_is_not_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, links: bool) -> None:
+    if not links:
+        # As a memory card's file system answers.
+        monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(PermissionError(1, "Operation not permitted")))
+    write_chunked(make_recording(10), tmp_path / "r.mcap")
+    before = (tmp_path / "r.mcap").read_bytes()
+    with pytest.raises(ConfigError, match=r"r\.mcap: cannot be written: File exists"):
+        started(make_recording(20), tmp_path / "r.mcap")
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("r.mcap", before)]
 
 
 def test_a_full_disk_keeps_the_file_whole_and_counts_the_loss(tmp_path: Path) -> None:
