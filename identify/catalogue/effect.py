@@ -58,6 +58,9 @@ class Shape:
         turn is a whole number, and nobody has said where on its travel a screw turns round.
     default
         What a robot configuration means that does not give it; ``None``: it must.
+    closer
+        Values to try beside those of the grid once the simulated loop has the effect in it: what a rigid arm's motion
+        does not excite says nothing there.
     """
 
     name: str
@@ -65,6 +68,7 @@ class Shape:
     grid: Callable[[Motion, int], Sequence[float]]
     continuous: tuple[bool, bool] = (True, True)
     default: float | None = None
+    closer: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

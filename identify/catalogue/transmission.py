@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from identify.catalogue.effect import Effect, Linear, Place, Shape
 from identify.catalogue.motion import Motion
@@ -15,6 +14,9 @@ Array = NDArray[np.float64]
 
 DAMPINGS = (0.1, 0.7)
 """Damping ratios of a link on its spring: of its own, and where the controlled motor, giving way, calms it."""
+
+LEAST_DAMPING = 0.02
+"""Of a link on a spring of steel: seen where the motion has its oscillation in it."""
 
 LEAST_INERTIA = 0.1
 """Inertia at a joint below which it is not believed, of the largest along the motion: a fit may make it negative."""
@@ -41,18 +43,32 @@ def harmonics(motion: Motion, joint: int) -> Sequence[float]:
 def _elasticity(
     motion: Motion, place: Place, *, frequency: float, damping: float = DAMPINGS[-1], rotor: float = 0.0
 ) -> Array:
-    """The link stands behind the motor by compliance times load, and swings there at its own frequency."""
-    j, behind = place.joint, -motion.handed_on(place.joint, rotor)
-    # Tustin's rule for w^2 s^k / (s^2 + 2 damping w s + w^2), k = 0, 1, 2: way, speed and acceleration of the link.
-    w, tustin = 2 * np.pi * frequency, 2 / motion.dt
-    swing = 2 * damping * w * tustin
-    a = np.array([tustin**2 + swing + w**2, 2 * w**2 - 2 * tustin**2, tustin**2 - swing + w**2])
-    moves = []
-    for numerator in ([1.0, 2.0, 1.0], [tustin, 0.0, -tustin], [tustin**2, -2 * tustin**2, tustin**2]):
-        b = w**2 * np.array(numerator)
-        start = signal.lfilter_zi(b / a[0], a / a[0]) * behind[0]
-        moves.append(signal.lfilter(b / a[0], a / a[0], behind, zi=start)[0])
+    """The link stands behind the motor by compliance times load, and swings there: slower where it has more inertia.
+
+    ``frequency`` is that of its mean inertia along the motion.
+    """
+    j = place.joint
+    inertia = inertias(motion, j, rotor)
+    share = inertia / inertia.mean() if inertia.max() > 0.0 else np.ones(motion.samples)
+    moves = swinging(-motion.handed_on(j, rotor), share, 2 * np.pi * frequency, damping, motion.dt)
     return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
+
+
+@compiled
+def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> tuple[Array, Array, Array]:
+    """Way, speed and acceleration (N,) of ``share x'' + 2 damping w x' + w^2 x = w^2 pull``, at first at rest.
+
+    By the trapezoidal rule (Newmark 1959): stable at any frequency.
+    """
+    way, rate, acceleration = np.empty(pull.size), np.zeros(pull.size), np.zeros(pull.size)
+    way[0] = pull[0]
+    half, drag, spring = 0.5 * dt, 2.0 * damping * w, w * w
+    for k in range(pull.size - 1):
+        v = rate[k] + half * acceleration[k]
+        x = way[k] + dt * rate[k] + half * half * acceleration[k]
+        a = (spring * (pull[k + 1] - x) - drag * v) / (share[k + 1] + drag * half + spring * half * half)
+        way[k + 1], rate[k + 1], acceleration[k + 1] = x + half * half * a, v + half * a, a
+    return way, rate, acceleration
 
 
 def frequencies(motion: Motion, joint: int) -> Sequence[float]:
@@ -69,11 +85,18 @@ def _backlash(motion: Motion, place: Place, *, gap: float, rotor: float = 0.0) -
 
 def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
     """Acceleration (N,) of a link from its motor where no tooth touches, over position and time as they are."""
-    inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
+    inertia = inertias(motion, joint, rotor)
     if inertia.max() <= 0.0:
         return np.zeros(motion.samples)
-    away: Array = -motion.handed_on(joint, rotor) / np.maximum(inertia, LEAST_INERTIA * inertia.max())
+    away: Array = -motion.handed_on(joint, rotor) / inertia
     return away
+
+
+def inertias(motion: Motion, joint: int, rotor: float) -> Array:
+    """Inertia (N,) of the link that a gear drives, kept from vanishing; nowhere above zero where the fit has none."""
+    inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
+    believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())
+    return believed
 
 
 @compiled
@@ -127,7 +150,7 @@ EFFECTS = (
         linear=(Linear("compliance", ("rad/(N m)", "m/N"), sign=1),),
         shapes=(
             Shape("frequency", ("Hz", "Hz"), frequencies),
-            Shape("damping", ("", ""), lambda motion, joint: DAMPINGS, default=DAMPINGS[-1]),
+            Shape("damping", ("", ""), lambda motion, joint: DAMPINGS, default=DAMPINGS[-1], closer=(LEAST_DAMPING,)),
             ROTOR,
         ),
         columns=_elasticity,

@@ -1,7 +1,7 @@
 """Which effects could sit where, and the columns they would add."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 
 import numpy as np
@@ -32,6 +32,15 @@ class Candidate:
     def key(self) -> tuple[str, int, int | None]:
         """Name and place."""
         return self.effect.name, self.place.joint, self.place.other
+
+    def closer(self) -> "Candidate":
+        """The candidate for a loop that has it inside, with what is worth trying there."""
+        shapes = self.effect.shapes
+        axes = [sorted({tried[k][1] for tried in self.grid} | {*s.closer}) for k, s in enumerate(shapes)]
+        if not any(shape.closer for shape in shapes):
+            return self
+        named = ([(s.name, value) for value in axis] for s, axis in zip(shapes, axes, strict=True))
+        return replace(self, grid=tuple(product(*named)))
 
 
 @dataclass(frozen=True)

@@ -73,6 +73,7 @@ def in_loop_of(moved: Study, fit: Fit, candidate: Candidate) -> Trial | None:
     again = fitted(replace(fit.study, train=train, held=held), fit.theta)
     bench = Workshop(again.study, again.theta)
     calm = again.renoised(noise_beyond_shapes(again, bench))
+    candidate = candidate.closer()
     look = screened(calm, candidate, bench)
     if look is None:
         return None

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from configs import DataError, RobotConfig
 from identify.discrepancy.candidates import Workshop, candidates
+from identify.discrepancy.polishing import polished
 from identify.discrepancy.retrial import in_its_loop, suspects
 from identify.discrepancy.screening import shortlist
 from identify.discrepancy.stanzas import added, stanza_number, valued, without
@@ -73,7 +74,7 @@ class Search:
         """Fit the model of a robot and try all candidates beside it; made once."""
         key = tuple(stanza.model_dump_json() for stanza in robot.effects)
         if key not in self._states:
-            study, found = refit(self.study, robot, before)
+            study, found = refit(self.study, robot, None if before is None else before.fit)
             previous = Workshop(study, found.theta) if before is None else before.workshop
             workshop = previous.with_theta(study, found.theta)
             every = list(candidates(workshop))
@@ -124,7 +125,9 @@ class Search:
                 trial = again
         try:
             robot = added(state.study.robot, trial)
-            return self.state(robot if effect.undo is None else self._put_right(robot, state, trial), state)
+            if effect.undo is not None:
+                robot = self._put_right(robot, state, trial)
+            return self.state(polished(self.study, robot, state.fit), state)
         except DataError:
             return None
 
@@ -138,7 +141,7 @@ class Search:
         """
         value = float(trial.values[0])
         for _ in range(ROUNDS):
-            study, found = refit(self.study, robot, state)
+            study, found = refit(self.study, robot, state.fit)
             rest = judge(found, trial.candidate, trial.shapes, Workshop(study, found.theta))
             if rest is None:
                 break

@@ -160,7 +160,7 @@ def _whitened_power(errors: Sequence[Array], noise: Sequence[ArModel]) -> Array:
     return np.array([float(white[rows] @ white[rows]) for rows in joints])
 
 
-def refit(study: Study, robot: RobotConfig, before: State | None) -> tuple[Study, Fit]:
+def refit(study: Study, robot: RobotConfig, before: Fit | None) -> tuple[Study, Fit]:
     """The data with the model of a robot, and its fit.
 
     Raises
@@ -184,9 +184,9 @@ def refit(study: Study, robot: RobotConfig, before: State | None) -> tuple[Study
     return moved, first
 
 
-def padded(before: State, model: ArmModel) -> Array:
+def padded(before: Fit, model: ArmModel) -> Array:
     """Rigid parameters of an earlier fit, zeros for the terms, (b,)."""
-    rigid = before.fit.theta[: before.study.model.base.b - before.study.model.e]
+    rigid = before.theta[: before.study.model.base.b - before.study.model.e]
     return np.concatenate([rigid, np.zeros(model.e)])
 
 

@@ -1,0 +1,151 @@
+"""Nonlinear parameters of all findings at once, by instrumental variables: what a search one after the other leaves."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from configs import DataError, RobotConfig
+from identify.catalogue.effect import Shape
+from identify.catalogue.terms import Term
+from identify.discrepancy.candidates import Shapes, Workshop
+from identify.discrepancy.regression import Fit
+from identify.discrepancy.stanzas import stanza_number
+from identify.discrepancy.state import refit
+from identify.discrepancy.study import Study
+from identify.discrepancy.whitening import whitened
+
+Array = NDArray[np.float64]
+
+STEP = 0.02
+"""Relative change of a parameter for its derivative."""
+ROUNDS = 6
+"""Most steps."""
+LONGEST = 0.35
+"""Of a step, on a logarithmic scale."""
+SETTLED = 0.01
+"""Longest step, on a logarithmic scale, that is not worth another."""
+RANK = 1e-9
+"""Singular value under which a direction counts as undetermined, of the largest."""
+
+
+@dataclass(frozen=True)
+class _Free:
+    """A nonlinear parameter that may be moved: of which term, and between which values."""
+
+    term: int
+    name: str
+    low: float
+    high: float
+
+
+def polished(study: Study, robot: RobotConfig, before: Fit) -> RobotConfig:
+    """The robot with the nonlinear parameters of its new effects where the training data have them.
+
+    Gauss-Newton steps with the model's own parameters beside: columns are derivatives of the torques at measured
+    signals, instruments the same at simulated ones, where noise makes a wrong value no better. Every step is simulated
+    anew. One is kept as long as it makes the errors of the training data smaller.
+
+    Parameters
+    ----------
+    study
+        The data, with the model that the search began with: its effects stay as they are.
+    robot
+        With effects found.
+    before
+        A fit without the last of them.
+    """
+    own = len(study.robot.effects)
+    try:
+        _, found = refit(study, robot, before)
+    except DataError:
+        return robot
+    for _ in range(ROUNDS):
+        step = _step(found, own)
+        if step is None:
+            break
+        moved, length = _moved(found.study.robot, step), max(abs(change) for _, change in step)
+        try:
+            _, after = refit(study, moved, found)
+        except DataError:
+            break
+        if not _errors(after) < _errors(found):
+            break
+        robot, found = moved, after
+        if length < SETTLED:
+            break
+    return robot
+
+
+def _errors(fit: Fit) -> float:
+    """Sum over the joints of the logarithms of their training errors' powers."""
+    errors = np.concatenate(fit.errors(fit.theta, held=False))
+    return float(np.sum(np.log(np.maximum(np.sum(errors**2, axis=0), 1e-300))))
+
+
+def _step(fit: Fit, own: int) -> list[tuple[_Free, float]] | None:
+    """Relative changes of the free parameters; ``None`` if there are none."""
+    bench = Workshop(fit.study, fit.theta)
+    free = _free(bench, own)
+    if not free:
+        return None
+    slopes = [_slopes(bench, fit, one) for one in free]
+    x = np.column_stack([fit.train.x, *(measured for measured, _ in slopes)])
+    z = np.column_stack([fit.train.z, *(simulated for _, simulated in slopes)])
+    scale = np.maximum(np.linalg.norm(z, axis=0), 1e-300)
+    change = np.linalg.lstsq((z / scale).T @ (x / scale), (z / scale).T @ fit.residual, rcond=RANK)[0] / scale
+    steps = np.clip(change[fit.theta.size :], -LONGEST, LONGEST)
+    return list(zip(free, steps.tolist(), strict=True))
+
+
+def _free(bench: Workshop, own: int) -> list[_Free]:
+    """Parameters that are not at zero, which no factor moves."""
+    study, found = bench.study, []
+    for k, term in enumerate(study.model.terms):
+        if stanza_number(study.robot, k) < own:
+            continue
+        refinable = term.effect.refinable(study.robot, term.place)
+        for shape, may in zip(term.effect.shapes, refinable, strict=True):
+            value = float(term.shapes[shape.name])
+            if may and value != 0.0:
+                values = [value, *_values(shape, bench, term)]
+                found.append(_Free(k, shape.name, min(v for v in values if v > 0.0), max(values)))
+    return found
+
+
+def _values(shape: Shape, bench: Workshop, term: Term) -> list[float]:
+    motion = bench.motion(bench.study.train[0], "measured")
+    return [*shape.grid(motion, term.place.joint), *shape.closer]
+
+
+def _slopes(bench: Workshop, fit: Fit, one: _Free) -> tuple[Array, Array]:
+    """Derivative (R,) of a term's whitened torque over the logarithm of a parameter, at measured and simulated signals.
+
+    Leaps are their own instruments: no simulation meets them to the sample.
+    """
+    term = fit.study.model.terms[one.term]
+    own = [fit.study.model.base.names.index(name) for name in term.names]
+    values = term.of_effect(fit.theta[own])
+
+    def torque(kind: str, value: float) -> Array:
+        shapes = {**term.shapes, one.name: value}
+        key: Shapes = tuple((shape.name, shapes[shape.name]) for shape in term.effect.shapes)
+        made: Array = whitened(bench.band(term.effect, term.place, key, "train", kind, keep=False), fit.noise) @ values
+        return made
+
+    here = float(term.shapes[one.name])
+    measured, simulated = (
+        (torque(kind, here * (1 + STEP)) - torque(kind, here * (1 - STEP))) / (2 * STEP)
+        for kind in ("measured", "measured" if term.effect.sudden else "simulated")
+    )
+    return measured, simulated
+
+
+def _moved(robot: RobotConfig, steps: list[tuple[_Free, float]]) -> RobotConfig:
+    """The robot after a step, with every parameter kept in its range."""
+    effects = list(robot.effects)
+    for one, step in steps:
+        k = stanza_number(robot, one.term)
+        value = float(np.clip(effects[k].parameters[one.name] * np.exp(step), one.low, one.high))
+        effects[k] = effects[k].model_copy(update={"parameters": {**effects[k].parameters, one.name: value}})
+    return robot.model_copy(update={"effects": tuple(effects)})
