@@ -6,13 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from identify.catalogue.effect import Effect, Linear, Place, Shape
+from identify.catalogue.effect import Effect, Linear, Place, Recorded, Shape, motor_limit
 from identify.catalogue.motion import Motion
 
 Array = NDArray[np.float64]
-
-NEAREST_KNEE = 0.98
-"""Share of the knee's torque beyond which currents are taken to grow no faster: simulated torques may pass it."""
 
 
 def _gain(motion: Motion, place: Place) -> Array:
@@ -31,30 +28,21 @@ def _gain_numbers(motion: Motion, place: Place) -> Array:
     return motion.theta[: motion.model.base.b, None].copy()
 
 
-def _saturation(motion: Motion, place: Place, *, knee: float = 0.0) -> Array:
-    """The first term of any odd curve beyond the straight line: the share lost grows with the square of the torque.
-
-    With a knee by as much more as currents grow that give ``torque = current / sqrt(1 + (current / knee)^2)``.
-    """
-    j = place.joint
-    torque, ratio = motion.motor_torque[:, j], _gear(motion, j)
+def _saturation(motion: Motion, place: Place) -> Array:
+    """The first term of any odd curve beyond the straight line: the share lost grows with the square of the torque."""
+    torque = motion.motor_torque[:, place.joint]
     # By the limit of the joint, so that the parameter is the same in every motion.
-    loss = torque * (torque * ratio / motion.model.robot.joints[j].limits.torque) ** 2
-    if knee > 0.0:
-        share = np.minimum((torque * ratio / knee) ** 2, NEAREST_KNEE**2)
-        loss = loss * np.where(share > 0.0, 2.0 * (1.0 / np.sqrt(1.0 - share) - 1.0) / np.maximum(share, 1e-12), 1.0)
-    return motion.of_motor(j, loss)
+    loss = torque * (torque / motor_limit(motion.model.robot, place.joint)) ** 2
+    return motion.of_motor(place.joint, loss)
 
 
-def _knees(motion: Motion, joint: int) -> Sequence[float]:
-    """Torques of the joint at which its motor could give no more: from just above those of the motion."""
-    most = float(np.abs(motion.motor_torque[:, joint]).max()) * _gear(motion, joint)
-    return [share * max(most, 1e-9) for share in (1.03, 1.15, 1.4, 2.0, 4.0)]
+def _unsaturated(recorded: Array, at: Recorded, loss: float) -> Array:
+    """Torques (N,) that currents give whose torque would be the recorded: ``i / sqrt(1 + 2 loss (i / limit)^2)``.
 
-
-def _gear(motion: Motion, joint: int) -> float:
-    """Turns of a motor for one of its own joint."""
-    return float(np.abs(motion.model.robot.transmission_matrix[joint]).max())
+    Sample by sample, as what a controller makes of the noise of its encoder is bent with the rest.
+    """
+    given: Array = recorded / np.sqrt(1.0 + 2.0 * max(loss, 0.0) * (recorded / at.limit) ** 2)
+    return given
 
 
 def _delay(motion: Motion, place: Place) -> Array:
@@ -65,18 +53,18 @@ def _bandwidth(motion: Motion, place: Place) -> Array:
     return motion.of_motor(place.joint, motion.rate(motion.motor_torque[:, place.joint]))
 
 
-def _earlier(recorded: Array, dt: float, delay: float) -> Array:
+def _earlier(recorded: Array, at: Recorded, delay: float) -> Array:
     """Recorded torques (N,) at the time that they belong to."""
-    t = dt * np.arange(recorded.size)
+    t = at.dt * np.arange(recorded.size)
     early: Array = np.interp(t + delay, t, recorded)
     return early
 
 
-def _lagging(recorded: Array, dt: float, lag: float) -> Array:
+def _lagging(recorded: Array, at: Recorded, lag: float) -> Array:
     """What a motor makes of the commands (N,) that are recorded: ``1 / (1 + lag s)``, from rest (Tustin)."""
     if lag <= 0.0:
         return recorded
-    ratio = 2.0 * lag / dt
+    ratio = 2.0 * lag / at.dt
     b, a = np.array([1.0, 1.0]) / (1.0 + ratio), np.array([1.0, (1.0 - ratio) / (1.0 + ratio)])
     late: Array = signal.lfilter(b, a, recorded, zi=recorded[:1] * (1.0 - b[0]))[0]
     return late
@@ -123,12 +111,12 @@ EFFECTS = (
         name="drive_gain_saturation",
         title="a torque constant that falls with current",
         says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost "
-        "at the joint's torque limit as far as it grows with the square of the torque, knee the torque never reached",
+        "at the joint's torque limit as far as it grows with the square of the torque",
         reference="Leonhard 2001, Control of Electrical Drives, chapter 5",
         linear=(Linear("gain_loss", ("", ""), sign=1),),
-        shapes=(Shape("knee", ("N m", "N"), _knees, default=0.0),),
         columns=_saturation,
         predicts=True,
+        undo=_unsaturated,
         needs="small and large torques",
         scope="motor",
         excitation=("load", "accelerations"),

@@ -72,6 +72,19 @@ class Shape:
 
 
 @dataclass(frozen=True)
+class Recorded:
+    """What is known of a motor whose torque was recorded: the sampling period, s, and its largest torque, N m or N."""
+
+    dt: float
+    limit: float
+
+
+def motor_limit(robot: RobotConfig, motor: int) -> float:
+    """Largest torque of a motor at its shaft, N m or N."""
+    return float(robot.joints[motor].limits.torque / np.abs(robot.transmission_matrix[motor]).max())
+
+
+@dataclass(frozen=True)
 class Effect:
     """One effect: the torque it adds to what the drives report is ``columns(motion, joint, **shapes) @ linear``.
 
@@ -109,9 +122,9 @@ class Effect:
     predicts
         Whether the columns depend on the torques that the model predicts, and so on its parameters.
     undo
-        ``(recorded, dt, value)`` to the torque (N,) that a motor really had where the recording says otherwise, for the
-        one linear parameter. The columns are derivatives of the model's torques then, which at measured signals hold
-        more noise than effect; a recording put right holds none that it did not have.
+        ``(recorded, at, value)`` to the torque (N,) that a motor really had where the recording says otherwise, for the
+        one linear parameter. The columns are what the first order of it makes of the model's torques, which at measured
+        signals hold more noise than effect; a recording put right holds none that it did not have.
     sudden
         Whether it makes the arm leap, at instants that no simulation meets to the sample: columns at measured signals
         are their own instruments then, and have to explain more than feedback lets a term without merit explain.
@@ -137,7 +150,7 @@ class Effect:
     excitation: tuple[str, ...] = field(default=("reversals", "speeds"))
     rewires: bool = False
     predicts: bool = False
-    undo: Callable[[Array, float, float], Array] | None = None
+    undo: Callable[[Array, Recorded, float], Array] | None = None
     sudden: bool = False
     physical: Callable[[Array, Mapping[str, float]], bool] | None = None
     negligible: Callable[[Array, float], bool] | None = None

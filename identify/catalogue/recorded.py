@@ -7,6 +7,7 @@ import numpy as np
 
 from configs import RobotConfig
 from configs.robot import Effect as Stanza
+from identify.catalogue.effect import Recorded, motor_limit
 from identify.catalogue.registry import known
 from identify.catalogue.wiring import rewired
 from identify.experiment import Experiment
@@ -40,7 +41,8 @@ def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Exp
         done = []
         for e in experiments:
             at_motors = e.tau @ np.linalg.inv(robot.transmission_matrix)
-            at_motors[:, motor] = effect.undo(at_motors[:, motor], e.dt, value)
+            at = Recorded(e.dt, motor_limit(robot, motor))
+            at_motors[:, motor] = effect.undo(at_motors[:, motor], at, value)
             done.append(replace(e, tau=np.ascontiguousarray(at_motors @ robot.transmission_matrix)))
         experiments = done
     return list(experiments)

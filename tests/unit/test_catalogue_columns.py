@@ -8,11 +8,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from configs import load_robot
+from configs.robot import Effect as Stanza
 from identify.catalogue.effect import Place
 from identify.catalogue.motion import Motion
+from identify.catalogue.recorded import put_right
 from identify.catalogue.registry import catalogue
 from identify.catalogue.rotor import rotors
 from identify.catalogue.transmission import crossing
+from identify.experiment import Experiment
 from identify.model.arm import ArmModel
 from virtual_robot.inertias import plant_parameters
 
@@ -259,14 +262,14 @@ def test_saturation_grows_with_the_cube_of_the_torque(axis: Motion) -> None:
     np.testing.assert_allclose(found, current - tau, rtol=2e-3, atol=1e-9)
 
 
-def test_a_knee_bends_the_saturation_to_its_end(axis: Motion) -> None:
-    tau = axis.torque[:, 0]
+def test_a_recording_of_a_saturated_motor_is_put_right_to_its_end(axis: Motion) -> None:
+    robot, tau = axis.model.robot, axis.torque[:, :1]
     knee = 1.1 * np.abs(tau).max()
-    loss = axis.model.robot.joints[0].limits.torque ** 2 / (2 * knee**2)
-    found = loss * columns("drive_gain_saturation", axis, knee=knee)[:, 0, 0]
-    np.testing.assert_allclose(found, tau / np.sqrt(1 - (tau / knee) ** 2) - tau, rtol=1e-6, atol=1e-9)
-    # Simulated torques may pass the knee; currents stay finite.
-    assert np.isfinite(columns("drive_gain_saturation", axis, knee=0.5 * knee)).all()
+    loss = robot.joints[0].limits.torque ** 2 / (2 * knee**2)
+    stanza = Stanza(effect="drive_gain_saturation", joint=robot.joints[0].name, parameters={"gain_loss": loss})
+    current = Experiment(axis.q, tau / np.sqrt(1 - (tau / knee) ** 2), None, axis.dt)
+    (found,) = put_right([current], robot.model_copy(update={"effects": (stanza,)}))
+    np.testing.assert_allclose(found.tau, tau, rtol=1e-9, atol=1e-12)
 
 
 def test_the_loss_at_the_torque_limit_is_the_same_in_every_motion(arm: Motion) -> None:
