@@ -15,6 +15,7 @@ from identify.discrepancy.stanzas import added, stanza_number, valued, without
 from identify.discrepancy.state import Places, Settings, State, accident, nearer, places_of, refit
 from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial, judge
+from identify.options import CONTROLLERS
 
 Array = NDArray[np.float64]
 
@@ -101,7 +102,10 @@ class Search:
 
         States that have been left before are not returned to: two effects could take each other's place for ever.
         """
-        for trial in state.passing(self.settings):
+        passing = state.passing(self.settings)
+        if state.study.loop not in CONTROLLERS:
+            passing = [*(t for t in passing if self._tells_the_controller(state, t)), *passing]
+        for trial in passing:
             self.progress(f"adding {trial.candidate.effect.name} of {state.study.joints[trial.candidate.place.joint]}")
             extended = self.with_trial(state, trial)
             if extended is not None and nearer(extended, state, self.settings.material):
@@ -109,6 +113,16 @@ class Search:
                 if places_of(pruned) not in been:
                     return pruned
         return None
+
+    def _tells_the_controller(self, state: State, trial: Trial) -> bool:
+        """Whether the controller can be identified once the recording is put right, where it could not as it was.
+
+        Nothing speaks more for it, while beside a stand-in scores mean little.
+        """
+        if trial.candidate.effect.undo is None:
+            return False
+        extended = self.with_trial(state, trial)
+        return extended is not None and extended.study.loop in CONTROLLERS
 
     def with_trial(self, state: State, trial: Trial) -> State | None:
         """The state with what a trial found; ``None`` if the motion cannot tell it from what the model has.
