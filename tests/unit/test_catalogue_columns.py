@@ -14,7 +14,7 @@ from identify.catalogue.motion import Motion
 from identify.catalogue.recorded import put_right
 from identify.catalogue.registry import catalogue
 from identify.catalogue.rotor import rotors
-from identify.catalogue.transmission import crossing
+from identify.catalogue.transmission import crossing, swinging
 from identify.experiment import Experiment
 from identify.model.arm import ArmModel
 from virtual_robot.inertias import plant_parameters
@@ -185,6 +185,27 @@ def test_an_elastic_axis_answers_a_sine_with_the_gain_of_its_two_masses(axis: Mo
     lag = MASS * OMEGA**2 * (gain * load).imag
     found = columns("joint_elasticity", axis, frequency=frequency, damping=damping)[:, 0, 0]
     np.testing.assert_allclose(found[2500:], lag[2500:], atol=2e-3 * np.abs(lag).max())
+
+
+def test_a_link_swings_slower_where_it_has_more_inertia() -> None:
+    dt, w, damping = 2e-4, 2 * np.pi * 9.0, 0.05
+    t = dt * np.arange(10_000)
+
+    def share(at: Any) -> Any:
+        return 1.0 + 0.5 * np.sin(4.0 * at)
+
+    def pull(at: Any) -> Any:
+        return 1e-3 * np.sin(11.0 * at)
+
+    def motion(at: float, state: Any) -> list[float]:
+        return [state[1], (w * w * (pull(at) - state[0]) - 2 * damping * w * state[1]) / share(at)]
+
+    exact = solve_ivp(motion, (0.0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-12).y
+    way, rate, acceleration = swinging(pull(t), share(t), w, damping, dt)
+    np.testing.assert_allclose(way, exact[0], atol=2e-3 * np.abs(exact[0]).max())
+    np.testing.assert_allclose(rate, exact[1], atol=2e-3 * np.abs(exact[1]).max())
+    force = share(t) * acceleration + 2 * damping * w * rate + w * w * way
+    np.testing.assert_allclose(force[1:], (w * w * pull(t))[1:], atol=1e-9 * w * w)
 
 
 def test_an_elastic_joint_sags_under_gravity(arm: Motion) -> None:
