@@ -1,19 +1,21 @@
 """Nonlinear parameters of all findings at once, by instrumental variables: what a search one after the other leaves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from configs import DataError, RobotConfig
 from identify.catalogue.effect import Shape
+from identify.catalogue.registry import known
 from identify.catalogue.terms import Term
 from identify.discrepancy.candidates import Shapes, Workshop
-from identify.discrepancy.regression import Fit
+from identify.discrepancy.regression import Fit, fit
 from identify.discrepancy.stanzas import stanza_number
-from identify.discrepancy.state import refit
+from identify.discrepancy.state import padded, refit
 from identify.discrepancy.study import Study
 from identify.discrepancy.whitening import whitened
+from identify.model.arm import ArmModel
 
 Array = NDArray[np.float64]
 
@@ -25,6 +27,8 @@ LONGEST = 0.35
 """Of a step, on a logarithmic scale."""
 SETTLED = 0.01
 """Longest step, on a logarithmic scale, that is not worth another."""
+FAR = 0.1
+"""Sum of the longest steps, on a logarithmic scale, after which the closed loop is simulated anew."""
 RANK = 1e-9
 """Singular value under which a direction counts as undetermined, of the largest."""
 
@@ -43,8 +47,8 @@ def polished(study: Study, robot: RobotConfig, before: Fit) -> RobotConfig:
     """The robot with the nonlinear parameters of its new effects where the training data have them.
 
     Gauss-Newton steps with the model's own parameters beside: columns are derivatives of the torques at measured
-    signals, instruments the same at simulated ones, where noise makes a wrong value no better. Every step is simulated
-    anew. One is kept as long as it makes the errors of the training data smaller.
+    signals, instruments the same at simulated ones, where noise makes a wrong value no better. The loop is simulated
+    anew where it has gone far. Steps are kept as long as they make the errors of the training data smaller.
 
     Parameters
     ----------
@@ -60,21 +64,38 @@ def polished(study: Study, robot: RobotConfig, before: Fit) -> RobotConfig:
         _, found = refit(study, robot, before)
     except DataError:
         return robot
+    gone = 0.0
     for _ in range(ROUNDS):
         step = _step(found, own)
         if step is None:
             break
-        moved, length = _moved(found.study.robot, step), max(abs(change) for _, change in step)
+        length = max(abs(change) for _, change in step)
+        gone += length
         try:
-            _, after = refit(study, moved, found)
+            after = _fitted(study, _moved(robot, step), found, simulate=gone > FAR)
         except DataError:
             break
         if not _errors(after) < _errors(found):
             break
-        robot, found = moved, after
+        robot, found = after.study.robot, after
         if length < SETTLED:
             break
+        gone = 0.0 if gone > FAR else gone
     return robot
+
+
+def _fitted(study: Study, robot: RobotConfig, before: Fit, *, simulate: bool) -> Fit:
+    """A fit of other nonlinear parameters, with the simulated motion that there is or with its own.
+
+    Raises
+    ------
+    DataError
+        If the motion does not determine the parameters of the model.
+    """
+    if simulate and any(known(stanza.effect).predicts for stanza in robot.effects):
+        return refit(study, robot, before)[1]
+    model = ArmModel.from_config(robot)
+    return fit(replace(before.study, robot=robot, model=model), padded(before, model))
 
 
 def _errors(fit: Fit) -> float:
