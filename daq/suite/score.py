@@ -44,6 +44,8 @@ class Score:
         Highest of any finding; zero without one.
     named
         First finding, as ``effect joint``.
+    shown
+        Whether the held-out recording has the injected gap at all: a bump that the motion does not pass is not in it.
     """
 
     verdict: str
@@ -56,6 +58,7 @@ class Score:
     within: tuple[bool, ...]
     confidence: float
     named: str | None
+    shown: bool = True
 
 
 def score(case: Case, record: Record, healthy: Record | None) -> Score:
@@ -95,6 +98,7 @@ def score(case: Case, record: Record, healthy: Record | None) -> Score:
         ),
         confidence=max((f["confidence"] for f in findings), default=0.0),
         named=f"{findings[0]['effect']} {findings[0]['joint']}" if findings else None,
+        shown=healthy is None or _injected(case, document, healthy["document"]) >= LEAST_GAP,
     )
 
 
@@ -119,13 +123,24 @@ def closed_share(case: Case, document: Document, healthy: Document) -> float | N
     """
     if any(part.rescales for part in case.parts) and not case.baseline:
         return None
-    views = [_at_measured_motion(case, document, healthy)]
-    if document.get("simulated") and healthy.get("simulated") and not case.baseline:
-        views.append(_of_the_simulated_loop(case, document, healthy))
-    before, after, clean = max(views, key=lambda v: v[0] / max(v[2], 1e-300))
+    before, after, clean = _clearest(case, document, healthy)
     if before - clean < LEAST_GAP * clean:
         return None
     return (before - after) / (before - clean)
+
+
+def _injected(case: Case, document: Document, healthy: Document) -> float:
+    """Power that is injected, over that of the healthy arm's errors."""
+    before, _, clean = _clearest(case, document, healthy)
+    return before / max(clean, 1e-300) - 1.0
+
+
+def _clearest(case: Case, document: Document, healthy: Document) -> "Powers":
+    """Where the gap shows most."""
+    views = [_at_measured_motion(case, document, healthy)]
+    if document.get("simulated") and healthy.get("simulated") and not case.baseline:
+        views.append(_of_the_simulated_loop(case, document, healthy))
+    return max(views, key=lambda v: v[0] / max(v[2], 1e-300))
 
 
 Powers = tuple[float, float, float]

@@ -139,6 +139,12 @@ def test_stale_numbers_are_judged_by_the_gap_of_their_own_findings() -> None:
     assert closed_share(case(GRIPPER, baseline=True), document, HEALTHY["document"]) == pytest.approx(1.0)
 
 
+def test_what_the_healthy_twin_shows_as_well_is_not_in_the_data() -> None:
+    bump = case(SPRING, kind="outside")
+    assert score(bump, record(before=20.0, after=20.0, verdict="no_gap"), HEALTHY).shown
+    assert not score(bump, record(before=8.1, after=8.1, verdict="no_gap"), HEALTHY).shown
+
+
 def test_parameters_are_compared_in_their_own_standard_deviations() -> None:
     found = finding("joint_spring", "joint_2", parameters={"ks": 1.2}, evidence={"std": {"ks": 0.1}})
     assert within(found, {"ks": 1.0}) == [True]
@@ -165,18 +171,22 @@ def test_the_tables_count_what_happened() -> None:
         (case(SPRING, kind="outside", seed=2), _score(confidence=0.9)),
         (case(SPRING, kind="outside", seed=3), _score(confidence=0.0, verdict="unexplained")),
         (case(SPRING, kind="outside", seed=4), _score(confidence=0.0, verdict="no_gap")),
+        (case(SPRING, kind="outside", seed=5), _score(confidence=0.0, verdict="no_gap", shown=False)),
     ]
     result = tables(scored, [case(SPRING, seed=4)])
     row = result.effects[0]
     assert (row.n, row.failed, row.first, row.second, row.missed) == (3, 1, 0.5, 1.0, 0.0)
     assert (row.invisible, row.closed, row.closed_enough, row.within) == (1 / 3, 0.75, 0.5, 0.5)
     outside = result.outside[0]
-    assert (outside.low_confidence, outside.named, outside.unexplained, outside.unseen) == (0.25, 0.25, 0.25, 0.25)
+    assert (outside.low_confidence, outside.named, outside.unexplained, outside.unseen) == (0.2, 0.2, 0.2, 0.2)
+    assert outside.absent == 0.2
     assert result.healthy[0].alarms == 1
     aims = {aim.what: aim.value for aim in result.aims}
     assert aims["name and place right"] == 0.5
     assert aims["healthy arms called healthy"] == 0.5
-    assert aims["outside the catalogue, of those seen: not named with confidence"] == pytest.approx(2 / 3)
+    # One of the five is not in the data, one is named, and one overlooked.
+    assert aims["outside the catalogue, in the data: unexplained, or named with low confidence"] == 0.5
+    assert aims["share of the injected gap closed, mean where named"] == 1.0
 
 
 def test_the_bounds_of_false_alarms_are_clopper_and_pearsons() -> None:
