@@ -16,7 +16,7 @@ from identify.discrepancy.candidates import Candidate, Workshop
 from identify.discrepancy.regression import Fit
 from identify.discrepancy.regression import fit as fitted
 from identify.discrepancy.screening import noise_beyond_shapes
-from identify.discrepancy.shaping import instrumented
+from identify.discrepancy.shaping import both_ends
 from identify.discrepancy.stanzas import added
 from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial, judge, refined, screened
@@ -77,5 +77,6 @@ def in_loop_of(moved: Study, fit: Fit, candidate: Candidate) -> Trial | None:
     look = screened(calm, candidate, bench)
     if look is None:
         return None
-    shapes = instrumented(calm, candidate, bench, refined(calm, candidate, bench, look))
-    return judge(again, candidate, shapes, bench, calm.noise)
+    ends = both_ends(calm, candidate, bench, refined(calm, candidate, bench, look))
+    judged = [judge(again, candidate, shapes, bench, calm.noise) for shapes in ends]
+    return max((trial for trial in judged if trial is not None), key=lambda trial: trial.score, default=None)

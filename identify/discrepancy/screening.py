@@ -12,7 +12,7 @@ from identify.catalogue.motion import Motion
 from identify.discrepancy.candidates import Candidate, Shapes, Workshop
 from identify.discrepancy.maps import hats
 from identify.discrepancy.regression import MAX_AR_ORDER, Fit, noise_models
-from identify.discrepancy.shaping import instrumented
+from identify.discrepancy.shaping import both_ends
 from identify.discrepancy.trial import refined, screened
 from identify.estimators.noise import ArModel
 
@@ -32,8 +32,8 @@ def shortlist(
     Returns
     -------
     tuple
-        Candidates with their shapes, best first; the keys of those that cannot be tried; and the noise models, one for
-        each joint, that they were looked at with.
+        Candidates with their shapes, best first, some with two; the keys of those that cannot be tried; and the noise
+        models, one for each joint, that they were looked at with.
     """
     calm = fit.renoised(noise_beyond_shapes(fit, workshop))
     looks: list[tuple[float, Candidate, Shapes]] = []
@@ -45,10 +45,10 @@ def shortlist(
         else:
             looks.append((look[0], candidate, look[1]))
     looks.sort(key=lambda look: len(look[1].effect.linear) - look[0])
-    best = [
-        (candidate, instrumented(calm, candidate, workshop, refined(calm, candidate, workshop, (look, shapes))))
-        for look, candidate, shapes in looks[:most]
-    ]
+    best: list[tuple[Candidate, Shapes]] = []
+    for score, candidate, shapes in looks[:most]:
+        own = refined(calm, candidate, workshop, (score, shapes))
+        best += [(candidate, ends) for ends in both_ends(calm, candidate, workshop, own)]
     return best, frozenset(hidden), calm.noise
 
 

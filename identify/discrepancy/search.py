@@ -81,8 +81,9 @@ class Search:
             every = list(candidates(workshop))
             promising, hidden, calm = shortlist(found, workshop, every, SHORTLIST)
             judged = [judge(found, candidate, shapes, workshop, calm) for candidate, shapes in promising]
-            trials = [trial for trial in judged if trial is not None]
-            made = State(study, found, workshop, _ranked(trials), len(every) - len(hidden), hidden)
+            ranked = _ranked(judged)
+            others = tuple(t for t in judged if t is not None and all(t is not best for best in ranked))
+            made = State(study, found, workshop, ranked, len(every) - len(hidden), hidden, others)
             self._states[key] = self._again(made)
         return self._states[key]
 
@@ -132,11 +133,8 @@ class Search:
         """
         effect = trial.candidate.effect
         if effect.predicts and not effect.sudden and any(effect.refinable(state.study.robot, trial.candidate.place)):
-            for _ in range(LOOPS):
-                again = in_its_loop(state.fit, trial)
-                if again is None or again.forbidden or again.score < trial.score:
-                    break
-                trial = again
+            starts = [trial, *(t for t in state.others if t.candidate.key == trial.candidate.key and not t.forbidden)]
+            trial = max((_settled(state, start) for start in starts), key=lambda t: t.score)
         try:
             robot = added(state.study.robot, trial)
             if effect.undo is not None:
@@ -200,5 +198,19 @@ class Search:
         return state
 
 
-def _ranked(trials: Sequence[Trial]) -> tuple[Trial, ...]:
-    return tuple(sorted(trials, key=lambda t: -t.score))
+def _settled(state: State, trial: Trial) -> Trial:
+    """A trial with its nonlinear parameters sought in the loop that it makes, and in that which these make."""
+    for _ in range(LOOPS):
+        again = in_its_loop(state.fit, trial)
+        if again is None or again.forbidden or again.score < trial.score:
+            break
+        trial = again
+    return trial
+
+
+def _ranked(trials: Sequence[Trial | None]) -> tuple[Trial, ...]:
+    """Best first, every candidate once."""
+    best: dict[tuple[str, int, int | None], Trial] = {}
+    for trial in sorted((t for t in trials if t is not None), key=lambda t: -t.score):
+        best.setdefault(trial.candidate.key, trial)
+    return tuple(best.values())

@@ -24,6 +24,15 @@ REFINEMENTS = 8
 """Evaluations of that refinement."""
 
 
+def both_ends(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Shapes) -> tuple[Shapes, ...]:
+    """Shapes as simulated signals have them, and as measured ones do where that is not the same: either may be astray.
+
+    Simulated signals are those of a loop without the effect, and measured ones hold noise that it amplifies.
+    """
+    found = instrumented(fit, candidate, workshop, shapes)
+    return (shapes,) if found == shapes else (found, shapes)
+
+
 def instrumented(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Shapes) -> Shapes:
     """Continuous nonlinear parameters, one after the other, between the neighbours on the grid of where they are.
 

@@ -61,6 +61,8 @@ class State:
         Number of candidates that they were chosen from.
     hidden
         Candidates that the model contains or the motion does not excite.
+    others
+        Trials of the same candidates with other nonlinear parameters, which scored less.
     """
 
     study: Study
@@ -69,6 +71,7 @@ class State:
     trials: tuple[Trial, ...]
     tests: int
     hidden: frozenset[tuple[str, int, int | None]]
+    others: tuple[Trial, ...] = ()
 
     def passing(self, settings: Settings) -> list[Trial]:
         """Trials that a finding may come from, best first."""

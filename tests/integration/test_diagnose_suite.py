@@ -81,7 +81,8 @@ LEAST = {
     "name and place right": 0.70,
     "name and place right, or second": 0.70,
     "healthy arms called healthy": 1.0,
-    "at least 90% of the injected gap closed, where named": 0.60,
+    "share of the injected gap closed, mean where named": 0.85,
+    "cases with at least 90% of it closed": 0.60,
     "parameters within three standard deviations": 0.70,
 }
 """Of the quick subset, one run of each effect: below what it comes to by two binomial deviations or more."""
