@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from identify.discrepancy.findings import described
 from identify.discrepancy.search import MOST, Search
 from identify.discrepancy.stanzas import without
-from identify.discrepancy.state import State, nearer, places_of
+from identify.discrepancy.state import Places, State, nearer, places_of
 from identify.discrepancy.trial import CLOSE
 from identify.discrepancy.where import Disagreement, Survey, unexplained
 from identify.document import Finding
@@ -59,7 +59,12 @@ def convincing(search: Search, first: State, final: State, seen: Survey) -> Outc
         findings = described(search, first, final, left)
         worst = min(range(len(findings)), key=lambda k: _confidence(findings[k]), default=None)
         if worst is None or _confidence(findings[worst]) >= CONVINCING:
-            break
+            better = _exchanged(search, first, final, considered, been)
+            if better is None:
+                break
+            final = better
+            been.add(places_of(final))
+            continue
         considered.append(findings[worst])
         search.progress(f"taking out {findings[worst].effect}")
         final = _without(search, first, final, worst, been)
@@ -72,9 +77,7 @@ def _confidence(finding: Finding) -> float:
     return float(finding.evidence["confidence_with_equals"])
 
 
-def _without(
-    search: Search, first: State, final: State, finding: int, been: set[tuple[tuple[str, str, str], ...]]
-) -> State:
+def _without(search: Search, first: State, final: State, finding: int, been: set[Places]) -> State:
     """The model without a finding, or with the effect that beats it."""
     number = len(first.study.robot.effects) + finding
     stanza = final.study.robot.effects[number]
@@ -91,6 +94,29 @@ def _without(
         if other is not None and nearer(other, rest, search.settings.material) and places_of(other) not in been:
             return other
     return rest
+
+
+def _exchanged(
+    search: Search, first: State, final: State, considered: Sequence[Finding], been: set[Places]
+) -> State | None:
+    """The model with something that was taken out in the place of a finding of its joint, where that comes nearer.
+
+    Of two that shared a gap the one that convinced less may be the right one once it is alone.
+    """
+    own, joints = len(first.study.robot.effects), final.study.joints
+    for number in range(own, len(final.study.robot.effects)):
+        joint = final.study.robot.effects[number].joint
+        names = {finding.effect for finding in considered if finding.joint == joint}
+        if not names:
+            continue
+        rest = search.state(without(final.study.robot, number), final)
+        for trial in rest.passing(search.settings):
+            if trial.candidate.effect.name not in names or joints[trial.candidate.place.joint] != joint:
+                continue
+            other = search.with_trial(rest, trial)
+            if other is not None and places_of(other) not in been and nearer(other, final, search.settings.material):
+                return other
+    return None
 
 
 def _unique(considered: Sequence[Finding], findings: Sequence[Finding]) -> tuple[Finding, ...]:
