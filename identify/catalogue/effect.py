@@ -61,6 +61,8 @@ class Shape:
     closer
         Values to try beside those of the grid once the simulated loop has the effect in it: what a rigid arm's motion
         does not excite says nothing there.
+    movable
+        Whether it is moved with the others once the effect is found, although the search takes it from its grid.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Shape:
     continuous: tuple[bool, bool] = (True, True)
     default: float | None = None
     closer: tuple[float, ...] = ()
+    movable: bool = False
 
 
 @dataclass(frozen=True)
@@ -171,6 +174,11 @@ class Effect:
         """Which of the nonlinear parameters may lie between the values of their grids at a place."""
         prismatic = robot.joints[place.joint].type == "prismatic"
         return tuple(shape.continuous[prismatic] for shape in self.shapes)
+
+    def movable(self, robot: RobotConfig, place: "Place", shapes: Mapping[str, float]) -> list[str]:
+        """Names of the nonlinear parameters to be moved once it is found: none at zero, which no factor moves."""
+        between = zip(self.shapes, self.refinable(robot, place), strict=True)
+        return [s.name for s, may in between if (may or s.movable) and shapes[s.name] != 0.0]
 
     def torque(self, motion: Motion, place: "Place", shapes: Mapping[str, float]) -> Array:
         """Columns of all joints, shape (N, n, k)."""

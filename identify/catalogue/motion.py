@@ -1,11 +1,12 @@
 """A motion as the effects of the catalogue see it."""
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import qmc
 
 if TYPE_CHECKING:
     from identify.model.arm import ArmModel
@@ -14,6 +15,18 @@ Array = NDArray[np.float64]
 
 STEP = 1e-6
 """Of the finite differences, rad and rad/s, or in metres."""
+
+
+POSTURES = 64
+"""Over which a mean is taken."""
+
+
+@cache
+def _spread(limits: tuple[tuple[float, float], ...]) -> Array:
+    """Points (P, n) of the Halton sequence between limits."""
+    points = qmc.Halton(len(limits), scramble=False).random(POSTURES)
+    low, high = np.array(limits).T
+    return np.ascontiguousarray(low + points * (high - low))
 
 
 @dataclass(frozen=True)
@@ -89,6 +102,11 @@ class Motion:
         """Speed that each joint exceeds for one sample in a hundred, (n,)."""
         top: Array = np.maximum(np.quantile(np.abs(self.qd), 0.99, axis=0), 1e-9)
         return top
+
+    @property
+    def postures(self) -> Array:
+        """Postures of the arm, spread evenly over the ranges of its joints whatever the motion, (P, n)."""
+        return _spread(tuple(joint.limits.position for joint in self.model.robot.joints))
 
     @cached_property
     def span(self) -> Array:

@@ -30,5 +30,5 @@ def rotors(motion: Motion, joint: int) -> Sequence[float]:
     return tuple(share * least for share in SHARES) if least > 0.0 else (0.0,)
 
 
-ROTOR = Shape("rotor", ("kg m^2", "kg"), rotors, continuous=(False, False), default=0.0)
+ROTOR = Shape("rotor", ("kg m^2", "kg"), rotors, continuous=(False, False), default=0.0, movable=True)
 """Shape of effects that depend on what the gear hands on."""

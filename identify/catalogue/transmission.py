@@ -45,11 +45,13 @@ def _elasticity(
 ) -> Array:
     """The link stands behind the motor by compliance times load, and swings there: slower where it has more inertia.
 
-    ``frequency`` is that of its mean inertia along the motion.
+    ``frequency`` is that of its mean inertia over the postures of the arm: the same spring in every motion.
     """
     j = place.joint
-    inertia = inertias(motion, j, rotor)
-    share = inertia / inertia.mean() if inertia.max() > 0.0 else np.ones(motion.samples)
+    inertia, share = inertias(motion, j, rotor), np.ones(motion.samples)
+    if inertia.max() > 0.0:
+        usual = float(motion.model.mass_matrix(motion.links, motion.postures)[:, j, j].mean()) - rotor
+        share = inertia / max(usual, LEAST_INERTIA * float(inertia.max()))
     moves = swinging(-motion.handed_on(j, rotor), share, 2 * np.pi * frequency, damping, motion.dt)
     return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
 

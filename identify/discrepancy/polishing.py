@@ -120,16 +120,15 @@ def _step(fit: Fit, own: int) -> list[tuple[_Free, float]] | None:
 
 
 def _free(bench: Workshop, own: int) -> list[_Free]:
-    """Parameters that are not at zero, which no factor moves."""
+    """Parameters that may be moved."""
     study, found = bench.study, []
     for k, term in enumerate(study.model.terms):
         if stanza_number(study.robot, k) < own:
             continue
-        refinable = term.effect.refinable(study.robot, term.place)
-        for shape, may in zip(term.effect.shapes, refinable, strict=True):
-            value = float(term.shapes[shape.name])
-            if may and value != 0.0:
-                values = [value, *_values(shape, bench, term)]
+        movable = term.effect.movable(study.robot, term.place, term.shapes)
+        for shape in term.effect.shapes:
+            if shape.name in movable:
+                values = [float(term.shapes[shape.name]), *_values(shape, bench, term)]
                 found.append(_Free(k, shape.name, min(v for v in values if v > 0.0), max(values)))
     return found
 

@@ -31,11 +31,9 @@ def standard_deviations(state: State) -> list[dict[str, float]]:
     owners: list[tuple[int, str]] = []
     for k, term in enumerate(study.model.terms):
         own = [study.model.base.names.index(name) for name in term.names]
-        free = term.effect.refinable(study.robot, term.place)
-        for shape, is_free in zip(term.effect.shapes, free, strict=True):
-            if is_free:
-                slopes.append(_slope(state.workshop, fit.noise, term, shape.name, term.of_effect(fit.theta[own])))
-                owners.append((k, shape.name))
+        for name in term.effect.movable(study.robot, term.place, term.shapes):
+            slopes.append(_slope(state.workshop, fit.noise, term, name, term.of_effect(fit.theta[own])))
+            owners.append((k, name))
     deviations = _deviations(fit, slopes)
     b = fit.theta.size
     found: list[dict[str, float]] = []
