@@ -52,7 +52,9 @@ COUNT_NAMES = (
 ) = range(10)  # fmt: skip
 
 RECENT = 256
-"""Times of so many SYNCs are kept for packed samples: a turn of the counter and more."""
+"""Times of at least so many SYNCs are kept for packed samples: a turn of the counter and more.
+
+Several buses keep as many as one may be behind another, twice: a bus whose frames waited finds its numbers by them."""
 
 
 class Books(NamedTuple):
@@ -132,10 +134,12 @@ def open_books(
     answers = rows + 64
     words = max(-(-shape.length // 8) for shape in shapes)
     pack = max(shape.pack for shape in shapes)
+    slack = max(w * s.every for w, s in zip(window, shapes, strict=True))
+    recent = RECENT if buses == 1 else RECENT + 2 * slack
     return Books(
         state=np.tile(np.array([-1, -1, UNSEEN, 1, 0, 0]), (buses, 1)),
-        slack=np.full(buses, max(w * s.every for w, s in zip(window, shapes, strict=True)), np.int64),
-        recent=np.full((buses, RECENT), UNSEEN, np.int64),
+        slack=np.full(buses, slack, np.int64),
+        recent=np.full((buses, recent), UNSEEN, np.int64),
         counts=np.zeros(len(COUNT_NAMES), np.int64),
         kind=np.array(
             [

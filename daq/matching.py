@@ -33,7 +33,6 @@ from daq.books import (
     ORIGIN,
     PACK,
     RECEIVED,
-    RECENT,
     SYNC,
     SYNC_MISALIGNED,
     SYNC_MISSING,
@@ -74,7 +73,7 @@ def _owe(b: Books, bus: int, k: int, s: int) -> None:
         for j in range(b.settled.shape[1]):
             b.row_code[s, slot, j] = LOST
     for i in range(b.kind[s, PACK]):
-        b.row_t[s, slot, i, bus] = b.recent[bus, (k - b.kind[s, PACK] + 1 + i) % RECENT]
+        b.row_t[s, slot, i, bus] = b.recent[bus, (k - b.kind[s, PACK] + 1 + i) % b.recent.shape[1]]
     b.head[bus, s] += 1
 
 
@@ -90,7 +89,7 @@ def _miss(b: Books, bus: int, first: int, until: int, out: Decided) -> None:
         if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2:
             settle_all(b, bus, s, False, out)
     for k in range(first, until):
-        b.recent[bus, k % RECENT] = UNSEEN
+        b.recent[bus, k % b.recent.shape[1]] = UNSEEN
         for s in range(streams):
             _owe(b, bus, k, s)
             if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2:
@@ -177,7 +176,7 @@ def match(
             k = last + step
             if step > 1:
                 _miss(b, bus, last + 1, k, out)
-            b.recent[bus, k % RECENT] = t_ns[i]
+            b.recent[bus, k % b.recent.shape[1]] = t_ns[i]
             for s in range(b.kind.shape[0]):
                 settle_all(b, bus, s, False, out)
                 _owe(b, bus, k, s)

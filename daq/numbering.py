@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from daq.books import BORROWED, COUNTER, ORIGIN, RECENT, SYNC, TIME, TORN, UNSEEN
+from daq.books import BORROWED, COUNTER, ORIGIN, SYNC, TIME, TORN, UNSEEN
 
 _EARLY = 0.25
 """By how much of a turn of the counter the time between two SYNCs may be too short, as their stamps say."""
@@ -13,6 +13,8 @@ _DISORDER = 8
 """A SYNC counter that goes back by less than this is a repeated SYNC, not a long gap."""
 _ON_TIME, _DRIFT = 2.0, 1e-4
 """By how many periods, and which share of the time since, SYNC comes earlier or later than its grid at most."""
+NOWHERE = -(1 << 60)
+"""No step at all."""
 _MISALIGNED = 2.0
 """SYNCs of equal counters on two buses that are farther apart than so many periods are not the same SYNC."""
 
@@ -62,9 +64,10 @@ def _begin(state: Any, recent: Any, bus: int, counter: int, t_ns: int, period_ns
             ahead = int(step + overflow * np.rint((elapsed - step) / overflow))
             apart = abs(elapsed - ahead)
             k = state[other, SYNC] + ahead
-            if ahead <= 0 <= k and ahead > -RECENT and recent[other, k % RECENT] != UNSEEN:
+            room = recent.shape[1]
+            if ahead <= 0 <= k and ahead > -room and recent[other, k % room] != UNSEEN:
                 # Known when the other bus had it: a master that was held up since does not matter.
-                apart = abs(t_ns - recent[other, k % RECENT]) / period_ns
+                apart = abs(t_ns - recent[other, k % room]) / period_ns
             if apart > _MISALIGNED:
                 return -1
         state[bus, ORIGIN] = state[other, ORIGIN]
@@ -72,6 +75,28 @@ def _begin(state: Any, recent: Any, bus: int, counter: int, t_ns: int, period_ns
     if counter >= 0:
         state[bus, ORIGIN] = counter
     return 1
+
+
+@njit(cache=True, nogil=True)
+def _heard_elsewhere(state: Any, recent: Any, bus: int, step: int, t_ns: int, period_ns: int, overflow: int) -> int:
+    """By how many SYNCs, ``step`` and whole turns, a bus advances to the SYNC that another one had at this time.
+
+    A master that is held up keeps to no period, but all buses have its SYNC at once. ``NOWHERE`` if none had one.
+    """
+    best, nearest, room = NOWHERE, _MISALIGNED * period_ns, recent.shape[1]
+    for other in range(state.shape[0]):
+        last = state[other, SYNC]
+        if other == bus or last < 0:
+            continue
+        # The first such number that the other bus may still have the time of.
+        k = max(0, last - room + 1)
+        k += (state[bus, SYNC] + step - k) % overflow
+        while k <= last:
+            at = recent[other, k % room]
+            if at != UNSEEN and abs(t_ns - at) <= nearest:
+                best, nearest = k - state[bus, SYNC], float(abs(t_ns - at))
+            k += overflow
+    return int(best)
 
 
 @njit(cache=True, nogil=True)
@@ -85,7 +110,10 @@ def advance(
     elif counter >= 0 and state[bus, COUNTER] >= 0 and state[bus, BORROWED]:
         # What had waited on this bus may be older than what others had meanwhile.
         step = (counter - state[bus, COUNTER]) % overflow
-        step += overflow * turns_in(elapsed - step, overflow)
+        step = _heard_elsewhere(state, recent, bus, step, t_ns, period_ns, overflow)
+        if step == NOWHERE:
+            step = (counter - state[bus, COUNTER]) % overflow
+            step += overflow * turns_in(elapsed - step, overflow)
     elif counter >= 0 and state[bus, COUNTER] >= 0:
         if not state[bus, TORN] and _was_held_up(counter, state[bus, COUNTER], elapsed, overflow):
             longest = 0

@@ -116,3 +116,23 @@ def test_what_one_bus_had_to_drop_another_one_may_have_received() -> None:
     now = T0 + 130 * PERIOD_NS
     assert assembler.unseen([0, 5], now) == 0
     assert assembler.unseen([0, 30], now) == 20
+
+
+@pytest.mark.parametrize("held_up", [0.0, 0.3, 0.9, 5.0])
+def test_a_bus_whose_frames_waited_finds_its_numbers_by_the_times_of_another(held_up: float) -> None:
+    """The master is held up for turns of its counter while one bus waits: nominal periods would be turns off."""
+    count, before, after = 60_000, 22_000, 30_000
+    assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, 1, bus_of=(0, 1))
+    late = round(held_up * OVERFLOW) * PERIOD_NS
+    both = answered(list(range(count)), lambda k: late * (k // 5000))
+    both["data"][both["can_id"] != 0x80, :8] = np.repeat(np.arange(count), 2)[:, None].view(np.uint8)
+    batches = []
+    for first, until, bus in ((0, after, 1), (0, after, 0), (after, count, 0), (after, count, 1)):
+        part = both[3 * first : 3 * until]
+        batches.append(assembler.push(part[part["can_id"] != (0x182, 0x181)[bus]], count, bus=bus))
+    batches.append(assembler.finish(count))
+    rows = [batch.rows["samples"] for batch in batches]
+    numbers = np.concatenate([row.sync for row in rows])
+    values = np.concatenate([row.data[:, :, :8].copy().view("<i8")[:, :, 0] for row in rows])
+    np.testing.assert_array_equal(values, np.repeat(numbers[:, None], 2, axis=1))
+    assert numbers.size >= count - before
