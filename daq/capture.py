@@ -17,7 +17,7 @@ from daq.journal import Line, Voice
 from daq.order import Order, prepare
 from daq.publisher import Publisher
 from daq.recorder import Recorder
-from daq.recording import Mark, RecordingSeries, TriggeredSeries
+from daq.recording import Mark, QueuedSeries
 from daq.reload import Change, Reloader
 from daq.sink import Sink
 from daq.storage import Tidiness, capture_stamp, kept_around, limits, open_series
@@ -125,12 +125,12 @@ def capture(
         return Captured(tuple(writer.paths), counters, tuple(run.sink.marks), trouble)
 
 
-def _exchange_limits(writer: RecordingSeries | TriggeredSeries, tidiness: Tidiness) -> Change:
+def _exchange_limits(writer: QueuedSeries, tidiness: Tidiness) -> Change:
     """Changes when files are full, how long they are kept, and how much around an event."""
 
     def change(session: SessionConfig) -> None:
         writer.limit(*limits(session.recording))
-        if isinstance(writer, TriggeredSeries) and session.recording.trigger is not None:
+        if session.recording.trigger is not None:
             writer.keep(*kept_around(session.recording.trigger))
         tidiness.options = session.recording
 

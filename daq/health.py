@@ -16,6 +16,9 @@ from daq.sink import Sink
 from daq.storage import free_space
 from drivers.receiver import Receiver
 
+SLOW_DISK_S = 1.0
+"""Rows of so long that wait for the disk are worth a line."""
+
 
 class Health:
     """Reports on one capture.
@@ -47,7 +50,7 @@ class Health:
         self.temperatures: Callable[[], dict[str, float]] = dict
         """Gives the temperature of each joint's drive, degrees Celsius, where it is known."""
         self._frames_before = self._lost_rows = 0
-        self._writing = True
+        self._writing, self._slow = True, False
 
     def serve(self, stack: ExitStack) -> None:
         """Serve metrics where the session asks for it, until the stack unwinds."""
@@ -90,6 +93,7 @@ class Health:
         health: dict[str, Value] = {
             "file": None if self._sink.path is None else self._sink.path.name,
             "rows_not_written": self._sink.lost_rows,
+            "rows_waiting": self._sink.waiting_rows,
             "sync": self._assembler.last_sync,
             "frames": counters["frames"],
             "frames_per_s": round(rate, 1),
@@ -124,6 +128,12 @@ class Health:
         elif lost == before and not self._writing:
             self._say(f"writing again; {lost} rows were not written")
         self._writing = lost == before
+        waits_s = self._sink.waiting_rows * self._order.session.sync_period
+        if waits_s > SLOW_DISK_S and not self._slow:
+            self._say(f"warning: the disk is slow: {waits_s:.1f} s of rows wait for it")
+        elif self._slow and waits_s <= SLOW_DISK_S:
+            self._say("the disk has caught up")
+        self._slow = waits_s > SLOW_DISK_S
 
 
 def _clock() -> dict[str, Value]:

@@ -10,7 +10,7 @@ import numpy as np
 from configs import RobotConfig, SessionConfig
 from daq.assembler import Batch, Rows
 from daq.publisher import Publisher
-from daq.recording import Gap, Mark, RecordingSeries, TriggeredSeries
+from daq.recording import Gap, Mark, QueuedSeries
 from daq.recording.model import MarkKind
 from daq.streams import CapturedStream
 from daq.zenoh_keys import Block, encode_event
@@ -34,7 +34,7 @@ class Sink:
 
     def __init__(
         self,
-        writer: RecordingSeries | TriggeredSeries,
+        writer: QueuedSeries,
         publisher: Publisher,
         streams: Sequence[CapturedStream],
         capture: str,
@@ -58,6 +58,11 @@ class Sink:
     def lost_rows(self) -> int:
         """Rows that the disk did not take."""
         return self._writer.lost_rows
+
+    @property
+    def waiting_rows(self) -> int:
+        """Rows that wait for the disk."""
+        return self._writer.waiting_rows
 
     @property
     def problem(self) -> str | None:

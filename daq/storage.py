@@ -8,7 +8,7 @@ from typing import Self
 
 from configs import RobotConfig, SessionConfig
 from configs.session import RecordingOptions, Trigger
-from daq.recording import RecordingSeries, RecordingWriter, TriggeredSeries
+from daq.recording import QueuedSeries, RecordingSeries, RecordingWriter, TriggeredSeries
 from daq.recording.retention import Janitor, prune
 from daq.streams import CapturedStream
 
@@ -20,8 +20,10 @@ def open_series(
     directory: Path,
     name: str,
     metadata: dict[str, str],
-) -> RecordingSeries | TriggeredSeries:
+) -> QueuedSeries:
     """Begin the files of a capture, or what keeps its last seconds until there is something to write.
+
+    A thread of its own writes them.
 
     Raises
     ------
@@ -30,6 +32,7 @@ def open_series(
     """
     options = session.recording
     layouts = [stream.layout for stream in streams]
+    every = {layout.name: layout.every for layout in layouts}
 
     def begin(path: Path, part: int) -> RecordingWriter:
         facts = metadata | {"part": str(part)}
@@ -40,13 +43,13 @@ def open_series(
 
     max_bytes, max_ns = limits(options)
     if options.trigger is None:
-        return RecordingSeries(begin, directory, name, max_bytes, max_ns)
+        return QueuedSeries(RecordingSeries(begin, directory, name, max_bytes, max_ns), every)
 
     def event(_: int) -> RecordingSeries:
         now = capture_stamp(datetime.datetime.now(datetime.UTC))
         return RecordingSeries(begin, directory, f"{robot.name}-{now}", max_bytes, max_ns)
 
-    return TriggeredSeries(event, *kept_around(options.trigger))
+    return QueuedSeries(TriggeredSeries(event, *kept_around(options.trigger)), every)
 
 
 def kept_around(trigger: Trigger) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 from daq.recording.healing import Healed, heal_recording
 from daq.recording.layout import StreamLayout
 from daq.recording.model import Field, Gap, Mark, Recording, Stream, join_parts
+from daq.recording.queued import QueuedSeries
 from daq.recording.reader import read_recording
 from daq.recording.series import RecordingSeries
 from daq.recording.triggered import TriggeredSeries
@@ -13,6 +14,7 @@ __all__ = [
     "Gap",
     "Healed",
     "Mark",
+    "QueuedSeries",
     "Recording",
     "RecordingSeries",
     "RecordingWriter",

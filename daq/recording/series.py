@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from configs import ConfigError
 from daq.recording.model import Gap, Mark
+from daq.recording.unwritten import Spans
 from daq.recording.writer import RecordingWriter
 
 RETRY_NS = 10_000_000_000
@@ -105,6 +106,10 @@ class RecordingSeries:
         """See :meth:`RecordingWriter.add_marks`."""
         self._writer.add_marks(marks)
 
+    def leave_out(self, rows: Spans) -> None:
+        """See :meth:`RecordingWriter.leave_out`."""
+        self._writer.leave_out(rows)
+
     def flush(self) -> None:
         """See :meth:`RecordingWriter.flush`."""
         self._writer.flush()
@@ -125,6 +130,9 @@ class RecordingSeries:
 
     def trigger(self, t_ns: int) -> None:
         """Everything is written anyway."""
+
+    def keep(self, before_ns: int, after_ns: int) -> None:
+        """Everything is kept anyway."""
 
     def abort(self) -> None:
         """Leave nothing behind of a capture that did not begin."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from configs import ConfigError
 from daq.recording.model import Gap, Mark
 from daq.recording.series import RETRY_NS, RecordingSeries
+from daq.recording.unwritten import Spans
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,15 @@ class TriggeredSeries:
             self._series.add_marks(marks)
         elif marks:
             self._keep(_Events(marks[-1].t_ns, marks=tuple(marks)), marks[-1].t_ns)
+
+    def leave_out(self, rows: Spans) -> None:
+        """See :meth:`RecordingWriter.leave_out`."""
+        if self._series is not None:
+            self._series.leave_out(rows)
+            return
+        self._lost_before += rows.rows
+        t_ns = _newest(self._kept[-1]) if self._kept else 0
+        self._keep(_Events(t_ns, gaps=tuple(rows.gaps())), t_ns)
 
     def flush(self) -> None:
         """Bring what is written to the disk."""

@@ -1,15 +1,78 @@
 """What the disk did not take: rows that become gaps, and events that are written later."""
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from daq.recording.model import Gap
 
 NOT_WRITTEN = "not written"
 """Samples that were received, but the disk did not take them."""
 
+STANDS_STILL = "the disk stands still"
+"""Why rows are not even handed to it."""
+
 Event = tuple[str, int, dict[str, Any]]
 """Topic, SYNC number and entries."""
+
+
+class Spans:
+    """Rows of streams, from one SYNC to another; what goes on without a seam is one span.
+
+    Parameters
+    ----------
+    every
+        Of each stream, on every how many SYNCs it has a row.
+    """
+
+    def __init__(self, every: Mapping[str, int]) -> None:
+        self._every = dict(every)
+        self._spans: dict[str, list[tuple[int, int]]] = {name: [] for name in every}
+
+    def __bool__(self) -> bool:
+        return any(self._spans.values())
+
+    def add(self, stream: str, sync: NDArray[np.int64]) -> None:
+        """Add rows by their SYNCs, shape (N,), which may have gaps."""
+        breaks = [0, *(np.flatnonzero(np.diff(sync) != self._every[stream]) + 1).tolist(), len(sync)]
+        for begin, end in pairwise(breaks):
+            self.add_span(stream, int(sync[begin]), int(sync[end - 1]))
+
+    def add_span(self, stream: str, first: int, last: int) -> None:
+        """Add the rows from SYNC ``first`` to ``last``."""
+        spans = self._spans[stream]
+        if spans and first == spans[-1][1] + self._every[stream]:
+            first = spans.pop()[0]
+        spans.append((first, last))
+
+    def take(self) -> "Spans":
+        """All of it, which is then elsewhere."""
+        taken = Spans(self._every)
+        taken._spans, self._spans = self._spans, taken._spans
+        return taken
+
+    def before(self, other: "Spans") -> "Spans":
+        """These rows, and those of another that came later."""
+        both = Spans(self._every)
+        for spans in (self._spans, other._spans):
+            for stream, found in spans.items():
+                for first, last in found:
+                    both.add_span(stream, first, last)
+        return both
+
+    @property
+    def rows(self) -> int:
+        """How many."""
+        return sum(
+            (last - first) // self._every[name] + 1 for name, spans in self._spans.items() for first, last in spans
+        )
+
+    def gaps(self) -> list[Gap]:
+        """Them as gaps."""
+        return [Gap(name, *span, None, NOT_WRITTEN) for name, spans in self._spans.items() for span in spans]
 
 
 class Unwritten:
@@ -22,35 +85,32 @@ class Unwritten:
     """
 
     def __init__(self, every: Mapping[str, int]) -> None:
-        self._every = dict(every)
-        self._gathered: list[tuple[str, int, int]] = []
-        self._lost: dict[str, list[tuple[int, int]]] = {name: [] for name in every}
+        self._gathered, self._lost = Spans(every), Spans(every)
         self.events: list[Event] = []
 
-    def gather(self, stream: str, first: int, last: int) -> None:
-        """Rows from SYNC ``first`` to ``last`` are in the chunk."""
-        self._gathered.append((stream, first, last))
+    def gather(self, stream: str, sync: NDArray[np.int64]) -> None:
+        """Rows of these SYNCs are in the chunk."""
+        self._gathered.add(stream, sync)
+
+    def lose(self, rows: Spans) -> None:
+        """Rows that never came into a chunk are lost."""
+        self._lost = self._lost.before(rows)
 
     def failed(self) -> None:
         """The chunk was not written: its rows are lost, its events are not."""
-        for stream, first, last in self._gathered:
-            spans = self._lost[stream]
-            if spans and first == spans[-1][1] + self._every[stream]:
-                first = spans.pop()[0]
-            spans.append((first, last))
-        self._gathered = []
+        self.lose(self._gathered.take())
 
     def written(self) -> None:
         """The chunk was written, and with it what was not before."""
-        self._gathered, self.events = [], []
-        self._lost = {name: [] for name in self._lost}
+        self.events = []
+        self._gathered.take()
+        self._lost.take()
 
     def gaps(self) -> list[Gap]:
         """The rows that were lost."""
-        return [Gap(name, *span, None, NOT_WRITTEN) for name, spans in self._lost.items() for span in spans]
+        return self._lost.gaps()
 
     def take_over(self, other: "Unwritten") -> None:
         """Take what another file could not be told."""
         self.events += other.events
-        for stream, spans in other._lost.items():
-            self._lost[stream] = spans + self._lost[stream]
+        self._lost = other._lost.before(self._lost)

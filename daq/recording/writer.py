@@ -10,7 +10,6 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
-from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -25,7 +24,7 @@ from daq.recording.layout import StreamLayout
 from daq.recording.looking import PREFIX, Look
 from daq.recording.model import Gap, Mark, Recording
 from daq.recording.summary import Summary
-from daq.recording.unwritten import Unwritten
+from daq.recording.unwritten import STANDS_STILL, Spans, Unwritten
 
 SCHEMA = "armident/recording/1"
 GAPS_TOPIC, MARKS_TOPIC = "/events/gaps", "/events/marks"
@@ -173,10 +172,7 @@ class RecordingWriter:
         rows = layout.pack(channel, sync, t_ns, raw)
         offsets = self._size + np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.itemsize)
         self._rows += len(rows)
-        # Rows may lie on both sides of a gap.
-        breaks = [0, *(np.flatnonzero(np.diff(sync) != layout.every) + 1).tolist(), len(sync)]
-        for begin, end in pairwise(breaks):
-            self._unwritten.gather(stream, int(sync[begin]), int(sync[end - 1]))
+        self._unwritten.gather(stream, sync)
         self._gather(channel, t_ns, offsets, rows.tobytes())
         if stream in self._looks:
             channel, look = self._looks[stream]
@@ -200,6 +196,12 @@ class RecordingWriter:
             self._event(MARKS_TOPIC, mark.sync, mark.t_ns, asdict(mark))
             self._unwritten.events.append((MARKS_TOPIC, mark.sync, asdict(mark)))
         self._flush_if_full()
+
+    def leave_out(self, rows: Spans) -> None:
+        """Rows that nobody could hand to the disk: they are lost as if it had refused them."""
+        self.lost_rows += rows.rows
+        self.problem = f"{self.path}: {STANDS_STILL}"
+        self._unwritten.lose(rows)
 
     def take_over(self, other: "RecordingWriter") -> None:
         """Tell what the file of another writer could not be told: rows and events that its disk did not take."""

@@ -1,0 +1,210 @@
+"""Writes a series from a thread of its own, so that whoever drains the buses never waits for the disk."""
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.recording.model import Gap, Mark
+from daq.recording.series import RecordingSeries
+from daq.recording.triggered import TriggeredSeries
+from daq.recording.unwritten import STANDS_STILL, Spans
+
+MOST_WAITING_BYTES = 128 << 20
+"""Rows that may wait for the disk: a minute of six buses at 5 kHz, five minutes of one."""
+
+_Do = Callable[[], object]
+
+
+@dataclass(frozen=True)
+class _State:
+    """What the series said when it had done the last thing."""
+
+    path: Path | None
+    lost_rows: int
+    problem: str | None
+    left_out: int
+    """Rows left out that it has been told of."""
+
+
+class QueuedSeries:
+    """Stands in the place of the series that it writes to; what it is told is done in the same order, a little later.
+
+    A disk that stands still for seconds (a worn memory card, a busy server) costs memory and no samples. When
+    ``most_bytes`` wait, rows are left out until there is room again: they count in :attr:`lost_rows` and become gaps,
+    as rows do that a full disk refuses. What is reported is how it was when the last thing was done.
+
+    Parameters
+    ----------
+    series
+        What is written; nobody else may use it.
+    every
+        Of each stream, on every how many SYNCs it has a row.
+    most_bytes
+        Of rows that wait.
+    """
+
+    def __init__(
+        self,
+        series: RecordingSeries | TriggeredSeries,
+        every: Mapping[str, int],
+        most_bytes: int = MOST_WAITING_BYTES,
+    ) -> None:
+        self._series, self._most_bytes = series, most_bytes
+        self._state = _State(series.path, series.lost_rows, series.problem, 0)
+        self._work: SimpleQueue[tuple[_Do, int, int] | threading.Event | None] = SimpleQueue()
+        self._failure: BaseException | None = None
+        # Of rows, what was put in and what was taken out: each is counted by one thread.
+        self._put_bytes = self._put_rows = self._done_bytes = self._done_rows = 0
+        self._left_out, self._left_out_rows, self._told_rows = Spans(every), 0, 0
+        self._thread: threading.Thread | None = threading.Thread(target=self._run, name="disk", daemon=True)
+        self._thread.start()
+
+    @property
+    def path(self) -> Path | None:
+        """The file being written, if one is."""
+        return self._state.path
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files so far."""
+        return list(self._series.paths)
+
+    @property
+    def lost_rows(self) -> int:
+        """Rows that the disk did not take, of all files."""
+        state = self._state
+        return state.lost_rows + self._left_out_rows - state.left_out
+
+    @property
+    def problem(self) -> str | None:
+        """What went wrong with writing last, in words."""
+        return f"{self.path}: {STANDS_STILL}" if self._left_out else self._state.problem
+
+    @property
+    def waiting_rows(self) -> int:
+        """Rows that wait for the disk."""
+        return self._put_rows - self._done_rows
+
+    def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
+        """Change when a file is full."""
+        self._put(lambda: self._series.limit(max_bytes, max_ns))
+
+    def keep(self, before_ns: int, after_ns: int) -> None:
+        """Change how much is kept before and after a trigger from now on, ns."""
+        self._put(lambda: self._series.keep(before_ns, after_ns))
+
+    def trigger(self, t_ns: int) -> None:
+        """Have what was just recorded, and what follows, written where only events are."""
+        self._put(lambda: self._series.trigger(t_ns))
+
+    def turn(self, t_ns: int) -> None:
+        """Begin a new file if the last is full at ``t_ns``, the time of the rows to come."""
+        self._put(lambda: self._series.turn(t_ns))
+
+    def append(
+        self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """Add rows to a stream: ``sync`` and ``t_ns`` of shape (N,), each of ``raw`` (N, n); none may change after."""
+        size = sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
+        if self._put_bytes - self._done_bytes + size > self._most_bytes:
+            self._left_out.add(stream, sync)
+            self._left_out_rows += len(sync)
+            return
+        self._own_up()
+        self._put(lambda: self._series.append(stream, sync, t_ns, raw), size, len(sync))
+
+    def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
+        """Record gaps found at ``t_ns``."""
+        self._put(lambda: self._series.add_gaps(gaps, t_ns))
+
+    def add_marks(self, marks: Sequence[Mark]) -> None:
+        """Record marks."""
+        self._put(lambda: self._series.add_marks(marks))
+
+    def flush(self) -> None:
+        """Bring all of it to the disk; returns when it is there."""
+        self._own_up()
+        self._put(self._series.flush)
+        self._wait()
+
+    def close(self, counters: Mapping[str, int]) -> None:
+        """Finish the last file, with the counters of the whole capture.
+
+        Raises
+        ------
+        ConfigError
+            If the disk does not take its end; what is there remains readable as a torn file.
+        """
+        self._own_up()
+        self._wait()
+        self._end()
+        self._series.close(counters)
+
+    def abort(self) -> None:
+        """Leave nothing behind of a capture that did not begin."""
+        self._end()
+        self._series.abort()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._end()
+        self._series.__exit__(kind, error, at)
+
+    def _own_up(self) -> None:
+        """Have the series say what was left out, before what comes next."""
+        if not self._left_out:
+            return
+        left_out, rows = self._left_out.take(), self._left_out_rows
+
+        def tell() -> None:
+            self._series.leave_out(left_out)
+            self._told_rows = rows
+
+        self._put(tell)
+
+    def _put(self, do: _Do, size: int = 0, rows: int = 0) -> None:
+        if self._failure is not None:
+            raise self._failure
+        self._put_bytes += size
+        self._put_rows += rows
+        self._work.put((do, size, rows))
+
+    def _wait(self) -> None:
+        """Until all that was put in is done."""
+        done = threading.Event()
+        self._work.put(done)
+        done.wait()
+        if self._failure is not None:
+            raise self._failure
+
+    def _end(self) -> None:
+        if self._thread is not None:
+            self._work.put(None)
+            self._thread.join()
+            self._thread = None
+
+    def _run(self) -> None:
+        while (work := self._work.get()) is not None:
+            if isinstance(work, threading.Event):
+                work.set()
+                continue
+            do, size, rows = work
+            try:
+                if self._failure is None:
+                    do()
+            except BaseException as error:
+                # Raised where something is put in next.
+                self._failure = error
+            series = self._series
+            self._state = _State(series.path, series.lost_rows, series.problem, self._told_rows)
+            self._done_bytes += size
+            self._done_rows += rows
