@@ -1,6 +1,6 @@
 """Turns the frames of the bus into rows per SYNC, and accounts for every SYNC: received, or in the gap list."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from daq.books import (
     COUNTER,
     ORIGIN,
     RECEIVED,
+    SENT_AT,
     SYNC,
     SYNC_MISALIGNED,
     TIME,
@@ -143,6 +144,9 @@ class Assembler:
             self._books.state[:, COUNTER] = (first_counter - 1) % overflow
             self._books.state[:, ORIGIN] = first_counter
         self._lossy = np.zeros(len(channel_of), bool)
+        self.when_sent: Callable[[int], tuple[int, NDArray[np.int64]]] | None = None
+        """Where we send SYNC: tells when, as :meth:`SyncProducer.sent_at` does."""
+        self._asked_from = 0
         self._gaps = OpenGaps(self._joints)
         self._given = [0] * len(streams)
         self._totals = dict.fromkeys(
@@ -207,6 +211,7 @@ class Assembler:
         if sent is not None and not self._lossy[bus]:
             # Our own SYNCs reach us unless the kernel drops them: time that passed is a producer held up, no loss.
             longest = 0
+        self._look_when_sent(self._lossy[bus])
         if dropped:
             self._books.state[bus, TORN] = 2
         syncs = _count_sync(*arguments, longest, self._books)
@@ -222,6 +227,16 @@ class Assembler:
                 "buses of one session need SYNC from one master"
             )
         return self._batch(out, False)
+
+    def _look_when_sent(self, lossy: bool) -> None:
+        """Where frames are lost, have at hand when we sent what has come: a producer held up keeps to no period."""
+        sent = self._books.sent
+        sent[0] = -1
+        if lossy and self.when_sent is not None:
+            first, times = self.when_sent(self._asked_from)
+            numbers = first + np.arange(times.size)[-SENT_AT:]
+            self._books.sent_at[numbers % SENT_AT] = times[-SENT_AT:]
+            sent[0] = self._asked_from = first + times.size - 1
 
     def silence(self, bus: int, silent: bool) -> None:
         """Say that a bus is known to be down, or back: its drives owe nothing meanwhile, and the others go on."""

@@ -56,6 +56,9 @@ RECENT = 256
 
 Several buses keep as many as one may be behind another, twice: a bus whose frames waited finds its numbers by them."""
 
+SENT_AT = 1 << 16
+"""SYNCs of our own have the times kept at which they were sent."""
+
 
 class Books(NamedTuple):
     """What is owed and what has come; buses ``b``, streams ``s``, joints ``j``, a stream's own SYNCs as ordinals ``u``.
@@ -65,12 +68,15 @@ class Books(NamedTuple):
     SYNCs of a bus have asked for, ``TOP`` of ``mark`` those of the bus that is ahead. A bus may be ``slack`` SYNCs
     behind another one before it is taken for silent. ``behind`` is how many answers a drive has owed at once lately,
     and at which row (``behind_at``); what is placed before row ``doubt`` is not certain. Before row ``hole`` of a bus a
-    frame is known to be missing on it. TPDOs that came in the time ``suspect`` (n, 2) were mapped by others.
+    frame is known to be missing on it. TPDOs that came in the time ``suspect`` (n, 2) were mapped by others. Where we
+    send SYNC and lose some, ``sent_at`` is a ring of the times at which it was sent, up to number ``sent`` (1,), or -1.
     """
 
     state: NDArray[np.int64]
     slack: NDArray[np.int64]
     recent: NDArray[np.int64]
+    sent_at: NDArray[np.int64]
+    sent: NDArray[np.int64]
     counts: NDArray[np.int64]
     kind: NDArray[np.int64]
     mark: NDArray[np.int64]
@@ -140,6 +146,8 @@ def open_books(
         state=np.tile(np.array([-1, -1, UNSEEN, 1, 0, 0]), (buses, 1)),
         slack=np.full(buses, slack, np.int64),
         recent=np.full((buses, recent), UNSEEN, np.int64),
+        sent_at=np.full(SENT_AT, UNSEEN, np.int64),
+        sent=np.array([-1]),
         counts=np.zeros(len(COUNT_NAMES), np.int64),
         kind=np.array(
             [

@@ -150,7 +150,7 @@ def count_sync(
     for i in range(count):
         if can_id[i] == sync_id:
             counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 else -1
-            total += max(0, advance(state, b.recent, bus, counter, t_ns[i], period_ns, overflow, longest))
+            total += max(0, advance(state, b, bus, counter, t_ns[i], period_ns, overflow, longest))
     return int(total)
 
 
@@ -168,7 +168,7 @@ def match(
         if identifier == sync_id:
             counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 else -1
             last = b.state[bus, SYNC]
-            step = advance(b.state, b.recent, bus, counter, t_ns[i], period_ns, overflow, longest)
+            step = advance(b.state, b, bus, counter, t_ns[i], period_ns, overflow, longest)
             if step <= 0:
                 unlike = last < 0 and step < 0
                 b.counts[SYNC_MISALIGNED if unlike else SYNC_REPEATED] += 1

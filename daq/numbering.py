@@ -100,26 +100,49 @@ def _heard_elsewhere(state: Any, recent: Any, bus: int, step: int, t_ns: int, pe
 
 
 @njit(cache=True, nogil=True)
-def advance(
-    state: Any, recent: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int
+def _sent_then(sent_at: Any, sent: int, last: int, step: int, t_ns: int, overflow: int) -> int:
+    """By how many SYNCs, ``step`` and whole turns, a bus advances to the one that we sent at this time."""
+    best, nearest, room = NOWHERE, np.int64(-1), sent_at.size
+    for k in range(last + step, sent + 1, overflow):
+        off = abs(t_ns - sent_at[k % room])
+        if k > sent - room and (nearest < 0 or off < nearest):
+            best, nearest = k - last, off
+    return int(best)
+
+
+@njit(cache=True, nogil=True)
+def _told_by_counter(
+    state: Any, b: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int
 ) -> int:
-    """By how many SYNCs a bus advances with this one, after which ``state`` says so; nothing changes if it does not."""
+    """By how many SYNCs a bus advances whose SYNC has a counter, as had the one before it."""
     elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != UNSEEN else 0.0
-    if state[bus, SYNC] < 0 and state[bus, COUNTER] < 0:
-        step = _begin(state, recent, bus, counter, t_ns, period_ns, overflow)
-    elif counter >= 0 and state[bus, COUNTER] >= 0 and state[bus, BORROWED]:
+    step = (counter - state[bus, COUNTER]) % overflow
+    if b.sent[0] > state[bus, SYNC]:
+        sent = _sent_then(b.sent_at, b.sent[0], state[bus, SYNC], step, t_ns, overflow)
+        if sent != NOWHERE:
+            return sent
+    if state[bus, BORROWED]:
         # What had waited on this bus may be older than what others had meanwhile.
-        step = (counter - state[bus, COUNTER]) % overflow
-        step = _heard_elsewhere(state, recent, bus, step, t_ns, period_ns, overflow)
-        if step == NOWHERE:
-            step = (counter - state[bus, COUNTER]) % overflow
-            step += overflow * turns_in(elapsed - step, overflow)
+        found = _heard_elsewhere(state, b.recent, bus, step, t_ns, period_ns, overflow)
+        return found if found != NOWHERE else int(step + overflow * turns_in(elapsed - step, overflow))
+    if not state[bus, TORN] and _was_held_up(counter, state[bus, COUNTER], elapsed, overflow):
+        longest = 0
+    return int(sync_step(counter, state[bus, COUNTER], elapsed, overflow, longest))
+
+
+@njit(cache=True, nogil=True)
+def advance(state: Any, b: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int) -> int:
+    """By how many SYNCs a bus advances with this one, after which ``state`` says so; nothing changes if it does not.
+
+    ``state`` is that of the books ``b``, or a copy.
+    """
+    if state[bus, SYNC] < 0 and state[bus, COUNTER] < 0:
+        step = _begin(state, b.recent, bus, counter, t_ns, period_ns, overflow)
     elif counter >= 0 and state[bus, COUNTER] >= 0:
-        if not state[bus, TORN] and _was_held_up(counter, state[bus, COUNTER], elapsed, overflow):
-            longest = 0
-        step = sync_step(counter, state[bus, COUNTER], elapsed, overflow, longest)
+        step = _told_by_counter(state, b, bus, counter, t_ns, period_ns, overflow, longest)
     elif counter < 0 and state.shape[0] > 1:
         # Without a counter, time alone keeps the buses together.
+        elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != UNSEEN else 0.0
         step = min(max(1, int(np.rint(elapsed))), max(1, longest))
     else:
         step = 1

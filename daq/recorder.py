@@ -112,6 +112,7 @@ class Recorder:
                 self._producer = KernelSync(session.all_buses[0], *timing)
             else:
                 self._producer = SyncProducer(session.all_buses, *timing)
+                self._assembler.when_sent = self._producer.sent_at
             self._producer.start()
             stack.callback(self._producer.stop)
 

@@ -40,6 +40,7 @@ from drivers.sync_loop import (
     SKIPPED,
     STATE_SIZE,
     STOP,
+    TIMES,
     Loop,
     is_knot,
 )
@@ -106,6 +107,7 @@ class SyncProducer:
         self._realtime = False
         self._errors = np.zeros(len(self._configured), dtype=np.int64)
         self._unsent = np.zeros(len(self._configured), dtype=np.int64)
+        self._times = np.zeros(TIMES, dtype=np.int64)
         self._thread: threading.Thread | None = None
         self._buses: list[FrameBus] = []
         self._loop: Loop | None = None
@@ -127,7 +129,7 @@ class SyncProducer:
         sockets = [bus.fileno() for bus in self._buses if isinstance(bus, RawSocket)]
         if len(sockets) == len(self._buses):
             fixed = np.array(sockets, np.int64), self._period_ns, self._counter
-            self._loop = Loop(*fixed, self._state, self._late, self._errors, self._unsent)
+            self._loop = Loop(*fixed, self._state, self._late, self._errors, self._unsent, self._times)
         run = self._run_interpreted if self._loop is None else self._run_compiled
         self._thread = threading.Thread(target=run, name="sync", daemon=True)
         self._thread.start()
@@ -182,6 +184,18 @@ class SyncProducer:
     def sent(self) -> int:
         """Number of SYNCs sent, and so the number k of the next one."""
         return int(self._state[SENT])
+
+    def sent_at(self, first: int) -> tuple[int, NDArray[np.int64]]:
+        """When SYNCs were sent, from ``first`` on or the first whose time is still known.
+
+        Returns
+        -------
+        tuple
+            Number of the first of them, and the times in ns UTC, shape (N,), the SYNC that is being sent included.
+        """
+        first = max(first, self.sent + 1 - TIMES, 0)
+        utc = time.time_ns() - time.monotonic_ns()
+        return first, self._times[np.arange(first, self.sent + 1) % TIMES] + utc
 
     @property
     def first(self) -> int | None:
@@ -253,6 +267,7 @@ class SyncProducer:
                 base += int(late / period) * period
             self._late[min(BINS - 1, int(late * 1e9) // BIN_NS)] += 1
             state[LATE_MAX] = max(int(state[LATE_MAX]), int(late * 1e9))
+            self._times[k % TIMES] = time.monotonic_ns()
             row = int(state[ROW])
             due = row < len(rows) and is_knot(k + 1, every)
             batch = frames(1 + (len(cob_ids) if due else 0))

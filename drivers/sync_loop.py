@@ -26,6 +26,9 @@ buses refuse SYNC."""
 
 STATE_SIZE = 11
 
+TIMES = 1 << 16
+"""So many SYNCs have the times kept at which they were sent."""
+
 _SEND_ATTEMPTS = 5000
 _RETRY_NS = 100_000
 _FEW_ATTEMPTS = 3
@@ -61,6 +64,8 @@ class Loop:
         Shared state and histogram of the lateness.
     errors, unsent
         Per bus the errno with which it refused the last SYNC (0: none), and how many SYNCs it refused.
+    times
+        Ring of the monotonic clock just before SYNC k was sent, at ``k % TIMES``, ns.
     """
 
     def __init__(
@@ -72,9 +77,10 @@ class Loop:
         late: NDArray[np.int64],
         errors: NDArray[np.int64],
         unsent: NDArray[np.int64],
+        times: NDArray[np.int64],
     ) -> None:
         self._fixed = (descriptors, period_ns, counter)
-        self._shared = (late, errors, unsent)
+        self._shared = (late, errors, unsent, times)
         self._state = state
         self._spec = np.zeros(2, dtype=np.int64)
         ended = np.ones(STATE_SIZE, dtype=np.int64)
@@ -156,7 +162,7 @@ def send_messages(descriptor, address, count, attempts, spec):  # type: ignore[n
 
 @njit(nogil=True, cache=True)
 def _run(  # type: ignore[no-untyped-def]
-    descriptors, period, counter, state, late, errors, unsent, address, body, first, place, rows, every, spec
+    descriptors, period, counter, state, late, errors, unsent, times, address, body, first, place, rows, every, spec
 ):
     buses = descriptors.size
     if state[BASE_NS] == 0:
@@ -179,6 +185,7 @@ def _run(  # type: ignore[no-untyped-def]
             for j in range(rows.shape[1]):
                 body[place[j], 2] = rows[state[ROW], j]
             state[ROW] += 1
+        times[k % TIMES] = now
         refused, code = 0, 0
         for b in range(buses):
             body[first[b], 2] = k % counter + 1

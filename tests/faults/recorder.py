@@ -28,8 +28,8 @@ def warm() -> None:
         where = (0, buses - 1)
         Assembler(streams, ("a", "b"), 1_000_000, bus_of=where).warm_up(frames(2))
     state, late = np.zeros(sync_loop.STATE_SIZE, np.int64), np.zeros(sync_loop.BINS, np.int64)
-    one, other, third = np.zeros((3, 1), np.int64)
-    sync_loop.Loop(one, 1_000_000, 240, state, late, other, third)
+    one, other, third, times = np.zeros((4, 1), np.int64)
+    sync_loop.Loop(one, 1_000_000, 240, state, late, other, third, times)
 
 
 class Capture:

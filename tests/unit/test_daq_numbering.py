@@ -136,3 +136,18 @@ def test_a_bus_whose_frames_waited_finds_its_numbers_by_the_times_of_another(hel
     values = np.concatenate([row.data[:, :, :8].copy().view("<i8")[:, :, 0] for row in rows])
     np.testing.assert_array_equal(values, np.repeat(numbers[:, None], 2, axis=1))
     assert numbers.size >= count - before
+
+
+@pytest.mark.parametrize("turns", [1.0, 1.1, 2.4, 40.0])
+@pytest.mark.parametrize("lost", [0, 700])
+def test_our_own_syncs_are_told_by_when_we_sent_them_where_frames_are_lost(turns: float, lost: int) -> None:
+    assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW)
+    stall = round(turns * OVERFLOW) * PERIOD_NS
+    sent = answered(list(range(2000)), lambda k: stall if k >= 500 else 0)
+    # Sent a little before the kernel stamps them, the last of them not counted yet.
+    assembler.when_sent = lambda first: (first, sent["t_ns"][3 * first :: 3] - 30_000)
+    gaps = list(assembler.push(sent[:900], sent=2000).gaps)
+    gaps += assembler.push(sent[3 * (300 + lost) :], sent=1999, dropped=True).gaps
+    gaps += assembler.finish(2000).gaps
+    assert outages(gaps) == ([(300, 300 + lost - 1)] if lost else [])
+    assert assembler.counters["samples.expected"] == 2000
