@@ -113,7 +113,9 @@ class QueuedSeries:
     ) -> None:
         """Add rows to a stream: ``sync`` and ``t_ns`` of shape (N,), each of ``raw`` (N, n); none may change after."""
         size = sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
-        if self._put_bytes - self._done_bytes + size > self._most_bytes:
+        # Not one in, one out: a disk that is too slow gets few long gaps.
+        room = self._most_bytes // 2 if self._left_out else self._most_bytes
+        if self._put_bytes - self._done_bytes + size > room:
             self._left_out.add(stream, sync)
             self._left_out_rows += len(sync)
             return

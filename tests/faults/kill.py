@@ -103,8 +103,7 @@ class Lane:
             kept = self._checked(files, heard, wrong)
         except Exception as error:
             wrong.append(f"{type(error).__name__}: {error}")
-        # What comes until the next SYNC belongs to the last.
-        lost_ms = float(at_ns - heard[kept - 1]) / 1e6 if 0 < kept < heard.size else (0.0 if kept else np.inf)
+        lost_ms = _lost_ms(np.append(heard[max(kept, 1) - 1 :], at_ns), 10**9 // rate) if kept else np.inf
         if lost_ms > MOST_LOST_MS:
             wrong.append(f"{lost_ms:.1f} ms lost")
         shutil.rmtree(out)
@@ -139,6 +138,14 @@ class Lane:
         if not (right & (samples.raw["current"] == current_of(k, joints))).all():
             wrong.append("values are not of their SYNC")
         return int(min(together.size, heard.size))
+
+
+def _lost_ms(times: NDArray[np.int64], period_ns: int) -> float:
+    """Time that the samples cover between the first of ``times``, that of the last SYNC kept, and the last, the kill.
+
+    What comes until the next SYNC belongs to the last. A machine that stood still as a whole lost no samples meanwhile.
+    """
+    return float(np.minimum(np.diff(times), period_ns).sum()) / 1e6 if times.size > 2 else 0.0
 
 
 def in_lanes(rounds: int, seed: int, lanes: int) -> list[Kill]:

@@ -13,6 +13,7 @@ import pytest
 from configs import ConfigError
 from daq.recording import (
     Mark,
+    QueuedSeries,
     Recording,
     RecordingSeries,
     RecordingWriter,
@@ -34,7 +35,7 @@ def beginner(recording: Recording, chunk_ns: int = 20_000_000) -> Callable[[Path
     )
 
 
-def write(series: RecordingSeries, recording: Recording, step: int = 50) -> list[Path]:
+def write(series: RecordingSeries | QueuedSeries, recording: Recording, step: int = 50) -> list[Path]:
     """Append a recording as a capture does, in batches; the files that were finished on the way."""
     finished = []
     samples, demand = recording.streams["samples"], recording.streams["demand"]
