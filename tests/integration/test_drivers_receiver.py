@@ -1,0 +1,41 @@
+"""Several buses read by one thread: none waits for the backlog of another."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from drivers.frames import Frames, frames
+from drivers.receiver import BATCH, Receiver
+from drivers.socketcan import RawSocket
+
+pytestmark = pytest.mark.vcan
+
+
+def numbered(first: int, count: int) -> Frames:
+    """Frames whose data are their number."""
+    batch = frames(count)
+    batch["can_id"], batch["length"] = 0x181, 8
+    batch["data"] = np.arange(first, first + count, dtype="<u8").view(np.uint8).reshape(count, 8)
+    return batch
+
+
+def test_a_bus_that_had_nothing_is_asked_again_behind_every_batch_of_another(vcan_buses: list[str]) -> None:
+    quiet, busy = vcan_buses
+    with (
+        RawSocket(quiet, filters=()) as one,
+        RawSocket(busy, filters=()) as other,
+        Receiver([partial(RawSocket, name) for name in vcan_buses]) as receiver,
+    ):
+        backlog = 3 * BATCH + 5
+        other.send(numbered(0, backlog))
+        order: list[tuple[int, int]] = []
+        for bus, batch, dropped in receiver.drain():
+            assert not dropped
+            numbers = batch["data"].copy().view("<u8").ravel()
+            order.append((bus, int(numbers[0])))
+            if len(order) == 1:
+                one.send(numbered(0, 7))
+        # Frames that came while the backlog was read do not wait for its end.
+        assert order == [(1, 0), (0, 0), (1, BATCH), (1, 2 * BATCH), (1, 3 * BATCH)]
+        assert [bus for bus, _, _ in receiver.drain()] == []
