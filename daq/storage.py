@@ -33,23 +33,24 @@ def open_series(
     options = session.recording
     layouts = [stream.layout for stream in streams]
     every = {layout.name: layout.every for layout in layouts}
+    # What is still in the kernel, and on the way to the disk, is lost with the chunk.
+    chunk_ns = round(max(options.chunk_ms - 2.5 * options.drain_ms, options.chunk_ms / 4) * 1e6)
 
     def begin(path: Path, part: int) -> RecordingWriter:
         facts = metadata | {"part": str(part)}
-        # What is still in the kernel, and on the way to the disk, is lost with the chunk.
-        chunk_ns = round(max(options.chunk_ms - 2.5 * options.drain_ms, options.chunk_ms / 4) * 1e6)
         rate = 1.0 / session.sync_period
-        return RecordingWriter(path, robot, session, rate, layouts, facts, chunk_ns, options.look_hz)
+        # By itself a writer ends chunks only where much comes at once.
+        return RecordingWriter(path, robot, session, rate, layouts, facts, 2 * chunk_ns, options.look_hz)
 
     max_bytes, max_ns = limits(options)
     if options.trigger is None:
-        return QueuedSeries(RecordingSeries(begin, directory, name, max_bytes, max_ns), every)
+        return QueuedSeries(RecordingSeries(begin, directory, name, max_bytes, max_ns), every, chunk_ns)
 
     def event(_: int) -> RecordingSeries:
         now = capture_stamp(datetime.datetime.now(datetime.UTC))
         return RecordingSeries(begin, directory, f"{robot.name}-{now}", max_bytes, max_ns)
 
-    return QueuedSeries(TriggeredSeries(event, *kept_around(options.trigger)), every)
+    return QueuedSeries(TriggeredSeries(event, *kept_around(options.trigger)), every, chunk_ns)
 
 
 def kept_around(trigger: Trigger) -> tuple[int, int]:

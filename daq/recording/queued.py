@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
 from types import TracebackType
@@ -20,6 +20,7 @@ MOST_WAITING_BYTES = 128 << 20
 """Rows that may wait for the disk: a minute of six buses at 5 kHz, five minutes of one."""
 
 _Do = Callable[[], object]
+_Rows = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,38 @@ class _State:
     """Rows left out that it has been told of."""
 
 
+@dataclass
+class _Chunk:
+    """What is handed over at once: rows of each stream as they came, gaps and when they were found, marks."""
+
+    rows: dict[str, list[_Rows]] = field(default_factory=dict)
+    gaps: list[tuple[Sequence[Gap], int]] = field(default_factory=list)
+    marks: list[Mark] = field(default_factory=list)
+    since: int | None = None
+    bytes: int = 0
+    count: int = 0
+
+    def add(self, stream: str, rows: _Rows, size: int) -> None:
+        self.rows.setdefault(stream, []).append(rows)
+        self.bytes += size
+        self.count += len(rows[0])
+
+    def write(self, series: RecordingSeries | TriggeredSeries) -> None:
+        if self.since is not None:
+            series.turn(self.since)
+        # Before the rows behind them: a file that ends in the middle says what is missing in what it has.
+        for gaps, found_ns in self.gaps:
+            series.add_gaps(gaps, found_ns)
+        for stream, parts in self.rows.items():
+            sync, t_ns = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+            raw = {name: np.concatenate([part[2][name] for part in parts]) for name in parts[0][2]}
+            series.append(stream, sync, t_ns, raw)
+        series.add_marks(self.marks)
+        series.flush()
+
+
 class QueuedSeries:
-    """Stands in the place of the series that it writes to; what it is told is done in the same order, a little later.
+    """Stands in the place of the series that it writes to: gathers rows, and has a thread write them chunk by chunk.
 
     A disk that stands still for seconds (a worn memory card, a busy server) costs memory and no samples. When
     ``most_bytes`` wait, rows are left out until there is room again: they count in :attr:`lost_rows` and become gaps,
@@ -46,6 +77,8 @@ class QueuedSeries:
         What is written; nobody else may use it.
     every
         Of each stream, on every how many SYNCs it has a row.
+    chunk_ns
+        Time that rows are gathered for, ns; they are on the disk soon after.
     most_bytes
         Of rows that wait.
     """
@@ -54,13 +87,15 @@ class QueuedSeries:
         self,
         series: RecordingSeries | TriggeredSeries,
         every: Mapping[str, int],
+        chunk_ns: int,
         most_bytes: int = MOST_WAITING_BYTES,
     ) -> None:
-        self._series, self._most_bytes = series, most_bytes
+        self._series, self._chunk_ns, self._most_bytes = series, chunk_ns, most_bytes
+        self._chunk = _Chunk()
         self._state = _State(series.path, series.lost_rows, series.problem, 0)
         self._work: SimpleQueue[tuple[_Do, int, int] | threading.Event | None] = SimpleQueue()
         self._failure: BaseException | None = None
-        # Of rows, what was put in and what was taken out: each is counted by one thread.
+        # Of rows, what was handed over and what was done with: each is counted by one thread.
         self._put_bytes = self._put_rows = self._done_bytes = self._done_rows = 0
         self._left_out, self._left_out_rows, self._told_rows = Spans(every), 0, 0
         self._thread: threading.Thread | None = threading.Thread(target=self._run, name="disk", daemon=True)
@@ -94,46 +129,53 @@ class QueuedSeries:
 
     def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
         """Change when a file is full."""
-        self._put(lambda: self._series.limit(max_bytes, max_ns))
+        self._do(lambda: self._series.limit(max_bytes, max_ns))
 
     def keep(self, before_ns: int, after_ns: int) -> None:
         """Change how much is kept before and after a trigger from now on, ns."""
-        self._put(lambda: self._series.keep(before_ns, after_ns))
+        self._do(lambda: self._series.keep(before_ns, after_ns))
 
     def trigger(self, t_ns: int) -> None:
         """Have what was just recorded, and what follows, written where only events are."""
-        self._put(lambda: self._series.trigger(t_ns))
+        self._do(lambda: self._series.trigger(t_ns))
 
     def turn(self, t_ns: int) -> None:
-        """Begin a new file if the last is full at ``t_ns``, the time of the rows to come."""
-        self._put(lambda: self._series.turn(t_ns))
+        """Rows that begin at ``t_ns`` are to come: a new file may be begun with them."""
+        if self._chunk.since is None:
+            self._chunk.since = t_ns
 
     def append(
         self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> None:
         """Add rows to a stream: ``sync`` and ``t_ns`` of shape (N,), each of ``raw`` (N, n); none may change after."""
+        if len(sync) == 0:
+            return
+        self._check()
         size = sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
         # Not one in, one out: a disk that is too slow gets few long gaps.
         room = self._most_bytes // 2 if self._left_out else self._most_bytes
-        if self._put_bytes - self._done_bytes + size > room:
+        if self._chunk.bytes + self._put_bytes - self._done_bytes + size > room:
             self._left_out.add(stream, sync)
             self._left_out_rows += len(sync)
             return
         self._own_up()
-        self._put(lambda: self._series.append(stream, sync, t_ns, raw), size, len(sync))
+        self.turn(int(t_ns[0]))
+        self._chunk.add(stream, (sync, t_ns, raw), size)
+        if self._chunk.since is not None and t_ns[-1] - self._chunk.since >= self._chunk_ns:
+            self._hand_over()
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
         """Record gaps found at ``t_ns``."""
-        self._put(lambda: self._series.add_gaps(gaps, t_ns))
+        self._chunk.gaps.append((gaps, t_ns))
 
     def add_marks(self, marks: Sequence[Mark]) -> None:
         """Record marks."""
-        self._put(lambda: self._series.add_marks(marks))
+        self._chunk.marks += marks
 
     def flush(self) -> None:
         """Bring all of it to the disk; returns when it is there."""
         self._own_up()
-        self._put(self._series.flush)
+        self._hand_over()
         self._wait()
 
     def close(self, counters: Mapping[str, int]) -> None:
@@ -144,8 +186,7 @@ class QueuedSeries:
         ConfigError
             If the disk does not take its end; what is there remains readable as a torn file.
         """
-        self._own_up()
-        self._wait()
+        self.flush()
         self._end()
         self._series.close(counters)
 
@@ -171,22 +212,34 @@ class QueuedSeries:
             self._series.leave_out(left_out)
             self._told_rows = rows
 
-        self._put(tell)
+        self._do(tell)
 
-    def _put(self, do: _Do, size: int = 0, rows: int = 0) -> None:
+    def _do(self, do: _Do) -> None:
+        """Have something done behind what has been gathered so far."""
+        self._hand_over()
+        self._put(do)
+
+    def _hand_over(self) -> None:
+        chunk, self._chunk = self._chunk, _Chunk()
+        self._put(lambda: chunk.write(self._series), chunk.bytes, chunk.count)
+
+    def _check(self) -> None:
+        """Raise what went wrong in the thread, if something did."""
         if self._failure is not None:
             raise self._failure
+
+    def _put(self, do: _Do, size: int = 0, rows: int = 0) -> None:
+        self._check()
         self._put_bytes += size
         self._put_rows += rows
         self._work.put((do, size, rows))
 
     def _wait(self) -> None:
-        """Until all that was put in is done."""
+        """Until all that was handed over is done."""
         done = threading.Event()
         self._work.put(done)
         done.wait()
-        if self._failure is not None:
-            raise self._failure
+        self._check()
 
     def _end(self) -> None:
         if self._thread is not None:
@@ -204,7 +257,7 @@ class QueuedSeries:
                 if self._failure is None:
                     do()
             except BaseException as error:
-                # Raised where something is put in next.
+                # Raised where something is handed over next.
                 self._failure = error
             series = self._series
             self._state = _State(series.path, series.lost_rows, series.problem, self._told_rows)

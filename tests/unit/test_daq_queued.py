@@ -10,12 +10,22 @@ import numpy as np
 import pytest
 
 from configs import ConfigError
-from daq.recording import Gap, QueuedSeries, RecordingSeries, Stream, TriggeredSeries, read_recording
+from daq.recording import (
+    Gap,
+    Mark,
+    QueuedSeries,
+    RecordingSeries,
+    Stream,
+    TriggeredSeries,
+    join_parts,
+    read_recording,
+)
 from daq.recording.unwritten import NOT_WRITTEN
 from tests.unit.test_daq_recording import make_recording
 from tests.unit.test_daq_series import NAME, beginner, write
 
 EVERY = {"samples": 1, "demand": 5}
+CHUNK_NS = 20_000_000
 
 
 @pytest.fixture
@@ -48,24 +58,44 @@ def until(true: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-def test_files_hold_the_same_as_without_a_thread(tmp_path: Path) -> None:
+def test_every_row_is_in_exactly_one_file_as_without_a_thread(tmp_path: Path) -> None:
     recording = make_recording(3000)
-    with RecordingSeries(beginner(recording), tmp_path / "here", NAME, max_bytes=60_000) as plain:
-        write(plain, recording)
-        plain.close({"frames": 7})
-    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path / "there", NAME, max_bytes=60_000), EVERY)
+    series = QueuedSeries(
+        RecordingSeries(beginner(recording, 2 * CHUNK_NS), tmp_path, NAME, max_bytes=60_000), EVERY, CHUNK_NS
+    )
     with series:
         write(series, recording)
+        series.add_gaps([Gap("samples", 3003, 3003, "joint_1", "no answer")], int(recording.samples.t_ns[-1]))
+        series.add_marks([Mark("note", 17, int(recording.samples.t_ns[14]), "here")])
         series.close({"frames": 7})
     assert len(series.paths) > 3
-    assert [path.name for path in series.paths] == [path.name for path in plain.paths]
-    for one, other in zip(plain.paths, series.paths, strict=True):
-        assert one.read_bytes() == other.read_bytes()
+    parts = [read_recording(path) for path in series.paths]
+    assert all(part.missing is None for part in parts)
+    assert parts[-1].counters == {"frames": 7}
+    assert [mark.text for part in parts for mark in part.marks] == ["here"]
+    assert [gap.first for part in parts for gap in part.gaps] == [3003]
+    whole = join_parts(parts)
+    for name, stream in recording.streams.items():
+        assert np.array_equal(whole.streams[name].sync, stream.sync)
+        for field, values in stream.raw.items():
+            assert np.array_equal(whole.streams[name].raw[field], values)
+
+
+def test_a_killed_capture_loses_no_more_than_a_chunk(tmp_path: Path) -> None:
+    recording = make_recording(1500)
+    series = QueuedSeries(RecordingSeries(beginner(recording, 2 * CHUNK_NS), tmp_path, NAME), EVERY, CHUNK_NS)
+    with series:
+        for first in range(0, 1500, 10):
+            append(series, recording.samples, first, first + 10)
+            until(lambda: series.waiting_rows == 0)
+            # What is on the disk by now, if it ended here.
+            rows = read_recording(series.paths[0]).samples.t_ns if first > 150 else None
+            assert rows is None or recording.samples.t_ns[first] - rows[-1] <= CHUNK_NS + 2_000_000
 
 
 def test_a_disk_that_stands_still_costs_no_row(tmp_path: Path, disk: threading.Event) -> None:
     recording = make_recording(3000)
-    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY)
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
     with series:
         disk.clear()
         begun = time.monotonic()
@@ -89,7 +119,7 @@ def test_rows_for_which_there_is_no_room_are_counted_and_become_gaps(
     recording = make_recording(3000)
     samples, demand = recording.samples, recording.streams["demand"]
     inner = RecordingSeries(beginner(recording), tmp_path, NAME, **limits)
-    series, lost = QueuedSeries(inner, EVERY, most_bytes=50_000), [0]
+    series, lost = QueuedSeries(inner, EVERY, CHUNK_NS, most_bytes=50_000), [0]
     with series:
         append(series, samples, 0, 500)
         series.flush()
@@ -131,7 +161,7 @@ def test_an_event_tells_what_its_last_seconds_lack(tmp_path: Path, disk: threadi
     inner = TriggeredSeries(
         lambda number: RecordingSeries(beginner(recording), tmp_path, f"event{number}"), 10**9, 10**8
     )
-    series = QueuedSeries(inner, EVERY, most_bytes=50_000)
+    series = QueuedSeries(inner, EVERY, CHUNK_NS, most_bytes=50_000)
     with series:
         append(series, recording.samples, 0, 200)
         series.trigger(int(recording.samples.t_ns[199]))
@@ -163,7 +193,7 @@ def test_an_event_tells_what_its_last_seconds_lack(tmp_path: Path, disk: threadi
 def test_gaps_and_marks_wait_for_the_disk_however_many_rows_do(tmp_path: Path, disk: threading.Event) -> None:
     recording = make_recording(1000)
     gap = Gap("samples", 1000, 1007, "joint_1", "no answer")
-    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, most_bytes=10_000)
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS, most_bytes=10_000)
     with series:
         disk.clear()
         for first in range(0, 1000, 50):
@@ -177,7 +207,7 @@ def test_gaps_and_marks_wait_for_the_disk_however_many_rows_do(tmp_path: Path, d
 
 def test_what_fails_in_the_thread_is_raised_where_rows_come_from(tmp_path: Path) -> None:
     recording = make_recording(100)
-    with QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), {"samples": 1}) as series:
+    with QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), {"samples": 1}, CHUNK_NS) as series:
         series.append("another", np.arange(3), np.arange(3), {})
         with pytest.raises(KeyError, match="another"):
             series.flush()
@@ -187,7 +217,7 @@ def test_what_fails_in_the_thread_is_raised_where_rows_come_from(tmp_path: Path)
 
 def test_a_disk_that_does_not_take_the_end_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = make_recording(100)
-    with QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY) as series:
+    with QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS) as series:
         append(series, recording.samples, 0, 50)
 
         def refuse(descriptor: int) -> None:
@@ -199,5 +229,5 @@ def test_a_disk_that_does_not_take_the_end_is_told(tmp_path: Path, monkeypatch: 
 
 
 def test_nothing_is_left_of_a_capture_that_did_not_begin(tmp_path: Path) -> None:
-    QueuedSeries(RecordingSeries(beginner(make_recording(100)), tmp_path, NAME), EVERY).abort()
+    QueuedSeries(RecordingSeries(beginner(make_recording(100)), tmp_path, NAME), EVERY, CHUNK_NS).abort()
     assert list(tmp_path.iterdir()) == []
