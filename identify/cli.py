@@ -140,6 +140,9 @@ def history(
     robot: Annotated[
         str | None, typer.Option(help="Whose runs. [default: that of the results, or the only one]")
     ] = None,
+    cell: Annotated[
+        str | None, typer.Option(help="Where the robot stands. [default: the cell of the results, or the only one]")
+    ] = None,
     parameter: Annotated[list[str] | None, typer.Option(help="Parameter to show; may be given more than once.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Plot parameters over time (.png, .svg, .pdf).")] = None,
     false_alarms: Annotated[
@@ -155,7 +158,7 @@ def history(
     """
     from identify.history_command import history_command
 
-    code = history_command(documents or [], database, robot, parameter or [], plot, false_alarms, as_json=json)
+    code = history_command(documents or [], database, robot, cell, parameter or [], plot, false_alarms, as_json=json)
     if code:
         raise typer.Exit(code)
 

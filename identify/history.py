@@ -3,7 +3,7 @@
 import datetime
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -197,19 +197,36 @@ class History:
         except sa.exc.SQLAlchemyError as error:
             raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
 
-    def first(self, robot: str) -> Run | None:
-        """The identification of a robot whose recording is the oldest, of those that converged."""
-        query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document)
-        query = query.where(_runs.c.robot == robot, _runs.c.converged)
-        found = self._read(query.order_by(_runs.c.recorded, _runs.c.id).limit(1))
+    def first(self, robot: str, cell: str | None = None) -> Run | None:
+        """The identification of an arm whose recording is the oldest, of those that converged; see `runs`."""
+        found = self._read(_of(robot, cell).where(_runs.c.converged).limit(1))
         return found[0] if found else None
 
-    def runs(self, robot: str | None = None) -> list[Run]:
-        """Identifications in the order in which their recordings were made."""
-        query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document).order_by(_runs.c.recorded, _runs.c.id)
-        if robot is not None:
-            query = query.where(_runs.c.robot == robot)
-        return self._read(query)
+    def runs(self, robot: str | None = None, cell: str | None = None) -> list[Run]:
+        """Identifications in the order in which their recordings were made.
+
+        Parameters
+        ----------
+        robot
+            Name of the robot; ``None``: all.
+        cell
+            Where it stands, as arms of one make often share a name; ``None``: anywhere. Runs of which the history
+            does not know the recording, and so the cell, may be of any.
+        """
+        return self._read(_of(robot, cell))
+
+    def arms(self) -> list[tuple[str, str | None]]:
+        """Robots and their cells, ``None`` where the history does not know them."""
+        query = sa.select(_runs.c.robot, _recordings.c.cell).select_from(_WHERE).distinct()
+        with self._engine.connect() as connection:
+            found = [(robot, cell) for robot, cell in connection.execute(query).all()]
+        return sorted(found, key=lambda arm: (arm[0], arm[1] or ""))
+
+    def cell(self, document: IdentificationDocument) -> str | None:
+        """Cell of an identification's recording, if the history knows it."""
+        query = sa.select(_recordings.c.cell).where(_recordings.c.sha256 == document.recording.sha256)
+        with self._engine.connect() as connection:
+            return connection.execute(query).scalar_one_or_none()
 
     def _read(self, query: sa.Select[Any]) -> list[Run]:
         try:
@@ -222,10 +239,18 @@ class History:
             for number, recorded, text in rows
         ]
 
-    def robots(self) -> Sequence[str]:
-        """Names of the robots that it knows."""
-        with self._engine.connect() as connection:
-            return connection.execute(sa.select(_runs.c.robot).distinct().order_by(_runs.c.robot)).scalars().all()
+
+_WHERE = _runs.outerjoin(_recordings, _runs.c.sha256 == _recordings.c.sha256)
+
+
+def _of(robot: str | None, cell: str | None) -> sa.Select[Any]:
+    """Runs of an arm in the order of their recordings."""
+    query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document).select_from(_WHERE)
+    if robot is not None:
+        query = query.where(_runs.c.robot == robot)
+    if cell is not None:
+        query = query.where(sa.or_(_recordings.c.cell == cell, _recordings.c.cell.is_(None)))
+    return query.order_by(_runs.c.recorded, _runs.c.id)
 
 
 def _digest(document: IdentificationDocument) -> str:

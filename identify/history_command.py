@@ -19,18 +19,19 @@ def history_command(
     documents: Sequence[Path],
     database: str,
     robot: str | None,
+    cell: str | None,
     parameters: Sequence[str],
     plot: Path | None,
     false_alarms: float,
     *,
     as_json: bool,
 ) -> int:
-    """Add documents, list the runs of a robot beside its first one, plot parameters; the exit code.
+    """Add documents, list the runs of an arm beside its first one, plot parameters; the exit code.
 
     Raises
     ------
     ConfigError
-        If the database, the robot, a parameter or the plot is wrong.
+        If the database, robot, cell, a parameter or the plot is wrong.
     DataError
         If a document is, or the runs are of different models.
     """
@@ -38,16 +39,19 @@ def history_command(
     history = History(database)
     for document, path in loaded:
         history.add(document, recorded_at(document, path))
-    runs = history.runs(_robot(history, robot, [document.robot for document, _ in loaded]))
+    wanted = _robot(history, robot, [document.robot for document, _ in loaded])
+    here = _cell(history, wanted, cell, [document for document, _ in loaded])
+    runs = history.runs(wanted, here)
+    title = wanted if here is None else f"{wanted} in cell {here}"
     first = next((k for k, run in enumerate(runs) if run.document.converged), len(runs))
     drifts = [_compared(runs[first], run, false_alarms) if k > first else None for k, run in enumerate(runs)]
     _check(parameters, runs)
     if plot is not None:
-        _plot(plot, runs, parameters or _most_changed(drifts, runs))
+        _plot(plot, title, runs, parameters or _most_changed(drifts, runs))
     if as_json:
         print(json.dumps([_entry(run, drift) for run, drift in zip(runs, drifts, strict=True)], indent=1))
     else:
-        _table(runs, drifts, parameters)
+        _table(title, runs, drifts, parameters)
     last = drifts[-1]
     return DRIFTED if last is not None and last.drifted else 0
 
@@ -60,7 +64,7 @@ def _compared(first: Run, run: Run, false_alarms: float) -> Drift | None:
 
 
 def _robot(history: History, wanted: str | None, added: Sequence[str]) -> str:
-    known = history.robots()
+    known = sorted({name for name, _ in history.arms()})
     names = set(added) if wanted is None else {wanted}
     if wanted is None and not added:
         names = set(known)
@@ -68,6 +72,19 @@ def _robot(history: History, wanted: str | None, added: Sequence[str]) -> str:
         have = ", ".join(known) or "none yet"
         raise ConfigError(f"--robot: say which of the robots in the history: {have}")
     return names.pop()
+
+
+def _cell(history: History, robot: str, wanted: str | None, added: Sequence[IdentificationDocument]) -> str | None:
+    """Cell of the arm that is meant; ``None`` where the history knows none of its robots' cells."""
+    known = sorted({cell for name, cell in history.arms() if name == robot and cell is not None})
+    if wanted is not None:
+        if wanted not in known:
+            raise ConfigError(f"--cell: no {wanted!r}; {robot} is known in {', '.join(known) or 'no cell'}")
+        return wanted
+    cells = {cell for cell in map(history.cell, added) if cell is not None} or set(known)
+    if len(cells) > 1:
+        raise ConfigError(f"--cell: say in which cell; {robot} is known in {', '.join(known)}")
+    return cells.pop() if cells else None
 
 
 def _check(parameters: Sequence[str], runs: Sequence[Run]) -> None:
@@ -103,11 +120,11 @@ def _entry(run: Run, drift: Drift | None) -> dict[str, object]:
     }
 
 
-def _table(runs: Sequence[Run], drifts: Sequence[Drift | None], parameters: Sequence[str]) -> None:
+def _table(title: str, runs: Sequence[Run], drifts: Sequence[Drift | None], parameters: Sequence[str]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=runs[0].document.robot)
+    table = Table(title=title)
     for heading in ("recorded (UTC)", "recording", "error", *parameters, "beside the first"):
         table.add_column(heading, justify="left" if heading in ("recording", "beside the first") else "right")
     first = next((run for run in runs if run.document.converged), None)
@@ -123,7 +140,7 @@ def _table(runs: Sequence[Run], drifts: Sequence[Drift | None], parameters: Sequ
     Console().print(table)
 
 
-def _plot(path: Path, runs: Sequence[Run], parameters: Sequence[str]) -> None:
+def _plot(path: Path, title: str, runs: Sequence[Run], parameters: Sequence[str]) -> None:
     """One row a parameter, against the time of the recordings, with two standard deviations."""
     import matplotlib.pyplot as plt
 
@@ -137,7 +154,7 @@ def _plot(path: Path, runs: Sequence[Run], parameters: Sequence[str]) -> None:
         axis.axhspan(values[0] - 2 * deviations[0], values[0] + 2 * deviations[0], color="0.9")
         axis.errorbar(times, values, 2 * deviations, fmt="o", markersize=3, linewidth=1, capsize=2)
         axis.set_ylabel(f"{name}\n{found[0].unit}")
-    axes[0, 0].set_title(f"{runs[0].document.robot}: two standard deviations; the band is that of the first run")
+    axes[0, 0].set_title(f"{title}: two standard deviations; the band is that of the first run")
     figure.autofmt_xdate()
     figure.tight_layout()
     try:

@@ -24,17 +24,17 @@ class Baseline:
         return f"first run of {document.robot}: it is the baseline from now on, kept as {self.file}"
 
 
-def baseline_of(file: Path | None, history: History, robot: str) -> Baseline:
-    """The baseline of a robot.
+def baseline_of(file: Path | None, history: History, robot: str, cell: str) -> Baseline:
+    """The baseline of the robot in a cell.
 
     Raises
     ------
     ConfigError
-        If ``file`` is missing although the history knows runs of this robot: a name misspelt, and not a first run.
+        If ``file`` is missing although the history knows runs of this arm: a name misspelt, and not a first run.
     DataError
         If it is of another robot.
     """
-    first = history.first(robot)
+    first = history.first(robot, cell)
     if file is None:
         if first is None:
             return Baseline(None, "none yet")

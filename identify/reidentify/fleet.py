@@ -27,6 +27,9 @@ DRIFTED, FAILED = 4, 1
 """Exit codes: an arm has changed; none has, and a recording could not be identified."""
 CONNECT_S = 10.0
 
+_Arm = tuple[str, str | None]
+"""Names of robot and cell, as arms of one make often share a name."""
+
 
 @dataclass(frozen=True)
 class Identified:
@@ -53,7 +56,7 @@ def fleet_command(pattern: str, asked: Asked, *, as_json: bool) -> int:
     """Carry out ``armident reidentify --recordings``; the exit code.
 
     Recordings are judged in the order of their names. Each is compared with the baseline, or with the first run of its
-    robot in the history; one that fails does not stop the others.
+    arm (robot and cell) in the history; one that fails does not stop the others.
 
     Raises
     ------
@@ -67,8 +70,8 @@ def fleet_command(pattern: str, asked: Asked, *, as_json: bool) -> int:
     known = None if asked.baseline is None else load_document(asked.baseline, IdentificationDocument)
     history = History(asked.store)
     rows: list[Row] = []
-    # Of each robot one baseline for all: an older recording that comes later must not take its place.
-    baselines: dict[str, IdentificationDocument] = {}
+    # Of each arm one baseline for all: an older recording that comes later must not take its place.
+    baselines: dict[_Arm, IdentificationDocument] = {}
     with cluster(asked.scheduler, asked.workers) as client:
         futures = [
             client.submit(identify_one, str(path), robot, _folder(path, asked.out), pure=False) for path in paths
@@ -142,21 +145,22 @@ def _judged(
     future: Any,
     history: History,
     known: IdentificationDocument | None,
-    baselines: dict[str, IdentificationDocument],
+    baselines: dict[_Arm, IdentificationDocument],
     false_alarms: float,
 ) -> Row:
     try:
         found: Identified = future.result()
         document = from_json(found.text, IdentificationDocument, str(path))
-        first = known or baselines.get(document.robot) or _first(history, document.robot)
+        arm = document.robot, found.facts["cell"]
+        first = known or baselines.get(arm) or _first(history, *arm)
         history.describe(found.facts)
         history.add(document, History.began(found.facts, document, Path(found.path)))
         if not document.converged:
             raise DataError(f"the identification did not converge ({document.stop_reason})")
-        baselines.setdefault(document.robot, first or document)
+        baselines.setdefault(arm, first or document)
         drift = None if first is None else compare(first, document, false_alarms)
         if drift is None or first is None:
-            return Row(str(path), words=(f"first run of {document.robot}: the baseline",), identification=found.path)
+            return Row(str(path), words=(f"first run of {_name(*arm)}: the baseline",), identification=found.path)
         history.judge(document, first, drift)
     except (ArmidentError, OSError, RuntimeError) as error:
         return Row(str(path), error=" ".join(str(error).split()))
@@ -164,9 +168,13 @@ def _judged(
     return Row(str(path), drift=drift, words=words, identification=found.path)
 
 
-def _first(history: History, robot: str) -> IdentificationDocument | None:
-    run = history.first(robot)
+def _first(history: History, robot: str, cell: str | None) -> IdentificationDocument | None:
+    run = history.first(robot, cell)
     return None if run is None else run.document
+
+
+def _name(robot: str, cell: str | None) -> str:
+    return robot if cell is None else f"{robot} in cell {cell}"
 
 
 def _folder(path: Path, out: Path | None) -> str:

@@ -113,7 +113,7 @@ def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, f
     if session.recording.trigger is not None:
         raise ConfigError(f"{config}: recording.trigger: writes only events, the job needs all of the motion")
     history = History(store)
-    chosen = baseline_of(baseline, history, robot.name)
+    chosen = baseline_of(baseline, history, robot.name, session.cell)
     check_trajectory(session, robot, chosen)
     return Job(config, session, robot, chosen, history, out or session.recording.directory, false_alarms)
 

@@ -63,7 +63,7 @@ def test_a_result_is_kept_once_and_comes_back_as_it_was(url: str, tmp_path: Path
     again = History(url)
     assert [run.document for run in again.runs("arm")] == [early, late]
     assert [run.recorded for run in again.runs()] == [START, START + 2 * WEEK]
-    assert again.robots() == ["arm"]
+    assert again.arms() == [("arm", None)]
 
 
 def test_weeks_of_the_same_arm_are_no_change_and_a_change_is_exit_code_4(url: str, tmp_path: Path) -> None:
@@ -91,6 +91,54 @@ def test_robots_are_kept_apart(url: str, tmp_path: Path) -> None:
     assert code == 2
     assert "--robot: say which of the robots in the history: arm, other" in err
     assert call("--database", url, "--robot", "other")[0] == 0
+
+
+def facts(document: IdentificationDocument, cell: str | None) -> dict[str, object]:
+    """What a job keeps of a recording."""
+    entries = {"duration_s": 7.5, "in_gaps": 0, "facts": {}, "counters": {}}
+    return {"sha256": document.recording.sha256, "path": document.recording.path, "cell": cell} | entries
+
+
+def of(number: int, document: IdentificationDocument) -> IdentificationDocument:
+    """From a recording of its own."""
+    source = document.recording.model_copy(update={"sha256": f"{number:064x}"})
+    return document.model_copy(update={"recording": source})
+
+
+def test_arms_of_one_name_in_two_cells_are_kept_apart(url: str, tmp_path: Path) -> None:
+    history = History(url)
+    left, right = of(1, result(0, TRUTH)), of(2, result(1, 2 * TRUTH))
+    for document, cell in ((left, "left"), (right, "right")):
+        history.describe(facts(document, cell))
+        history.add(document, recorded_at(document, tmp_path))
+    assert history.arms() == [("arm", "left"), ("arm", "right")]
+    for cell, document in (("left", left), ("right", right)):
+        run = history.first("arm", cell)
+        assert run is not None
+        assert run.document == document
+    assert history.first("arm", "middle") is None
+    code, _, err = call("--database", url)
+    assert code == 2
+    assert "--cell: say in which cell; arm is known in left, right" in err
+    assert "--cell: no 'middle'; arm is known in left, right" in call("--database", url, "--cell", "middle")[2]
+    code, out, err = call("--database", url, "--cell", "right", "--plot", str(tmp_path / "p.svg"))
+    assert code == 0, err
+    assert "arm in cell right" in out
+    # A result that is known already says itself where its arm stands.
+    (path,) = written(tmp_path, [left])
+    code, out, err = call(path, "--database", url)
+    assert code == 0, err
+    assert "arm in cell left" in out
+
+
+def test_runs_whose_cell_nobody_knows_may_be_of_any(url: str, tmp_path: Path) -> None:
+    history = History(url)
+    old, new = of(1, result(0, TRUTH)), of(2, result(1, TRUTH))
+    for document in (old, new):
+        history.add(document, recorded_at(document, tmp_path))
+    history.describe(facts(new, "left"))
+    assert [run.document for run in history.runs("arm", "left")] == [old, new]
+    assert call("--database", url)[0] == 0
 
 
 def test_what_is_wrong_is_said_in_one_line(url: str, tmp_path: Path) -> None:

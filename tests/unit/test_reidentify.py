@@ -114,18 +114,18 @@ def test_the_first_run_becomes_the_baseline_and_a_name_misspelt_later_does_not(
     tmp_path: Path, documents: dict[str, IdentificationDocument]
 ) -> None:
     history, file = History(store(tmp_path)), tmp_path / "baseline.json"
-    first = baseline_of(file, history, "tx40")
+    first = baseline_of(file, history, "tx40", "cell")
     assert first.document is None
     assert str(file) in first.become(documents["a_monday"])
     assert load_document(file, IdentificationDocument) == documents["a_monday"]
     history.add(documents["a_monday"], NOW)
-    assert baseline_of(file, history, "tx40").document == documents["a_monday"]
-    assert baseline_of(None, history, "tx40").document == documents["a_monday"]
+    assert baseline_of(file, history, "tx40", "cell").document == documents["a_monday"]
+    assert baseline_of(None, history, "tx40", "cell").document == documents["a_monday"]
     with pytest.raises(
         ConfigError, match="no such file, and this is not the first run: the history has one of 2026-03-01"
     ):
-        baseline_of(tmp_path / "baselin.json", history, "tx40")
-    assert baseline_of(None, history, "emps").document is None
+        baseline_of(tmp_path / "baselin.json", history, "tx40", "cell")
+    assert baseline_of(None, history, "emps", "cell").document is None
 
 
 def test_a_tenth_more_friction_is_told_as_such(documents: dict[str, IdentificationDocument]) -> None:
