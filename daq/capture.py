@@ -20,7 +20,7 @@ from daq.recorder import Recorder
 from daq.recording import Mark, QueuedSeries
 from daq.reload import Change, Reloader
 from daq.sink import Sink
-from daq.storage import Tidiness, capture_stamp, kept_around, limits, open_series
+from daq.storage import Tidiness, capture_stamp, gathered, kept_around, limits, open_series
 from daq.systemd import Notifier
 from daq.zenoh_keys import Keys
 from drivers.frames import FrameBus
@@ -126,9 +126,10 @@ def capture(
 
 
 def _exchange_limits(writer: QueuedSeries, tidiness: Tidiness) -> Change:
-    """Changes when files are full, how long they are kept, and how much around an event."""
+    """Changes how often rows are written, when files are full, how long they are kept, and how much around an event."""
 
     def change(session: SessionConfig) -> None:
+        writer.gather(gathered(session.recording))
         writer.limit(*limits(session.recording))
         if session.recording.trigger is not None:
             writer.keep(*kept_around(session.recording.trigger))

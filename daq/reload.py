@@ -19,6 +19,7 @@ CHANGEABLE = (
     "recording.rotate_minutes",
     "recording.keep_days",
     "recording.min_free_gb",
+    "recording.chunk_ms",
     "recording.drain_ms",
     "recording.trigger.",
     "zenoh.queue_blocks",

@@ -33,8 +33,7 @@ def open_series(
     options = session.recording
     layouts = [stream.layout for stream in streams]
     every = {layout.name: layout.every for layout in layouts}
-    # What is still in the kernel, and on the way to the disk, is lost with the chunk.
-    chunk_ns = round(max(options.chunk_ms - 2.5 * options.drain_ms, options.chunk_ms / 4) * 1e6)
+    chunk_ns = gathered(options)
 
     def begin(path: Path, part: int) -> RecordingWriter:
         facts = metadata | {"part": str(part)}
@@ -51,6 +50,11 @@ def open_series(
         return RecordingSeries(begin, directory, f"{robot.name}-{now}", max_bytes, max_ns)
 
     return QueuedSeries(TriggeredSeries(event, *kept_around(options.trigger)), every, chunk_ns)
+
+
+def gathered(options: RecordingOptions) -> int:
+    """Time that the rows of a chunk are gathered for, ns: what is still in the kernel is lost with them."""
+    return round(max(options.chunk_ms - 2.5 * options.drain_ms, options.chunk_ms / 4) * 1e6)
 
 
 def kept_around(trigger: Trigger) -> tuple[int, int]:

@@ -131,6 +131,10 @@ class QueuedSeries:
         """Change when a file is full."""
         self._do(lambda: self._series.limit(max_bytes, max_ns))
 
+    def gather(self, chunk_ns: int) -> None:
+        """Change how long rows are gathered for, ns."""
+        self._chunk_ns = chunk_ns
+
     def keep(self, before_ns: int, after_ns: int) -> None:
         """Change how much is kept before and after a trigger from now on, ns."""
         self._do(lambda: self._series.keep(before_ns, after_ns))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from configs import ConfigError
+from configs.session import RecordingOptions
 from daq.recording import (
     Gap,
     Mark,
@@ -21,6 +22,7 @@ from daq.recording import (
     read_recording,
 )
 from daq.recording.unwritten import NOT_WRITTEN
+from daq.storage import gathered
 from tests.unit.test_daq_recording import make_recording
 from tests.unit.test_daq_series import NAME, beginner, write
 
@@ -110,6 +112,25 @@ def test_a_disk_that_stands_still_costs_no_row(tmp_path: Path, disk: threading.E
         series.close({})
     (path,) = series.paths
     assert read_recording(path).samples.sync.tolist() == recording.samples.sync.tolist()
+
+
+def test_rows_are_gathered_for_as_long_as_was_said_last(tmp_path: Path) -> None:
+    recording = make_recording(1500)
+    series = QueuedSeries(RecordingSeries(beginner(recording, 2 * CHUNK_NS), tmp_path, NAME), EVERY, CHUNK_NS)
+    sizes = []
+    with series:
+        for first in range(0, 1500, 10):
+            if first == 750:
+                series.gather(CHUNK_NS // 4)
+            append(series, recording.samples, first, first + 10)
+            until(lambda: series.waiting_rows == 0)
+            sizes.append(series.paths[0].stat().st_size)
+        series.close({})
+    # A period is 0.2 ms: ten chunks of 100 rows, then of 25 to 30.
+    assert np.count_nonzero(np.diff(sizes[:70])) in (6, 7)
+    assert np.count_nonzero(np.diff(sizes[80:])) >= 20
+    assert gathered(RecordingOptions(chunk_ms=100, drain_ms=20)) == 50_000_000
+    assert gathered(RecordingOptions(chunk_ms=100, drain_ms=100)) == 25_000_000
 
 
 @pytest.mark.parametrize("limits", [{}, {"max_bytes": 60_000}])

@@ -69,9 +69,11 @@ def test_what_can_change_does(tmp_path: Path) -> None:
 def test_what_is_kept_around_an_event_changes_and_whether_only_events_are_written_does_not(tmp_path: Path) -> None:
     path = tmp_path / "cell.yaml"
     capture = Capture(cell(path, recording={"trigger": {"before_s": 5.0, "events": ["command"]}}))
-    cell(path, recording={"trigger": {"before_s": 8.0, "events": ["emcy"]}, "drain_ms": 10})
+    cell(path, recording={"trigger": {"before_s": 8.0, "events": ["emcy"]}, "drain_ms": 10, "chunk_ms": 50})
     said = capture.reload()
-    assert said.endswith(": recording.drain_ms, recording.trigger.before_s, recording.trigger.events")
+    assert said.endswith(
+        ": recording.chunk_ms, recording.drain_ms, recording.trigger.before_s, recording.trigger.events"
+    )
     trigger = capture.taken[-1].recording.trigger
     assert trigger is not None
     assert (trigger.before_s, trigger.events) == (8.0, ("emcy",))
