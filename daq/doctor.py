@@ -4,7 +4,9 @@ import json
 import os
 import shutil
 import socket
+import statistics
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Literal
 from configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
 from configs.session import Bus
 from daq.clock import clock_state
+from daq.storage import gathered
 from daq.streams import captured_streams
 from daq.zenoh_keys.session import configuration, endpoints
 from drivers.bus_load import check_fits
@@ -24,6 +27,9 @@ Verdict = Literal["ok", "warning", "failed"]
 
 _LEAST_HOURS = 24.0
 """Hours of recording that the disk should have room for."""
+
+_CHUNKS = 20
+"""Written to see how fast the disk is."""
 
 
 @dataclass(frozen=True)
@@ -169,21 +175,23 @@ def _clock() -> Check:
 def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:
     """Whether recordings can be written, and how long there is room."""
     folder = session.recording.directory
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".armident-doctor.{os.getpid()}"
-        with probe.open("xb") as file:
-            file.write(b"\0" * 4096)
-            os.fsync(file.fileno())
-        probe.unlink()
-    except OSError as error:
-        yield Check("recordings", "failed", f"{folder}: cannot be written: {error.strerror}")
-        return
-    free = shutil.disk_usage(folder).free
     rate = (
         sum(s.layout.record[0].itemsize / s.layout.every for s in captured_streams(session, robot))
         / session.sync_period
     )
+    span_s = gathered(session.recording) * 1e-9
+    probe = folder / f".armident-doctor.{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            times = _write_times(probe, round(rate * span_s))
+        finally:
+            probe.unlink(missing_ok=True)
+    except OSError as error:
+        yield Check("recordings", "failed", f"{folder}: cannot be written: {error.strerror}")
+        return
+    yield _speed(times, span_s)
+    free = shutil.disk_usage(folder).free
     hours = free / rate / 3600
     found = f"{folder}: {free / 1e9:.1f} GB free, at least {hours:.0f} h ({rate * 3.6e-6:.1f} GB/h before compression)"
     options = session.recording
@@ -197,6 +205,31 @@ def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:
         )
     else:
         yield Check("recordings", "ok", found)
+
+
+def _write_times(probe: Path, size: int) -> list[float]:
+    """How long the disk takes for chunks, s."""
+    times, content = [], os.urandom(size)
+    with probe.open("xb", buffering=0) as file:
+        for _ in range(_CHUNKS):
+            begun = time.monotonic()
+            file.write(content)
+            os.fdatasync(file.fileno())
+            times.append(time.monotonic() - begun)
+    return times
+
+
+def _speed(times: list[float], span_s: float) -> Check:
+    """Whether a disk that took so long for chunks keeps up with a capture that writes one every ``span_s``."""
+    usual, worst = statistics.median(times), max(times)
+    found = (
+        f"{1e3 * span_s:.0f} ms of rows are written and synced in {1e3 * usual:.2g} ms, {1e3 * worst:.2g} ms at worst"
+    )
+    if usual > 0.5 * span_s:
+        return Check(
+            "disk", "warning", f"{found}: too slow; a larger recording.chunk_ms asks less often, and loses more"
+        )
+    return Check("disk", "ok", found)
 
 
 def _zenoh(session: SessionConfig) -> Check:

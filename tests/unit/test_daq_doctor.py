@@ -3,6 +3,7 @@
 import json
 import os
 import socket
+import time
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,18 @@ def test_a_folder_that_cannot_be_written_fails(tmp_path: Path) -> None:
     checks = found(cell(tmp_path, recording={"directory": str(tmp_path / "file" / "in")}))
     assert checks["recordings"].verdict == "failed"
     assert "Not a directory" in checks["recordings"].found
+
+
+@pytest.mark.parametrize(("takes_s", "verdict"), [(0.0, "ok"), (0.03, "warning")])
+def test_a_disk_too_slow_for_chunks_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, takes_s: float, verdict: str
+) -> None:
+    monkeypatch.setattr(os, "fdatasync", lambda descriptor: time.sleep(takes_s))
+    # Chunks of 50 ms, of which the disk may take half.
+    check = found(cell(tmp_path))["disk"]
+    assert check.found.startswith("50 ms of rows are written and synced in ")
+    assert check.verdict == verdict
+    assert ("larger recording.chunk_ms" in check.found) == (verdict == "warning")
 
 
 def test_a_capture_that_runs_already_is_noticed(tmp_path: Path) -> None:
