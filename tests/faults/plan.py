@@ -278,7 +278,7 @@ def disk_full(room: Room) -> Expected:
                 with suppress(OSError):
                     while file.write(bytes(block)) == block:
                         pass
-        time.sleep(length)
+        _while_full(room, length)
         filler.unlink()
 
     room.actions.append((room.at(1.1), lambda: room.farm.beside(fill)))
@@ -286,6 +286,27 @@ def disk_full(room: Room) -> Expected:
     return lambda done: (
         done.counters["tpdo_late"] > BEHIND or (done.counters["writer.rows_lost"] > 0 and done.gap(None, "not written"))
     )
+
+
+def _while_full(room: Room, length: float) -> None:
+    """For so long, and until the disk has refused something: a host that is busy may keep the capture from trying."""
+
+    def looks() -> dict[Path, tuple[int, int]]:
+        return {path: (stat.st_size, stat.st_mtime_ns) for path in files for stat in [path.stat()]}
+
+    files = list(room.disk.glob("r*/*.mcap"))
+    until, last, before, refused = (
+        time.monotonic() + length,
+        0.8 * room.seconds / room.farm.session.sync_period,
+        looks(),
+        False,
+    )
+    while time.monotonic() < until or (not refused and len(room.farm.lanes[0].ledger) < last):
+        time.sleep(0.005)
+        now = looks()
+        # What was not written whole is taken back: the file is touched, and no larger.
+        refused |= any(now[path][0] == size and now[path][1] != at for path, (size, at) in before.items())
+        before = now
 
 
 def rotation(room: Room) -> Expected:
