@@ -194,12 +194,12 @@ class Recorder:
 
     def _drain(self) -> int:
         total = 0
-        if self._master is not None and self._master.suspect is not self._suspect:
-            before, self._suspect = self._suspect, self._master.suspect
-            for joint, span in self._suspect.items():
-                if before.get(joint) != span:
-                    self._assembler.suspect(joint, *span)
+        self._pass_on_suspicions()
         for bus, frames, dropped in self._receiver.drain():
+            if dropped and self._master is not None:
+                # Whether a mapping was changed meanwhile cannot be seen in these frames.
+                self._master.listen()
+                self._pass_on_suspicions()
             sent = self._producer.sent if self._producer is not None else None
             self._jitters[bus].take(frames)
             self.sink.take(self._assembler.push(frames, sent, dropped, bus))
@@ -210,6 +210,15 @@ class Recorder:
             self._fed = time.monotonic()
             self._notifier.progress(f"SYNC {self._assembler.last_sync}")
         return total
+
+    def _pass_on_suspicions(self) -> None:
+        """Tell the assembler whose TPDOs are not to be trusted, where the master says something new."""
+        if self._master is None or self._master.suspect is self._suspect:
+            return
+        before, self._suspect = self._suspect, self._master.suspect
+        for joint, span in self._suspect.items():
+            if before.get(joint) != span:
+                self._assembler.suspect(joint, *span)
 
     def _watch(self) -> None:
         """Look after buses, SYNC and drives; what fails while we move the arm ends the capture."""

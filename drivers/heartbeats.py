@@ -2,23 +2,19 @@
 
 import time
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 
 import numpy as np
 
-from configs.errors import ArmidentError
 from configs.session import Bus
-from drivers.frames import BusDown, FrameBus, frames
-from drivers.objects import COB_HEARTBEAT, COB_MASK
-from drivers.udp import open_bus
+from drivers.objects import COB_HEARTBEAT
+from drivers.side_socket import SideSocket
 
-BATCH = 256
 HELD_UP_S = 0.1
 """Whoever looks less often than this was held up."""
 
 
 class HeartbeatSocket:
-    """The heartbeats on one bus, boot-up messages among them, in a socket of its own.
+    """The heartbeats on one bus, boot-up messages among them, in a socket of their own.
 
     Parameters
     ----------
@@ -36,38 +32,21 @@ class HeartbeatSocket:
     """
 
     def __init__(self, bus: Bus, nodes: Sequence[int]) -> None:
-        self._config, self._nodes = bus, tuple(nodes)
-        self._bus = self._open()
-        self._batch = frames(BATCH)
-        self._gone = False
-
-    def _open(self) -> FrameBus:
-        classic = self._config.model_copy(update={"fd": False, "data_bitrate": None})
-        return open_bus(classic, filters=[(COB_HEARTBEAT + node, COB_MASK) for node in self._nodes])
+        self._socket = SideSocket(bus, [COB_HEARTBEAT + node for node in nodes])
 
     def read(self) -> list[tuple[int, float]]:
         """Node and time (s, of the monotonic clock) of what has come; nothing while the bus is down or removed."""
-        if self._gone:
-            with suppress(ArmidentError):
-                fresh = self._open()
-                self._bus.close()
-                self._bus, self._gone = fresh, False
         found: list[tuple[int, float]] = []
-        try:
-            while (got := self._bus.receive(self._batch)) > 0:
-                # Stamps are wall clock time, which may be set: only their age at this moment is used.
-                ages = (time.time_ns() - self._batch["t_ns"][:got]) * 1e-9
-                came = time.monotonic() - np.maximum(ages, 0.0)
-                nodes = self._batch["can_id"][:got] - COB_HEARTBEAT
-                found += zip(nodes.tolist(), came.tolist(), strict=True)
-        except BusDown:
-            # A socket whose interface was removed has lost it for good.
-            self._gone = not self._bus.bound
+        for batch in self._socket.read():
+            # Stamps are wall clock time, which may be set: only their age at this moment is used.
+            ages = (time.time_ns() - batch["t_ns"]) * 1e-9
+            came = time.monotonic() - np.maximum(ages, 0.0)
+            found += zip((batch["can_id"] - COB_HEARTBEAT).tolist(), came.tolist(), strict=True)
         return found
 
     def close(self) -> None:
         """Release the socket."""
-        self._bus.close()
+        self._socket.close()
 
 
 class Silences:

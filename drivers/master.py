@@ -104,6 +104,7 @@ class DriveMaster:
         """From when on, and until when (ns, UTC), the TPDOs of joints are not to be trusted; a new one per change."""
         self._written: dict[str, float] = {}
         self._started = False
+        self._started_ns = 0
         self._enabled = False
         self._networks: dict[str, NodeNetwork] = {}
         try:
@@ -158,7 +159,7 @@ class DriveMaster:
             self._await_operational(sdo)
         self._heard()
         self._silences = Silences(self._joints.values(), time.monotonic())
-        self._started = True
+        self._started, self._started_ns = True, time.time_ns()
         if not enable:
             return
         self._enabled = True
@@ -187,10 +188,24 @@ class DriveMaster:
             raise BusDown(f"bus {', '.join(alive)}: went down")
         if self._started and self._silences is not None:
             self._judge(self._silences)
+        self.listen()
         events = []
         while not self._events.empty():
             events.append(self._events.get())
         return events
+
+    def listen(self) -> None:
+        """Take note of what others have written to drives by now, so that ``suspect`` says so; never waits.
+
+        `supervise` does so, too. Where TPDOs were dropped, the requests before those that were not may be among them.
+        """
+        by_joint = {sdo.drive.joint: sdo for sdo in self._drives}
+        for channel, network in self._networks.items():
+            for node, index, t_ns in network.written():
+                joint = self._joints[channel, node]
+                # What we write ourselves, or somebody beside us, is in the time that is suspect anyway.
+                if t_ns > max(self._started_ns, self.suspect.get(joint, (0, 0))[1]):
+                    self._on_others(by_joint[joint], index, t_ns)
 
     @property
     def drives(self) -> tuple[DriveSdo, ...]:

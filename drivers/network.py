@@ -5,8 +5,8 @@ Filters in the kernel keep TPDO and SYNC away from canopen's socket: it costs te
 
 import logging
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 
 import can
 import canopen
@@ -18,6 +18,7 @@ from drivers import objects as od
 from drivers.frames import BusDown
 from drivers.heartbeats import HeartbeatSocket
 from drivers.objects import NmtCommand
+from drivers.side_socket import SideSocket
 from drivers.socketcan import RawSocket
 
 REOPEN_S = 0.25
@@ -56,11 +57,12 @@ class NodeNetwork:
         self.down = False
         self._tried = 0.0
         first = self._open()
-        try:
+        with ExitStack() as opened:
+            opened.callback(first.shutdown)
             self.heartbeats = HeartbeatSocket(bus, self._nodes)
-        except BaseException:
-            first.shutdown()
-            raise
+            opened.callback(self.heartbeats.close)
+            self._requests = SideSocket(bus, [od.COB_SDO_REQUEST + node for node in self._nodes])
+            opened.pop_all()
         self._network = canopen.Network(bus=first)
         self._network.NOTIFIER_CYCLE = 0.05
         self._network.listeners = [_QuietListener(self._network)]
@@ -106,6 +108,17 @@ class NodeNetwork:
                 told(int.from_bytes(data[1:3], "little"), round(timestamp * 1e9))
 
         self._network.subscribe(od.COB_SDO_REQUEST + node_id, heard)
+
+    def written(self) -> Iterator[tuple[int, int, int]]:
+        """Node, object index and time (ns, UTC) of what anybody, we too, has written over SDO since the last call.
+
+        Unlike ``overhear`` it waits for no thread.
+        """
+        for batch in self._requests.read():
+            downloads = batch[(batch["length"] == 8) & (batch["data"][:, 0] >> 5 == od.SDO_DOWNLOAD)]
+            index = downloads["data"][:, 1].astype(int) + 256 * downloads["data"][:, 2].astype(int)
+            nodes = downloads["can_id"].astype(int) - od.COB_SDO_REQUEST
+            yield from zip(nodes.tolist(), index.tolist(), downloads["t_ns"].tolist(), strict=True)
 
     def command(self, command: NmtCommand, node_id: int) -> None:
         """Send an NMT command to one node.
@@ -160,6 +173,7 @@ class NodeNetwork:
     def close(self) -> None:
         """Leave the bus."""
         self.heartbeats.close()
+        self._requests.close()
         try:
             self._network.disconnect()
         except Exception as error:  # canopen raises here again what ended its receive thread

@@ -13,9 +13,10 @@ from canopen.sdo import SdoAbortedError
 
 from configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session
 from drivers import objects as od
-from drivers.frames import BusDown
+from drivers.frames import BusDown, frames
 from drivers.master import DriveEvent, DriveMaster
 from drivers.objects import Control, DriveState
+from drivers.socketcan import RawSocket
 
 pytestmark = pytest.mark.vcan
 
@@ -239,6 +240,39 @@ def test_a_lost_heartbeat_is_reported_once_and_its_return_too(vcan_bus: str) -> 
         assert not [e for e in master.supervise() if e.joint == "joint_1"]
         servos[1].node.nmt.start_heartbeat(session.heartbeat_ms)
         assert any(e.joint == "joint_1" for e in events_within(master, 5.0, "heartbeat_back"))
+
+
+def test_what_others_write_is_known_as_soon_as_it_is_asked_for_and_our_own_requests_are_not_taken_for_it(
+    vcan_bus: str,
+) -> None:
+    request = frames(1)
+    request["can_id"], request["length"] = od.COB_SDO_REQUEST + 2, 8
+    # Download of four bytes to object 1800h, subindex 1.
+    request["data"][0] = [0x23, 0x00, 0x18, 0x01, 0x82, 0x01, 0x00, 0x80]
+    with (
+        cell(vcan_bus) as (session, robot, _),
+        DriveMaster(session, robot) as master,
+        RawSocket(vcan_bus, filters=()) as other,
+    ):
+        master.configure()
+        master.start()
+        master.listen()
+        assert master.suspect == {}
+        before = time.time_ns()
+        other.send(request)
+        master.listen()
+        (since, until) = master.suspect["joint_2"]
+        assert before <= since <= time.time_ns() < until
+        told = events_within(master, 10.0, "configured")
+        assert [e.kind for e in told if e.kind in ("mapping_changed", "configured")] == [
+            "mapping_changed",
+            "configured",
+        ]
+        assert since < master.suspect["joint_2"][1] <= time.time_ns()
+        # What we wrote to put it right was heard, too.
+        told = events_within(master, 0.3, "mapping_changed")
+        assert [e.kind for e in told if e.kind == "mapping_changed"] == []
+        assert set(master.suspect) == {"joint_2"}
 
 
 def test_a_bus_that_goes_down_under_the_master_is_no_missing_drive(vcan_bus: str) -> None:
