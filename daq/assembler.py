@@ -236,7 +236,7 @@ class Assembler:
             first, times = self.when_sent(self._asked_from)
             numbers = first + np.arange(times.size)[-SENT_AT:]
             self._books.sent_at[numbers % SENT_AT] = times[-SENT_AT:]
-            sent[0] = self._asked_from = first + times.size - 1
+            sent[0] = self._asked_from = first + times.size
 
     def silence(self, bus: int, silent: bool) -> None:
         """Say that a bus is known to be down, or back: its drives owe nothing meanwhile, and the others go on."""

@@ -69,7 +69,7 @@ class Books(NamedTuple):
     behind another one before it is taken for silent. ``behind`` is how many answers a drive has owed at once lately,
     and at which row (``behind_at``); what is placed before row ``doubt`` is not certain. Before row ``hole`` of a bus a
     frame is known to be missing on it. TPDOs that came in the time ``suspect`` (n, 2) were mapped by others. Where we
-    send SYNC and lose some, ``sent_at`` is a ring of the times at which it was sent, up to number ``sent`` (1,), or -1.
+    send SYNC and lose some, ``sent_at`` is a ring of the times by which those before number ``sent`` (1,) were sent.
     """
 
     state: NDArray[np.int64]

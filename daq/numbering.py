@@ -100,14 +100,19 @@ def _heard_elsewhere(state: Any, recent: Any, bus: int, step: int, t_ns: int, pe
 
 
 @njit(cache=True, nogil=True)
-def _sent_then(sent_at: Any, sent: int, last: int, step: int, t_ns: int, overflow: int) -> int:
-    """By how many SYNCs, ``step`` and whole turns, a bus advances to the one that we sent at this time."""
-    best, nearest, room = NOWHERE, np.int64(-1), sent_at.size
-    for k in range(last + step, sent + 1, overflow):
-        off = abs(t_ns - sent_at[k % room])
-        if k > sent - room and (nearest < 0 or off < nearest):
-            best, nearest = k - last, off
-    return int(best)
+def _sent_then(sent_at: Any, sent: int, last: int, step: int, t_ns: int, half_turn_ns: int, overflow: int) -> int:
+    """By how many SYNCs, ``step`` and whole turns, a bus advances to the one that we had sent by this time.
+
+    It is the first that was sent by no earlier time than it came, give or take what the bus and clocks need; a turn
+    before it another one had been sent long ago. ``NOWHERE`` if there is none.
+    """
+    k = last + step
+    while k < sent:
+        if k >= sent - sent_at.size and sent_at[k % sent_at.size] >= t_ns - half_turn_ns:
+            return int(k - last)
+        k += overflow
+    # The one that is being sent has no time yet.
+    return int(k - last) if k == sent else NOWHERE
 
 
 @njit(cache=True, nogil=True)
@@ -118,7 +123,8 @@ def _told_by_counter(
     elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != UNSEEN else 0.0
     step = (counter - state[bus, COUNTER]) % overflow
     if b.sent[0] > state[bus, SYNC]:
-        sent = _sent_then(b.sent_at, b.sent[0], state[bus, SYNC], step, t_ns, overflow)
+        half_turn_ns = period_ns * overflow // 2
+        sent = _sent_then(b.sent_at, b.sent[0], state[bus, SYNC], step, t_ns, half_turn_ns, overflow)
         if sent != NOWHERE:
             return sent
     if state[bus, BORROWED]:

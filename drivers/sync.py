@@ -186,16 +186,16 @@ class SyncProducer:
         return int(self._state[SENT])
 
     def sent_at(self, first: int) -> tuple[int, NDArray[np.int64]]:
-        """When SYNCs were sent, from ``first`` on or the first whose time is still known.
+        """When SYNCs had been sent, from ``first`` on or the first whose time is still known.
 
         Returns
         -------
         tuple
-            Number of the first of them, and the times in ns UTC, shape (N,), the SYNC that is being sent included.
+            Number of the first of them, and the times in ns UTC, shape (N,).
         """
-        first = max(first, self.sent + 1 - TIMES, 0)
-        utc = time.time_ns() - time.monotonic_ns()
-        return first, self._times[np.arange(first, self.sent + 1) % TIMES] + utc
+        sent = self.sent
+        first = min(max(first, sent - TIMES + 1, 0), sent)
+        return first, self._times[np.arange(first, sent) % TIMES]
 
     @property
     def first(self) -> int | None:
@@ -267,7 +267,6 @@ class SyncProducer:
                 base += int(late / period) * period
             self._late[min(BINS - 1, int(late * 1e9) // BIN_NS)] += 1
             state[LATE_MAX] = max(int(state[LATE_MAX]), int(late * 1e9))
-            self._times[k % TIMES] = time.monotonic_ns()
             row = int(state[ROW])
             due = row < len(rows) and is_knot(k + 1, every)
             batch = frames(1 + (len(cob_ids) if due else 0))
@@ -281,6 +280,7 @@ class SyncProducer:
             except BusDown:
                 state[ERROR] = errno.ENETDOWN
                 return
+            self._times[k % TIMES] = time.time_ns()
             state[SENT] += 1
 
     def _rows(self) -> tuple[NDArray[np.int32], NDArray[np.uint32], int]:

@@ -33,7 +33,7 @@ _SEND_ATTEMPTS = 5000
 _RETRY_NS = 100_000
 _FEW_ATTEMPTS = 3
 """The same where other buses wait for their SYNC meanwhile."""
-_MONOTONIC = 1
+_REALTIME, _MONOTONIC = 0, 1
 _ABSOLUTE = 1
 _EINTR, _EAGAIN, _ENOBUFS = errno.EINTR, errno.EAGAIN, errno.ENOBUFS
 _DONTWAIT = int(socket.MSG_DONTWAIT)
@@ -65,7 +65,7 @@ class Loop:
     errors, unsent
         Per bus the errno with which it refused the last SYNC (0: none), and how many SYNCs it refused.
     times
-        Ring of the monotonic clock just before SYNC k was sent, at ``k % TIMES``, ns.
+        Ring of the time (ns, UTC) at which SYNC k had just been sent, at ``k % TIMES``.
     """
 
     def __init__(
@@ -135,6 +135,13 @@ def monotonic_ns(spec):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
+def utc_ns(spec):  # type: ignore[no-untyped-def]
+    """Read CLOCK_REALTIME (ns), which the kernel stamps frames with; ``spec`` as in `monotonic_ns`."""
+    _clock_gettime(_REALTIME, spec.ctypes.data)
+    return spec[0] * 1_000_000_000 + spec[1]
+
+
+@njit(nogil=True, cache=True)
 def sleep_until(deadline, spec):  # type: ignore[no-untyped-def]
     """Sleep until CLOCK_MONOTONIC reads ``deadline`` (ns)."""
     spec[0], spec[1] = deadline // 1_000_000_000, deadline % 1_000_000_000
@@ -185,7 +192,6 @@ def _run(  # type: ignore[no-untyped-def]
             for j in range(rows.shape[1]):
                 body[place[j], 2] = rows[state[ROW], j]
             state[ROW] += 1
-        times[k % TIMES] = now
         refused, code = 0, 0
         for b in range(buses):
             body[first[b], 2] = k % counter + 1
@@ -198,4 +204,6 @@ def _run(  # type: ignore[no-untyped-def]
                 code = errors[b]
         state[ERROR] = code if refused == buses else 0
         state[LAST_NS] = now
+        # Behind it: whoever hears it never hears it later than this, however long we were held up before.
+        times[k % TIMES] = utc_ns(spec)
         state[SENT] = k + 1
