@@ -17,7 +17,7 @@ from daq.recording.triggered import TriggeredSeries
 from daq.recording.unwritten import STANDS_STILL, Spans
 
 MOST_WAITING_BYTES = 128 << 20
-"""Rows that may wait for the disk: a minute of six buses at 5 kHz, five minutes of one."""
+"""Rows that may wait for the disk: some six minutes of six axes at 5 kHz."""
 
 _Do = Callable[[], object]
 _Rows = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
