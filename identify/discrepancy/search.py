@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 
 from configs import DataError, RobotConfig
 from identify.discrepancy.candidates import Workshop, candidates
+from identify.discrepancy.excess import excesses
 from identify.discrepancy.polishing import polished
 from identify.discrepancy.retrial import in_its_loop, suspects
 from identify.discrepancy.screening import shortlist
 from identify.discrepancy.stanzas import added, stanza_number, valued, without
 from identify.discrepancy.state import Places, Settings, State, accident, nearer, places_of, refit
 from identify.discrepancy.study import Study
-from identify.discrepancy.trial import Trial, judge
+from identify.discrepancy.trial import Trial, best_trial, judge
 from identify.options import CONTROLLERS
 
 Array = NDArray[np.float64]
@@ -30,6 +31,8 @@ ROUNDS = 5
 """Most times that a recording is put right for one finding, each time by what was still missing."""
 SETTLED = 0.01
 """Part still missing that ends them."""
+EXPLAINED = 0.5
+"""Part of what a joint leaves beyond noise that what passes there explains, where the loop is a likeness of the arm."""
 MOST = 8
 """Most effects of one diagnosis."""
 
@@ -89,14 +92,30 @@ class Search:
 
     def _again(self, state: State) -> State:
         """With a second look at what the simulated loop without it may have been too far off to show."""
-        passing = {t.candidate.key for t in state.passing(self.settings)}
-        failed = [t for t in state.trials if t.candidate.key not in passing]
+        passing = state.passing(self.settings)
+        keys = {t.candidate.key for t in passing}
+        failed = [t for t in state.trials if t.candidate.key not in keys]
         second = {}
-        for trial in suspects(failed):
+        for trial in [*suspects(failed), *self._recorded_otherwise(state, passing)]:
             again = in_its_loop(state.fit, trial)
             if again is not None:
                 second[trial.candidate.key] = again
-        return replace(state, trials=_ranked([second.get(t.candidate.key, t) for t in state.trials]))
+        known = {t.candidate.key: t for t in state.trials} | second
+        return replace(state, trials=_ranked(list(known.values())))
+
+    def _recorded_otherwise(self, state: State, passing: Sequence[Trial]) -> list[Trial]:
+        """Trials of what puts recordings right, at joints that leave more than noise of which nothing explains much.
+
+        A controller identified from recordings that are not right makes a loop in which the right one may score worst.
+        """
+        joints = {
+            excess.joint
+            for excess in excesses(state.fit, self.settings.false_alarms)
+            if all(t.share < EXPLAINED * excess.share for t in passing if t.candidate.place.joint == excess.joint)
+        }
+        able = [c for c in candidates(state.workshop) if c.effect.undo is not None and c.place.joint in joints]
+        found = (best_trial(state.fit, candidate, state.workshop) for candidate in able)
+        return [t for t in found if t is not None and not t.forbidden]
 
     def _extended(self, state: State, own: int, been: set[Places]) -> State | None:
         """The state with the best candidate that passes and really makes the held-out error smaller, pruned.
