@@ -90,7 +90,9 @@ def _finding(
     alone = 0.0 if mine is None else float(np.exp(mine.score - special.logsumexp(scores)))
     close = [] if mine is None else [score for score in scores if abs(score - mine.score) < CLOSE]
     among = float(np.exp(special.logsumexp(close) - special.logsumexp(scores))) if close else 0.0
-    remaining = max((d.share for d in left if d.joint == stanza.joint), default=0.0)
+    # What couples two joints has to account for both.
+    at = (stanza.joint, stanza.other) if effect.scope == "pair" else (stanza.joint,)
+    remaining = max((d.share for d in left if d.joint in at), default=0.0)
     # What is left is a share of the smaller residual that the finding leaves.
     explained = share / max(share + (1 - share) * remaining, 1e-300) if share > 0 else 0.0
     joint = place.joint

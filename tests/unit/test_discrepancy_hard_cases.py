@@ -1,0 +1,52 @@
+"""Single cases of the shipped suite in which a wrong answer lies near."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from configs.loading import load_suite
+from daq.suite.cases import all_cases
+from identify.discrepancy import batch
+from virtual_robot.batch import record
+
+pytestmark = pytest.mark.timeout(600)
+
+
+def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]]:
+    """Diagnosis of a case, and what is hidden in it."""
+    (case,) = (case for case in all_cases(load_suite("suite.yaml")) if case.name == name)
+    file = folder / "case.mcap"
+    request = {
+        "id": case.key,
+        "robot": case.config,
+        "trajectory": case.trajectory,
+        "repeats": case.repeats,
+        "period": case.period,
+        "seed": case.seed,
+        "effects": [asdict(part) for part in case.parts],
+        "out": str(file),
+    }
+    (hidden,) = record(request)["truth"]
+    told = batch.answer({"id": case.key, "do": "diagnose", "recording": str(file), "robot": case.config})
+    return told["document"], hidden
+
+
+def test_a_late_torque_of_joint_2_is_found_in_the_loop_that_it_makes(tmp_path: Path) -> None:
+    """The simulated loop without the delay speaks against the delay."""
+    told, hidden = diagnosed("effect time_delay joint_2 obvious tx40 run 1", tmp_path)
+    (found,) = told["findings"]
+    assert (found["effect"], found["joint"]) == ("time_delay", "joint_2")
+    assert abs(found["parameters"]["delay"] - hidden["delay"]) < 3.0 * found["evidence"]["std"]["delay"]
+    errors = told["gap"]["validation"]
+    assert errors["after"]["all"] < errors["before"]["all"]
+    assert told["verdict"] == "explained"
+
+
+def test_a_coupling_has_to_account_for_both_of_its_joints(tmp_path: Path) -> None:
+    """Crosstalk of currents, which the catalogue does not have, is no coupling of friction."""
+    told, _ = diagnosed("outside current_crosstalk joint_4+joint_3 obvious tx40 run 2", tmp_path)
+    assert all(found["confidence"] < 0.5 for found in told["findings"])
+    assert "joint_4" in {rest["joint"] for rest in told["unexplained"]}
+    assert told["verdict"] == "unexplained"
