@@ -22,6 +22,7 @@ from daq.systemd import Notifier
 from drivers.bcm import KernelSync
 from drivers.frames import BusDown
 from drivers.master import DriveMaster
+from drivers.priority import ahead
 from drivers.receiver import Receiver
 from drivers.sync import SyncProducer
 from drivers.temperature import TemperaturePoll
@@ -33,6 +34,8 @@ TELL_BEHIND_S = 0.5
 """Drives that are farther behind than this at the end are worth a line."""
 QUICK_STOP_S = 0.3
 """How long a quick stop is given before the drives are disabled."""
+AHEAD = 10
+"""Steps of niceness by which whoever drains the buses comes before the threads that write and publish."""
 OUTAGE_S = 5.0
 """A capture ends when no bus has worked for this long."""
 
@@ -124,13 +127,14 @@ class Recorder:
     def record(self) -> ArmidentError | None:
         """Drain, match, write and publish until it is over; what ended it early, if something did."""
         trouble: ArmidentError | None = None
-        try:
-            self._play()
-            self._loop()
-        except ArmidentError as error:
-            trouble = error
-        self._come_to_rest(trouble is not None or self._stop.is_set())
-        self._mark_end(trouble)
+        with ahead(AHEAD):
+            try:
+                self._play()
+                self._loop()
+            except ArmidentError as error:
+                trouble = error
+            self._come_to_rest(trouble is not None or self._stop.is_set())
+            self._mark_end(trouble)
         return trouble
 
     def counters(self) -> dict[str, int]:

@@ -9,7 +9,6 @@ up: the grid moves by whole periods, and ``SyncStats.skipped`` counts them. No S
 refuses one (it is down) lacks it, the others go on.
 """
 
-import ctypes
 import errno
 import os
 import threading
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from configs.session import Bus
 from drivers.frames import BusDown, FrameBus, frames
 from drivers.objects import COB_SYNC
+from drivers.priority import be_punctual
 from drivers.setpoints import SetpointPlan
 from drivers.socketcan import RawSocket
 from drivers.sync_loop import (
@@ -49,7 +49,6 @@ from drivers.udp import open_bus
 __all__ = ["SetpointPlan", "SyncProducer", "SyncStats"]
 
 REALTIME_PRIORITY = 10
-PR_SET_TIMERSLACK = 29
 
 
 @dataclass(frozen=True)
@@ -242,7 +241,7 @@ class SyncProducer:
 
     def _run_compiled(self) -> None:
         assert self._loop is not None
-        self._realtime = _be_punctual()
+        self._realtime = be_punctual(REALTIME_PRIORITY)
         while not self._state[STOP]:
             self._take_plan()
             rows, cob_ids, every = self._rows()
@@ -301,13 +300,3 @@ class SyncProducer:
             self._state[ROW] = 0
             self._state[FIRST] = knot
             self._taken.set()
-
-
-def _be_punctual() -> bool:
-    """Ask for exact wake-ups and real-time priority for this thread; whether the priority was granted."""
-    ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REALTIME_PRIORITY))
-    except OSError:
-        return False
-    return True

@@ -1,7 +1,5 @@
 """``armident guard``: reads the buses, and orders a quick stop from every drive when something is wrong."""
 
-import ctypes
-import os
 import signal
 import sys
 import time
@@ -18,7 +16,7 @@ from daq.guard.watch import Alarm, Watch
 from daq.streams import bus_numbers, node_ids
 from drivers.frames import BusDown, FrameBus, Frames, frames
 from drivers.objects import COB_MASK, COB_SDO_REQUEST, CONTROLWORD, Control, rpdo_cob, stop_rpdo
-from drivers.sync import PR_SET_TIMERSLACK
+from drivers.priority import be_punctual
 from drivers.udp import open_bus
 
 BATCH = 512
@@ -167,7 +165,7 @@ def guard(config: str, following_s: float = FOLLOWING_S) -> None:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, stop)
         signal.signal(signal.SIGUSR1, leave)
-        _come_first()
+        be_punctual(_PRIORITY)
         print(f"guard: ready on {', '.join(bus.channel for bus in buses)}", flush=True)
         alarm = watcher.run()
     if alarm is not None:
@@ -176,12 +174,3 @@ def guard(config: str, following_s: float = FOLLOWING_S) -> None:
 
 def _opened(bus: Bus, watch: Watch, number: int) -> FrameBus:
     return open_bus(bus, filters=[(identifier, COB_MASK) for identifier in watch.identifiers(number)])
-
-
-def _come_first() -> None:
-    """Ask for exact wake-ups and real-time priority; without the right to it the guard runs as everybody else."""
-    ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
-    except OSError:
-        return

@@ -1,6 +1,7 @@
 """Writes a series from a thread of its own, so that whoever drains the buses never waits for the disk."""
 
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,9 @@ from daq.recording.unwritten import STANDS_STILL, Spans
 MOST_WAITING_BYTES = 128 << 20
 """Rows that may wait for the disk: some six minutes of six axes at 5 kHz."""
 
+CATCH_UP = 2.0
+"""Times as fast as they came that rows are written which have waited: the buses want the processor, too."""
+
 _Do = Callable[[], object]
 _Rows = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
 
@@ -34,6 +38,16 @@ class _State:
     """Rows left out that it has been told of."""
 
 
+@dataclass(frozen=True)
+class _Work:
+    """Something to do, and the rows that go with it: their bytes, how many they are, and how long they took, ns."""
+
+    do: _Do
+    bytes: int = 0
+    rows: int = 0
+    span_ns: int = 0
+
+
 @dataclass
 class _Chunk:
     """What is handed over at once: rows of each stream as they came, gaps and when they were found, marks."""
@@ -42,11 +56,14 @@ class _Chunk:
     gaps: list[tuple[Sequence[Gap], int]] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
     since: int | None = None
+    span_ns: int = 0
     bytes: int = 0
     count: int = 0
 
     def add(self, stream: str, rows: _Rows, size: int) -> None:
         self.rows.setdefault(stream, []).append(rows)
+        if self.since is not None:
+            self.span_ns = max(self.span_ns, int(rows[1][-1]) - self.since)
         self.bytes += size
         self.count += len(rows[0])
 
@@ -93,7 +110,8 @@ class QueuedSeries:
         self._series, self._chunk_ns, self._most_bytes = series, chunk_ns, most_bytes
         self._chunk = _Chunk()
         self._state = _State(series.path, series.lost_rows, series.problem, 0)
-        self._work: SimpleQueue[tuple[_Do, int, int] | threading.Event | None] = SimpleQueue()
+        self._work: SimpleQueue[_Work | threading.Event | None] = SimpleQueue()
+        self._hurry = threading.Event()
         self._failure: BaseException | None = None
         # Of rows, what was handed over and what was done with: each is counted by one thread.
         self._put_bytes = self._put_rows = self._done_bytes = self._done_rows = 0
@@ -165,7 +183,7 @@ class QueuedSeries:
         self._own_up()
         self.turn(int(t_ns[0]))
         self._chunk.add(stream, (sync, t_ns, raw), size)
-        if self._chunk.since is not None and t_ns[-1] - self._chunk.since >= self._chunk_ns:
+        if self._chunk.span_ns >= self._chunk_ns:
             self._hand_over()
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
@@ -221,32 +239,35 @@ class QueuedSeries:
     def _do(self, do: _Do) -> None:
         """Have something done behind what has been gathered so far."""
         self._hand_over()
-        self._put(do)
+        self._put(_Work(do))
 
     def _hand_over(self) -> None:
         chunk, self._chunk = self._chunk, _Chunk()
-        self._put(lambda: chunk.write(self._series), chunk.bytes, chunk.count)
+        self._put(_Work(lambda: chunk.write(self._series), chunk.bytes, chunk.count, chunk.span_ns))
 
     def _check(self) -> None:
         """Raise what went wrong in the thread, if something did."""
         if self._failure is not None:
             raise self._failure
 
-    def _put(self, do: _Do, size: int = 0, rows: int = 0) -> None:
+    def _put(self, work: _Work) -> None:
         self._check()
-        self._put_bytes += size
-        self._put_rows += rows
-        self._work.put((do, size, rows))
+        self._put_bytes += work.bytes
+        self._put_rows += work.rows
+        self._work.put(work)
 
     def _wait(self) -> None:
         """Until all that was handed over is done."""
         done = threading.Event()
+        self._hurry.set()
         self._work.put(done)
         done.wait()
+        self._hurry.clear()
         self._check()
 
     def _end(self) -> None:
         if self._thread is not None:
+            self._hurry.set()
             self._work.put(None)
             self._thread.join()
             self._thread = None
@@ -256,14 +277,16 @@ class QueuedSeries:
             if isinstance(work, threading.Event):
                 work.set()
                 continue
-            do, size, rows = work
+            began = time.monotonic_ns()
             try:
                 if self._failure is None:
-                    do()
+                    work.do()
             except BaseException as error:
                 # Raised where something is handed over next.
                 self._failure = error
             series = self._series
             self._state = _State(series.path, series.lost_rows, series.problem, self._told_rows)
-            self._done_bytes += size
-            self._done_rows += rows
+            self._done_bytes += work.bytes
+            self._done_rows += work.rows
+            if not self._work.empty():
+                self._hurry.wait(1e-9 * max(0.0, work.span_ns / CATCH_UP - (time.monotonic_ns() - began)))

@@ -19,6 +19,7 @@ from daq.recording import (
     Stream,
     TriggeredSeries,
     join_parts,
+    queued,
     read_recording,
 )
 from daq.recording.unwritten import NOT_WRITTEN
@@ -109,6 +110,39 @@ def test_a_disk_that_stands_still_costs_no_row(tmp_path: Path, disk: threading.E
         disk.set()
         series.flush()
         assert series.waiting_rows == 0
+        series.close({})
+    (path,) = series.paths
+    assert read_recording(path).samples.sync.tolist() == recording.samples.sync.tolist()
+
+
+def test_what_has_waited_is_not_written_all_at_once(tmp_path: Path, disk: threading.Event) -> None:
+    """Whoever drains the buses wants the processor, too, when the disk is back."""
+    recording = make_recording(3000)
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
+    with series:
+        disk.clear()
+        write(series, recording)
+        disk.set()
+        begun = time.monotonic()
+        # Some 0.6 s of rows wait.
+        until(lambda: series.waiting_rows == 0)
+        assert time.monotonic() - begun > 0.25
+        series.close({})
+    (path,) = series.paths
+    assert read_recording(path).samples.sync.tolist() == recording.samples.sync.tolist()
+
+
+def test_the_end_waits_for_nothing_but_the_disk(
+    tmp_path: Path, disk: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the pace of this test what has waited would take ten minutes."""
+    monkeypatch.setattr(queued, "CATCH_UP", 0.001)
+    recording = make_recording(3000)
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
+    with series:
+        disk.clear()
+        write(series, recording)
+        disk.set()
         series.close({})
     (path,) = series.paths
     assert read_recording(path).samples.sync.tolist() == recording.samples.sync.tolist()
