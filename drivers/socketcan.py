@@ -30,8 +30,9 @@ from drivers.stamps import (
 
 __all__ = ["ERROR_FLAG", "FRAME", "BusDown", "Messages", "RawSocket", "frame", "frames"]
 
-RECEIVE_BUFFER = 64 << 20
-"""Bytes of kernel buffer asked for: about two seconds of 36 000 frames/s at 900 bytes each."""
+RECEIVE_BUFFER = 128 << 20
+"""Bytes of kernel buffer asked for, and given twice over: eight seconds of 36 000 frames/s at 900 bytes each. They are
+taken while nobody reads."""
 
 BATCH = 4096
 """Most frames that one system call moves."""
