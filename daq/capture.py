@@ -23,6 +23,7 @@ from daq.sink import Sink
 from daq.storage import Tidiness, capture_stamp, gathered, kept_around, limits, open_series
 from daq.systemd import Notifier
 from daq.zenoh_keys import Keys
+from drivers.eavesdropper import Eavesdropper
 from drivers.frames import FrameBus
 from drivers.receiver import Receiver
 from drivers.udp import NOTE, open_bus
@@ -77,6 +78,8 @@ def capture(
     name = f"{robot.name}-{capture_stamp(now)}"
     with ExitStack() as stack:
         receiver = stack.enter_context(Receiver([_opener(bus, k, order) for k, bus in enumerate(session.all_buses)]))
+        # Nothing that drives report is missed while the rest is made ready.
+        eavesdropper = stack.enter_context(Eavesdropper(session)) if order.listen_only else None
         stamps = {
             f"timestamps.{channel}": kind for channel, kind in zip(receiver.channels, receiver.stamps, strict=True)
         }
@@ -94,6 +97,7 @@ def capture(
             run = Recorder(
                 order,
                 receiver,
+                eavesdropper,
                 Sink(writer, publisher, order.streams, name),
                 publisher,
                 notifier,

@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 
@@ -20,8 +21,9 @@ from daq.remote import Command
 from daq.sink import Sink
 from daq.systemd import Notifier
 from drivers.bcm import KernelSync
+from drivers.eavesdropper import Eavesdropper
 from drivers.frames import BusDown
-from drivers.master import DriveMaster
+from drivers.master import DriveEvent, DriveMaster
 from drivers.priority import ahead
 from drivers.receiver import Receiver
 from drivers.sync import SyncProducer
@@ -47,6 +49,7 @@ class Recorder:
         self,
         order: Order,
         receiver: Receiver,
+        eavesdropper: Eavesdropper | None,
         sink: Sink,
         publisher: Publisher,
         notifier: Notifier,
@@ -74,6 +77,7 @@ class Recorder:
         self.health = Health(order, self._assembler, receiver, self._jitters, sink, publisher, say)
         self._producer: SyncProducer | KernelSync | None = None
         self._master: DriveMaster | None = None
+        self._reports: DriveMaster | Eavesdropper | None = eavesdropper
         self._temperatures: TemperaturePoll | None = None
         self._motion: Motion | None = None
         self._span: tuple[int, int] | None = None
@@ -82,6 +86,7 @@ class Recorder:
         """Called between two looks at the bus."""
         self.reload: Callable[[], None] = lambda: None
         """Called when somebody asks for the configuration to be read again."""
+        self._heard: deque[DriveEvent] = deque()
         self._fed = -math.inf
         self._refused: float | None = None
         self._suspect: dict[str, tuple[int, int]] = {}
@@ -94,7 +99,7 @@ class Recorder:
         self.health.serve(stack)
         if order.listen_only:
             return
-        self._master = stack.enter_context(DriveMaster(session, order.robot))
+        self._master = self._reports = stack.enter_context(DriveMaster(session, order.robot))
         self._say(f"configuring {len(session.drives)} drives on {', '.join(self._receiver.channels)}")
         self._master.configure()
         # Whoever else produces SYNC also moves the arm.
@@ -234,8 +239,7 @@ class Recorder:
         try:
             if self._producer is not None:
                 self._producer.check()
-            for event in self._master.supervise() if self._master is not None else ():
-                self._happenings.of_drive(event)
+            self._hear_drives()
             if self._receiver.all_down_s:
                 raise BusDown(f"bus {', '.join(self._receiver.channels)}: the interface went down and stays down")
             self._refused = None
@@ -244,6 +248,13 @@ class Recorder:
             self._refused = now if self._refused is None else self._refused
             if self._happenings.moving or now - self._refused > OUTAGE_S:
                 raise
+
+    def _hear_drives(self) -> None:
+        """Take what drives have reported, each once, though one of them may end the capture."""
+        if self._reports is not None:
+            self._heard += self._reports.supervise()
+        while self._heard:
+            self._happenings.of_drive(self._heard.popleft())
 
     def _obey(self) -> None:
         """Do what was asked over Zenoh or by SIGUSR1."""
@@ -282,6 +293,9 @@ class Recorder:
             self._producer.stop()
         with suppress(ArmidentError):
             self._await_answers()
+        self._happenings.moving = False
+        with suppress(ArmidentError):
+            self._hear_drives()
         if self._master is not None:
             self._master.stop()
         self.sink.take(self._assembler.finish(self._sent_in_all()))

@@ -1,6 +1,10 @@
-"""Emergency error codes (EMCY) in words: CiA 301, CiA 402, and what a vendor adds."""
+"""Emergency messages (EMCY), and their error codes in words: CiA 301, CiA 402, and what a vendor adds."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from drivers.frames import Frames
+from drivers.objects import COB_EMCY
 
 EMCY_TEXTS: dict[int, str] = {
     0x0000: "error reset or no error",
@@ -90,3 +94,39 @@ def emcy_text(code: int, vendor: Mapping[int, str] | None = None) -> str:
         if code & mask in EMCY_TEXTS:
             return EMCY_TEXTS[code & mask]
     return "unknown error"
+
+
+@dataclass(frozen=True)
+class Emergency:
+    """An emergency message (CiA 301 section 7.2.7.1).
+
+    Parameters
+    ----------
+    node
+        Who sent it.
+    t_ns
+        When it was received, ns, UTC.
+    code, register
+        Error code, and error register (1001h).
+    manufacturer
+        Five bytes of which the vendor knows the meaning.
+    """
+
+    node: int
+    t_ns: int
+    code: int
+    register: int
+    manufacturer: bytes
+
+    def text(self, vendor: Mapping[int, str] | None = None) -> str:
+        """The message in words."""
+        more = f", manufacturer {self.manufacturer.hex(' ')}" if any(self.manufacturer) else ""
+        return f"EMCY {self.code:04X}h, {emcy_text(self.code, vendor)} (error register {self.register:02X}h{more})"
+
+
+def read_emergencies(batch: Frames) -> Iterator[Emergency]:
+    """The emergency messages among frames; bytes that a drive leaves out are zero, what has no code is none."""
+    for one in batch[batch["length"] >= 2]:
+        data = bytes(one["data"][: int(one["length"])]).ljust(8, b"\0")
+        code = int.from_bytes(data[:2], "little")
+        yield Emergency(int(one["can_id"]) - COB_EMCY, int(one["t_ns"]), code, data[2], data[3:8])

@@ -1,6 +1,6 @@
 """The CANopen master: finds the drives, configures what they send, enables them and watches over them.
 
-canopen does the protocol (SDO, NMT, EMCY). Filters in the kernel keep TPDO and SYNC away from its socket:
+canopen does the protocol (SDO, NMT). Filters in the kernel keep TPDO and SYNC away from its socket:
 it costs tens of microseconds per frame and must never see the hot path.
 """
 
@@ -12,13 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Self
 
-from canopen.emcy import EmcyError
-
 from configs.errors import ArmidentError, ConfigError
 from configs.robot import RobotConfig
 from configs.session import DriveNode, SessionConfig
 from drivers import objects as od
-from drivers.emcy import emcy_text
 from drivers.enabling import POLL_INTERVAL, enable_drive, stand_still, state_of
 from drivers.frames import BusDown
 from drivers.heartbeats import Silences
@@ -118,7 +115,6 @@ class DriveMaster:
     def _add(self, drive: DriveNode) -> DriveSdo:
         node = self._network_of(drive).add(drive)
         sdo = DriveSdo(node, drive, self._session)
-        node.emcy.add_callback(lambda emcy: self._on_emcy(sdo, emcy))
         node.nmt.add_heartbeat_callback(lambda state: self._on_heartbeat(sdo, state))
         self._network_of(drive).overhear(drive.node_id, lambda index, t_ns: self._on_others(sdo, index, t_ns))
         return sdo
@@ -195,12 +191,16 @@ class DriveMaster:
         return events
 
     def listen(self) -> None:
-        """Take note of what others have written to drives by now, so that ``suspect`` says so; never waits.
+        """Take note of what drives have reported and others have written to them by now; never waits.
 
-        `supervise` does so, too. Where TPDOs were dropped, the requests before those that were not may be among them.
+        ``suspect`` says so then; `supervise` does so, too. Where TPDOs were dropped, the requests before those that
+        were not may be among them.
         """
         by_joint = {sdo.drive.joint: sdo for sdo in self._drives}
         for channel, network in self._networks.items():
+            for emcy in network.emergencies():
+                sdo = by_joint[self._joints[channel, emcy.node]]
+                self._report("emcy", sdo, emcy.t_ns, emcy.text(sdo.emcy_texts), emcy.code)
             for node, index, t_ns in network.written():
                 joint = self._joints[channel, node]
                 # What we write ourselves, or somebody beside us, is in the time that is suspect anyway.
@@ -301,11 +301,6 @@ class DriveMaster:
     def _report(self, kind: EventKind, sdo: DriveSdo, t_ns: int, text: str, code: int = 0) -> None:
         drive = sdo.drive
         self._events.put(DriveEvent(kind, drive.joint, drive.node_id, t_ns, f"{sdo.who}: {text}", code))
-
-    def _on_emcy(self, sdo: DriveSdo, emcy: EmcyError) -> None:
-        text = f"EMCY {emcy.code:04X}h, {emcy_text(emcy.code, sdo.emcy_texts)} (error register {emcy.register:02X}h"
-        text += f", manufacturer {emcy.data.hex(' ')})" if any(emcy.data) else ")"
-        self._report("emcy", sdo, round(emcy.timestamp * 1e9), text, emcy.code)
 
     def _on_heartbeat(self, sdo: DriveSdo, state: int) -> None:
         joint = sdo.drive.joint

@@ -1,4 +1,4 @@
-"""One bus as canopen sees it: SDO, NMT, EMCY and heartbeats of its drives, and nothing of the hot path.
+"""One bus as canopen sees it: SDO, NMT and heartbeats of its drives, and nothing of the hot path.
 
 Filters in the kernel keep TPDO and SYNC away from canopen's socket: it costs tens of microseconds per frame.
 """
@@ -15,6 +15,7 @@ from canopen.network import MessageListener
 from configs.errors import ArmidentError, ConfigError
 from configs.session import Bus, DriveNode
 from drivers import objects as od
+from drivers.emcy import Emergency, read_emergencies
 from drivers.frames import BusDown
 from drivers.heartbeats import HeartbeatSocket
 from drivers.objects import NmtCommand
@@ -62,6 +63,8 @@ class NodeNetwork:
             self.heartbeats = HeartbeatSocket(bus, self._nodes)
             opened.callback(self.heartbeats.close)
             self._requests = SideSocket(bus, [od.COB_SDO_REQUEST + node for node in self._nodes])
+            opened.callback(self._requests.close)
+            self._emergencies = SideSocket(bus, [od.COB_EMCY + node for node in self._nodes])
             opened.pop_all()
         self._network = canopen.Network(bus=first)
         self._network.NOTIFIER_CYCLE = 0.05
@@ -73,8 +76,7 @@ class NodeNetwork:
         filters = [
             {"can_id": base + node, "can_mask": od.COB_MASK, "extended": False}
             for node in self._nodes
-            # The full mask matters: EMCY is 80h + node, and any coarser one lets SYNC (80h) through.
-            for base in (od.COB_SDO_RESPONSE, od.COB_SDO_REQUEST, od.COB_HEARTBEAT, od.COB_EMCY)
+            for base in (od.COB_SDO_RESPONSE, od.COB_SDO_REQUEST, od.COB_HEARTBEAT)
         ]
         if bus.interface == "socketcan":
             # Says what is wrong with the interface, and what to do about it.
@@ -119,6 +121,11 @@ class NodeNetwork:
             index = downloads["data"][:, 1].astype(int) + 256 * downloads["data"][:, 2].astype(int)
             nodes = downloads["can_id"].astype(int) - od.COB_SDO_REQUEST
             yield from zip(nodes.tolist(), index.tolist(), downloads["t_ns"].tolist(), strict=True)
+
+    def emergencies(self) -> Iterator[Emergency]:
+        """The emergency messages since the last call, however busy canopen's thread is."""
+        for batch in self._emergencies.read():
+            yield from read_emergencies(batch)
 
     def command(self, command: NmtCommand, node_id: int) -> None:
         """Send an NMT command to one node.
@@ -174,6 +181,7 @@ class NodeNetwork:
         """Leave the bus."""
         self.heartbeats.close()
         self._requests.close()
+        self._emergencies.close()
         try:
             self._network.disconnect()
         except Exception as error:  # canopen raises here again what ended its receive thread

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from configs.errors import ConfigError
 from configs.robot import Drive
 from configs.session import ObjectName
-from drivers.emcy import emcy_text as emcy_text
 
 PDO_BYTES = 8
 """Data bytes of a classic CAN frame, and so the most a PDO can carry."""

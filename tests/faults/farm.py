@@ -91,7 +91,8 @@ class Orders:
     """What shall go wrong with answers: by SYNC number and joint, how often each is sent, or when.
 
     ``lost`` are not sent, ``twice`` sent twice, ``again`` once more behind the next SYNC, ``late`` sent behind the SYNC
-    of that number. ``skipped`` SYNCs are not sent where the farm is their master.
+    of that number. ``skipped`` SYNCs are not sent where the farm is their master. ``done`` has the names of the first
+    three where they happened: they do not while the farm itself is late.
     """
 
     lost: set[tuple[int, int]] = field(default_factory=set)
@@ -99,6 +100,7 @@ class Orders:
     again: set[tuple[int, int]] = field(default_factory=set)
     late: dict[tuple[int, int], int] = field(default_factory=dict)
     skipped: set[int] = field(default_factory=set)
+    done: set[str] = field(default_factory=set)
 
     @cached_property
     def touched(self) -> set[int]:
@@ -447,6 +449,7 @@ class Farm:
             if counter % every or j in self.deaf:
                 continue
             if (k, j) in orders.lost and lane.prompt:
+                orders.done.add("lost")
                 continue
             item = cob_id, b"".join(_value(index, k, j, size, word) for index, size, word in entries)
             waits = max([orders.late.get((k, j), 0), *(h[0] for h in lane.held if h[1] == j)])
@@ -455,8 +458,10 @@ class Farm:
                 continue
             n = self._put(out, n, *item)
             if (k, j) in orders.twice and lane.prompt:
+                orders.done.add("twice")
                 n = self._put(out, n, *item)
             if (k, j) in orders.again and lane.prompt:
+                orders.done.add("again")
                 lane.repeats.append(item)
         if n:
             with suppress(BusDown):

@@ -72,6 +72,9 @@ class Room:
 
 Expected = Callable[[Outcome], bool]
 
+ORDERED = {"lost": "lost", "all_lost": "lost", "twice": "twice", "again": "again"}
+"""Faults that do not happen while the drives are late themselves, and the order that they become."""
+
 
 def _was_down(done: Outcome) -> bool:
     """Whether a bus was down: what others send meanwhile does not happen."""

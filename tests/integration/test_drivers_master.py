@@ -229,6 +229,26 @@ def test_an_emcy_becomes_an_event_with_its_text(vcan_bus: str) -> None:
         assert "excess drive temperature" in event.text
 
 
+def test_an_emcy_is_not_lost_while_canopen_has_no_time(vcan_bus: str) -> None:
+    """Nor because a drive leaves out what it has nothing to say in."""
+    short = frames(1)
+    short["can_id"], short["length"] = od.COB_EMCY + 1, 3
+    short["data"][0, :3] = [0x30, 0x23, 0x02]
+    with cell(vcan_bus) as (session, robot, servos), DriveMaster(session, robot) as master:
+        master.configure()
+        master.start()
+        for network in master._networks.values():
+            assert network._network.notifier is not None
+            network._network.notifier.stop()
+        servos[2].node.emcy.send(0x4310, 0x08, b"\x01\x02")
+        with RawSocket(vcan_bus, filters=()) as other:
+            other.send(short)
+        first, second = (e for e in events_within(master, 5.0, "emcy") if e.kind == "emcy")
+        assert (first.joint, first.code, second.joint, second.code) == ("joint_2", 0x4310, "joint_1", 0x2330)
+        assert "error register 08h, manufacturer 01 02 00 00 00" in first.text
+        assert "earth leakage on the output side (error register 02h)" in second.text
+
+
 def test_a_lost_heartbeat_is_reported_once_and_its_return_too(vcan_bus: str) -> None:
     with cell(vcan_bus) as (session, robot, servos), DriveMaster(session, robot) as master:
         master.configure()

@@ -13,7 +13,8 @@ import pytest
 
 from configs import config_path
 from daq.recording import read_recording
-from drivers.frames import Frames, frames
+from drivers.frames import Frames, frame, frames
+from drivers.objects import COB_EMCY
 from drivers.socketcan import RawSocket
 from tests.integration.test_several_buses_vcan import session_file, start
 
@@ -24,7 +25,7 @@ SYNC = {"role": "producer", "period_us": 5000, "counter": 240}
 
 
 class Strangers:
-    """Six drives and their master, of which we know nothing: SYNC, and a TPDO of each."""
+    """Six drives and their master, of which we know nothing: SYNC, a TPDO of each, and EMCY of one every second."""
 
     def __init__(self, channel: str, length: int, every: int = 1) -> None:
         self.heard: list[Frames] = []
@@ -44,6 +45,8 @@ class Strangers:
                 out["can_id"][1:], out["length"][1:] = 0x180 + np.arange(1, 7), self._length
                 out["data"][1:, :4] = np.full((6, 1), k, "<i4").view(np.uint8)
             self._bus.send(out)
+            if k % 200 == 100:
+                self._bus.send(frame(COB_EMCY + 3, b"\x11\x86\x20\0\0\0\0\0"))
             # A socket does not hear itself: what comes here is somebody else's.
             if got := self._bus.receive(batch):
                 self.heard.append(batch[:got].copy())
@@ -85,6 +88,8 @@ def test_the_mapping_of_the_session_is_recorded_and_nothing_is_sent(vcan_bus: st
     assert recording.counters["samples.rows"] >= 300
     assert recording.gaps == ()
     assert np.all(np.diff(recording.samples.raw["position"][:, 0]) == 1)
+    assert "node 3 (joint_3): EMCY 8611h, following error (error register 20h)" in err
+    assert recording.counters["emcy"] == len([mark for mark in recording.marks if mark.kind == "emcy"]) >= 1
 
 
 def test_an_eds_that_fits_what_is_heard_is_recorded_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
