@@ -28,8 +28,9 @@ TOP, BASE, BEHIND, EMITTED = range(4)
 
 # Columns of Books.pace, per stream and joint: answers less rows at the drive's best lately, the row at which that was
 # reached, for how many rows in a row it has stood there, for how many nothing has been owed, the row at which this was
-# counted last, and whether answers to rows that were given up may still come.
-BEST, BEST_AT, STOOD, CALM, PACED, UNSURE = range(6)
+# counted last, whether answers to rows that were given up may still come, and the row at which late ones were kept
+# because one of them may have been sent twice.
+BEST, BEST_AT, STOOD, CALM, PACED, UNSURE, HELD = range(7)
 
 IN_STEP = 8
 """A drive whose balance stands for so many rows answers each of them."""
@@ -162,7 +163,7 @@ def open_books(
         writes_to=writes_to,
         head=np.zeros((buses, streams), np.int64),
         hole=np.zeros((buses, streams), np.int64),
-        pace=np.tile(np.array([UNSEEN, 0, 0, 0, 0, 0]), (streams, n, 1)),
+        pace=np.tile(np.array([UNSEEN, 0, 0, 0, 0, 0, UNSEEN]), (streams, n, 1)),
         settled=np.zeros((streams, n), np.int64),
         pending=np.zeros((streams, n), np.int64),
         fresh=np.zeros((streams, n), np.int64),

@@ -1,9 +1,12 @@
 """The commands of this room, as the command line sees them."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from daq.recording import Recording
 
 
 def capture(
@@ -90,9 +93,7 @@ def import_(
         logged = recording_from_log(file, session, load_robot(session.robot))
         write_recording(logged, out)
         rows, gaps = logged.counters["samples.rows"], logged.counters["samples.in_gaps"]
-        print(
-            f"{out}: {rows} samples at {logged.sample_rate_hz:g} Hz, {gaps} in gaps, {', '.join(logged.samples.fields)}"
-        )
+        print(f"{out}: {rows} samples at {logged.sample_rate_hz:g} Hz, {gaps} in gaps, {_fields(logged)}")
         return
 
     pairs = [pair.partition("=") for pair in names.split(",") if pair]
@@ -109,14 +110,20 @@ def import_(
         polled=polled,
     )
     write_recording(recording, out)
-    samples = recording.samples
-    print(f"{out}: {samples.sync.size} samples at {recording.sample_rate_hz:g} Hz, {', '.join(samples.fields)}")
+    rows, fields = recording.samples.sync.size, _fields(recording)
+    print(f"{out}: {rows} samples at {recording.sample_rate_hz:g} Hz, {fields}")
+
+
+def _fields(recording: "Recording") -> str:
+    """What a recording holds, in words."""
+    return ", ".join(name for stream in recording.streams.values() for name in stream.fields)
 
 
 def export(
     recording: Annotated[Path, typer.Argument(help="The recording.")],
     out: Annotated[
-        Path, typer.Option("--out", help="File to write: .csv, .npz, .mat, .parquet, .mcap (ROS 2), .log, .asc, .blf.")
+        Path,
+        typer.Option("--out", help="File to write: .csv, .npz, .mat, .parquet, .mcap (ROS 2), .log, .asc, .blf, .trc."),
     ],
 ) -> None:
     """Write a recording for other tools, in SI units at the joints.

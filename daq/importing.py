@@ -120,7 +120,10 @@ def import_recording(
         raise DataError(
             f"{path}: expected columns q1..q{robot.n} and tau1..tau{robot.n} (or current, voltage); found {have}"
         )
-    _check_units(path, robot, fields, raw)
+    known = _known(raw["demand"]) if "demand" in raw else slice(0, len(raw["position"]))
+    _check_units(path, robot, fields, raw, known)
+    if polled and known != slice(0, len(raw["position"])):
+        raise DataError(f"{source.place(0, 'demand')}: --polled needs a demand in every row, or --map demand={ABSENT}")
     facts = {"source": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     if effort is not None:
         facts |= {"effort": effort.name, "effort_sha256": hashlib.sha256(effort.read_bytes()).hexdigest()}
@@ -134,9 +137,23 @@ def import_recording(
     count = len(raw["position"])
     sync = np.arange(count, dtype=np.int64)
     t_ns = np.round(sync * (1e9 / rate)).astype(np.int64)
-    stream = Stream("samples", 1, sync, t_ns, fields, raw)
-    counters = {"samples.expected": count, "samples.rows": count, "samples.in_gaps": 0}
-    return Recording(None, robot, None, rate, {"samples": stream}, counters=counters, metadata=facts)
+    streams: dict[str, Stream] = {}
+    if known != slice(0, count) and not polled:
+        demand, field = raw.pop("demand")[known], fields.pop("demand")
+        streams["demand"] = Stream("demand", 1, sync[known], t_ns[known], {"demand": field}, {"demand": demand})
+    streams["samples"] = Stream("samples", 1, sync, t_ns, fields, raw)
+    counters = {
+        f"{name}.{what}": number
+        for name, stream in streams.items()
+        for what, number in (("expected", stream.sync.size), ("rows", stream.sync.size), ("in_gaps", 0))
+    }
+    return Recording(None, robot, None, rate, streams, counters=counters, metadata=facts)
+
+
+def _known(demand: NDArray[np.float64]) -> slice:
+    """Rows from the first to the last with a demand: ours is not known before the first set point."""
+    rows = np.flatnonzero(~np.isnan(demand).all(axis=1))
+    return slice(int(rows[0]), int(rows[-1]) + 1) if rows.size else slice(0, len(demand))
 
 
 def _load(path: Path, robot: RobotConfig) -> Source:
@@ -217,7 +234,9 @@ def _pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
         if not file.is_file():
             raise ConfigError(f"{file}: no such file")
         _, values, first_line = _csv(file)
-        _check_finite(Source(file, {}, first_line), values, [f"{j + 1}" for j in range(values.shape[1])])
+        _check_finite(
+            Source(file, {}, first_line), values, [f"{j + 1}" for j in range(values.shape[1])], slice(0, len(values))
+        )
         if values.shape[1] == 1 and values.shape[0] % robot.n == 0:
             values = values.reshape(-1, robot.n)
         if values.shape[1] != robot.n:
@@ -297,17 +316,17 @@ def _pick(source: Source, quantity: str, n: int, names: Mapping[str, str]) -> ND
             values = np.stack([source.table[name] for name in labels], axis=1)
         else:
             continue
-        _check_finite(source, values, labels)
+        _check_finite(source, values, labels, _known(values) if quantity == "demand" else slice(0, len(values)))
         return np.ascontiguousarray(values)
     if quantity in names:
         raise DataError(f"{source.path}: nothing named {names[quantity]!r}; found {', '.join(source.table)}")
     return None
 
 
-def _check_finite(source: Source, values: NDArray[np.float64], labels: Sequence[str]) -> None:
-    bad = np.argwhere(~np.isfinite(values))
+def _check_finite(source: Source, values: NDArray[np.float64], labels: Sequence[str], rows: slice) -> None:
+    bad = np.argwhere(~np.isfinite(values[rows]))
     if bad.size:
-        row, column = (int(k) for k in bad[0])
+        row, column = rows.start + int(bad[0, 0]), int(bad[0, 1])
         more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
         raise DataError(f"{source.place(row, labels[column])}: {values[row, column]} is not a number{more}")
 
@@ -343,10 +362,11 @@ def _unit(quantity: str, robot: RobotConfig) -> str:
     return "A" if quantity == "current" else "V"
 
 
-def _check_units(path: Path, robot: RobotConfig, fields: Mapping[str, Field], raw: Table) -> None:
-    """Refuse what cannot be in SI units on the side said."""
+def _check_units(path: Path, robot: RobotConfig, fields: Mapping[str, Field], raw: Table, known: slice) -> None:
+    """Refuse what cannot be in SI units on the side said; ``known`` are the rows that have a demand."""
     transmission = robot.transmission_matrix
     for name, values in raw.items():
+        values = values[known] if name == "demand" else values
         motor = fields[name].side == "motor"
         if name in ("position", "demand"):
             joint = values @ np.linalg.inv(transmission).T if motor else values
@@ -365,7 +385,7 @@ def _check_units(path: Path, robot: RobotConfig, fields: Mapping[str, Field], ra
                     f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
                 )
     if "demand" in raw:
-        _check_demand(path, robot, raw["demand"], raw["position"])
+        _check_demand(path, robot, raw["demand"][known], raw["position"][known])
 
 
 def _check_demand(path: Path, robot: RobotConfig, demand: NDArray[np.float64], position: NDArray[np.float64]) -> None:

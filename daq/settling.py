@@ -13,6 +13,7 @@ from daq.books import (
     BEST_AT,
     CALM,
     EMITTED,
+    HELD,
     IN_STEP,
     LENGTH,
     NO_SYNC,
@@ -136,6 +137,15 @@ def _drop_first(b: Books, s: int, j: int, count: int) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _may_repeat(b: Books, s: int, j: int) -> bool:
+    """Whether late answers came together that may be one sent twice: the next SYNC shows if there are too many."""
+    found = False
+    for i in range(1, b.pending[s, j]):
+        found = found or (b.label[s, j, i] == b.label[s, j, i - 1] and _same(b, s, j, i, i - 1))
+    return found
+
+
+@njit(cache=True, nogil=True)
 def _settle(b: Books, s: int, j: int, final: bool, witness: bool) -> None:
     """Close the books of one TPDO of one drive: match what is certain, give up what nobody answers any more."""
     bus = b.bus_of[j]
@@ -149,6 +159,9 @@ def _settle(b: Books, s: int, j: int, final: bool, witness: bool) -> None:
     if (balance == 0 and not unsure) or (balance >= 0 and unsure and stood >= IN_STEP):
         if balance > 0:
             _drop_first(b, s, j, balance)
+        elif not unsure and not final and b.pace[s, j, HELD] != head - 1 and _may_repeat(b, s, j):
+            b.pace[s, j, HELD] = head
+            return
         for i in range(owed):
             if b.label[s, j, i] > b.settled[s, j] + i and _seen(b, s, j, b.label[s, j, i]):
                 _was_behind(b, s, j, owed)

@@ -49,6 +49,23 @@ def test_a_frame_sent_twice_is_dropped_where_its_bytes_tell() -> None:
     assert sync.size == 50
 
 
+def test_a_late_answer_that_is_sent_twice_is_not_taken_for_the_next_one() -> None:
+    """Nor is the next one, which is late, too, for that behind it."""
+    _, sync, value = assembled(bus(60, {30: [], 31: [(40, 30), (50, 30)], 32: [(40, 31), (50, 32)]}), 60)
+    assert np.array_equal(value, sync)
+    assert sync.size == 60
+
+
+def test_late_answers_of_a_drive_that_rests_are_given_out_all_the_same() -> None:
+    """They have the same bytes, sent twice or not."""
+    late = {k: [] if k % 4 else [(10 * i, 7) for i in range(4)] for k in range(17, 37)}
+    rest = {k: [(50, 7)] for k in range(60)}
+    assembler, sync, value = assembled(bus(60, rest | late), 60)
+    assert np.array_equal(sync, np.arange(60))
+    assert set(value.tolist()) == {7}
+    assert assembler.counters["tpdo_duplicate"] == 0
+
+
 def test_a_late_answer_before_a_lost_one_is_given_up_by_a_drive_that_is_late_at_times() -> None:
     """Answer 10 comes late, 11 with it: known to happen. Then 30 comes late and 31 never."""
     late = {10: [], 11: [(40, 10), (50, 11)], 30: [], 31: [(50, 30)]}

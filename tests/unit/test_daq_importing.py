@@ -201,6 +201,30 @@ def test_a_demand_in_another_unit_is_refused_and_can_be_left_out(tmp_path: Path)
     assert "demand" in import_recording(path, PANDA, rate_hz=1000.0).samples.fields
 
 
+@pytest.mark.parametrize("kind", ["csv", "npz", "mat", "parquet"])
+def test_a_demand_that_begins_later_and_ends_sooner_comes_back(tmp_path: Path, kind: str) -> None:
+    """As that of every capture does: it is on every fifth SYNC."""
+    values = table()
+    demand = values[:, 1:7] + 0.001
+    demand[:4], demand[-3:] = np.nan, np.nan
+    header = HEADER + "," + ",".join(f"qr{j}" for j in range(1, 7))
+    whole = write_csv(tmp_path / "a.csv", np.column_stack([values, demand]), header)
+    recording = import_recording(whole, TX40)
+    assert np.array_equal(recording.samples.raw["position"], values[:, 1:7])
+    assert np.array_equal(recording.streams["demand"].sync, np.arange(4, 47))
+    assert np.array_equal(recording.streams["demand"].raw["demand"], demand[4:-3])
+    assert recording.counters["samples.rows"] == 50
+    assert recording.counters["demand.rows"] == 43
+    export_recording(recording, tmp_path / f"b.{kind}")
+    assert import_recording(tmp_path / f"b.{kind}", TX40).sha256 == recording.sha256
+    with pytest.raises(DataError, match="--polled needs a demand in every row"):
+        import_recording(whole, TX40, rate_hz=1000.0, polled=True)
+    demand[20, 2] = np.nan
+    holed = write_csv(tmp_path / "c.csv", np.column_stack([values, demand]), header)
+    with pytest.raises(DataError, match=r"c\.csv: line 22, column qr3: nan is not a number"):
+        import_recording(holed, TX40)
+
+
 def test_a_recording_without_samples_is_not_exported(tmp_path: Path) -> None:
     recording = import_recording(write_csv(tmp_path / "a.csv", table()), TX40)
     samples = recording.samples
