@@ -132,6 +132,22 @@ def test_what_has_waited_is_not_written_all_at_once(tmp_path: Path, disk: thread
     assert read_recording(path).samples.sync.tolist() == recording.samples.sync.tolist()
 
 
+def test_a_clock_that_is_set_keeps_nothing_waiting(tmp_path: Path, disk: threading.Event) -> None:
+    recording = make_recording(1500)
+    stream = recording.samples
+    stream.t_ns[700:] += 3_600_000_000_000
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
+    with series:
+        disk.clear()
+        for first in range(0, 1500, 50):
+            append(series, stream, first, first + 50)
+        disk.set()
+        until(lambda: series.waiting_rows == 0)
+        series.close({})
+    (path,) = series.paths
+    assert read_recording(path).samples.sync.tolist() == stream.sync[stream.sync < 1500].tolist()
+
+
 def test_the_end_waits_for_nothing_but_the_disk(
     tmp_path: Path, disk: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
