@@ -21,6 +21,7 @@ from typing import Self
 import numpy as np
 
 import daq.capture
+import drivers.side_socket
 from configs import ArmidentError
 from configs.session import Bus
 from daq.order import prepare
@@ -125,8 +126,9 @@ def watched(order: daq.capture.Order, bus: MadeUp, count: int, folder: Path) -> 
                 time.sleep(0.5)
                 stop.set()
 
-    # The one thing that is not real: where the frames come from.
+    # The one thing that is not real: where the frames come from, among them no EMCY.
     setattr(daq.capture, "open_bus", open_bus)  # noqa: B010
+    setattr(drivers.side_socket, "open_bus", lambda config, **_: MadeUp(0))  # noqa: B010
     watcher = threading.Thread(target=look)
     watcher.start()
     begin, cpu = time.monotonic(), time.process_time()

@@ -1,0 +1,14 @@
+"""What ``python -m tests.faults.hour`` shows of an hour, for a minute: all of it is taken, whatever the memory does."""
+
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.mark.timeout(280)
+def test_a_minute_of_six_drives_is_recorded_faster_than_it_lasts() -> None:
+    command = [sys.executable, "-m", "tests.faults.hour", "--hours", "0.02"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=270)
+    assert "rows 360000, in gaps 0" in done.stdout, done.stderr
+    assert "settled_mb" in done.stdout
