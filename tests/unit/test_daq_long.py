@@ -1,4 +1,4 @@
-"""What ``python -m tests.faults.hour`` shows of an hour, for a minute: all of it is taken, whatever the memory does."""
+"""What ``python -m tests.faults.hour`` shows of an hour, for a minute: in so little time memory says nothing."""
 
 import subprocess
 import sys
