@@ -40,12 +40,12 @@ class _State:
 
 @dataclass(frozen=True)
 class _Work:
-    """Something to do, and the rows that go with it: their bytes, how many they are, and how long they took, ns."""
+    """Something to do, and the rows that go with it: their bytes, how many they are, and how long they took to come."""
 
     do: _Do
     bytes: int = 0
     rows: int = 0
-    span_ns: int = 0
+    took_ns: int = 0
 
 
 @dataclass
@@ -57,10 +57,13 @@ class _Chunk:
     marks: list[Mark] = field(default_factory=list)
     since: int | None = None
     span_ns: int = 0
+    began_ns: int = 0
     bytes: int = 0
     count: int = 0
 
     def add(self, stream: str, rows: _Rows, size: int) -> None:
+        if not self.rows:
+            self.began_ns = time.monotonic_ns()
         self.rows.setdefault(stream, []).append(rows)
         if self.since is not None:
             self.span_ns = max(self.span_ns, int(rows[1][-1]) - self.since)
@@ -243,7 +246,8 @@ class QueuedSeries:
 
     def _hand_over(self) -> None:
         chunk, self._chunk = self._chunk, _Chunk()
-        self._put(_Work(lambda: chunk.write(self._series), chunk.bytes, chunk.count, chunk.span_ns))
+        took_ns = time.monotonic_ns() - chunk.began_ns if chunk.rows else 0
+        self._put(_Work(lambda: chunk.write(self._series), chunk.bytes, chunk.count, took_ns))
 
     def _check(self) -> None:
         """Raise what went wrong in the thread, if something did."""
@@ -289,6 +293,6 @@ class QueuedSeries:
             self._done_bytes += work.bytes
             self._done_rows += work.rows
             if not self._work.empty():
-                # A clock that was set makes a chunk seem long.
-                wanted_ns = min(work.span_ns, self._chunk_ns) / CATCH_UP
+                # Where SYNC rests a chunk takes long to come.
+                wanted_ns = min(work.took_ns, self._chunk_ns) / CATCH_UP
                 self._hurry.wait(1e-9 * max(0.0, wanted_ns - (time.monotonic_ns() - began)))

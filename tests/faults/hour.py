@@ -149,13 +149,14 @@ def watched(order: daq.capture.Order, bus: MadeUp, count: int, folder: Path) -> 
         f"{count} SYNCs, {7 * count} frames ({count / RATE_HZ / 60:.1f} min) in {wall:.0f} s, CPU {used:.0f} s;",
         end=" ",
     )
-    print(f"rows {rows}, in gaps {done.counters['samples.in_gaps']}, files {len(done.paths)}")
+    lost = done.counters["writer.rows_lost"]
+    print(f"rows {rows}, in gaps {done.counters['samples.in_gaps']}, not written {lost}, files {len(done.paths)}")
     print(
         "memory, MB, at minute: " + ", ".join(f"{m:.1f} ({at:.0f})" for at, m in memory[:: max(1, len(memory) // 10)])
     )
     settled = memory[len(memory) // 4][1]
     print(json.dumps({"settled_mb": settled, "end_mb": memory[-1][1], "most_mb": max(m for _, m in memory)}))
-    return int(rows != count or memory[-1][1] > 1.05 * settled)
+    return int(rows != count or lost or memory[-1][1] > 1.05 * settled)
 
 
 if __name__ == "__main__":
