@@ -56,6 +56,10 @@ HINTS: dict[Kind, str] = {
         "tried explains it: record the same motion twice to see how much of it repeats, and look for what is not in "
         "the model"
     ),
+    "time, in bursts": (
+        "the torque of {joint} is off for moments at a time, most at {at}, and nothing in the motion tells when: look "
+        "for dirt or a chip in gear and guide, a cable that catches, a brake that drags, contact, or a loose plug"
+    ),
 }
 """For each kind; the names of the joint and of another one, and where the shape is largest, are filled in."""
 
@@ -76,7 +80,7 @@ def unit_of(kind: Kind, joint: str) -> str:
             return length
         case "acceleration":
             return f"{length}/s^2"
-        case "time" | "time and direction":
+        case "time" | "time and direction" | "time, in bursts":
             return "s"
         case "frequency" | "motion":
             return "Hz"

@@ -16,10 +16,11 @@ Array = NDArray[np.float64]
 Kind = Literal[
     "velocity", "position", "position and direction", "motor angle", "load", "load and direction", "torque",
     "acceleration", "time", "time and direction", "velocity of another joint", "torque of another joint",
-    "frequency", "motion",
+    "frequency", "motion", "time, in bursts",
 ]  # fmt: skip
 """Variables; those with a direction count for the positive one, and with the other sign for the negative one. The last
-are no maps: a frequency that does not move with the motion, and whatever moves with it in a way nobody can tell."""
+are no maps: a frequency that does not move with the motion, whatever moves with it in a way nobody can tell, and
+moments at times of their own."""
 
 SIDE = (0.0, 0.05, 0.15, 0.35, 0.65, 1.0)
 """Speeds of the knots of either direction, over the top speed: close at low speeds, where friction is curved."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from identify.catalogue.effect import Place
+from identify.discrepancy.bursts import Bursts, bursts
 from identify.discrepancy.candidates import Candidate, Workshop
 from identify.discrepancy.excess import Excess, excesses
 from identify.discrepancy.hints import hint_of, unit_of
@@ -70,12 +71,13 @@ class Disagreement:
         Of the variable.
     share
         Share of the power of the joint's held-out residual, as whitened, that the dependence predicts as fitted on the
-        training data; of a frequency its share of the residual at the working rate; of the motion what is not noise.
+        training data; of a frequency its share of the residual at the working rate; of the motion what is not noise;
+        of bursts what of the residual, as smoothed, is more than noise of its usual power.
     p_value
         That a joint without the dependence shows it so clearly, of this one test.
     curve
         Its shape; of a frequency the spectrum around it; of the motion the root of the residual's density, per root of
-        a hertz, and the noise's for a band.
+        a hertz, and the noise's for a band; of bursts the root mean square in each moment, and that of noise.
     """
 
     joint: str
@@ -96,11 +98,16 @@ class Disagreement:
         return f"{self.kind.removesuffix(' of another joint')} of {self.other}"
 
     @property
+    def of_noise(self) -> bool:
+        """Whether the band of the curve is what noise reaches, instead of the curve's own uncertainty."""
+        return self.kind in ("frequency", "motion", "time, in bursts")
+
+    @property
     def hint(self) -> str:
         """What to look for, for whoever stands at the machine."""
         height = np.abs(self.curve.value)
-        if self.kind == "motion":
-            height = height / self.curve.band
+        if self.kind in ("motion", "time, in bursts"):
+            height = height / np.maximum(self.curve.band, 1e-300)
         at = self.curve.x[int(np.argmax(height))]
         return hint_of(self.kind, self.joint, self.other, f"{at:.3g} {self.unit}")
 
@@ -173,6 +180,8 @@ def unexplained(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Surv
 def beyond_noise(fit: Fit, left: Sequence[Disagreement], alpha: float = 0.01) -> list[Disagreement]:
     """What is left, with the joints whose residual is more than noise although nothing named explains most of that.
 
+    Joints with nothing else left are looked at for bursts, too.
+
     Parameters
     ----------
     fit
@@ -180,20 +189,34 @@ def beyond_noise(fit: Fit, left: Sequence[Disagreement], alpha: float = 0.01) ->
     left
         What is left of it by name.
     alpha
-        Chance of a false alarm over all joints.
+        Chance of a false alarm over all joints and both tests.
     """
     found = list(left)
-    for excess in excesses(fit, alpha):
+    for excess in excesses(fit, 0.5 * alpha):
         joint = fit.study.joints[excess.joint]
         named = sum(d.share for d in left if d.joint == joint and d.kind != "frequency")
         if named < 0.5 * excess.share:
             found.append(_moving(joint, excess))
+    # What leaps, or is left over of anything else, has tails of its own.
+    open_joints = {d.joint for d in found}
+    open_joints |= {fit.study.joints[t.place.joint] for t in fit.study.model.terms if t.effect.sudden}
+    for number, own in bursts(fit, 0.5 * alpha).items():
+        joint = fit.study.joints[number]
+        if joint not in open_joints:
+            found.append(_bursting(joint, own))
     return sorted(found, key=lambda d: -d.share)
 
 
 def _moving(joint: str, excess: Excess) -> Disagreement:
     curve = Curve(excess.f, excess.amplitude, excess.noise)
     return Disagreement(joint, "motion", None, unit_of("motion", ""), excess.share, excess.p_value, curve)
+
+
+def _bursting(joint: str, own: Bursts) -> Disagreement:
+    kind: Kind = "time, in bursts"
+    return Disagreement(
+        joint, kind, None, unit_of(kind, ""), own.share, own.p_value, Curve(own.t, own.amplitude, own.noise)
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,7 +48,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
         ],
         gaps=_gap_figure(document),
         map=_map_figure(diagnosis, joints),
-        left=[_curve_figure([d], joints) for d in diagnosis.left],
+        left=[_curve_figure(d, _unit(diagnosis, joints.index(d.joint))) for d in diagnosis.left],
         joints=joints,
         hidden=hidden,
     )
@@ -105,7 +105,7 @@ def _finding_figure(diagnosis: Diagnosis, joint: int) -> str:
         "before": diagnosis.measured[:, joint] - diagnosis.before[:, joint],
         "after": diagnosis.measured[:, joint] - diagnosis.after[:, joint],
     }
-    unit = "N m" if diagnosis.robot.joints[joint].type == "revolute" else "N"
+    unit = _unit(diagnosis, joint)
     seen = [d for d in diagnosis.where if d.joint == name]
     with figure(1, 2, 2.7) as (_, axes, picture):
         over_time, over_cause = axes[0]
@@ -128,14 +128,19 @@ def _finding_figure(diagnosis: Diagnosis, joint: int) -> str:
     return picture[0]
 
 
+def _unit(diagnosis: Diagnosis, joint: int) -> str:
+    return "N m" if diagnosis.robot.joints[joint].type == "revolute" else "N"
+
+
 def _curve(axis: Any, d: Disagreement, unit: str) -> None:
-    """What the model lacks over the variable that the residual depends on most."""
+    """What the model lacks over the variable that the residual depends on most; of a size, what noise has of it."""
     x, value, band = d.curve.x, d.curve.value, d.curve.band
-    axis.fill_between(x, value - band, value + band, color=BAND, linewidth=0)
+    low, high = (np.zeros_like(band), band) if d.of_noise else (value - band, value + band)
+    axis.fill_between(x, low, high, color=BAND, linewidth=0)
     axis.plot(x, value, color=RESIDUAL, linewidth=1.6)
     axis.set_title(f"what the model as configured lacks, over {d.varies_with}")
     axis.set_xlabel(d.unit)
-    axis.set_ylabel(unit)
+    axis.set_ylabel(f"{unit}/√Hz" if d.kind == "motion" else unit)
 
 
 def _map_figure(diagnosis: Diagnosis, joints: Sequence[str]) -> str | None:
@@ -164,11 +169,12 @@ def _map_figure(diagnosis: Diagnosis, joints: Sequence[str]) -> str | None:
     return picture[0]
 
 
-def _curve_figure(found: Sequence[Disagreement], joints: Sequence[str]) -> str:
-    """Shapes of what is left."""
+def _curve_figure(d: Disagreement, unit: str) -> str:
+    """Shape of what is left, in the unit of the joint's torque."""
     with figure(1, 1, 2.3) as (_, axes, picture):
-        _curve(axes[0, 0], found[0], "N m")
-        axes[0, 0].set_title(f"{found[0].joint}: what remains, over {found[0].varies_with}")
+        _curve(axes[0, 0], d, unit)
+        over = {"motion": "frequency; shaded: noise", "time, in bursts": "time, from moment to moment; shaded: noise"}
+        axes[0, 0].set_title(f"{d.joint}: what remains, over {over.get(d.kind, d.varies_with)}")
         axes[0, 0].axhline(0, color=MUTED, linewidth=0.6)
     return picture[0]
 

@@ -50,3 +50,16 @@ def test_a_coupling_has_to_account_for_both_of_its_joints(tmp_path: Path) -> Non
     assert all(found["confidence"] < 0.5 for found in told["findings"])
     assert "joint_4" in {rest["joint"] for rest in told["unexplained"]}
     assert told["verdict"] == "unexplained"
+
+
+@pytest.mark.parametrize(
+    "case", ["outside stick_events joint_2 obvious tx40 run 4", "outside stick_events joint_1 typical emps run 1"]
+)
+def test_friction_for_moments_at_random_times_is_no_noise(case: str, tmp_path: Path) -> None:
+    """Dirt in the gear, which the catalogue does not have, adds a small part to the power of the residual."""
+    told, hidden = diagnosed(case, tmp_path)
+    assert hidden == {}
+    assert told["verdict"] == "unexplained"
+    (rest,) = told["unexplained"]
+    assert rest["varies_with"] == "time, in bursts"
+    assert rest["joint"] == case.split()[2]
