@@ -142,13 +142,13 @@ class Arm:
     def _distort(self, noise: NDArray[np.float64], disturbance: NDArray[np.float64]) -> None:
         """Put hidden errors of amplifiers, wiring and names between drives, plant and bus."""
         signals, (position, current, demand) = self._signals, self._own
-        self._tau[:] = signals.applied(self._current) + disturbance
-        permille = np.floor((signals.reported(self._current) + noise) * self._permille + 0.5)
-        current[:] = np.clip(permille, -32768, 32767)
+        self._tau[:] = signals.applied(self._current)
+        self._tau += disturbance
+        signals.on_the_bus(self._current, noise, self._permille, current)
         if signals.swapped:
-            self.current[:] = np.clip(signals.torque_sign * current[signals.torque_from], -32768, 32767)
-            self.position[:] = signals.position_sign * position[signals.position_from]
-            self.demand[:] = signals.position_sign * demand[signals.position_from]
+            signals.rewired_torque(current, self.current)
+            signals.rewired_position(position, self.position)
+            signals.rewired_position(demand, self.demand)
 
 
 def counts_per_si(robot: RobotConfig) -> NDArray[np.float64]:

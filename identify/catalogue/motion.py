@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from identify.model.compiled import compiled
+
 if TYPE_CHECKING:
     from identify.model.arm import ArmModel
 
@@ -172,9 +174,7 @@ class Motion:
         rotor
             What of the link's inertia is the motor's, kg m^2 or kg.
         """
-        position, velocity, inertia = self.slopes(joint, links=links)
-        change: Array = position * shift[:, None] + velocity * rate[:, None] + inertia * acceleration[:, None]
-        change[:, joint] -= rotor * acceleration
+        change: Array = _first_order(*self.slopes(joint, links=links), shift, rate, acceleration, joint, rotor)
         return change
 
     def slopes(self, joint: int, *, links: bool = False) -> tuple[Array, Array, Array]:
@@ -216,3 +216,23 @@ class Motion:
         if self.theta is None:
             raise ValueError("a motion without parameters predicts no torque")
         return self.theta
+
+
+@compiled
+def _first_order(
+    position: Array,
+    velocity: Array,
+    inertia: Array,
+    shift: Array,
+    rate: Array,
+    acceleration: Array,
+    joint: int,
+    rotor: float,
+) -> Array:
+    """See `Motion.response`; the slopes are (N, n) each."""
+    change = np.empty(position.shape)
+    for k in range(position.shape[0]):
+        for i in range(position.shape[1]):
+            change[k, i] = position[k, i] * shift[k] + velocity[k, i] * rate[k] + inertia[k, i] * acceleration[k]
+        change[k, joint] -= rotor * acceleration[k]
+    return change

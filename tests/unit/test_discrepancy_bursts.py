@@ -10,6 +10,7 @@ from identify.discrepancy.bursts import MATERIAL, Bursts, bursts_of
 Array = NDArray[np.float64]
 
 DT, BANDWIDTH, LENGTH = 0.004, 10.0, 4000
+T = np.asarray(DT * np.arange(LENGTH), dtype=np.float64)
 SPEED = np.abs(np.sin(2 * np.pi * 0.3 * DT * np.arange(LENGTH)))
 
 
@@ -29,7 +30,7 @@ def events(seed: int, share: float) -> Array:
 
 
 def judged(*residuals: Array, speed: Array = SPEED) -> Bursts:
-    times = [DT * np.arange(e.size) for e in residuals]
+    times = [T[: e.size] for e in residuals]
     found = bursts_of(residuals, [speed[: e.size] for e in residuals], times, DT, BANDWIDTH)
     assert found is not None
     return found
@@ -70,5 +71,5 @@ def test_a_joint_that_stands_still_has_none_for_that() -> None:
 
 
 def test_too_little_is_not_judged() -> None:
-    assert bursts_of([noise(1, 300)], [SPEED[:300]], [DT * np.arange(300)], DT, BANDWIDTH) is None
-    assert bursts_of([noise(1, 20)], [SPEED[:20]], [DT * np.arange(20)], DT, BANDWIDTH) is None
+    assert bursts_of([noise(1, 300)], [SPEED[:300]], [T[:300]], DT, BANDWIDTH) is None
+    assert bursts_of([noise(1, 20)], [SPEED[:20]], [T[:20]], DT, BANDWIDTH) is None

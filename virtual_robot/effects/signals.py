@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from configs import RobotConfig
@@ -11,6 +12,79 @@ from virtual_robot.effects.forces import waves
 from virtual_robot.effects.hidden import Hidden
 
 Vector = NDArray[np.float64]
+
+
+@njit(cache=True, error_model="numpy")
+def _measured(q, encoders, to_joints):  # type: ignore[no-untyped-def]
+    """Joint positions (n,) with encoder errors: rows of joint, amplitude, phase and wave numbers (n,)."""
+    n = q.size
+    error, out = np.zeros(n), q.copy()
+    for e in range(encoders.shape[0]):
+        angle = encoders[e, 2]
+        for j in range(n):
+            angle += encoders[e, 3 + j] * q[j]
+        error[int(encoders[e, 0])] += encoders[e, 1] * math.sin(angle)
+    for i in range(n):
+        for j in range(n):
+            out[i] += to_joints[i, j] * error[j]
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _applied(signal, level, knee, lag, lagging, period, torque):  # type: ignore[no-untyped-def]
+    """Joint torques (n,) of signals (n,); ``lagging`` moves on in place."""
+    n = signal.size
+    given, out = np.empty(n), np.zeros(n)
+    for j in range(n):
+        mean = signal[j]
+        if lag[j] > 0.0:
+            # The mean of the exponential over the period, which the plant holds.
+            left = math.exp(-period / lag[j])
+            away = lagging[j] - signal[j]
+            mean = signal[j] + away * lag[j] / period * (1.0 - left)
+            lagging[j] = signal[j] + away * left
+        given[j] = level[j] * mean / math.sqrt(1.0 + (mean / knee[j]) ** 2)
+    for i in range(n):
+        for j in range(n):
+            out[i] += torque[i, j] * given[j]
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _reported(signal, past, newest, delay, leak, ripples, t):  # type: ignore[no-untyped-def]
+    """Signals (n,) as reported at ``t``; ``past`` (L, n) is a ring whose row ``newest`` gets the present one.
+
+    Ripples are rows of drive, amplitude, angular frequency and phase.
+    """
+    n, length = signal.size, past.shape[0]
+    late, out = np.empty(n), np.zeros(n)
+    past[newest] = signal
+    for j in range(n):
+        whole = int(delay[j])
+        part = delay[j] - whole
+        # Row k back from the newest.
+        late[j] = (1.0 - part) * past[(newest + whole) % length, j] + part * past[(newest + whole + 1) % length, j]
+    for i in range(n):
+        for j in range(n):
+            out[i] += leak[i, j] * late[j]
+    for r in range(ripples.shape[0]):
+        out[int(ripples[r, 0])] += ripples[r, 1] * math.sin(ripples[r, 2] * t + ripples[r, 3])
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _permille(signal, noise, permille, out):  # type: ignore[no-untyped-def]
+    """Signals (n,) with noise as numbers on the bus, int16, into ``out`` (n,)."""
+    for j in range(signal.size):
+        raw = math.floor((signal[j] + noise[j]) * permille[j] + 0.5)
+        out[j] = np.int16(min(max(raw, -32768.0), 32767.0))
+
+
+@njit(cache=True, error_model="numpy")
+def _rewired(own, origin, sign, low, high, out):  # type: ignore[no-untyped-def]
+    """Numbers (n,) of other drives with other signs, within what the bus can carry, into ``out`` (n,)."""
+    for j in range(own.size):
+        out[j] = min(max(sign[j] * np.int64(own[origin[j]]), low), high)
 
 
 class Signals:
@@ -42,7 +116,8 @@ class Signals:
         gain = np.array([joint.drive.gain for joint in robot.joints])
         joint_gain = gain * np.diag(ratio)
 
-        self._encoders = [_encoder(h, robot) for h in mine if h.effect == "encoder_eccentricity"]
+        encoders = [_encoder(h, robot) for h in mine if h.effect == "encoder_eccentricity"]
+        self._encoders = np.array(encoders).reshape(len(encoders), 3 + n)
         self._to_joints = np.linalg.inv(ratio) * np.diag(ratio)
 
         self._torque = ratio.T * gain
@@ -60,7 +135,7 @@ class Signals:
 
         self._delay = np.zeros(n)
         self._leak = np.eye(n)
-        self._ripple: list[tuple[int, float, float, float]] = []
+        ripples: list[tuple[float, float, float, float]] = []
         for h in mine:
             if h.effect == "time_delay":
                 self._delay[h.joint] = h["delay"] / period
@@ -68,14 +143,15 @@ class Signals:
                 self._leak[h.joint, h.other] += h["share"] * joint_gain[h.other] / joint_gain[h.joint]
             elif h.effect == "mains_ripple":
                 amplitude = h["amplitude"] / joint_gain[h.joint]
-                self._ripple.append((h.joint, amplitude, 2.0 * math.pi * h["frequency"], h["phase"]))
+                ripples.append((h.joint, amplitude, 2.0 * math.pi * h["frequency"], h["phase"]))
+        self._ripples = np.array(ripples).reshape(-1, 4)
         self._past = np.zeros((int(self._delay.max()) + 2, n))
 
-        self.torque_from, self.torque_sign = np.arange(n), np.ones(n)
-        self.position_from, self.position_sign = np.arange(n), np.ones(n, np.int32)
+        self.torque_from, self.torque_sign = np.arange(n), np.ones(n, np.int64)
+        self.position_from, self.position_sign = np.arange(n), np.ones(n, np.int64)
         for h in mine:
             if h.effect == "sign_error":
-                self.torque_sign[h.joint] *= -1.0 if h["torque"] > 0.5 else 1.0
+                self.torque_sign[h.joint] *= -1 if h["torque"] > 0.5 else 1
                 self.position_sign[h.joint] *= -1 if h["position"] > 0.5 else 1
             elif h.effect == "joint_order":
                 both, turned = [h.joint, h.other], [h.other, h.joint]
@@ -88,45 +164,40 @@ class Signals:
 
     def measured(self, q: Vector) -> Vector:
         """Joint positions (n,) as the encoders have them."""
-        if not self._encoders:
+        if not len(self._encoders):
             return q
-        error = np.zeros(q.size)
-        for joint, amplitude, wave, phase in self._encoders:
-            error[joint] += amplitude * math.sin(float(wave @ q) + phase)
-        out: Vector = q + self._to_joints @ error
+        out: Vector = _measured(q, self._encoders, self._to_joints)
         return out
 
     def applied(self, signal: Vector) -> Vector:
         """Joint torques (n,) that the motors give over the coming period at the drives' ``signal`` (n,)."""
-        mean = signal
-        if self._lag.any():
-            # The mean of the exponential over the period, which the plant holds.
-            with np.errstate(divide="ignore"):
-                left = np.exp(-self._period / self._lag)
-            away = self._lagging - signal
-            mean = signal + away * self._lag / self._period * (1.0 - left)
-            self._lagging = signal + away * left
-        saturated = self._level * mean / np.sqrt(1.0 + (mean / self._knee) ** 2)
-        out: Vector = self._torque @ saturated
+        out: Vector = _applied(signal, self._level, self._knee, self._lag, self._lagging, self._period, self._torque)
         return out
 
     def reported(self, signal: Vector) -> Vector:
         """The drives' ``signal`` (n,) as it is reported now, before noise, in the drives' own order."""
-        self._past = np.roll(self._past, 1, axis=0)
-        self._past[0] = signal
-        whole = self._delay.astype(np.int64)
-        part, column = self._delay - whole, np.arange(signal.size)
-        out: Vector = (1.0 - part) * self._past[whole, column] + part * self._past[whole + 1, column]
-        out = self._leak @ out
-        t = self._periods * self._period
-        for joint, amplitude, rate, phase in self._ripple:
-            out[joint] += amplitude * math.sin(rate * t + phase)
+        newest = -self._periods % len(self._past)
+        out: Vector = _reported(
+            signal, self._past, newest, self._delay, self._leak, self._ripples, self._periods * self._period
+        )
         self._periods += 1
         return out
 
+    def on_the_bus(self, signal: Vector, noise: Vector, permille: Vector, out: NDArray[np.int16]) -> None:
+        """Signals (n,) with noise, as numbers of ``permille`` per unit, into ``out`` (n,)."""
+        _permille(self.reported(signal), noise, permille, out)
 
-def _encoder(h: Hidden, robot: RobotConfig) -> tuple[int, float, Vector, float]:
-    """Joint, amplitude, wave numbers over the joint positions (n,), phase."""
+    def rewired_torque(self, own: NDArray[np.int16], out: NDArray[np.int16]) -> None:
+        """The drives' ``own`` numbers (n,) under the names and signs that they are recorded with, into ``out``."""
+        _rewired(own, self.torque_from, self.torque_sign, -32768, 32767, out)
+
+    def rewired_position(self, own: NDArray[np.int32], out: NDArray[np.int32]) -> None:
+        """The same of positions and demands, in counts."""
+        _rewired(own, self.position_from, self.position_sign, -(2**31), 2**31 - 1, out)
+
+
+def _encoder(h: Hidden, robot: RobotConfig) -> Vector:
+    """Joint, amplitude, phase, and wave numbers over the joint positions (n,): (3 + n,)."""
     joint, wave = robot.joints[h.joint], np.zeros(robot.n)
     if h["motor"] <= 0.5:
         wave[h.joint] = waves(h, joint)
@@ -134,4 +205,4 @@ def _encoder(h: Hidden, robot: RobotConfig) -> tuple[int, float, Vector, float]:
         wave = h.given("per_turn", 1.0) * robot.transmission_matrix[h.joint]
     else:
         wave[h.joint] = 2.0 * math.pi * h.given("per_turn", 1.0) / h["pitch"]
-    return h.joint, h["amplitude"], wave, h["phase"]
+    return np.concatenate([[h.joint, h["amplitude"], h["phase"]], wave])
