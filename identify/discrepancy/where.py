@@ -34,6 +34,9 @@ LOOKS = 6
 MATERIAL = 0.02
 """Share of a joint's held-out residual power that an unexplained dependence must have to be reported."""
 
+SLOWEST = 0.25
+"""Lowest frequency of a line at a joint with nothing else left, over the bandwidth of the motion."""
+
 MOST = 2
 """Most unexplained dependences of one joint."""
 
@@ -126,7 +129,9 @@ def survey(fit: Fit, workshop: Workshop, alpha: float = 0.01) -> Survey:
     """Try all variables on all joints; see `where` for the arguments."""
     own = _bench(workshop)
     level = alpha / _tests(fit, own)
-    return Survey(own, level, tuple(_significant(fit, own, level)), tuple(_lines(fit, level)))
+    return Survey(
+        own, level, tuple(_significant(fit, own, level)), tuple(_lines(fit, level, lowest_frequency(fit.study)))
+    )
 
 
 def where(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Survey | None = None) -> list[Disagreement]:
@@ -180,7 +185,8 @@ def unexplained(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Surv
 def beyond_noise(fit: Fit, left: Sequence[Disagreement], alpha: float = 0.01) -> list[Disagreement]:
     """What is left, with the joints whose residual is more than noise although nothing named explains most of that.
 
-    Joints with nothing else left are looked at for bursts, too.
+    Joints with nothing else left are looked at for lines among the frequencies of the motion and for bursts, too:
+    what a model lacks otherwise may leave either.
 
     Parameters
     ----------
@@ -189,21 +195,23 @@ def beyond_noise(fit: Fit, left: Sequence[Disagreement], alpha: float = 0.01) ->
     left
         What is left of it by name.
     alpha
-        Chance of a false alarm over all joints and both tests.
+        Chance of a false alarm over all joints and tests.
     """
-    found = list(left)
-    for excess in excesses(fit, 0.5 * alpha):
+    found, each = list(left), alpha / 3
+    for excess in excesses(fit, each):
         joint = fit.study.joints[excess.joint]
         named = sum(d.share for d in left if d.joint == joint and d.kind != "frequency")
         if named < 0.5 * excess.share:
             found.append(_moving(joint, excess))
-    # What leaps, or is left over of anything else, has tails of its own.
-    open_joints = {d.joint for d in found}
-    open_joints |= {fit.study.joints[t.place.joint] for t in fit.study.model.terms if t.effect.sudden}
-    for number, own in bursts(fit, 0.5 * alpha).items():
-        joint = fit.study.joints[number]
-        if joint not in open_joints:
-            found.append(_bursting(joint, own))
+    slow = _lines(fit, each / fit.study.robot.n, SLOWEST * lowest_frequency(fit.study))
+    found += [line for line in slow if line.share >= MATERIAL and line.joint not in {d.joint for d in found}]
+    # What leaps has tails of its own.
+    told = {d.joint for d in found} | {
+        fit.study.joints[t.place.joint] for t in fit.study.model.terms if t.effect.sudden
+    }
+    found += [
+        _bursting(fit.study.joints[j], own) for j, own in bursts(fit, each).items() if fit.study.joints[j] not in told
+    ]
     return sorted(found, key=lambda d: -d.share)
 
 
@@ -315,14 +323,14 @@ def _with(fit: Fit, found: _Found, workshop: Workshop) -> Fit:
     return solved(fit.study, equations, own.noise, theta)
 
 
-def _lines(fit: Fit, level: float) -> list[Disagreement]:
-    """The strongest line of each joint, where there is one."""
+def _lines(fit: Fit, level: float, lowest: float) -> list[Disagreement]:
+    """The strongest line of each joint from a frequency on, Hz, where there is one."""
     study = fit.study
     train = residuals(study, study.train, fit.theta)
     held = residuals(study, study.held, fit.theta)
     found: list[Disagreement] = []
     for j, joint in enumerate(study.joints):
-        line = strongest_line([e[:, j] for e in train], [e[:, j] for e in held], study.dt, lowest_frequency(study))
+        line = strongest_line([e[:, j] for e in train], [e[:, j] for e in held], study.dt, lowest)
         if line is None or not line.p_value < level or not line.p_held < HELD_OUT_LEVEL:
             continue
         if of_references(study, line.frequency):

@@ -63,3 +63,11 @@ def test_friction_for_moments_at_random_times_is_no_noise(case: str, tmp_path: P
     (rest,) = told["unexplained"]
     assert rest["varies_with"] == "time, in bursts"
     assert rest["joint"] == case.split()[2]
+
+
+def test_ripple_among_the_frequencies_of_the_motion_is_a_line(tmp_path: Path) -> None:
+    """Mains of 16.7 Hz under a motion of 20 Hz: a tenth of the residual's power, at a single frequency."""
+    told, _ = diagnosed("outside mains_ripple joint_1 typical emps run 2", tmp_path)
+    (rest,) = told["unexplained"]
+    assert rest["varies_with"] == "frequency"
+    assert "16.7 Hz" in rest["hint"]
