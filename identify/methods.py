@@ -194,11 +194,12 @@ def solve(problem: Problem) -> Solution:
 
 
 def _idim_piv(problem: Problem) -> Solution:
-    """IDIM-PIV, unless the prefilter contradicts IDIM-IV.
+    """IDIM-PIV, unless the prefilter contradicts IDIM-IV, or comes to no rest where IDIM-IV does.
 
     A noise model may move the estimate within its uncertainty only. Where it moves it further, the residual
     is not noise but what the model lacks, and its inverse filter amplifies that (thesis section 6.2.3); then, as in
-    SEP-PEM, the dynamic model is estimated without it and it only enters the covariance (6.2.1).
+    SEP-PEM, the dynamic model is estimated without it and it only enters the covariance (6.2.1). So it is where the
+    iterations with the prefilter, which weighs what lies beyond the motion's own frequencies, do not converge.
     """
     options, plain = problem.options, problem.plain_problem
     without = idim_iv(plain.blocks, plain.auxiliary, problem.start, serial_order=options.max_ar_order)
@@ -211,15 +212,19 @@ def _idim_piv(problem: Problem) -> Solution:
     )
     shift = np.abs(estimate.theta - without.theta) / without.std
     worst = int(np.argmax(shift))
-    if shift[worst] <= CONTRADICTION:
+    if shift[worst] > CONTRADICTION:
+        name = problem.auxiliary.model.base.names[worst]
+        why = (
+            f"the prefilter of idim-piv moves {name} by {shift[worst]:.0f} standard deviations from idim-iv: the "
+            "residuals are model error, not noise"
+        )
+    elif without.converged and not estimate.converged:
+        why = f"idim-piv {estimate.stop_reason} without converging"
+    else:
         if options.noise_model == "grey-box":
             return Solution(estimate, problem, noise_of="motor position")
         return Solution(estimate, problem, prefiltered=True)
-    warning = (
-        f"the prefilter of idim-piv moves {problem.auxiliary.model.base.names[worst]} by {shift[worst]:.0f} standard "
-        "deviations from idim-iv: the residuals are model error, not noise; the parameters are those of idim-iv, the "
-        "noise model only enters their standard deviations"
-    )
+    warning = f"{why}; the parameters are those of idim-iv, the noise model only enters their standard deviations"
     return Solution(without, plain, warnings=(warning,))
 
 
