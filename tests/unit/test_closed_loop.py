@@ -1,9 +1,13 @@
 """The closed loop that instruments come from: given up where the identified controller leads astray."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from configs import load_robot, load_trajectory
+from identify import methods
+from identify.estimators.idim_piv import idim_piv
 from identify.experiment import Experiment
 from identify.from_recording import experiments_from_recording
 from identify.options import Method, Options
@@ -32,3 +36,18 @@ def test_a_loop_at_the_edge_of_stability_is_replaced(at_500_hz: list[Experiment]
     assert np.all(found.std < 10 * ls_std)
     essential = found.essential
     assert np.all(np.abs(found.theta - ls)[essential] < 0.3 * np.abs(ls)[essential] + 6 * found.std[essential])
+
+
+def test_a_prefilter_that_comes_to_no_rest_is_done_without(
+    at_500_hz: list[Experiment], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same iterations, stopped after the first: the estimate is that of IDIM-IV, which converges."""
+    monkeypatch.setattr(methods, "idim_piv", partial(idim_piv, iterations=1))
+    robot = load_robot("tx40.yaml")
+    found = identify_experiment(at_500_hz, robot, Options())
+    assert found.converged
+    assert any("stopped after 1 iterations without converging" in warning for warning in found.warnings)
+    without = identify_experiment(at_500_hz, robot, Options(method="idim-iv"))
+    np.testing.assert_allclose(found.theta, without.theta, rtol=0, atol=1e-9)
+    # Serial correlation counts, which plain IDIM-IV leaves out.
+    assert np.median(found.std / without.std) > 1.0
