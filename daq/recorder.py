@@ -185,13 +185,20 @@ class Recorder:
 
     def _loop(self) -> None:
         last = self._last_wanted()
+        if isinstance(self._producer, SyncProducer) and math.isfinite(last):
+            # Who counts SYNCs here may be late; drives that are behind would be so by ever more.
+            self._producer.end_after(round(last) + 1)
         due = reported = time.monotonic()
         deadline = None if self._order.duration is None else due + self._order.duration
         while not self._stop.is_set() and self._assembler.last_sync < last:
             due = max(due + self._drain_s, time.monotonic())
             time.sleep(max(0.0, due - time.monotonic()))
+            sent = self._producer.sent if self._producer is not None else None
             self._drain()
             self._watch()
+            if sent is not None and sent > last:
+                # There are no more, even if the kernel dropped the last ones on their way back.
+                break
             now = time.monotonic()
             if now - reported >= HEALTH_S:
                 self._happenings.look_for_other_mappings()

@@ -1,6 +1,6 @@
 """Where captured rows go: the recording, and Zenoh."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,9 @@ from daq.recording.model import MarkKind
 from daq.streams import CapturedStream
 from daq.zenoh_keys import Block, encode_event
 from daq.zenoh_keys.codec import end_content, start_content
+
+PIECE_NS = 200_000_000
+"""So much recorded time is written and published at once, however much became certain together."""
 
 
 class Sink:
@@ -93,6 +96,10 @@ class Sink:
 
     def take(self, batch: Batch) -> None:
         """Write and publish what became certain."""
+        for piece in pieces(batch):
+            self._take(piece)
+
+    def _take(self, batch: Batch) -> None:
         samples = batch.rows["samples"]
         if samples.sync.size:
             self._writer.turn(int(samples.t_ns[0]))
@@ -143,6 +150,30 @@ class Sink:
             self.marks.append(mark)
             self._writer.add_marks([mark])
             self._publisher.event(encode_event("mark", {"capture": self._capture, **asdict(mark, dict_factory=_mark)}))
+
+
+def pieces(batch: Batch) -> Iterator[Batch]:
+    """Cut what drives that were behind sent at once into pieces of ``PIECE_NS``, by the time of the samples.
+
+    Rows of every stream are in the piece of their SYNC, a gap is in that of its first one: files end, and blocks have
+    the size, as if the answers had come in time.
+    """
+    samples = batch.rows["samples"]
+    if samples.sync.size == 0 or samples.t_ns[-1] - samples.t_ns[0] < PIECE_NS:
+        yield batch
+        return
+    number = (samples.t_ns - samples.t_ns[0]) // PIECE_NS
+    borders = samples.sync[np.flatnonzero(np.diff(number) > 0) + 1]
+    of_gap = np.searchsorted(borders, [gap.first for gap in batch.gaps], side="right")
+    cuts = {
+        name: [0, *np.searchsorted(rows.sync, borders).tolist(), rows.sync.size] for name, rows in batch.rows.items()
+    }
+    for k in range(borders.size + 1):
+        part = {}
+        for name, rows in batch.rows.items():
+            here = slice(cuts[name][k], cuts[name][k + 1])
+            part[name] = Rows(rows.sync[here], rows.t_ns[here], rows.data[here])
+        yield Batch(part, tuple(gap for gap, at in zip(batch.gaps, of_gap, strict=True) if at == k))
 
 
 def _mark(entries: list[tuple[str, Any]]) -> dict[str, Any]:

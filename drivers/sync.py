@@ -4,7 +4,8 @@ A compiled loop without the interpreter's lock sleeps until each deadline (``clo
 SYNC and the set points that belong behind it to the kernel in one system call.
 
 What it does when it wakes up late: the SYNC goes out at once and the following ones return to the grid, never
-closer to each other than half a period. When it is late by more than ``MAX_LATE_PERIODS`` nothing is caught
+closer to each other than half a period, in which a machine that is too slow for its buses does everything else: with
+real-time priority nothing but this rest would let it. When it is late by more than ``MAX_LATE_PERIODS`` nothing is caught
 up: the grid moves by whole periods, and ``SyncStats.skipped`` counts them. No SYNC number is ever left out: a bus that
 refuses one (it is down) lacks it, the others go on.
 """
@@ -41,6 +42,7 @@ from drivers.sync_loop import (
     STATE_SIZE,
     STOP,
     TIMES,
+    WANTED,
     Loop,
     is_knot,
 )
@@ -57,6 +59,7 @@ class SyncStats:
 
     sent: int
     late_p50_us: float
+    """How long behind its time on the grid a SYNC had been handed to the kernel of every bus."""
     late_p99_us: float
     late_max_us: float
     overruns: int
@@ -102,6 +105,7 @@ class SyncProducer:
         self._taken = threading.Event()
         self._state = np.zeros(STATE_SIZE, dtype=np.int64)
         self._state[FIRST] = -1
+        self._state[WANTED] = np.iinfo(np.int64).max
         self._late = np.zeros(BINS, dtype=np.int64)
         self._realtime = False
         self._errors = np.zeros(len(self._configured), dtype=np.int64)
@@ -140,6 +144,16 @@ class SyncProducer:
             self._thread.join()
         for bus in self._buses:
             bus.close()
+
+    def end_after(self, count: int) -> None:
+        """Send SYNC ``count - 1`` as the last one, however late somebody looks whether it was; :meth:`stop` remains due.
+
+        Parameters
+        ----------
+        count
+            SYNCs in all; where so many have been sent already, no other follows.
+        """
+        self._state[WANTED] = count
 
     def play(self, plan: SetpointPlan) -> int:
         """Play set points from the next possible knot on, in place of those played so far.
@@ -197,6 +211,10 @@ class SyncProducer:
         return first, self._times[np.arange(first, sent) % TIMES]
 
     @property
+    def _over(self) -> bool:
+        return bool(self._state[STOP] or self._state[SENT] >= self._state[WANTED])
+
+    @property
     def first(self) -> int | None:
         """SYNC at which row 0 of the set points becomes the target; ``None`` while nothing is played."""
         first = int(self._state[FIRST])
@@ -242,7 +260,7 @@ class SyncProducer:
     def _run_compiled(self) -> None:
         assert self._loop is not None
         self._realtime = be_punctual(REALTIME_PRIORITY)
-        while not self._state[STOP]:
+        while not self._over:
             self._take_plan()
             rows, cob_ids, every = self._rows()
             plan = self._plan
@@ -254,7 +272,7 @@ class SyncProducer:
         (bus,) = self._buses
         state, period = self._state, self._period_ns * 1e-9
         base = time.monotonic() + period
-        while not state[STOP]:
+        while not self._over:
             self._take_plan()
             rows, cob_ids, every = self._rows()
             k = int(state[SENT])
