@@ -177,6 +177,8 @@ class Server:
                 if backlog or self._syncs % LATENESS_SYNCS == 0:
                     self._note(time.time_ns() - int(stamps[at]))
                 exchange.act()
+                # Drives that are behind obey at the same SYNC as those that are not.
+                self._catch_up()
                 self._advance()
                 backlog += 1
                 at += 1

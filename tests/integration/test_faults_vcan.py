@@ -19,7 +19,7 @@ def run(*arguments: str) -> str:
 
 def test_every_sync_is_accounted_for_whatever_goes_wrong() -> None:
     assert sorted(name for faults, *_ in HANDFUL for name in faults) == sorted(FAULTS)
-    assert "0 with something wrong" in run("tests.faults.bus", "--handful", "--lanes", "2")
+    assert "0 with something wrong" in run("tests.faults.bus", "--handful", "--lanes", "1")
 
 
 def test_a_kill_costs_a_tenth_of_a_second_at_most_and_every_file_heals() -> None:

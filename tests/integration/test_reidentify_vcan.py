@@ -16,7 +16,7 @@ import sqlalchemy as sa
 import yaml
 
 from daq.recording import read_recording
-from drivers.frames import frame, frames
+from drivers.frames import Frames, frame, frames
 from drivers.objects import COB_EMCY, DriveState, drive_state
 from drivers.socketcan import RawSocket
 from tests.statistics.weeks import WORN, cell_file
@@ -105,9 +105,9 @@ def test_an_emcy_in_the_middle_stops_the_arm_within_a_cycle(vcan_bus: str, tmp_p
     config = cell_file(tmp_path, vcan_bus, "stopped", **QUICK)
     with arm(config), RawSocket(vcan_bus) as listener, RawSocket(vcan_bus, filters=()) as sender:
         process = job(config, tmp_path)
-        _await_motion(listener, process)
+        rows = _await_motion(listener, process)
         sender.send(frame(COB_EMCY + 3, b"\x10\x43\x08\0\0\0\0\0"))
-        rows = _until_ended(listener, process)
+        rows += _until_ended(listener, process)
         _, err = process.communicate(timeout=120)
     assert process.returncode == 1
     line = one_line(err)
@@ -121,9 +121,12 @@ def test_an_emcy_in_the_middle_stops_the_arm_within_a_cycle(vcan_bus: str, tmp_p
     print(f"last stop order {late:.2f} ms and {len(syncs)} SYNC after the EMCY, one period is 2 ms")
     # All processes of this test share one CPU in a guest, so that a cycle may begin while the guard is woken.
     assert len(syncs) <= 2 or late < 20.0
-    after = [data for _, can_id, data in rows[stops[-1] :] if can_id == 0x183]
-    states = [drive_state(int.from_bytes(data[6:8], "little")) for data in after]
-    assert DriveState.QUICK_STOP_ACTIVE in states[:50]
+    # The n-th answer belongs to the n-th SYNC: drives on a busy machine still answer some of before the order.
+    before = sum(can_id == 0x80 for _, can_id, _ in rows[: stops[-1]])
+    answers = [data for _, can_id, data in rows if can_id == 0x183]
+    assert len(answers) == sum(can_id == 0x80 for _, can_id, _ in rows) > before + 3
+    states = [drive_state(int.from_bytes(data[6:8], "little")) for data in answers[before:]]
+    assert DriveState.QUICK_STOP_ACTIVE in states[:3]
     (recording,) = (tmp_path / "out").glob("*.mcap")
     assert str(recording) in line
     assert read_recording(recording).missing is None
@@ -160,9 +163,9 @@ def test_a_bus_that_is_not_there_is_one_line(tmp_path: Path) -> None:
 Rows = list[tuple[int, int, bytes]]
 
 
-def _await_motion(listener: RawSocket, process: subprocess.Popen[str]) -> None:
-    """Until the set points have been played for half a second or so."""
-    batch, seen = frames(4096), 0
+def _await_motion(listener: RawSocket, process: subprocess.Popen[str]) -> Rows:
+    """Everything on the bus until the set points have been played for half a second or so."""
+    batch, rows, seen = frames(4096), Rows(), 0
     until = time.monotonic() + 120
     while seen < 250:
         assert process.poll() is None, process.communicate()
@@ -170,6 +173,8 @@ def _await_motion(listener: RawSocket, process: subprocess.Popen[str]) -> None:
         if listener.poll(0.1):
             got = listener.receive(batch)
             seen += int((batch["can_id"][:got] == 0x201).sum())
+            rows += _rows(batch[:got])
+    return rows
 
 
 def _until_ended(listener: RawSocket, process: subprocess.Popen[str]) -> Rows:
@@ -179,5 +184,9 @@ def _until_ended(listener: RawSocket, process: subprocess.Popen[str]) -> Rows:
     while process.poll() is None and time.monotonic() < until:
         if listener.poll(0.1):
             got = listener.receive(batch)
-            rows += [(int(r["t_ns"]), int(r["can_id"]), r["data"][: r["length"]].tobytes()) for r in batch[:got]]
+            rows += _rows(batch[:got])
     return rows
+
+
+def _rows(batch: Frames) -> Rows:
+    return [(int(r["t_ns"]), int(r["can_id"]), r["data"][: r["length"]].tobytes()) for r in batch]
