@@ -4,10 +4,10 @@ A compiled loop without the interpreter's lock sleeps until each deadline (``clo
 SYNC and the set points that belong behind it to the kernel in one system call.
 
 What it does when it wakes up late: the SYNC goes out at once and the following ones return to the grid, never
-closer to each other than half a period, in which a machine that is too slow for its buses does everything else: with
-real-time priority nothing but this rest would let it. When it is late by more than ``MAX_LATE_PERIODS`` nothing is caught
-up: the grid moves by whole periods, and ``SyncStats.skipped`` counts them. No SYNC number is ever left out: a bus that
-refuses one (it is down) lacks it, the others go on.
+closer to each other than half a period. On a machine that is too slow for its buses everything else happens in this
+rest: a loop of real-time priority would not let it otherwise. When it is late by more than ``MAX_LATE_PERIODS`` nothing
+is caught up: the grid moves by whole periods, and ``SyncStats.skipped`` counts them. No SYNC number is ever left out: a
+bus that refuses one (it is down) lacks it, the others go on.
 """
 
 import errno
@@ -146,7 +146,7 @@ class SyncProducer:
             bus.close()
 
     def end_after(self, count: int) -> None:
-        """Send SYNC ``count - 1`` as the last one, however late somebody looks whether it was; :meth:`stop` remains due.
+        """Send SYNC ``count - 1`` as the last one, however late anybody looks; :meth:`stop` remains due.
 
         Parameters
         ----------

@@ -35,12 +35,16 @@ class Linear:
         +1 or -1 where physics knows it, 0 where both are possible.
     bounds
         Values beyond which the effect would be something else.
+    through
+        The nonlinear parameter without which (where it is zero) there is no such parameter, if there is one. A search
+        leaves it out where the effect without it is likelier.
     """
 
     name: str
     unit: tuple[str, str]
     sign: int = 0
     bounds: tuple[float, float] = (-math.inf, math.inf)
+    through: str | None = None
 
 
 @dataclass(frozen=True)
@@ -169,6 +173,12 @@ class Effect:
             p.sign * value >= -DOUBT * doubt and p.bounds[0] - DOUBT * doubt <= value <= p.bounds[1] + DOUBT * doubt
             for p, value, doubt in zip(self.linear, values, std, strict=True)
         )
+
+    def choices(self) -> list[list[int]]:
+        """Numbers of the linear parameters to try together: all, and those that go with no nonlinear one."""
+        every = [k for k, _ in enumerate(self.linear)]
+        alone = [k for k in every if self.linear[k].through is None]
+        return [every] if alone == every else [every, alone]
 
     def refinable(self, robot: RobotConfig, place: "Place") -> tuple[bool, ...]:
         """Which of the nonlinear parameters may lie between the values of their grids at a place."""

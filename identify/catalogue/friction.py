@@ -45,7 +45,8 @@ def _stribeck(motion: Motion, place: Place, *, velocity: float, displacement: fl
     j = place.joint
     # So slow that the model's smoothed sign is only on its way, while a bristle has long been bent.
     side = dahl(motion.q[:, j], displacement) if displacement > 0.0 else motion.sign[:, j]
-    return (np.exp(-((motion.qd[:, j] / velocity) ** 2)) * side)[:, None]
+    # The bristle carries the model's dry friction, too: what of it the smoothed sign has no part in any more.
+    return np.stack([np.exp(-((motion.qd[:, j] / velocity) ** 2)) * side, side - motion.sign[:, j]], axis=1)
 
 
 def bristles(motion: Motion, joint: int) -> Sequence[float]:
@@ -165,7 +166,7 @@ EFFECTS = (
         title="extra friction at low speed",
         says="extra friction at low speed that fades as the joint speeds up: poor or squeezed-out lubricant",
         reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
-        linear=(Linear("fst", TORQUE, sign=1),),
+        linear=(Linear("fst", TORQUE, sign=1), Linear("fsb", TORQUE, through="displacement")),
         shapes=(
             Shape("velocity", ("rad/s", "m/s"), speeds),
             Shape("displacement", ("rad", "m"), bristles, default=0.0),

@@ -75,7 +75,7 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
         shapes = _shapes(stanza, effect, where)
         kind = int(robot.joints[place.joint].type == "prismatic")
         number = f"{place.joint + 1}" if place.other is None else f"{place.joint + 1}{place.other + 1}"
-        kept = _kept(stanza, effect, where)
+        kept = _kept(stanza, effect, shapes, where)
         names = []
         for linear in (effect.linear[k] for k in kept):
             name = f"{linear.name}{number}"
@@ -124,13 +124,14 @@ def stanza_of(
     )
 
 
-def _kept(stanza: Stanza, effect: Effect, where: str) -> tuple[int, ...]:
-    """Numbers of the linear parameters that a stanza does not leave out."""
+def _kept(stanza: Stanza, effect: Effect, shapes: dict[str, float], where: str) -> tuple[int, ...]:
+    """Numbers of the linear parameters that a stanza does not leave out, and that its nonlinear ones do not."""
     names = [parameter.name for parameter in effect.linear]
     for name in stanza.without:
         if name not in names:
             raise ConfigError(f"{where}: without: {name!r} is none of its linear parameters ({', '.join(names)})")
-    kept = tuple(k for k, name in enumerate(names) if name not in stanza.without)
+    there = [p.through is None or shapes[p.through] != 0.0 for p in effect.linear]
+    kept = tuple(k for k, name in enumerate(names) if name not in stanza.without and there[k])
     if not kept:
         raise ConfigError(f"{where}: without: nothing is left of it")
     return kept

@@ -120,8 +120,8 @@ def test_files_follow_each_other_without_losing_a_sample(vcan_bus: str, tmp_path
     assert process.returncode == 0, err
     document = json.loads(out)
     parts = [read_recording(path) for path in document["recordings"]]
-    # Six seconds are five files; an arm that is behind is answered in large batches, each in one file.
-    assert len(parts) >= 2
+    # Six seconds and what the producer was late: a file every 1.2 s of it, also where answers came all at once.
+    assert len(parts) >= 5
     assert all(part.missing is None for part in parts)
     sync = np.concatenate([part.samples.sync for part in parts])
     lost = {n for part in parts for g in part.gaps if g.stream == "samples" for n in range(g.first, g.last + 1)}

@@ -70,6 +70,14 @@ def test_two_syncs_are_never_closer_than_half_a_period(vcan_bus: str) -> None:
     assert np.diff(got["t_ns"]).min() > PERIOD_US * 500 - 50_000
 
 
+def test_the_last_sync_is_the_last_however_late_somebody_looks(vcan_bus: str) -> None:
+    producer = producer_on(vcan_bus, counter=10)
+    producer.end_after(70)
+    begin = time.monotonic()
+    got = record(vcan_bus, producer, lambda: time.monotonic() > begin + 0.5 and producer.sent == 70)
+    assert got["data"][:, 0].tolist() == [k % 10 + 1 for k in range(70)]
+
+
 def rows_of(got: Frames, cob: int) -> list[int]:
     return [int(v) for v in got[got["can_id"] == cob]["data"][:, :4].copy().view("<i4")[:, 0]]
 

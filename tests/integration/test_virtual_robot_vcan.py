@@ -1,5 +1,6 @@
 """The virtual arm on a real (virtual) SocketCAN bus, driven by the project's own master and SYNC producer."""
 
+import os
 import re
 import signal
 import subprocess
@@ -20,7 +21,7 @@ from configs.trajectory import Move
 from daq.recording import write_recording
 from drivers.frames import frames
 from drivers.master import DriveMaster
-from drivers.objects import COB_MASK, COB_SYNC, NmtCommand
+from drivers.objects import COB_MASK, COB_SYNC, Control, DriveState, NmtCommand, drive_state
 from drivers.socketcan import RawSocket
 from drivers.sync import SetpointPlan, SyncProducer
 from virtual_robot.offline import simulate_recording
@@ -35,6 +36,7 @@ RUN = "import sys; from pathlib import Path; from virtual_robot.cli import robot
 class Output:
     """What the robot process printed on stderr when it ended, and its exit code."""
 
+    process_id: int
     text: str = ""
     code: int | None = None
 
@@ -46,7 +48,7 @@ def robot_process(config: Path, options: str = "noise=0.0") -> Iterator[Output]:
         [sys.executable, "-c", RUN + options + ")", str(config)],
         cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    output = Output()
+    output = Output(process.pid)
     try:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready:")
@@ -140,6 +142,31 @@ def test_every_sync_is_answered_by_every_drive_and_set_points_are_followed(confi
         np.testing.assert_array_equal(demand[knot : knot + len(rows)], rows[: demand.size - knot, j])
         # The loosest loop lags a 1 s swing by far less than a tenth of it once friction is overcome.
         assert np.abs(position[4::5][: demand.size] - demand).max() < 12_000
+
+
+def test_drives_that_are_behind_obey_at_the_same_sync(config: Path) -> None:
+    """All frames of a moment in which the arm stood still are read at once: the stop acts in the middle of them."""
+    session = load_session(config)
+    before, after = 30, 20
+    burst = frames(before + 1 + after)
+    burst["can_id"], burst["length"] = COB_SYNC, 1
+    burst["data"][:, 0] = np.where(np.arange(burst.size) < before, np.arange(burst.size), np.arange(burst.size) - 1) + 1
+    burst["can_id"][before], burst["length"][before] = 0x303, 2
+    burst["data"][before, :2] = int(Control.QUICK_STOP), 0
+    with robot_process(config) as output, DriveMaster(session, load_robot(session.robot)) as master:
+        master.configure()
+        master.start()
+        with RawSocket(session.bus.channel, filters=((0x183, COB_MASK),)) as bus:
+            os.kill(output.process_id, signal.SIGSTOP)
+            with RawSocket(session.bus.channel, filters=()) as other:
+                other.send(burst)
+            os.kill(output.process_id, signal.SIGCONT)
+            log = collect(bus, 3.0)
+    states = [drive_state(int(word)) for word in column(log, 0x183, 6, "<u2")]
+    assert len(states) == before + after
+    assert set(states[:before]) == {DriveState.ENABLED}
+    # The order acts at the SYNC behind it, whose answer is on its way then.
+    assert set(states[before + 1 :]) == {DriveState.QUICK_STOP_ACTIVE}
 
 
 def test_mappings_are_refused_as_cia_301_prescribes(config: Path) -> None:

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from configs import load_robot
 from configs.robot import Effect as Stanza
 from identify.catalogue.effect import Place
+from identify.catalogue.friction import dahl
 from identify.catalogue.motion import Motion
 from identify.catalogue.recorded import put_right
 from identify.catalogue.registry import catalogue
@@ -87,6 +88,14 @@ def test_stribeck_friction_falls_as_a_bell(axis: Motion) -> None:
     v = axis.qd[:, 0]
     expected = np.exp(-(v**2) / 0.03**2) * sign(axis)
     np.testing.assert_allclose(columns("stribeck_friction", axis, velocity=0.03)[:, 0, 0], expected)
+
+
+def test_a_bristle_of_stribeck_friction_carries_the_dry_friction_of_the_model(axis: Motion) -> None:
+    bump, moved = columns("stribeck_friction", axis, velocity=0.03, displacement=1e-4)[:, 0].T
+    side = dahl(axis.q[:, 0], 1e-4)
+    np.testing.assert_allclose(bump, np.exp(-(axis.qd[:, 0] ** 2) / 0.03**2) * side)
+    np.testing.assert_allclose(moved + sign(axis), side)
+    assert not columns("stribeck_friction", axis, velocity=0.03)[:, 0, 1].any()
 
 
 @pytest.mark.parametrize("knee", [0.02, 0.2])

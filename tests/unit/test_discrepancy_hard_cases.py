@@ -71,3 +71,13 @@ def test_ripple_among_the_frequencies_of_the_motion_is_a_line(tmp_path: Path) ->
     (rest,) = told["unexplained"]
     assert rest["varies_with"] == "frequency"
     assert "16.7 Hz" in rest["hint"]
+
+
+@pytest.mark.parametrize("strength", ["obvious emps run 3", "typical emps run 4"])
+def test_a_spring_is_found_beside_friction_that_is_far_stronger(strength: str, tmp_path: Path) -> None:
+    """A bristle carries the Coulomb friction of a joint with Stribeck friction, too, or reversals hide the spring."""
+    told, _ = diagnosed(f"pair joint_spring joint_1 and stribeck_friction joint_1 {strength}", tmp_path)
+    assert {found["effect"] for found in told["findings"]} == {"joint_spring", "stribeck_friction"}
+    assert all(found["confidence"] > 0.9 for found in told["findings"])
+    assert told["verdict"] == "explained"
+    assert told["gap"]["validation"]["after"]["all"] < 0.5

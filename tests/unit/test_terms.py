@@ -150,6 +150,13 @@ def test_a_missing_nonlinear_parameter_is_asked_for(robot: RobotConfig) -> None:
         ArmModel.from_config(with_effects(robot, Effect(effect="stribeck_friction", joint="joint_1")))
 
 
+def test_a_parameter_that_goes_with_another_is_there_only_with_it(robot: RobotConfig) -> None:
+    rigid = Effect(effect="stribeck_friction", joint="joint_3", parameters={"velocity": 0.1})
+    bristle = Effect(effect="stribeck_friction", joint="joint_3", parameters={"velocity": 0.1, "displacement": 1e-4})
+    assert ArmModel.from_config(with_effects(robot, rigid)).base.names[-1:] == ("fst3",)
+    assert ArmModel.from_config(with_effects(robot, bristle)).base.names[-2:] == ("fst3", "fsb3")
+
+
 def test_terms_of_the_wrist_coupling_are_those_of_the_configured_coupling(robot: RobotConfig) -> None:
     rng = np.random.default_rng(5)
     q, qd, qdd = rng.normal(size=(3, 40, 6))
