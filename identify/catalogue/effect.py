@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -37,7 +38,7 @@ class Linear:
         Values beyond which the effect would be something else.
     through
         The nonlinear parameter without which (where it is zero) there is no such parameter, if there is one. A search
-        leaves it out where the effect without it is likelier.
+        tries the effect without it, and takes it with the effect where that comes nearer to data kept back.
     """
 
     name: str
@@ -174,11 +175,13 @@ class Effect:
             for p, value, doubt in zip(self.linear, values, std, strict=True)
         )
 
-    def choices(self) -> list[list[int]]:
-        """Numbers of the linear parameters to try together: all, and those that go with no nonlinear one."""
-        every = [k for k, _ in enumerate(self.linear)]
-        alone = [k for k in every if self.linear[k].through is None]
-        return [every] if alone == every else [every, alone]
+    @property
+    def essence(self) -> "Effect":
+        """The effect without the parameters that it may be without."""
+        kept = [k for k, linear in enumerate(self.linear) if linear.through is None]
+        if len(kept) == len(self.linear):
+            return self
+        return replace(self, linear=tuple(self.linear[k] for k in kept), columns=partial(_some, self.columns, kept))
 
     def refinable(self, robot: RobotConfig, place: "Place") -> tuple[bool, ...]:
         """Which of the nonlinear parameters may lie between the values of their grids at a place."""
@@ -198,6 +201,11 @@ class Effect:
         whole = np.zeros((motion.samples, motion.n, columns.shape[1]))
         whole[:, place.joint] = columns
         return whole
+
+
+def _some(columns: Callable[..., Array], kept: Sequence[int], motion: Motion, place: "Place", **shapes: float) -> Array:
+    """Some of the columns of an effect."""
+    return columns(motion, place, **shapes)[..., kept]
 
 
 @dataclass(frozen=True)

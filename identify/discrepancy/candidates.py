@@ -168,7 +168,7 @@ def candidates(workshop: Workshop) -> Iterator[Candidate]:
                 continue
             if effect.visible is not None and effect.visible(motion, place) is not None:
                 continue
-            yield Candidate(effect, place, tuple(s for s in grid(effect, motion, place) if s not in there))
+            yield Candidate(effect.essence, place, tuple(s for s in grid(effect, motion, place) if s not in there))
 
 
 def places(effect: Effect, n: int) -> list[Place]:

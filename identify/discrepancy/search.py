@@ -12,7 +12,7 @@ from identify.discrepancy.excess import excesses
 from identify.discrepancy.polishing import polished
 from identify.discrepancy.retrial import in_its_loop, suspects
 from identify.discrepancy.screening import shortlist
-from identify.discrepancy.stanzas import added, stanza_number, valued, without
+from identify.discrepancy.stanzas import added, completed, stanza_number, valued, without
 from identify.discrepancy.state import Places, Settings, State, accident, nearer, places_of, refit
 from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial, best_trial, judge
@@ -158,9 +158,24 @@ class Search:
             robot = added(state.study.robot, trial)
             if effect.undo is not None:
                 robot = self._put_right(robot, state, trial)
-            return self.state(polished(self.study, robot, state.fit), state)
+            return self.state(self._completed(polished(self.study, robot, state.fit), state), state)
         except DataError:
             return None
+
+    def _completed(self, robot: RobotConfig, state: State) -> RobotConfig:
+        """With what belongs to the last stanza but need not be there, where that comes nearer to data kept back."""
+        whole = completed(robot)
+        if whole is None:
+            return robot
+        try:
+            whole = polished(self.study, whole, state.fit)
+            made = [refit(self.study, one, state.fit) for one in (whole, robot)]
+        except DataError:
+            return robot
+        with_it, without_it = (replace(state, study=study, fit=found) for study, found in made)
+        if accident(with_it, with_it.study.model.terms[-1], lambda p: p.through is not None) > NEEDED:
+            return robot
+        return whole if nearer(with_it, without_it, self.settings.material) else robot
 
     def _put_right(self, robot: RobotConfig, state: State, trial: Trial) -> RobotConfig:
         """With the value in its last stanza that leaves nothing more of it to find (Newton's method).

@@ -2,17 +2,29 @@
 
 from configs import RobotConfig
 from identify.catalogue.recorded import of_recording
+from identify.catalogue.registry import known
 from identify.catalogue.terms import stanza_of
 from identify.discrepancy.trial import Trial
 
 
 def added(robot: RobotConfig, trial: Trial) -> RobotConfig:
-    """The robot with what a trial found as its last stanza."""
+    """The robot with what a trial found as its last stanza, without the parameters that the effect may be without."""
     parameters = dict(trial.shapes) | values_of(trial)
     effect = trial.candidate.effect
     contained = tuple(p.name for p, there in zip(effect.linear, trial.contained, strict=True) if there)
-    stanza = stanza_of(effect, trial.candidate.place, robot, parameters, contained)
+    spared = tuple(p.name for p in known(effect.name).linear if p.through is not None)
+    stanza = stanza_of(effect, trial.candidate.place, robot, parameters, contained + spared)
     return robot.model_copy(update={"effects": (*robot.effects, stanza)})
+
+
+def completed(robot: RobotConfig) -> RobotConfig | None:
+    """The robot with the parameters of its last stanza that the effect may be without; ``None`` if there are none."""
+    last = robot.effects[-1]
+    spared = [p.name for p in known(last.effect).linear if p.through is not None]
+    if not any(name in last.without for name in spared):
+        return None
+    changed = last.model_copy(update={"without": tuple(name for name in last.without if name not in spared)})
+    return robot.model_copy(update={"effects": (*robot.effects[:-1], changed)})
 
 
 def valued(robot: RobotConfig, name: str, value: float) -> RobotConfig:

@@ -96,7 +96,7 @@ class Trial:
     @property
     def p_train(self) -> float:
         """That a candidate without merit fits the training residual so well, at the best of all shapes tried."""
-        p = float(stats.chi2.sf(self.statistic / self.inflation, max(self.kept.size, 1)))
+        p = float(stats.chi2.sf(self.statistic / self.inflation, self.values.size))
         return min(1.0, p * max(len(self.candidate.grid), 1))
 
     @property
@@ -160,30 +160,27 @@ def judge(
     ----------
     calm
         Noise models that the gap cannot fool, to start from, too, at the joints that the candidate acts on: those of
-        ``fit`` may hold the gap for noise and whiten it away. The likelier end of both starts counts;
-        of an effect that may be without some of its parameters, the likelier choice.
+        ``fit`` may hold the gap for noise and whiten it away. The likelier end of both starts counts.
     """
-    tried = []
-    for parts in candidate.effect.choices():
-        tried.append(_judged(fit, fit, candidate, shapes, parts, workshop, 1))
-        if calm is not None:
-            start = _calmed(fit, candidate, shapes, workshop, calm)
-            tried.append(_judged(fit, start, candidate, shapes, parts, workshop, CALM_PASSES))
+    tried = [_judged(fit, fit, candidate, shapes, workshop, 1)]
+    if calm is not None:
+        start = _calmed(fit, candidate, shapes, workshop, calm)
+        tried.append(_judged(fit, start, candidate, shapes, workshop, CALM_PASSES))
     return max((trial for trial in tried if trial is not None), key=lambda trial: trial.score, default=None)
 
 
 def _judged(
-    alone: Fit, fit: Fit, candidate: Candidate, shapes: Shapes, parts: list[int], workshop: Workshop, passes: int
+    alone: Fit, fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, passes: int
 ) -> Trial | None:
-    """See `judge`; with the noise models of ``fit`` to start from, and some of the linear parameters."""
+    """See `judge`; with the noise models of ``fit`` to start from."""
     # What the model lacks must not pass for noise: the noise is that of the residual with the candidate in the model.
     for _ in range(passes):
-        screening = _beside_model(fit, candidate, shapes, parts, workshop)
+        screening = _beside_model(fit, candidate, shapes, workshop)
         if screening is None:
             return None
         fit = alone.renoised(noise_with(fit, candidate, shapes, workshop, *screening))
     columns = workshop.columns(candidate.effect, candidate.place, shapes, fit.noise)
-    solution = _values(fit, columns, parts)
+    solution = _values(fit, columns)
     if solution is None:
         return None
     statistic, values, std = solution
@@ -197,7 +194,7 @@ def _judged(
     variance = size * inflation + fit.spread(change)
     gain = float(before @ before - after @ after)
     share = _share_of_joint(change, before, after, [s.y.shape[0] for s in fit.study.held], fit.noise)
-    fitted = 0.5 * (len(parts) + len(shapes))
+    fitted = 0.5 * (values.size + len(shapes))
     supported = 0.5 * (statistic + gain)
     return Trial(
         candidate,
@@ -232,12 +229,10 @@ def _calmed(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, 
     return fit.renoised([c if there else own for c, own, there in zip(calm, fit.noise, acts, strict=True)])
 
 
-def _beside_model(
-    fit: Fit, candidate: Candidate, shapes: Shapes, parts: list[int], workshop: Workshop
-) -> tuple[Array, Array] | None:
+def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) -> tuple[Array, Array] | None:
     """Linear parameters of a candidate beside the model, and the change of the model's own that goes with them."""
     columns = workshop.columns(candidate.effect, candidate.place, shapes, fit.noise)
-    solution = _values(fit, columns, parts)
+    solution = _values(fit, columns)
     if solution is None:
         return None
     return solution[1], fit.absorbed(columns.x @ solution[1][:, None])[:, 0]
@@ -253,12 +248,9 @@ def noise_with(
     return noise_models(errors, fit.theta.size + values.size, MAX_AR_ORDER)
 
 
-def _values(fit: Fit, columns: Columns, parts: list[int]) -> tuple[float, Array, Array] | None:
-    """Score statistic, linear parameters and their standard deviations; ``None`` if nothing can be said of them.
-
-    Only those of ``parts`` are not zero.
-    """
-    basis = directions_beside(fit, columns.z[:, parts])
+def _values(fit: Fit, columns: Columns) -> tuple[float, Array, Array] | None:
+    """Score statistic, linear parameters and their standard deviations; ``None`` if nothing can be said of them."""
+    basis = directions_beside(fit, columns.z)
     if basis is None:
         return None
     u, right, scale = basis
@@ -266,14 +258,13 @@ def _values(fit: Fit, columns: Columns, parts: list[int]) -> tuple[float, Array,
     alone = np.linalg.norm(right, axis=1) > ALONE
     score = u.T @ fit.residual
     # (D~' C) in the coordinates of u: how much of the instrument's direction the measured columns have.
-    gram = u.T @ (columns.x[:, parts] / scale) @ right
+    gram = u.T @ (columns.x / scale) @ right
     try:
         inverse = np.linalg.inv(gram)
     except np.linalg.LinAlgError:
         return None
-    values, std = np.zeros((2, columns.x.shape[1]))
-    values[parts] = np.where(alone, (right @ (inverse @ score)) / scale, 0.0)
-    std[parts] = np.sqrt(np.sum((right @ inverse) ** 2, axis=1)) / scale
+    values = np.where(alone, (right @ (inverse @ score)) / scale, 0.0)
+    std = np.sqrt(np.sum((right @ inverse) ** 2, axis=1)) / scale
     return float(score @ score), values, std
 
 
