@@ -38,7 +38,10 @@ class Linear:
         Values beyond which the effect would be something else.
     through
         The nonlinear parameter without which (where it is zero) there is no such parameter, if there is one. A search
-        tries the effect without it, and takes it with the effect where that comes nearer to data kept back.
+        tries the effect without it.
+    replaces
+        The rigid parameter of the joint whose part it takes over then: the search gives it to an effect where it takes
+        over all of that, and data kept back are nearer with it.
     """
 
     name: str
@@ -46,6 +49,7 @@ class Linear:
     sign: int = 0
     bounds: tuple[float, float] = (-math.inf, math.inf)
     through: str | None = None
+    replaces: str = ""
 
 
 @dataclass(frozen=True)

@@ -166,7 +166,7 @@ EFFECTS = (
         title="extra friction at low speed",
         says="extra friction at low speed that fades as the joint speeds up: poor or squeezed-out lubricant",
         reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
-        linear=(Linear("fst", TORQUE, sign=1), Linear("fsb", TORQUE, through="displacement")),
+        linear=(Linear("fst", TORQUE, sign=1), Linear("fsb", TORQUE, through="displacement", replaces="fc")),
         shapes=(
             Shape("velocity", ("rad/s", "m/s"), speeds),
             Shape("displacement", ("rad", "m"), bristles, default=0.0),

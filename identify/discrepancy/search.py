@@ -13,7 +13,7 @@ from identify.discrepancy.polishing import polished
 from identify.discrepancy.retrial import in_its_loop, suspects
 from identify.discrepancy.screening import shortlist
 from identify.discrepancy.stanzas import added, completed, stanza_number, valued, without
-from identify.discrepancy.state import Places, Settings, State, accident, nearer, places_of, refit
+from identify.discrepancy.state import Places, Settings, State, accident, nearer, places_of, refit, takes_over
 from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial, best_trial, judge
 from identify.options import CONTROLLERS
@@ -31,6 +31,8 @@ ROUNDS = 5
 """Most times that a recording is put right for one finding, each time by what was still missing."""
 SETTLED = 0.01
 """Part still missing that ends them."""
+TAKEN_OVER = 0.25
+"""Part of a rigid parameter that an effect may leave, or have too much, where it takes it over."""
 EXPLAINED = 0.5
 """Part of what a joint leaves beyond noise that what passes there explains, where the loop is a likeness of the arm."""
 MOST = 8
@@ -163,7 +165,10 @@ class Search:
             return None
 
     def _completed(self, robot: RobotConfig, state: State) -> RobotConfig:
-        """With what belongs to the last stanza but need not be there, where that comes nearer to data kept back."""
+        """With what belongs to the last stanza but need not be there, where that comes nearer to data kept back.
+
+        A bristle carries all the dry friction of its joint, or what is extra alone: a part of it would be another's.
+        """
         whole = completed(robot)
         if whole is None:
             return robot
@@ -173,9 +178,8 @@ class Search:
         except DataError:
             return robot
         with_it, without_it = (replace(state, study=study, fit=found) for study, found in made)
-        if accident(with_it, with_it.study.model.terms[-1], lambda p: p.through is not None) > NEEDED:
-            return robot
-        return whole if nearer(with_it, without_it, self.settings.material) else robot
+        all_of_it = takes_over(with_it, with_it.study.model.terms[-1], TAKEN_OVER)
+        return whole if all_of_it and nearer(with_it, without_it, self.settings.material) else robot
 
     def _put_right(self, robot: RobotConfig, state: State, trial: Trial) -> RobotConfig:
         """With the value in its last stanza that leaves nothing more of it to find (Newton's method).

@@ -1,6 +1,6 @@
 """The model as far as a search has come, and what can be said of it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +9,6 @@ from scipy import stats
 
 from configs import RobotConfig
 from configs.robot import Effect as Stanza
-from identify.catalogue.effect import Linear
 from identify.catalogue.recorded import put_right
 from identify.catalogue.registry import known
 from identify.catalogue.terms import Term
@@ -194,12 +193,22 @@ def padded(before: Fit, model: ArmModel) -> Array:
     return np.concatenate([rigid, np.zeros(model.e)])
 
 
-def accident(state: State, term: Term, only: Callable[[Linear], bool] = lambda _: True) -> float:
-    """Chance that the linear parameters of a term, or only some of them, are all zero (Wald test)."""
+def accident(state: State, term: Term) -> float:
+    """Chance that the linear parameters of a term are all zero (Wald test)."""
     names = state.study.model.base.names
-    own = [names.index(name) for name, linear in zip(term.names, term.linear, strict=True) if only(linear)]
+    own = [names.index(name) for name in term.names]
     values, covariance = state.fit.theta[own], state.fit.covariance[np.ix_(own, own)]
     return float(stats.chi2.sf(values @ np.linalg.pinv(covariance) @ values, len(own)))
+
+
+def takes_over(state: State, term: Term, most: float) -> bool:
+    """Whether what a term takes over of rigid parameters of its joint is all of them, but for a share of ``most``."""
+    estimates = dict(zip(state.study.model.base.names, state.fit.theta, strict=True))
+    for name, linear in zip(term.names, term.linear, strict=True):
+        whole = estimates.get(f"{linear.replaces}{term.place.joint + 1}", 0.0)
+        if linear.through is not None and abs(estimates[name] - whole) > most * abs(whole):
+            return False
+    return True
 
 
 def with_values(state: State, shapes: Mapping[int, Mapping[str, float]] | None = None) -> RobotConfig:
