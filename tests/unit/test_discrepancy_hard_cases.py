@@ -15,7 +15,7 @@ pytestmark = pytest.mark.timeout(600)
 
 
 def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]]:
-    """Diagnosis of a case, and what is hidden in it."""
+    """Diagnosis of a case, and what is hidden in it first."""
     (case,) = (case for case in all_cases(load_suite("suite.yaml")) if case.name == name)
     file = folder / "case.mcap"
     request = {
@@ -28,7 +28,7 @@ def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]
         "effects": [asdict(part) for part in case.parts],
         "out": str(file),
     }
-    (hidden,) = record(request)["truth"]
+    hidden = record(request)["truth"][0]
     told = batch.answer({"id": case.key, "do": "diagnose", "recording": str(file), "robot": case.config})
     return told["document"], hidden
 
