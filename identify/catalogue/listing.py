@@ -24,7 +24,10 @@ def described(effect: Effect) -> dict[str, Any]:
         "title": effect.title,
         "says": effect.says,
         "scope": effect.scope,
-        "parameters": [{"name": p.name, "unit": list(p.unit), "sign": p.sign} for p in effect.linear],
+        "parameters": [
+            {"name": p.name, "unit": list(p.unit), "sign": p.sign, "through": p.through, "replaces": p.replaces or None}
+            for p in effect.linear
+        ],
         "shapes": [{"name": s.name, "unit": list(s.unit), "continuous": list(s.continuous)} for s in effect.shapes],
         "needs": effect.needs,
         "reference": effect.reference,
@@ -65,6 +68,10 @@ def _one(effect: Effect) -> None:
     print(f"{effect.name}: {effect.title}\n{effect.says}")
     for parameter in _parameters(effect):
         print(f"  {parameter}")
+    for linear in effect.linear:
+        if linear.through is not None:
+            print(f"{linear.name} is there only with {linear.through}, in the place of {linear.replaces} of the joint;")
+            print(f"  a stanza with `without: [{linear.name}]` leaves {linear.replaces} as it is")
     print(f"needs: {effect.needs}\nsource: {effect.reference}")
     names = [shape.name for shape in effect.shapes] + [parameter.name for parameter in effect.linear]
     values = [f"{parameter}: ..." for parameter in names]
