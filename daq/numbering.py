@@ -104,15 +104,16 @@ def _sent_then(sent_at: Any, sent: int, last: int, step: int, t_ns: int, half_tu
     """By how many SYNCs, ``step`` and whole turns, a bus advances to the one that we had sent by this time.
 
     It is the first that was sent by no earlier time than it came, give or take what the bus and clocks need; a turn
-    before it another one had been sent long ago. ``NOWHERE`` if there is none.
+    before it another one had been sent long ago. ``NOWHERE`` if there is none, or if the one before that was sent
+    later: then it is older than the last of this bus, whose number is borrowed from others.
     """
-    k = last + step
-    while k < sent:
-        if k >= sent - sent_at.size and sent_at[k % sent_at.size] >= t_ns - half_turn_ns:
-            return int(k - last)
-        k += overflow
+    k, room = last + step, sent_at.size
     # The one that is being sent has no time yet.
-    return int(k - last) if k == sent else NOWHERE
+    while k < sent and (k < sent - room or sent_at[k % room] < t_ns - half_turn_ns):
+        k += overflow
+    if k > sent or (k - 1 >= max(0, sent - room) and sent_at[(k - 1) % room] > t_ns + half_turn_ns):
+        return NOWHERE
+    return int(k - last)
 
 
 @njit(cache=True, nogil=True)

@@ -36,6 +36,8 @@ from tests.faults.recorder import Capture, Recorders, result, said, warm
 
 PERIOD_US = 1000
 DISK_BYTES = 3 << 20
+ATTEMPTS = 4
+"""Most times that one round is done."""
 SMALL_BUFFER = 96 << 10
 """Bytes of the kernel's buffer where it shall overrun."""
 LONGEST_S = 40.0
@@ -71,6 +73,8 @@ class Round:
     said: str = ""
     undone: Sequence[str] = ()
     """Faults for which the drives were too late themselves."""
+    again: int = 0
+    """How often it was done again, because they became late in the middle of one."""
 
 
 def session_file(
@@ -133,7 +137,15 @@ class Lane:
         shutil.rmtree(self._folder)
 
     def run(self, number: int, plan: Plan | None = None, only: Sequence[str] = ()) -> Round:
-        """One round: as planned, or at random."""
+        """One round: as planned, or at random; once more where the drives became late while they did what is wrong."""
+        for attempt in range(ATTEMPTS):
+            found, spoilt = self._attempt(number, attempt, plan, only)
+            if not spoilt:
+                break
+        return found
+
+    def _attempt(self, number: int, attempt: int, plan: Plan | None, only: Sequence[str]) -> tuple[Round, bool]:
+        """A round, and whether what its drives did was something else than planned, by their own lateness."""
         rng = np.random.default_rng([self._seed, number])
         faults, producing, buses = chosen(rng, number, only) if plan is None else plan
         farm = self._farms[buses]
@@ -145,7 +157,7 @@ class Lane:
         syncs = round(seconds * 1e6 / PERIOD_US)
         farm.prepare(room.orders, room.actions, None if producing else syncs)
         path = session_file(self._folder, f"{self._name}r{number}", self._of(buses), producing, "rotation" in faults)
-        out, log = self._disk / f"r{number}", self._folder / f"r{number}"
+        out, log = self._disk / f"r{number}a{attempt}", self._folder / f"r{number}a{attempt}"
         out.mkdir()
         small = SMALL_BUFFER if "kernel_drop" in faults else None
         process = self._recorders.start(path, out, log, seconds if producing else None, small)
@@ -156,12 +168,12 @@ class Lane:
             process.kill()
             process.join()
             seen, ledgers = farm.finish(), [list(lane.ledger) for lane in farm.lanes]
-        words = said(log)
+        words, spoilt = said(log), room.orders.spoilt
         undone = [name for name in faults if name in ORDERED and ORDERED[name] not in room.orders.done]
         faults = [name for name in faults if name not in undone]
         if process.exitcode != 0:
             what = [f"the capture ended with {process.exitcode}"]
-            return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words)
+            return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words), False
         try:
             paths, counters = result(log)
             done = Outcome(join_parts([read_recording(p) for p in paths]), counters, words, len(paths))
@@ -171,7 +183,7 @@ class Lane:
                 wrong.append(f"torn: {done.recording.missing}")
         except Exception as error:
             what = [f"{type(error).__name__}: {error}"]
-            return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words)
+            return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words), False
         gaps = [g for g in done.recording.gaps if g.stream == "samples"]
         covered = {k for g in gaps for k in range(g.first, g.last + 1)}
         rows = done.recording.samples.sync.size
@@ -179,10 +191,11 @@ class Lane:
         report = words if wrong or unnamed else ""
         if report:
             report += f"\n{counters}\n" + "\n".join(map(str, done.recording.gaps[:30]))
-        return Round(
+        found = Round(
             number, faults, _shape(producing, buses), len(set().union(*ledgers)), rows, len(covered), len(gaps), wrong,
-            unnamed, report, undone,
+            unnamed, report, undone, attempt,
         )  # fmt: skip
+        return found, spoilt
 
     def _wait(self, process: Capture, farm: Farm, log: Path, producing: bool) -> None:
         """Until the capture is over; a foreign master begins when it is ready, and ends before it."""
@@ -262,6 +275,8 @@ def show(rounds: Sequence[Round]) -> int:
     for r in rounds:
         if r.undone:
             print(f"round {r.number}: {', '.join(r.undone)} not done, the drives were late themselves")
+        if r.again:
+            print(f"round {r.number}: done {r.again + 1} times, the drives became late while they did what is wrong")
     bad = [r for r in rounds if r.violations or r.unnamed]
     for r in bad:
         print(f"\nround {r.number} ({r.shape}; {', '.join(r.faults)}):")

@@ -93,7 +93,7 @@ class Orders:
 
     ``lost`` are not sent, ``twice`` sent twice, ``again`` once more behind the next SYNC, ``late`` sent behind the SYNC
     of that number. ``skipped`` SYNCs are not sent where the farm is their master. ``done`` has the names of the first
-    three where they happened: they do not while the farm itself is late.
+    three where they happened: they do not while the farm itself is late. ``spoilt``: it became late while they did.
     """
 
     lost: set[tuple[int, int]] = field(default_factory=set)
@@ -102,6 +102,7 @@ class Orders:
     late: dict[tuple[int, int], int] = field(default_factory=dict)
     skipped: set[int] = field(default_factory=set)
     done: set[str] = field(default_factory=set)
+    spoilt: bool = False
 
     @cached_property
     def touched(self) -> set[int]:
@@ -379,6 +380,8 @@ class Farm:
                     self._begin()
                 self._answer(lane, lane.last, int(one["data"][0]))
                 lane.sent_ns = time.time_ns()
+                if self.orders.done and lane.last in self.orders.touched:
+                    self.orders.spoilt |= lane.prompt and lane.sent_ns - stamp >= PROMPT * self._period * 1e9
         return 0.005
 
     def _number_of(self, lane: _Lane, counter: int, stamp: int) -> None:

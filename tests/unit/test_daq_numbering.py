@@ -157,3 +157,27 @@ def test_our_own_syncs_are_told_by_when_we_sent_them_where_frames_are_lost(
     gaps += assembler.finish(2000).gaps
     assert outages(gaps) == ([(300, 300 + lost - 1)] if lost else [])
     assert assembler.counters["samples.expected"] == 2000
+
+
+@pytest.mark.parametrize("back", [502, 762, 1400])
+@pytest.mark.parametrize("known", [False, True])
+def test_what_waited_behind_an_outage_is_older_than_what_another_bus_had_meanwhile(back: int, known: bool) -> None:
+    """Whoever reads the buses was held up: one is read on to SYNC 1900 before what the other had since its return."""
+    assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, 1, bus_of=(0, 1))
+    sent = answered(list(range(2000)))
+    times = sent["t_ns"][::3] + 20_000
+    assembler.when_sent = lambda first: (first, times[first:1999])
+    one, other = (sent[sent["can_id"] != identifier] for identifier in (0x182, 0x181))
+    gaps = list(assembler.push(other[:1000], 500, bus=1).gaps)
+    assembler.silence(1, True)
+    gaps += assembler.push(one[:3800], 1999, bus=0).gaps
+    assembler.silence(1, False)
+    if known:
+        gaps += assembler.push(one[3800:], 1999, bus=0).gaps
+    gaps += assembler.push(other[2 * back :], 1999, bus=1).gaps
+    gaps += assembler.push(one[3800:], 1999, bus=0).gaps if not known else ()
+    gaps += assembler.finish(2000).gaps
+    assert assembler.counters["samples.expected"] == 2000
+    missing = {k for gap in gaps for k in range(gap.first, gap.last + 1)}
+    assert set(range(500, back)) <= missing
+    assert {gap.joint for gap in gaps} <= {"joint_2", None}
