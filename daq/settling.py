@@ -146,6 +146,18 @@ def _may_repeat(b: Books, s: int, j: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _not_behind(b: Books, s: int, j: int) -> int:
+    """How many of its answers a drive has certainly sent in time, or all where it is not known to have been behind."""
+    count, prompt = b.pending[s, j], 0
+    while prompt < count and not b.pace[s, j, UNSURE] and b.label[s, j, prompt] == b.settled[s, j] + prompt:
+        prompt += 1
+    behind = b.behind[s, j] > 0 and b.head[b.bus_of[j], s] - b.behind_at[s, j] <= 2 * b.kind[s, WINDOW]
+    for i in range(prompt + 1, count):
+        behind = behind or b.label[s, j, i] == b.label[s, j, i - 1]
+    return prompt if behind else count
+
+
+@njit(cache=True, nogil=True)
 def _settle(b: Books, s: int, j: int, final: bool, witness: bool) -> None:
     """Close the books of one TPDO of one drive: match what is certain, give up what nobody answers any more."""
     bus = b.bus_of[j]
@@ -187,10 +199,17 @@ def _settle(b: Books, s: int, j: int, final: bool, witness: bool) -> None:
         keep = max(keep, head - 2 * b.kind[s, SHORT])
     keep = max(keep, b.settled[s, j])
     u, twice, answered = head, False, b.settled[s, j]
+    ends = (final or silent) and not in_step
+    caught_up = _not_behind(b, s, j)
     for i in range(count - 1, -1, -1):
-        u = min(b.label[s, j, i], u - 1)
+        after, u = u, min(b.label[s, j, i], u - 1)
         answered = max(answered, u + 1)
         _place(b, s, j, u, i)
+        # Who has been behind may be so before silence: what it sent last is late, or what it did not send is lost.
+        for v in range(u + 1, after):
+            ends = ends or not _seen(b, s, j, v)
+        if ends and i >= caught_up:
+            b.row_code[s, slot_of(b, s, u), j] = AMBIGUOUS
         # A frame sent twice looks like two late answers, which move those before them.
         twice = u < b.label[s, j, i] and (
             twice or (b.label[s, j, i] == b.label[s, j, i + 1] and _same(b, s, j, i, i + 1))

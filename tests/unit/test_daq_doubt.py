@@ -74,6 +74,22 @@ def test_a_late_answer_before_a_lost_one_is_given_up_by_a_drive_that_is_late_at_
     assert {30, 31} == set(range(60)) - set(sync.tolist())
 
 
+def test_late_answers_before_a_silence_are_not_taken_for_prompt_ones() -> None:
+    """From 40 on each answer comes behind the next SYNC, twice two at once, and the last two never come."""
+    late = {40: [], 41: [(50, 40)], 42: [(50, 41)], 43: [(50, 42), (60, 43)], 44: [], 45: [(50, 44)], 46: [(50, 45)]}
+    late |= {47: [], 48: [(40, 46), (50, 47)], 49: [(50, 48)], 50: [(50, 49)], 51: [(50, 50)]}
+    _, sync, value = assembled(bus(53, late | {52: []}), 53)
+    assert np.array_equal(value, sync)
+    assert set(range(40)) <= set(sync.tolist())
+
+
+def test_prompt_answers_before_a_silence_are_kept() -> None:
+    """The last two never come; nothing was late before."""
+    _, sync, value = assembled(bus(53, {51: [], 52: []}), 53)
+    assert np.array_equal(value, sync)
+    assert np.array_equal(sync, np.arange(51))
+
+
 def test_a_frame_sent_twice_does_not_move_those_before_it() -> None:
     """30 is lost, 45 sent twice: as many frames as SYNCs, or two late ones."""
     _, sync, value = assembled(bus(60, {30: [], 31: [], 45: [(50, 45), (60, 45)]}), 60)
