@@ -35,6 +35,9 @@ BEST, BEST_AT, STOOD, CALM, PACED, UNSURE, HELD = range(7)
 IN_STEP = 8
 """A drive whose balance stands for so many rows answers each of them."""
 
+STILL = 3
+"""A drive that leaves out so many rows one after the other rather stood still than lost each of its answers."""
+
 COUNT_NAMES = (
     "sync_seen",
     "sync_missing",

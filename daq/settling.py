@@ -23,6 +23,7 @@ from daq.books import (
     RECEIVED,
     SHORT,
     SIZE,
+    STILL,
     STOOD,
     TOP,
     TPDO_DUPLICATE,
@@ -152,8 +153,11 @@ def _not_behind(b: Books, s: int, j: int) -> int:
     while prompt < count and not b.pace[s, j, UNSURE] and b.label[s, j, prompt] == b.settled[s, j] + prompt:
         prompt += 1
     behind = b.behind[s, j] > 0 and b.head[b.bus_of[j], s] - b.behind_at[s, j] <= 2 * b.kind[s, WINDOW]
-    for i in range(prompt + 1, count):
-        behind = behind or b.label[s, j, i] == b.label[s, j, i - 1]
+    previous = b.settled[s, j] + prompt - 1
+    for i in range(prompt, count):
+        # Two at once; or so many missing in a row that it rather stood still.
+        behind = behind or b.label[s, j, i] == previous or b.label[s, j, i] - previous > STILL
+        previous = b.label[s, j, i]
     return prompt if behind else count
 
 
