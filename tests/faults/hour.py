@@ -1,8 +1,8 @@
 """An hour in minutes: ``python -m tests.faults.hour --hours 1``.
 
-A capture gets the frames of six drives at 5 kHz as fast as it takes them, from a bus that makes them up: recorder,
-matching, files (turned over, and deleted when they are finished), Zenoh and health are the real ones. Prints its memory
-all along. Needs no vcan.
+A capture gets the frames of six drives at 5 kHz many times as fast as time goes by, from a bus that makes them up:
+recorder, matching, files (turned over, and deleted when they are finished), Zenoh and health are the real ones. Prints
+its memory all along. Needs no vcan.
 """
 
 import argparse
@@ -37,12 +37,13 @@ BLOCK = 500
 
 
 class MadeUp:
-    """A bus on which six drives answer ``count`` SYNCs at once."""
+    """A bus on which six drives answer ``count`` SYNCs, ``pace`` times as fast as time goes by."""
 
     channel, dropped, fd, stamps, up, bound = "made-up", 0, False, "software", True, True
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, pace: float) -> None:
         self.sent, self._count = 0, count
+        self._per_s, self._begin = pace * RATE_HZ, time.monotonic()
         self._begin_ns = time.time_ns()
         self._block = frames(7 * BLOCK).reshape(BLOCK, 7)
         self._block["can_id"] = [COB_SYNC, *range(0x181, 0x187)]
@@ -53,7 +54,9 @@ class MadeUp:
         """The frames of the next SYNCs; none every now and then, as a bus that has been read empty."""
         self._asked += 1
         n = min(BLOCK, self._count - self.sent)
-        if not n or self._asked % 2 == 0:
+        ahead_s = self.sent / self._per_s - (time.monotonic() - self._begin)
+        if not n or ahead_s > 0 or self._asked % 2 == 0:
+            time.sleep(min(max(ahead_s, 0.0), 0.01))
             return 0
         k = self.sent + np.arange(n)[:, None]
         block = self._block[:n]
@@ -92,6 +95,7 @@ def main() -> int:
     """Run it; 1 if anything is missing, or memory grew by more than 5 % after the first quarter."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.hour", description=__doc__)
     parser.add_argument("--hours", type=float, default=1.0)
+    parser.add_argument("--pace", type=float, default=10.0, help="times as fast as time goes by")
     options = parser.parse_args()
     count = round(options.hours * 3600 * RATE_HZ)
     memory = Path("/dev/shm")
@@ -101,7 +105,7 @@ def main() -> int:
         text = session.read_text().replace("recording: {}", "recording: {rotate_mb: 20, drain_ms: 1}")
         session.write_text(text)
         order = replace(prepare(session, folder / "out", None, True))
-        return watched(order, MadeUp(count), count, folder)
+        return watched(order, MadeUp(count, options.pace), count, folder)
     finally:
         shutil.rmtree(folder)
 
@@ -132,7 +136,7 @@ def watched(order: daq.capture.Order, bus: MadeUp, count: int, folder: Path) -> 
 
     # The one thing that is not real: where the frames come from, among them no EMCY.
     setattr(daq.capture, "open_bus", open_bus)  # noqa: B010
-    setattr(drivers.side_socket, "open_bus", lambda config, **_: MadeUp(0))  # noqa: B010
+    setattr(drivers.side_socket, "open_bus", lambda config, **_: MadeUp(0, 1.0))  # noqa: B010
     watcher = threading.Thread(target=look)
     watcher.start()
     begin, cpu = time.monotonic(), time.process_time()
