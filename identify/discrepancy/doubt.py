@@ -8,7 +8,7 @@ from identify.discrepancy.search import MOST, Search
 from identify.discrepancy.stanzas import without
 from identify.discrepancy.state import Places, State, nearer, places_of
 from identify.discrepancy.trial import CLOSE
-from identify.discrepancy.where import Disagreement, Survey, unexplained
+from identify.discrepancy.where import Disagreement, Survey, strangers, unexplained
 from identify.document import Finding
 
 CONVINCING = 0.5
@@ -70,11 +70,27 @@ def convincing(search: Search, first: State, final: State, seen: Survey) -> Outc
         final = _without(search, first, final, worst, been)
         been.add(places_of(final))
     ordered = sorted(findings, key=lambda finding: -float(finding.evidence["score"] or 0.0))
-    return Outcome(final, tuple(ordered), _unique(considered, ordered), tuple(left))
+    taken_out = _unique(considered, ordered)
+    return Outcome(final, tuple(ordered), taken_out, (*left, *_instead_of(search, final, taken_out, left)))
 
 
 def _confidence(finding: Finding) -> float:
     return float(finding.evidence["confidence_with_equals"])
+
+
+def _instead_of(
+    search: Search, final: State, taken_out: Sequence[Finding], left: Sequence[Disagreement]
+) -> list[Disagreement]:
+    """What has no name and took the place of findings, at joints with nothing else left, however small it is."""
+    told: list[Disagreement] = []
+    for finding in taken_out:
+        at = {finding.joint, finding.other or finding.joint}
+        if not finding.evidence["better_without_name"] or at & {d.joint for d in (*left, *told)}:
+            continue
+        numbers = {final.study.joints.index(joint) for joint in at}
+        found = strangers(final.fit, final.workshop, numbers, search.settings.false_alarms)
+        told += [s.disagreement() for s in sorted(found, key=lambda s: -s.score)[:1]]
+    return told
 
 
 def _without(search: Search, first: State, final: State, finding: int, been: set[Places]) -> State:

@@ -1,6 +1,6 @@
 """What a search found, as the document says it: sizes, certainty, rivals, and what could not be seen."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from identify.discrepancy.search import Search
 from identify.discrepancy.stanzas import without
 from identify.discrepancy.state import State, nearer, power_put_right, with_values
 from identify.discrepancy.trial import CLOSE, Trial, judge
-from identify.discrepancy.where import Disagreement
+from identify.discrepancy.where import Disagreement, strangers
 from identify.discrepancy.wiring_check import WiringFinding
 from identify.document import Alternative, Finding, Gap, Invisible
 
@@ -87,11 +87,15 @@ def _finding(
         was, now = power_put_right(rest, final), power_put_right(final, rest)
         share = max(share, float(1.0 - now[place.joint] / was[place.joint]))
     scores = [] if mine is None else [mine.score, *(_instead(t, final) for t in serious)]
-    alone = 0.0 if mine is None else float(np.exp(mine.score - special.logsumexp(scores)))
     close = [] if mine is None else [score for score in scores if abs(score - mine.score) < CLOSE]
-    among = float(np.exp(special.logsumexp(close) - special.logsumexp(scores))) if close else 0.0
     # What couples two joints has to account for both.
     at = (stanza.joint, stanza.other) if effect.scope == "pair" else (stanza.joint,)
+    nameless: dict[str, float] = {}
+    if mine is not None and effect.undo is None:
+        nameless = _nameless(search, rest, final, mine, {study.joints.index(name) for name in at if name})
+    everything = special.logsumexp([*scores, *nameless.values()]) if scores else 0.0
+    alone = 0.0 if mine is None else float(np.exp(mine.score - everything))
+    among = float(np.exp(special.logsumexp(close) - everything)) if close else 0.0
     remaining = max((d.share for d in left if d.joint in at), default=0.0)
     # What is left is a share of the smaller residual that the finding leaves.
     explained = share / max(share + (1 - share) * remaining, 1e-300) if share > 0 else 0.0
@@ -123,8 +127,18 @@ def _finding(
             "ambiguous_with": [
                 t.candidate.effect.name for t in serious if mine and _instead(t, final) > mine.score - CLOSE
             ],
+            "better_without_name": [words for words, score in nameless.items() if mine and score > mine.score],
         },
     )
+
+
+def _nameless(search: Search, rest: State, final: State, mine: Trial, joints: Collection[int]) -> dict[str, float]:
+    """Scores, in place of a finding, of what its joints have of other joints without that the catalogue has a name."""
+    found = strangers(rest.fit, rest.workshop, joints, search.settings.false_alarms)
+    near = [s for s in found if s.score > mine.score - CLOSE]
+    scores = [s.score - s.beside(final.fit, final.workshop) for s in near]
+    told = [s.disagreement() for s in near]
+    return {f"{d.varies_with} at {d.joint}": score for d, score in zip(told, scores, strict=True)}
 
 
 def _instead(rival: Trial, final: State) -> float:

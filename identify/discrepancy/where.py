@@ -1,6 +1,6 @@
 """Where model and data disagree: what the residual of each joint depends on, and with which shape."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,9 @@ MATERIAL = 0.02
 
 SLOWEST = 0.25
 """Lowest frequency of a line at a joint with nothing else left, over the bandwidth of the motion."""
+
+OF_OTHERS: tuple[Kind, ...] = ("velocity of another joint", "torque of another joint")
+"""Variables that belong to another joint."""
 
 MOST = 2
 """Most unexplained dependences of one joint."""
@@ -182,6 +185,17 @@ def unexplained(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Surv
     return sorted(found, key=lambda d: -d.share)
 
 
+def strangers(fit: Fit, workshop: Workshop, joints: Collection[int], alpha: float = 0.01) -> list["Stranger"]:
+    """What the residuals of some joints depend on that belongs to another joint, whatever the shape.
+
+    Rivals without a name of what the catalogue finds there: their scores are comparable. Arguments as those of `where`.
+    """
+    own = _bench(workshop)
+    every = _maps(fit, workshop)
+    mine = [m for m in every if m.other is not None and m.kind in OF_OTHERS and m.joint in joints]
+    return [Stranger(fit, f, own) for f in _passing(fit, mine, own, alpha / (len(every) + fit.study.robot.n))]
+
+
 def beyond_noise(fit: Fit, left: Sequence[Disagreement], alpha: float = 0.01) -> list[Disagreement]:
     """What is left, with the joints whose residual is more than noise although nothing named explains most of that.
 
@@ -259,6 +273,29 @@ class _Found:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Stranger:
+    """A dependence of a fit's residual on what another joint does."""
+
+    fit: Fit
+    found: _Found
+    bench: Workshop
+
+    @property
+    def score(self) -> float:
+        """As that of a trial."""
+        return self.found.trial.score
+
+    def disagreement(self) -> Disagreement:
+        """As what is left is told."""
+        return self.found.disagreement(self.fit, self.bench)
+
+    def beside(self, fit: Fit, workshop: Workshop) -> float:
+        """What it scores beside another model."""
+        again = _judged(fit, self.found.map, _bench(workshop))
+        return 0.0 if again is None else max(again.trial.score, 0.0)
+
+
 def _bench(workshop: Workshop) -> Workshop:
     """The same motions, with room for columns that belong to no effect of the catalogue."""
     return replace(workshop, kept={})
@@ -275,9 +312,13 @@ def _tests(fit: Fit, workshop: Workshop) -> int:
 
 def _significant(fit: Fit, workshop: Workshop, level: float) -> list[_Found]:
     """Maps that pass, of those that a quick look at the training data finds worth a trial."""
+    return _passing(fit, _maps(fit, workshop), workshop, level)
+
+
+def _passing(fit: Fit, tried: Sequence[Map], workshop: Workshop, level: float) -> list[_Found]:
     calm = fit.renoised(noise_beyond_shapes(fit, workshop))
     looks: dict[int, list[tuple[float, Map]]] = {}
-    for m in _maps(fit, workshop):
+    for m in tried:
         effect = m.effect()
         instruments = workshop.instruments(effect, Place(m.joint), (), calm.noise, keep=False)
         statistic = score_statistic(calm, instruments)

@@ -44,9 +44,13 @@ def test_a_late_torque_of_joint_2_is_found_in_the_loop_that_it_makes(tmp_path: P
     assert told["verdict"] == "explained"
 
 
-def test_a_coupling_has_to_account_for_both_of_its_joints(tmp_path: Path) -> None:
-    """Crosstalk of currents, which the catalogue does not have, is no coupling of friction."""
-    told, _ = diagnosed("outside current_crosstalk joint_4+joint_3 obvious tx40 run 2", tmp_path)
+@pytest.mark.parametrize("strength", ["obvious tx40 run 2", "typical tx40 run 2"])
+def test_a_coupling_has_to_account_for_both_of_its_joints(strength: str, tmp_path: Path) -> None:
+    """Crosstalk of currents, which the catalogue does not have, is no coupling of friction.
+
+    Where it is weak the coupling takes all of it; but the torque of the other joint explains it far better.
+    """
+    told, _ = diagnosed(f"outside current_crosstalk joint_4+joint_3 {strength}", tmp_path)
     assert all(found["confidence"] < 0.5 for found in told["findings"])
     assert "joint_4" in {rest["joint"] for rest in told["unexplained"]}
     assert told["verdict"] == "unexplained"
