@@ -126,6 +126,13 @@ class Finding(Document):
     gap_after: float
     evidence: dict[str, Any]
 
+    @property
+    def doubt(self) -> str:
+        """Its name and place, and what without a name explains more, for a list of those that did not convince."""
+        better = self.evidence.get("better_without_name", [])
+        reason = f" (the {' and the '.join(better)} explains more)" if better else ""
+        return f"{self.effect.replace('_', ' ')} of {self.joint}{reason}"
+
 
 class Unexplained(Document):
     """What no effect of the catalogue explains, and what it varies with."""

@@ -160,7 +160,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
             unsure = f"; could also be {', '.join(rivals)}" if rivals else ""
             console.print(f"{f.joint}: {f.evidence['says']}{unsure}", highlight=False)
     if document.considered:
-        named = ", ".join(f"{f.effect} of {f.joint}" for f in document.considered)
+        named = ", ".join(f.doubt for f in document.considered)
         console.print(f"considered, and not convincing: {named}", highlight=False, soft_wrap=True)
     for u in document.unexplained:
         console.print(

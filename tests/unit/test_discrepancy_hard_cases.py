@@ -54,6 +54,8 @@ def test_a_coupling_has_to_account_for_both_of_its_joints(strength: str, tmp_pat
     assert all(found["confidence"] < 0.5 for found in told["findings"])
     assert "joint_4" in {rest["joint"] for rest in told["unexplained"]}
     assert told["verdict"] == "unexplained"
+    (other,) = (found for found in told["considered"] if found["effect"] == "coupling_friction")
+    assert "torque of joint_3 at joint_4" in other["evidence"]["better_without_name"]
 
 
 @pytest.mark.parametrize(
