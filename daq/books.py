@@ -13,9 +13,9 @@ UNSEEN = int(np.iinfo(np.int64).min)
 """The time of a SYNC that was not received."""
 
 # Positions in Books.state, per bus: number, counter and time of the last SYNC, counter of SYNC 0, whether the last
-# SYNC is one of other buses, which this one lacks, and whether frames are known to be missing: 1 behind the last SYNC,
-# 2 somewhere among those that come now.
-SYNC, COUNTER, TIME, ORIGIN, BORROWED, TORN = 0, 1, 2, 3, 4, 5
+# SYNC is one of other buses, which this one lacks, whether frames are known to be missing (1 behind the last SYNC, 2
+# somewhere among those that come now), and how often SYNC has been late or early lately, times two to the `FORGOTTEN`.
+SYNC, COUNTER, TIME, ORIGIN, BORROWED, TORN, STRAYED = range(7)
 
 # Columns of Books.kind: every how many SYNCs a frame is due, its samples, their bytes, its bytes, and for how many rows
 # an answer may be late: where its drive has not been in step since, where all are late, and where it is in step again
@@ -54,6 +54,9 @@ COUNT_NAMES = (
     SYNC_SEEN, SYNC_MISSING, SYNC_REPEATED, SYNC_MISALIGNED, FRAMES, FRAMES_UNKNOWN,
     TPDO_EARLY, TPDO_LATE, TPDO_DUPLICATE, TPDO_WRONG_LENGTH,
 ) = range(10)  # fmt: skip
+
+FORGOTTEN = 14
+"""That a SYNC was late is forgotten bit by bit over the next two to this."""
 
 RECENT = 256
 """Times of at least so many SYNCs are kept for packed samples: a turn of the counter and more.
@@ -147,7 +150,7 @@ def open_books(
     slack = max(w * s.every for w, s in zip(window, shapes, strict=True))
     recent = RECENT if buses == 1 else RECENT + 2 * slack
     return Books(
-        state=np.tile(np.array([-1, -1, UNSEEN, 1, 0, 0]), (buses, 1)),
+        state=np.tile(np.array([-1, -1, UNSEEN, 1, 0, 0, 0]), (buses, 1)),
         slack=np.full(buses, slack, np.int64),
         recent=np.full((buses, recent), UNSEEN, np.int64),
         sent_at=np.full(SENT_AT, UNSEEN, np.int64),

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from daq.books import BORROWED, COUNTER, ORIGIN, SYNC, TIME, TORN, UNSEEN
+from daq.books import BORROWED, COUNTER, FORGOTTEN, ORIGIN, STRAYED, SYNC, TIME, TORN, UNSEEN
 
 _EARLY = 0.25
 """By how much of a turn of the counter the time between two SYNCs may be too short, as their stamps say."""
@@ -15,6 +15,8 @@ _ON_TIME, _DRIFT = 2.0, 1e-4
 """By how many periods, and which share of the time since, SYNC comes earlier or later than its grid at most."""
 NOWHERE = -(1 << 60)
 """No step at all."""
+_OFTEN = (3 << FORGOTTEN) // 2
+"""A master that has been late more often than this lately is late all the time: twice in a few seconds at 5 kHz."""
 _MISALIGNED = 2.0
 """SYNCs of equal counters on two buses that are farther apart than so many periods are not the same SYNC."""
 
@@ -26,11 +28,14 @@ def turns_in(periods: float, overflow: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _was_held_up(counter: int, previous: int, elapsed: float, overflow: int) -> bool:
-    """Whether a counter that goes on without a seam is that of a master that was held up: not a time of whole turns."""
+def _was_held_up(counter: int, previous: int, elapsed: float, often: bool, overflow: int) -> bool:
+    """Whether a counter that goes on without a seam is that of a master that was held up: not a time of whole turns.
+
+    Of one that is held up ``often`` no time says anything else.
+    """
     step = (counter - previous) % overflow
     off = elapsed - step - turns_in(elapsed - step, overflow) * overflow
-    return bool(step == 1 and abs(off) > _ON_TIME + _DRIFT * elapsed)
+    return bool(step == 1 and (often or abs(off) > _ON_TIME + _DRIFT * elapsed))
 
 
 @njit(cache=True, nogil=True)
@@ -81,7 +86,8 @@ def _begin(state: Any, recent: Any, bus: int, counter: int, t_ns: int, period_ns
 def _heard_elsewhere(state: Any, recent: Any, bus: int, step: int, t_ns: int, period_ns: int, overflow: int) -> int:
     """By how many SYNCs, ``step`` and whole turns, a bus advances to the SYNC that another one had at this time.
 
-    A master that is held up keeps to no period, but all buses have its SYNC at once. ``NOWHERE`` if none had one.
+    A master that is held up keeps to no period, but all buses have its SYNC at once, or one of them between two that
+    another has if it is held up between buses. ``NOWHERE`` if none had one.
     """
     best, nearest, room = NOWHERE, _MISALIGNED * period_ns, recent.shape[1]
     for other in range(state.shape[0]):
@@ -95,8 +101,32 @@ def _heard_elsewhere(state: Any, recent: Any, bus: int, step: int, t_ns: int, pe
             at = recent[other, k % room]
             if at != UNSEEN and abs(t_ns - at) <= nearest:
                 best, nearest = k - state[bus, SYNC], float(abs(t_ns - at))
+            elif best == NOWHERE and last - room + 1 < k < last:
+                before, after = recent[other, (k - 1) % room], recent[other, (k + 1) % room]
+                if before != UNSEEN and after != UNSEEN and before < t_ns < after:
+                    best = k - state[bus, SYNC]
             k += overflow
     return int(best)
+
+
+@njit(cache=True, nogil=True)
+def _is_apart(state: Any, bus: int, number: int, t_ns: int, period_ns: int, overflow: int) -> int:
+    """Another bus that had later SYNCs than one that comes now, by more than there was time for; -1 if none had."""
+    for other in range(state.shape[0]):
+        ahead = state[other, SYNC] - number
+        if ahead <= overflow // 2 or other == bus or state[other, BORROWED]:
+            continue
+        if ahead - (state[other, TIME] - t_ns) / period_ns > overflow // 2:
+            return other
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _together(state: Any, bus: int, other: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
+    """By how many SYNCs a bus advances to the one nearest in time to the last of another bus."""
+    elapsed = (t_ns - state[other, TIME]) / period_ns
+    step = (counter - state[other, COUNTER]) % overflow
+    return int(state[other, SYNC] + step + overflow * np.rint((elapsed - step) / overflow) - state[bus, SYNC])
 
 
 @njit(cache=True, nogil=True)
@@ -132,9 +162,19 @@ def _told_by_counter(
         # What had waited on this bus may be older than what others had meanwhile.
         found = _heard_elsewhere(state, b.recent, bus, step, t_ns, period_ns, overflow)
         return found if found != NOWHERE else int(step + overflow * turns_in(elapsed - step, overflow))
-    if not state[bus, TORN] and _was_held_up(counter, state[bus, COUNTER], elapsed, overflow):
+    often = state[bus, STRAYED] > _OFTEN
+    if not state[bus, TORN] and _was_held_up(counter, state[bus, COUNTER], elapsed, often, overflow):
         longest = 0
-    return int(sync_step(counter, state[bus, COUNTER], elapsed, overflow, longest))
+    told = sync_step(counter, state[bus, COUNTER], elapsed, overflow, longest)
+    found = 0
+    if told > overflow:
+        found = _heard_elsewhere(state, b.recent, bus, step, t_ns, period_ns, overflow)
+    else:
+        # Time may have deceived one of them; who is behind can still leave numbers out.
+        other = _is_apart(state, bus, state[bus, SYNC] + told, t_ns, period_ns, overflow)
+        if other >= 0 and state[other, COUNTER] >= 0:
+            found = _together(state, bus, other, counter, t_ns, period_ns, overflow)
+    return int(found) if found > 0 else int(told)
 
 
 @njit(cache=True, nogil=True)
@@ -154,6 +194,10 @@ def advance(state: Any, b: Any, bus: int, counter: int, t_ns: int, period_ns: in
     else:
         step = 1
     if step > 0:
+        if state[bus, TIME] != UNSEEN:
+            state[bus, STRAYED] -= state[bus, STRAYED] >> FORGOTTEN
+            if abs(t_ns - state[bus, TIME] - step * period_ns) > (_ON_TIME + _DRIFT * step) * period_ns:
+                state[bus, STRAYED] += 1 << FORGOTTEN
         state[bus, SYNC] += step
         state[bus, TIME] = t_ns
         state[bus, BORROWED] = 0

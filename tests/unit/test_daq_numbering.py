@@ -49,6 +49,15 @@ def answered(numbers: list[int], late_ns: Callable[[int], int] = lambda k: 0) ->
     return out
 
 
+def test_a_master_that_is_held_up_at_times_has_never_been_so_for_a_turn_of_the_counter_by_chance() -> None:
+    """Once its stamps tell nothing, a pause of a turn to the microsecond tells nothing either."""
+    listener = Listener()
+    stalls = {400: 37, 700: 90, 900: OVERFLOW, 1500: 2 * OVERFLOW}
+    listener.push(answered(list(range(2000)), lambda k: sum(n for at, n in stalls.items() if k >= at) * PERIOD_NS))
+    assert listener.finish() == []
+    assert listener.assembler.last_sync == 1999
+
+
 @pytest.mark.parametrize("turns", [0.76, 1.1, 3.2])
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_master_that_was_held_up_has_sent_nothing_meanwhile(turns: float, cut: bool) -> None:
