@@ -39,6 +39,7 @@ DISK_BYTES = 3 << 20
 ATTEMPTS = 4
 """Most times that one round is done."""
 OF_ANOTHER = "are not of their SYNC"
+UNFINISHED = "could not be finished: No space left on device"
 SMALL_BUFFER = 96 << 10
 """Bytes of the kernel's buffer where it shall overrun."""
 LONGEST_S = 40.0
@@ -75,7 +76,7 @@ class Round:
     undone: Sequence[str] = ()
     """Faults for which the drives were too late themselves."""
     dropped: Sequence[str] = ()
-    """What was wrong in attempts in the middle of which they became late."""
+    """What was wrong in attempts that were not the round that was planned."""
 
 
 def session_file(
@@ -138,21 +139,22 @@ class Lane:
         shutil.rmtree(self._folder)
 
     def run(self, number: int, plan: Plan | None = None, only: Sequence[str] = ()) -> Round:
-        """One round: as planned, or at random; once more where drives that became late meanwhile explain what is wrong.
+        """One round: as planned, or at random; once more where it was another round than planned, and this explains it.
 
-        They explain values of another SYNC, and no SYNC that is not accounted for.
+        Drives that became late meanwhile explain values of another SYNC, and no SYNC that is not accounted for. A disk
+        that was full to the end explains a capture that says that its file could not be finished.
         """
         dropped: list[str] = []
         for attempt in range(ATTEMPTS):
-            found, spoilt = self._attempt(number, attempt, plan, only)
-            if not spoilt or not found.violations or any(OF_ANOTHER not in text for text in found.violations):
+            found, explained = self._attempt(number, attempt, plan, only)
+            if not found.violations or explained is None or any(explained not in text for text in found.violations):
                 break
             if attempt + 1 < ATTEMPTS:
                 dropped += found.violations
         return replace(found, dropped=dropped)
 
-    def _attempt(self, number: int, attempt: int, plan: Plan | None, only: Sequence[str]) -> tuple[Round, bool]:
-        """A round, and whether what its drives did was something else than planned, by their own lateness."""
+    def _attempt(self, number: int, attempt: int, plan: Plan | None, only: Sequence[str]) -> tuple[Round, str | None]:
+        """A round, and what is wrong in it because it was another one than planned."""
         rng = np.random.default_rng([self._seed, number])
         faults, producing, buses = chosen(rng, number, only) if plan is None else plan
         farm = self._farms[buses]
@@ -175,12 +177,15 @@ class Lane:
             process.kill()
             process.join()
             seen, ledgers = farm.finish(), [list(lane.ledger) for lane in farm.lanes]
-        words, spoilt = said(log), room.orders.spoilt
+        words = said(log)
+        explained = OF_ANOTHER if room.orders.spoilt else None
         undone = [name for name in faults if name in ORDERED and ORDERED[name] not in room.orders.done]
         faults = [name for name in faults if name not in undone]
         if process.exitcode != 0:
             what = [f"the capture ended with {process.exitcode}"]
-            return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words), False
+            if room.orders.full_at_end and UNFINISHED in words and _torn_only(out):
+                what, explained = [f"{what[0]}: {UNFINISHED}"], UNFINISHED
+            return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words), explained
         try:
             paths, counters = result(log)
             done = Outcome(join_parts([read_recording(p) for p in paths]), counters, words, len(paths))
@@ -190,7 +195,7 @@ class Lane:
                 wrong.append(f"torn: {done.recording.missing}")
         except Exception as error:
             what = [f"{type(error).__name__}: {error}"]
-            return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words), False
+            return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words), None
         gaps = [g for g in done.recording.gaps if g.stream == "samples"]
         covered = {k for g in gaps for k in range(g.first, g.last + 1)}
         rows = done.recording.samples.sync.size
@@ -202,7 +207,7 @@ class Lane:
             number, faults, _shape(producing, buses), len(set().union(*ledgers)), rows, len(covered), len(gaps), wrong,
             unnamed, report, undone,
         )  # fmt: skip
-        return found, spoilt
+        return found, explained
 
     def _wait(self, process: Capture, farm: Farm, log: Path, producing: bool) -> None:
         """Until the capture is over; a foreign master begins when it is ready, and ends before it."""
@@ -222,6 +227,11 @@ class Lane:
                 os.kill(process.pid, signal.SIGINT)
                 stopped = True
             time.sleep(0.02)
+
+
+def _torn_only(folder: Path) -> bool:
+    """Whether every file can be read, and the one that was not finished says so."""
+    return any([bool(read_recording(path).missing) for path in folder.glob("*.mcap")])
 
 
 def _shape(producing: bool, buses: int) -> str:
@@ -283,7 +293,7 @@ def show(rounds: Sequence[Round]) -> int:
         if r.undone:
             print(f"round {r.number}: {', '.join(r.undone)} not done, the drives were late themselves")
         for text in r.dropped:
-            print(f"round {r.number}: done again, as the drives became late while they did what is wrong: {text}")
+            print(f"round {r.number}: done again, as it was not the round that was planned: {text}")
     bad = [r for r in rounds if r.violations or r.unnamed]
     for r in bad:
         print(f"\nround {r.number} ({r.shape}; {', '.join(r.faults)}):")

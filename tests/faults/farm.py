@@ -94,6 +94,7 @@ class Orders:
     ``lost`` are not sent, ``twice`` sent twice, ``again`` once more behind the next SYNC, ``late`` sent behind the SYNC
     of that number. ``skipped`` SYNCs are not sent where the farm is their master. ``done`` has the names of the first
     three where they happened: they do not while the farm itself is late. ``spoilt``: it became late while they did.
+    ``full_at_end``: the disk was still full when the capture had to finish its file.
     """
 
     lost: set[tuple[int, int]] = field(default_factory=set)
@@ -103,6 +104,7 @@ class Orders:
     skipped: set[int] = field(default_factory=set)
     done: set[str] = field(default_factory=set)
     spoilt: bool = False
+    full_at_end: bool = False
 
     @cached_property
     def touched(self) -> set[int]:

@@ -40,6 +40,11 @@ class Outcome:
         """Whether there is a gap of a joint (``None``: of any), for one of the reasons."""
         return any((joint is None or g.joint == joint) and g.reason in reasons for g in self.recording.gaps)
 
+    def within(self, text: str, reason: str) -> bool:
+        """Whether a mark with this text is in a gap for this reason, or at the SYNC before it."""
+        at = [mark.sync for mark in self.recording.marks if text in mark.text]
+        return any(g.reason == reason and any(g.first - 1 <= k <= g.last for k in at) for g in self.recording.gaps)
+
 
 @dataclass
 class Room:
@@ -185,7 +190,13 @@ def reboot(room: Room) -> Expected:
     """A drive loses its power for a moment and boots."""
     j, seconds = room.joint(), float(room.rng.uniform(0.03, 0.2))
     room.actions.append((room.at(1.1), lambda: room.farm.reboot(j, seconds)))
-    return lambda done: done.counters["rebooted"] > 0 and done.marked("has booted again") and done.gap(_name(j), "lost")
+
+    def told(done: Outcome) -> bool:
+        # While no SYNC came it owed no answer: then the gap in which it booted is everybody's.
+        missed = done.gap(_name(j), "lost") or done.within("has booted again", "SYNC not received")
+        return done.counters["rebooted"] > 0 and done.marked("has booted again") and missed
+
+    return told
 
 
 def _remap(room: Room, j: int, entries: list[int], nmt: bool) -> None:
@@ -236,16 +247,27 @@ def held_up(room: Room) -> Expected:
     return lambda done: done.counters["sync_skipped_periods"] > 0
 
 
+def _state(pid: int) -> str:
+    """What the kernel says a process does; ``X`` if it is no more."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return "X"
+
+
+def _has_ended(pid: int) -> bool:
+    return _state(pid) in "ZX"
+
+
 def _stopped(room: Room) -> None:
     begin, length = room.at(1.2), float(room.rng.uniform(0.1, 0.3))
 
     def stop() -> None:
-        status = Path(f"/proc/{room.pid()}/stat")
         # A capture that failed is no more.
-        with suppress(FileNotFoundError, ProcessLookupError):
+        with suppress(ProcessLookupError):
             os.kill(room.pid(), signal.SIGSTOP)
             # One that has not been obeyed yet would be called off by what follows.
-            while status.read_text().rpartition(")")[2].split()[0] not in "TZX":
+            while _state(room.pid()) not in "TZX":
                 time.sleep(0.001)
             time.sleep(length)
             os.kill(room.pid(), signal.SIGCONT)
@@ -282,6 +304,7 @@ def disk_full(room: Room) -> Expected:
                     while file.write(bytes(block)) == block:
                         pass
         _while_full(room, length)
+        room.orders.full_at_end = _has_ended(room.pid())
         filler.unlink()
 
     room.actions.append((room.at(1.1), lambda: room.farm.beside(fill)))
