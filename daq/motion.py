@@ -1,5 +1,6 @@
 """What a capture makes the arm do: from where it is to the start of the trajectory, the trajectory, and rest."""
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,49 @@ from drivers.sync import SetpointPlan
 APPROACH_SHARE = 0.5
 """Largest share of the joints' velocity and acceleration limits used on the way to the start."""
 SHORTEST_APPROACH_S = 0.5
+REST_SPAN_S = 0.05
+SLOW_SHARE = 0.01
+"""Share of a joint's velocity limit below which it counts as standing."""
 _ALREADY_THERE = 1e-4
 """A joint closer to the start than this (rad or m) needs no approach."""
+
+
+class Standstill:
+    """Sees in the newest positions whether an arm has come to rest.
+
+    At rest is an arm none of whose joints moved faster, on average over 50 ms, than 1 % of its velocity limit.
+
+    Parameters
+    ----------
+    session, robot
+        Period, scales and limits.
+
+    Raises
+    ------
+    ConfigError
+        If a drive has no ``counts_per_unit``.
+    """
+
+    def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
+        self._period = session.sync_period
+        self._per_count = np.linalg.inv(robot.transmission_matrix) / counts_per_si(robot)
+        self._slow = np.array([joint.limits.velocity for joint in robot.joints]) * SLOW_SHARE
+        self._past: deque[tuple[int, NDArray[np.float64]]] = deque()
+
+    def look(self, sync: int, counts: NDArray[np.integer]) -> bool:
+        """Whether the arm rests, where SYNC ``sync`` found its motors at ``counts``, (n,).
+
+        Knows it only from positions that are 50 ms apart; the same SYNC again says nothing new.
+        """
+        if not self._past or sync > self._past[-1][0]:
+            self._past.append((sync, self._per_count @ counts))
+        (last, now), span = self._past[-1], round(REST_SPAN_S / self._period)
+        while len(self._past) > 1 and last - self._past[1][0] >= span:
+            self._past.popleft()
+        first, before = self._past[0]
+        if last - first < span:
+            return False
+        return bool((np.abs(now - before) <= self._slow * (last - first) * self._period).all())
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from daq.assembler import LATE_S, Assembler
 from daq.happenings import Happenings
 from daq.health import Health
 from daq.jitter import SyncJitter, worst
-from daq.motion import Motion, plan_motion
+from daq.motion import Motion, Standstill, plan_motion
 from daq.order import Order
 from daq.publisher import Publisher
 from daq.remote import Command
@@ -35,7 +35,9 @@ REST_S = 0.01
 TELL_BEHIND_S = 0.5
 """Drives that are farther behind than this at the end are worth a line."""
 QUICK_STOP_S = 0.3
-"""How long a quick stop is given before the drives are disabled."""
+"""How long an arm of which nothing is heard after a quick stop keeps its drives enabled."""
+BRAKING_S = 5.0
+"""How long it keeps them that is seen to move."""
 AHEAD = 10
 """Steps of niceness by which whoever drains the buses comes before the threads that write and publish."""
 OUTAGE_S = 5.0
@@ -138,7 +140,7 @@ class Recorder:
                 self._loop()
             except ArmidentError as error:
                 trouble = error
-            self._come_to_rest(trouble is not None or self._stop.is_set())
+            self._come_to_rest(trouble is not None or self._stop.is_set() or self._cut_short())
             self._mark_end(trouble)
         return trouble
 
@@ -183,10 +185,15 @@ class Recorder:
             wanted = min(wanted, self._span[1] + (len(plan.rows) - 1 - self._motion.last) * plan.every)
         return wanted
 
+    def _cut_short(self) -> bool:
+        """Whether the capture ends in the middle of the motion."""
+        return self._motion is not None and self._span is not None and self._assembler.last_sync < self._span[1]
+
     def _loop(self) -> None:
         last = self._last_wanted()
-        if isinstance(self._producer, SyncProducer) and math.isfinite(last):
-            # Who counts SYNCs here may be late; drives that are behind would be so by ever more.
+        if isinstance(self._producer, SyncProducer) and self._motion is None and math.isfinite(last):
+            # Who counts SYNCs here may be late; drives that are behind would be so by ever more. Not where an arm
+            # moves: enabled drives, and who guards them, take silence for the death of their master.
             self._producer.end_after(round(last) + 1)
         due = reported = time.monotonic()
         deadline = None if self._order.duration is None else due + self._order.duration
@@ -295,7 +302,7 @@ class Recorder:
         with suppress(ArmidentError):
             if self._master is not None and early and self._motion is not None:
                 self._master.quick_stop()
-                self._rest(QUICK_STOP_S)
+                self._await_standstill()
         if self._producer is not None:
             self._producer.stop()
         with suppress(ArmidentError):
@@ -318,13 +325,21 @@ class Recorder:
             self._happenings.of_the_end(sum(dropped), self._unseen)
         return self._assembler.last_sync + 1 + self._unseen
 
-    def _rest(self, seconds: float) -> None:
-        """Go on recording for so long."""
-        until = time.monotonic() + seconds
-        self._drain()
-        while time.monotonic() < until:
-            time.sleep(min(REST_S, max(0.0, until - time.monotonic())))
+    def _await_standstill(self) -> None:
+        """Go on recording until the arm is seen to rest; not for long where nothing is seen of it."""
+        standstill = Standstill(self._order.session, self._order.robot)
+        begin = heard = time.monotonic()
+        seen = self.sink.last_sync
+        # What drives that are behind tell of earlier says nothing.
+        since = (self._producer.sent if self._producer is not None else None) or 0
+        while time.monotonic() < min(heard + QUICK_STOP_S, begin + BRAKING_S):
+            time.sleep(REST_S)
             self._drain()
+            if self.sink.last_sync > seen and "position" in self.sink.last_raw:
+                seen, heard = self.sink.last_sync, time.monotonic()
+                if seen >= since and standstill.look(seen, self.sink.last_raw["position"]):
+                    return
+        self._say("the arm was not seen to come to rest; its drives are disabled all the same")
 
     def _await_answers(self) -> None:
         """Go on recording until no drive owes an answer, or none has come for ``LATE_S``."""

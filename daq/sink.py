@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from configs import RobotConfig, SessionConfig
 from daq.assembler import Batch, Rows
@@ -46,6 +47,8 @@ class Sink:
         self.marks: list[Mark] = []
         self.first_sync: int | None = None
         self.last_sync = -1
+        self.last_raw: dict[str, NDArray[Any]] = {}
+        """What the newest samples said, by object, each (n,)."""
         self.last_ns = 0
         self._writer, self._publisher = writer, publisher
         self._streams, self._capture = tuple(streams), capture
@@ -120,6 +123,7 @@ class Sink:
                 if self.first_sync is None:
                     self.first_sync = int(rows.sync[0])
                 self.last_sync, self.last_ns = int(rows.sync[-1]), int(rows.t_ns[-1])
+                self.last_raw = {name: column[-1] for name, column in raw.items()}
                 self._place_marks(False, rows)
         if batch.gaps:
             found = [asdict(gap) for gap in batch.gaps]

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -15,8 +16,10 @@ import numpy as np
 import pytest
 import yaml
 
-from configs import config_path
+from configs import config_path, load_robot
+from daq.capture import capture, prepare
 from daq.recording import read_recording
+from daq.streams import counts_per_si
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
 
@@ -189,6 +192,55 @@ def test_a_signal_ends_with_a_finished_file(vcan_bus: str, tmp_path: Path, numbe
     expected, rows, gaps, drops = (recording.counters[name] for name in COUNTED)
     assert expected == rows + gaps == recording.counters["sync_sent"]
     assert drops == 0
+
+
+def moving_session(folder: Path, bus: str, cell: str, moves: list[dict[str, Any]]) -> Path:
+    """A session that moves joint 1 from 0, at 500 Hz."""
+    motion = {"schema": "armident/trajectory/1", "start": [0.0, 0.0, 1.57, 0.0, 0.0, 0.0], "moves": moves}
+    (folder / f"{cell}_motion.yaml").write_text(yaml.safe_dump(motion))
+    session = session_file(folder, bus, cell, sync={"period_us": 2000})
+    data = yaml.safe_load(session.read_text())
+    data["setpoints"] |= {"trajectory": str(folder / f"{cell}_motion.yaml"), "every": 1, "settle_s": 0.1}
+    session.write_text(yaml.safe_dump(data))
+    return session
+
+
+class Late(threading.Event):
+    """Nobody asks a capture to stop, but whoever looks is held up, as on a machine that is too slow."""
+
+    def is_set(self) -> bool:
+        time.sleep(0.4)
+        return super().is_set()
+
+
+@pytest.mark.usefixtures("robot")
+def test_sync_goes_on_until_somebody_disables_the_drives_of_an_arm_that_moved(vcan_bus: str, tmp_path: Path) -> None:
+    """Enabled drives, and who guards them, take silence for the death of their master."""
+    there = {"to": [0.1, 0.0, 1.57, 0.0, 0.0, 0.0], "duration": 0.6}
+    session = moving_session(tmp_path, vcan_bus, "ends_late", [there])
+    done = capture(prepare(session, tmp_path / "out", None, False), Late(), lambda line: None)
+    assert done.trouble is None
+    end = next(mark.sync for mark in done.marks if mark.kind == "experiment_end")
+    settled = end + 0.1 / 0.002
+    assert done.counters["sync_sent"] > settled + 100
+    assert done.counters["samples.rows"] == done.counters["sync_sent"]
+
+
+@pytest.mark.usefixtures("robot")
+def test_a_capture_that_is_over_in_the_middle_of_a_motion_stops_the_arm(vcan_bus: str, tmp_path: Path) -> None:
+    away = {"to": [1.5, 0.0, 1.57, 0.0, 0.0, 0.0], "duration": 4.0}
+    session = moving_session(tmp_path, vcan_bus, "cut_short", [away])
+    done = capture(prepare(session, tmp_path / "out", 2.5, False), threading.Event(), lambda line: None)
+    assert done.trouble is None
+    end = next(mark for mark in done.marks if mark.kind == "experiment_end")
+    assert "before its end" in end.text
+    robot, raw = load_robot("tx40.yaml"), read_recording(done.paths[-1]).samples.raw["position"]
+    position = np.linalg.solve(robot.transmission_matrix, (raw / counts_per_si(robot)).T)[0]
+    assert 0.2 < position[-1] < 1.3
+    assert position.max() - position[-1] < 0.01
+    velocity = np.diff(position) / 0.002
+    assert velocity.max() > 0.3
+    assert np.abs(velocity[-20:]).max() < 0.05
 
 
 def refused(process: subprocess.Popen[str], out: Path, code: int) -> str:
