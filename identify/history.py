@@ -86,7 +86,7 @@ class History:
     Parameters
     ----------
     url
-        As SQLAlchemy understands it: ``sqlite:///history.sqlite``, ``postgresql+psycopg://...``.
+        As SQLAlchemy understands it: ``sqlite:///history.sqlite``, ``postgresql://USER:PASSWORD@HOST/NAME``.
 
     Raises
     ------
@@ -96,10 +96,12 @@ class History:
 
     def __init__(self, url: str = DEFAULT) -> None:
         try:
-            self._engine = sa.create_engine(url)
+            self._engine = sa.create_engine(_driven(url))
             _tables.create_all(self._engine)
         except (sa.exc.SQLAlchemyError, ImportError, OSError) as error:
-            raise ConfigError(f"{_shown(url)}: cannot be used as history: {_one_line(error)}") from error
+            missing = getattr(error, "name", None) == "psycopg"
+            hint = "; install it with: pip install 'armident[postgresql]'" if missing else ""
+            raise ConfigError(f"{_shown(url)}: cannot be used as history: {_one_line(error)}{hint}") from error
 
     def add(self, document: IdentificationDocument, recorded: datetime.datetime) -> bool:
         """Keep an identification; whether it is new, since the same one is kept once.
@@ -263,6 +265,11 @@ def recorded_at(document: IdentificationDocument, file: Path) -> datetime.dateti
     if found is not None:
         return datetime.datetime.strptime(found[1] + "+0000", "%Y%m%dT%H%M%S%z")
     return datetime.datetime.fromtimestamp(file.stat().st_mtime, datetime.UTC)
+
+
+def _driven(url: str) -> str:
+    """The URL with the driver that our extra installs, where it names none."""
+    return re.sub(r"^postgres(ql)?://", "postgresql+psycopg://", url)
 
 
 def _shown(url: str) -> str:

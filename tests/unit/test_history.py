@@ -3,6 +3,7 @@
 import datetime
 import json
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -153,3 +154,13 @@ def test_what_is_wrong_is_said_in_one_line(url: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         History("postgresql+pg8000://me:secret@localhost/x")
     assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize("scheme", ["postgresql", "postgres", "postgresql+psycopg"])
+def test_postgresql_is_reached_by_the_driver_of_our_extra(scheme: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match=r"cannot be used as history: .*[Cc]onnection refused") as caught:
+        History(f"{scheme}://me:secret@127.0.0.1:1/x")
+    assert "secret" not in str(caught.value)
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    with pytest.raises(ConfigError, match=r"install it with: pip install 'armident\[postgresql\]'"):
+        History(f"{scheme}://me:secret@127.0.0.1:1/x")
