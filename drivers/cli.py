@@ -12,7 +12,8 @@ def bus_load(
         int | None, typer.Option("--bitrate", min=10_000, help="Bit rate in bit/s, instead of the configuration's.")
     ] = None,
     data_bitrate: Annotated[
-        int | None, typer.Option("--data-bitrate", min=10_000, help="Data bit rate of CAN FD, with --bitrate.")
+        int | None,
+        typer.Option("--data-bitrate", min=10_000, help="Data bit rate with --bitrate; makes classic buses CAN FD."),
     ] = None,
 ) -> None:
     """Compute the load of every bus from a configuration, and refuse what cannot fit.
@@ -31,10 +32,13 @@ def bus_load(
     if data_bitrate is not None and bitrate is None:
         raise ConfigError("--data-bitrate: needs --bitrate")
     if bitrate is not None:
+        rates = {"bitrate": bitrate} if data_bitrate is None else {"bitrate": bitrate, "data_bitrate": data_bitrate}
         buses = tuple(
-            bus.model_copy(update={"bitrate": bitrate, "data_bitrate": data_bitrate, "fd": data_bitrate is not None})
-            for bus in session.all_buses
+            bus.model_copy(update=rates | {"fd": bus.fd or data_bitrate is not None}) for bus in session.all_buses
         )
+        unknown = [bus.channel for bus in buses if bus.fd and bus.data_bitrate is None]
+        if unknown:
+            raise ConfigError(f"--bitrate: {', '.join(unknown)}: CAN FD, which needs --data-bitrate, too")
         session = session.model_copy(update={"buses": buses})
     console = Console()
     for bus in session.all_buses:

@@ -1,5 +1,8 @@
 """Bus load against the figures of can-utils and of Davis et al. 2007."""
 
+import subprocess
+import sys
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -116,3 +119,20 @@ def test_each_bus_carries_its_own_drives_and_every_sync() -> None:
     assert len(per_bus) == 6
     assert sum(row.frames_per_s for row in rows if row.message.startswith("TPDO1")) == pytest.approx(30_000)
     assert sum(row.frames_per_s for row in rows if row.message == "SYNC") == pytest.approx(30_000)
+
+
+def table(*options: str) -> str:
+    """What the command prints, with its errors."""
+    command = [sys.executable, "-m", "daq.cli", "bus-load", *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    return done.stdout + done.stderr
+
+
+def test_a_bus_with_fd_remains_one_at_another_bit_rate() -> None:
+    shipped = "tx40_one_fd.yaml"
+    assert "vcan0: CAN FD, which needs --data-bitrate, too" in table("--config", shipped, "--bitrate", "1000000")
+    both = table("--config", shipped, "--bitrate", "1000000", "--data-bitrate", "5000000")
+    assert "vcan0 (CAN FD)" in both
+    assert "%" in both
+    classic = table("--config", "tx40_six_buses.yaml", "--bitrate", "1000000")
+    assert classic.count("(classic)") == 6
