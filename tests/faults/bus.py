@@ -74,7 +74,7 @@ class Round:
     unnamed: list[str]
     said: str = ""
     undone: Sequence[str] = ()
-    """Faults for which the drives were too late themselves."""
+    """Faults that did not happen: the drives were too late themselves, or the disk was asked nothing."""
     dropped: Sequence[str] = ()
     """What was wrong in attempts that were not the round that was planned."""
 
@@ -291,7 +291,9 @@ def show(rounds: Sequence[Round]) -> int:
         )
     for r in rounds:
         if r.undone:
-            print(f"round {r.number}: {', '.join(r.undone)} not done, the drives were late themselves")
+            print(
+                f"round {r.number}: {', '.join(r.undone)} not done: the drives were late themselves, or the disk was asked nothing"
+            )
         for text in r.dropped:
             print(f"round {r.number}: done again, as it was not the round that was planned: {text}")
     bad = [r for r in rounds if r.violations or r.unnamed]

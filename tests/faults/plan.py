@@ -77,8 +77,8 @@ class Room:
 
 Expected = Callable[[Outcome], bool]
 
-ORDERED = {"lost": "lost", "all_lost": "lost", "twice": "twice", "again": "again"}
-"""Faults that do not happen while the drives are late themselves, and the order that they become."""
+ORDERED = {"lost": "lost", "all_lost": "lost", "twice": "twice", "again": "again", "disk_full": "full"}
+"""Faults that do not happen while the drives are late themselves, or nothing is written, and the order they become."""
 
 
 def _was_down(done: Outcome) -> bool:
@@ -303,7 +303,8 @@ def disk_full(room: Room) -> Expected:
                 with suppress(OSError):
                     while file.write(bytes(block)) == block:
                         pass
-        _while_full(room, length)
+        if _while_full(room, length):
+            room.orders.done.add("full")
         room.orders.full_at_end = _has_ended(room.pid())
         filler.unlink()
 
@@ -314,8 +315,11 @@ def disk_full(room: Room) -> Expected:
     )
 
 
-def _while_full(room: Room, length: float) -> None:
-    """For so long, and until the disk has refused something: a host that is busy may keep the capture from trying."""
+def _while_full(room: Room, length: float) -> bool:
+    """For so long, and until the disk has refused something: a host that is busy may keep the capture from trying.
+
+    Whether it has refused something in the end.
+    """
 
     def looks() -> dict[Path, tuple[int, int]]:
         return {path: (stat.st_size, stat.st_mtime_ns) for path in files for stat in [path.stat()]}
@@ -333,6 +337,7 @@ def _while_full(room: Room, length: float) -> None:
         # What was not written whole is taken back: the file is touched, and no larger.
         refused |= any(now[path][0] == size and now[path][1] != at for path, (size, at) in before.items())
         before = now
+    return refused
 
 
 def rotation(room: Room) -> Expected:
