@@ -291,9 +291,8 @@ def show(rounds: Sequence[Round]) -> int:
         )
     for r in rounds:
         if r.undone:
-            print(
-                f"round {r.number}: {', '.join(r.undone)} not done: the drives were late themselves, or the disk was asked nothing"
-            )
+            why = "the drives were late themselves, or the disk was asked nothing"
+            print(f"round {r.number}: {', '.join(r.undone)} not done: {why}")
         for text in r.dropped:
             print(f"round {r.number}: done again, as it was not the round that was planned: {text}")
     bad = [r for r in rounds if r.violations or r.unnamed]
