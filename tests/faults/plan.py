@@ -77,8 +77,8 @@ class Room:
 
 Expected = Callable[[Outcome], bool]
 
-ORDERED = {"lost": "lost", "all_lost": "lost", "twice": "twice", "again": "again", "disk_full": "full"}
-"""Faults that do not happen while the drives are late themselves, or nothing is written, and the order they become."""
+ORDERED = {"lost": "lost", "all_lost": "lost", "twice": "twice", "again": "again"}
+"""Faults that do not happen while the drives are late themselves, and the order that they become."""
 
 
 def _was_down(done: Outcome) -> bool:
