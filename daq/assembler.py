@@ -161,8 +161,17 @@ class Assembler:
     @property
     def owed(self) -> int:
         """Most SYNCs that any drive has still to answer."""
-        heads = self._books.head[self._books.bus_of].T
-        return int((heads - self._books.settled - self._books.pending).max())
+        return int(self._debts().max())
+
+    @property
+    def owed_by_all(self) -> int:
+        """SYNCs that every drive has still to answer, in every stream: they are behind together."""
+        return max(int(self._debts().min()), 0)
+
+    def _debts(self) -> NDArray[np.int64]:
+        """SYNCs that are not answered yet, (streams, drives)."""
+        debts: NDArray[np.int64] = self._books.head[self._books.bus_of].T - self._books.settled - self._books.pending
+        return debts
 
     @property
     def wrong_lengths(self) -> dict[tuple[str, str], int]:

@@ -1,6 +1,5 @@
 """What a capture makes the arm do: from where it is to the start of the trajectory, the trajectory, and rest."""
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +15,13 @@ APPROACH_SHARE = 0.5
 """Largest share of the joints' velocity and acceleration limits used on the way to the start."""
 SHORTEST_APPROACH_S = 0.5
 REST_SPAN_S = 0.05
-SLOW_SHARE = 0.01
-"""Share of a joint's velocity limit below which it counts as standing."""
+"""How long an arm must not have moved before it counts as standing."""
+REST_STEP_S = 0.01
+"""Motion is looked for between positions that are at least so far apart."""
+SLOW_SHARE = 0.002
+"""Share of a joint's velocity limit up to which it counts as standing."""
+SHAKE_COUNTS = 2.0
+"""Encoder counts by which the position of a standing motor may differ between two looks."""
 _ALREADY_THERE = 1e-4
 """A joint closer to the start than this (rad or m) needs no approach."""
 
@@ -25,7 +29,8 @@ _ALREADY_THERE = 1e-4
 class Standstill:
     """Sees in the newest positions whether an arm has come to rest.
 
-    At rest is an arm none of whose joints moved faster, on average over 50 ms, than 1 % of its velocity limit.
+    At rest is an arm none of whose joints was faster, on average over any 10 ms of the last 50 ms, than 0.2 % of its
+    velocity limit: one that swings back does not rest where it turns round. Two encoder counts are no motion.
 
     Parameters
     ----------
@@ -39,25 +44,28 @@ class Standstill:
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
-        self._period = session.sync_period
+        self._step, self._span = round(REST_STEP_S / session.sync_period), round(REST_SPAN_S / session.sync_period)
         self._per_count = np.linalg.inv(robot.transmission_matrix) / counts_per_si(robot)
-        self._slow = np.array([joint.limits.velocity for joint in robot.joints]) * SLOW_SHARE
-        self._past: deque[tuple[int, NDArray[np.float64]]] = deque()
+        limits = np.array([joint.limits.velocity for joint in robot.joints])
+        self._slow = limits * SLOW_SHARE * session.sync_period
+        self._shake = np.abs(self._per_count).sum(axis=1) * SHAKE_COUNTS
+        self._last: tuple[int, NDArray[np.float64]] | None = None
+        self._since = 0
 
     def look(self, sync: int, counts: NDArray[np.integer]) -> bool:
         """Whether the arm rests, where SYNC ``sync`` found its motors at ``counts``, (n,).
 
         Knows it only from positions that are 50 ms apart; the same SYNC again says nothing new.
         """
-        if not self._past or sync > self._past[-1][0]:
-            self._past.append((sync, self._per_count @ counts))
-        (last, now), span = self._past[-1], round(REST_SPAN_S / self._period)
-        while len(self._past) > 1 and last - self._past[1][0] >= span:
-            self._past.popleft()
-        first, before = self._past[0]
-        if last - first < span:
-            return False
-        return bool((np.abs(now - before) <= self._slow * (last - first) * self._period).all())
+        now = self._per_count @ counts
+        if self._last is None:
+            self._last, self._since = (sync, now), sync
+        last, before = self._last
+        if sync - last >= max(self._step, 1):
+            if (np.abs(now - before) > np.maximum(self._slow * (sync - last), self._shake)).any():
+                self._since = sync
+            self._last = sync, now
+        return self._last[0] - self._since >= self._span
 
 
 @dataclass(frozen=True)

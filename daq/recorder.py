@@ -36,6 +36,8 @@ TELL_BEHIND_S = 0.5
 """Drives that are farther behind than this at the end are worth a line."""
 QUICK_STOP_S = 0.3
 """How long an arm of which nothing is heard after a quick stop keeps its drives enabled."""
+STARVED_S = 20.0
+"""How long the end waits for drives that are all behind, though nothing at all has come; the watchdog waits longer."""
 BRAKING_S = 5.0
 """How long it keeps them that is seen to move."""
 AHEAD = 10
@@ -342,15 +344,24 @@ class Recorder:
         self._say("the arm was not seen to come to rest; its drives are disabled all the same")
 
     def _await_answers(self) -> None:
-        """Go on recording until no drive owes an answer, or none has come for ``LATE_S``."""
+        """Go on recording until no drive owes an answer, or none has come for ``LATE_S``.
+
+        Where all owe some they are behind together, on a host that is too busy for them: they get ``STARVED_S``, unless
+        a heartbeat is missing or no bus works.
+        """
         told = False
-        until = time.monotonic() + LATE_S
+        heard, lost = time.monotonic(), self._happenings.counts["heartbeat_lost"]
         while True:
             if self._drain():
-                until = time.monotonic() + LATE_S
-            owed = self._assembler.owed
-            if owed <= 0 or time.monotonic() > until:
+                heard = time.monotonic()
+            owed, silent = self._assembler.owed, time.monotonic() - heard
+            if owed <= 0 or silent > STARVED_S:
                 return
+            if silent > LATE_S:
+                self._hear_drives()
+                alive = self._happenings.counts["heartbeat_lost"] == lost and not self._receiver.all_down_s
+                if not (alive and self._assembler.owed_by_all):
+                    return
             if not told and owed * self._period > TELL_BEHIND_S:
                 self._say(f"the drives are {owed * self._period:.1f} s behind: waiting for their answers")
                 told = True

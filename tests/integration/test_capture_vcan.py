@@ -17,6 +17,7 @@ import pytest
 import yaml
 
 from configs import config_path, load_robot
+from daq.assembler import LATE_S
 from daq.capture import capture, prepare
 from daq.recording import read_recording
 from daq.streams import counts_per_si
@@ -108,6 +109,45 @@ def test_sixty_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_pat
     assert gaps == drops == 0, told
     assert recording.gaps == (), told
     assert expected == rows == recording.counters["sync_sent"] >= 300_000, told
+
+
+def test_drives_without_a_cpu_for_seconds_are_waited_for_at_the_end(
+    vcan_bus: str, robot: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    """Nobody answers the last SYNCs for longer than a lost answer is waited for, then all do: nothing is in a gap."""
+    session = session_file(tmp_path, vcan_bus, "starved", sync={"period_us": 1000}, setpoints=None)
+    process = run("capture", "--config", session, "--duration", "3", "--out", tmp_path / "out", "--json")
+    wait_for_file(tmp_path / "out", 20_000, process)
+    robot.send_signal(signal.SIGSTOP)
+    try:
+        assert process.stderr is not None
+        told = next(line for line in process.stderr if "behind: waiting for their answers" in line)
+        time.sleep(LATE_S + 2.0)
+        assert process.poll() is None, told
+    finally:
+        robot.send_signal(signal.SIGCONT)
+    out, err = process.communicate(timeout=200)
+    assert process.returncode == 0, err
+    recording = read_recording(json.loads(out)["recording"])
+    expected, rows, gaps, drops = (recording.counters[name] for name in COUNTED)
+    assert gaps == drops == 0, (told, err)
+    assert expected == rows == 3000
+
+
+def test_drives_that_died_are_not_waited_for_at_the_end(
+    vcan_bus: str, robot: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    session = session_file(tmp_path, vcan_bus, "died", sync={"period_us": 1000}, setpoints=None)
+    process = run("capture", "--config", session, "--duration", "3", "--out", tmp_path / "out", "--json")
+    wait_for_file(tmp_path / "out", 20_000, process)
+    robot.kill()
+    assert process.stderr is not None
+    told = [line for line in process.stderr]
+    begin = next(k for k, line in enumerate(told) if "behind: waiting for their answers" in line)
+    assert process.wait(timeout=200) == 0, told
+    recording = read_recording(next((tmp_path / "out").glob("*.mcap")))
+    assert recording.counters["heartbeat_lost"] == 6, told[begin:]
+    assert recording.counters["samples.rows"] + recording.counters["samples.in_gaps"] == 3000
 
 
 @pytest.mark.usefixtures("robot")
@@ -234,10 +274,12 @@ def test_a_capture_that_is_over_in_the_middle_of_a_motion_stops_the_arm(vcan_bus
     assert done.trouble is None
     end = next(mark for mark in done.marks if mark.kind == "experiment_end")
     assert "before its end" in end.text
-    robot, raw = load_robot("tx40.yaml"), read_recording(done.paths[-1]).samples.raw["position"]
-    position = np.linalg.solve(robot.transmission_matrix, (raw / counts_per_si(robot)).T)[0]
+    robot, recording = load_robot("tx40.yaml"), read_recording(done.paths[-1])
+    raw = recording.samples.raw["position"], recording.streams["demand"].raw["demand"]
+    position, held = (np.linalg.solve(robot.transmission_matrix, (r / counts_per_si(robot)).T)[0] for r in raw)
     assert 0.2 < position[-1] < 1.3
-    assert position.max() - position[-1] < 0.01
+    # It overshoots and swings back to where its drives hold it.
+    assert abs(position[-1] - held[-1]) < 0.01
     velocity = np.diff(position) / 0.002
     assert velocity.max() > 0.3
     assert np.abs(velocity[-20:]).max() < 0.05
