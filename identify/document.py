@@ -152,6 +152,19 @@ class Invisible(Document):
     needs: str
 
 
+class Hideable(Document):
+    """An effect that could be in the arm without showing in these recordings, up to a size.
+
+    ``below`` holds, for each parameter by itself, the size from which on nine diagnoses of ten would have found it.
+    """
+
+    effect: str
+    joint: str
+    other: str | None = None
+    below: dict[str, float]
+    units: dict[str, str]
+
+
 class Gap(Document):
     """Relative torque error in percent, of all joints together and of each; ``rms`` is that of each in N m or N."""
 
@@ -194,6 +207,7 @@ class DiagnosisDocument(Document):
     versions: dict[str, str]
     warnings: list[str]
     not_visible: list[Invisible] = []
+    could_hide: list[Hideable] = []
     simulated: dict[str, dict[str, float]] | None = None
     considered: list[Finding] = []
 

@@ -33,7 +33,7 @@ class Score:
     missed
         Nothing was found, and nothing left unexplained.
     invisible
-        Missed, and the diagnosis says that this motion cannot show the effect.
+        Missed, and the diagnosis says that these recordings cannot show the effect, at all or of this size.
     extra
         Findings beside what is hidden and what comes with it.
     closed
@@ -81,13 +81,16 @@ def score(case: Case, record: Record, healthy: Record | None) -> Score:
             first = bool(findings) and matches(case.parts[0], findings[0])
         second = all(_among(part, findings) for part in case.parts)
     missed = document["verdict"] == "no_gap" and bool(case.parts)
+    truths = [*record["truth"], *({} for _ in case.parts)]
     right = [f for f in matched if f is not None] if known else []
     return Score(
         verdict=document["verdict"],
         first=first,
         second=second,
         missed=missed,
-        invisible=missed and not case.baseline and all(_called_invisible(part, document) for part in case.parts),
+        invisible=missed
+        and not case.baseline
+        and all(_called_invisible(p, truth, document) for p, truth in zip(case.parts, truths, strict=False)),
         extra=sum(not any(matches(part, f) or _comes_with(part, f) for part in case.parts) for f in findings),
         closed=None if healthy is None else closed_share(case, document, healthy["document"]),
         within=tuple(
@@ -155,7 +158,7 @@ def _at_measured_motion(case: Case, document: Document, healthy: Document) -> Po
     numbers = [f for f in document["findings"] if f["kind"] == "numbers"]
     if case.baseline and numbers:
         place = numbers[0]["joint"]
-        torque = _torques(document)[place]
+        torque = _torques(document, "before")[place]
         return (
             (float(numbers[0]["gap_before"]) * torque) ** 2,
             (float(numbers[-1]["gap_after"]) * torque) ** 2,
@@ -166,16 +169,19 @@ def _at_measured_motion(case: Case, document: Document, healthy: Document) -> Po
 
 def _of_the_simulated_loop(case: Case, document: Document, healthy: Document) -> Powers:
     def power(of: Document, when: str) -> float:
-        errors, torques = of["simulated"][when], _torques(of)
+        errors, torques = of["simulated"][f"torque_{when}"], _torques(of, when)
         return float(sum((errors[j] * torques[j]) ** 2 for j in _joints(case, errors)))
 
-    return power(document, "torque_before"), power(document, "torque_after"), power(healthy, "torque_before")
+    return power(document, "before"), power(document, "after"), power(healthy, "before")
 
 
-def _torques(document: Document) -> dict[str, float]:
-    """A hundredth of the torque of each joint (RMS), N m or N: that of which errors are percentages."""
-    before = document["gap"]["validation"]["before"]
-    return {joint: before["rms"][joint] / max(before["by_joint"][joint], 1e-300) for joint in before["rms"]}
+def _torques(document: Document, when: str) -> dict[str, float]:
+    """A hundredth of the torque of each joint (RMS), N m or N, of which errors ``before`` or ``after`` are percentages.
+
+    They differ where torques have been put right.
+    """
+    gap = document["gap"]["validation"][when]
+    return {joint: gap["rms"][joint] / max(gap["by_joint"][joint], 1e-300) for joint in gap["rms"]}
 
 
 def _joints(case: Case, every: Iterable[str]) -> set[str]:
@@ -204,5 +210,10 @@ def _among(part: HiddenPart, findings: Sequence[Document]) -> bool:
     return any(matches(part, f) or any(matches(part, rival) for rival in f["alternatives"][:1]) for f in findings)
 
 
-def _called_invisible(part: HiddenPart, document: Document) -> bool:
-    return any(matches(part, entry) for entry in document["not_visible"])
+def _called_invisible(part: HiddenPart, truth: dict[str, float], document: Document) -> bool:
+    """Whether the diagnosis says that an effect cannot show, or could hide with parameters of this size."""
+    if any(matches(part, entry) for entry in document["not_visible"]):
+        return True
+    limits = [entry["below"] for entry in document.get("could_hide", []) if matches(part, entry)]
+    sizes = [[abs(value) < below[name] for name, value in truth.items() if name in below] for below in limits]
+    return any(bool(compared) and all(compared) for compared in sizes)

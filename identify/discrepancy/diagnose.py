@@ -18,6 +18,7 @@ from identify.discrepancy.findings import (
     outdated,
     undetectable,
 )
+from identify.discrepancy.hiding import hideable
 from identify.discrepancy.numbers import stale_numbers
 from identify.discrepancy.regression import relative_errors
 from identify.discrepancy.search import Search
@@ -41,6 +42,9 @@ from identify.experiment import Experiment
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
+
+SHARE_OF_ALARMS = 0.1
+"""Of the rate of false alarms, for a mistake of wiring that no other gap speaks for."""
 
 
 @dataclass(frozen=True)
@@ -164,9 +168,12 @@ def _diagnose(
     wiring = find_wiring([*training, *validation], robot)
     found = _searched(training, validation, robot, wiring if wiring and wiring.certain else None, steps, settings)
     if wiring is not None and not wiring.certain:
-        other = None if found.open == 0 else _searched(training, validation, robot, wiring, steps, settings)
+        # Where nothing else can be to blame, the recordings alone must say it; elsewhere they say it of many things.
+        alone = found.open == 0 and wiring.p_values[0] <= SHARE_OF_ALARMS * settings.false_alarms
+        other = _searched(training, validation, robot, wiring, steps, settings) if alone or found.open else None
         # The mistake itself is one thing more to believe in.
-        if other is not None and other.open + 1 <= found.open and other.misfit < found.misfit:
+        room = 0 if alone else found.open - 1
+        if other is not None and other.open <= room and other.misfit < found.misfit:
             found = other
         else:
             wiring = None
@@ -178,6 +185,8 @@ def _diagnose(
         findings += outdated(stale_numbers(final.fit, final.workshop, baseline, settings.false_alarms))
     steps("simulation")
     simulated = simulated_errors(first, final)
+    steps("what could hide")
+    could_hide = hideable(final, settings)
     document = DiagnosisDocument(
         robot=robot.name,
         recordings=list(recordings),
@@ -198,6 +207,7 @@ def _diagnose(
         versions=versions(),
         warnings=[*notes, *study.warnings],
         not_visible=undetectable(first),
+        could_hide=could_hide,
         simulated=None if simulated is None else simulated.document(),
     )
     held = final.study.held

@@ -33,6 +33,13 @@ FEEDBACK = 0.05
 motion follow the disturbances, so that terms without merit explain a percent or two."""
 
 
+ANCHORINGS = 4
+"""Most times that terms are made anew by what the fit with them predicts."""
+
+ANCHORED = 0.1
+"""Change of their parameters, in standard deviations, that ends them."""
+
+
 @dataclass(frozen=True)
 class Settings:
     """What a user may choose of a diagnosis.
@@ -184,7 +191,23 @@ def refit(study: Study, robot: RobotConfig, before: Fit | None) -> tuple[Study, 
     moved = changed.resimulated(first.theta)
     if moved is not changed:
         first = fit(moved, first.theta if model.e else None)
+    if any(term.effect.predicts for term in model.terms):
+        first = _anchored(first)
     return moved, first
+
+
+def _anchored(found: Fit) -> Fit:
+    """Terms that are made of predicted torques by those that the model itself predicts.
+
+    A drive that gives half its torque is a share of another torque than the model without it predicts.
+    """
+    terms = slice(found.study.model.base.b - found.study.model.e, None)
+    for _ in range(ANCHORINGS):
+        before, std = found.theta[terms], np.sqrt(np.diag(found.covariance)[terms])
+        found = fit(found.study, found.theta)
+        if np.all(np.abs(found.theta[terms] - before) <= ANCHORED * std):
+            break
+    return found
 
 
 def padded(before: Fit, model: ArmModel) -> Array:

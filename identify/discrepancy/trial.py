@@ -190,7 +190,7 @@ def _judged(
     size = float(change @ change)
     if size == 0.0:
         return None
-    inflation = max(1.0, newey_west(change * _without_leaps(after)) / size)
+    inflation = inflation_along(change, after)
     variance = size * inflation + fit.spread(change)
     gain = float(before @ before - after @ after)
     share = _share_of_joint(change, before, after, [s.y.shape[0] for s in fit.study.held], fit.noise)
@@ -211,6 +211,17 @@ def _judged(
         supported - fitted,
         tuple(bool(there) for there in values == 0.0),
     )
+
+
+def inflation_along(change: Array, residual: Array) -> float:
+    """Variance of whitened residuals (R,) along a change of prediction, over that of white noise; at least 1."""
+    return max(1.0, newey_west(change * _without_leaps(residual)) / float(change @ change))
+
+
+def deviations(fit: Fit, columns: Columns) -> Array | None:
+    """Standard deviations (k,) that linear parameters would have beside the model, zero of those that it contains."""
+    solution = _values(fit, columns)
+    return None if solution is None else np.where(solution[1] == 0.0, 0.0, solution[2])
 
 
 def _share_of_joint(

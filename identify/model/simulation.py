@@ -75,6 +75,7 @@ def simulate(
     qd0: ArrayLike | None = None,
     max_velocity: ArrayLike | None = None,
     disturbance: ArrayLike | None = None,
+    inertia: ArrayLike | None = None,
 ) -> Simulation:
     """Simulate the arm under its controller along a reference (thesis equation 2.9, section B.3).
 
@@ -97,6 +98,8 @@ def simulate(
     disturbance
         Motor torques (N, n), N m or N, that something else adds to those of the controller, after their saturation;
         ``tau`` contains them.
+    inertia
+        Of the joints (n,), kg m^2 or kg, beside that of the parameters.
 
     Raises
     ------
@@ -121,6 +124,8 @@ def simulate(
     q[0], qd[0] = start, qd0
     transmission = np.ascontiguousarray(model.robot.transmission_matrix)
     values = model.values(theta_base)
+    if inertia is not None:
+        values = values._replace(ia=values.ia + np.asarray(inertia, dtype=np.float64))
     stopped = run(
         model.chain,
         values,

@@ -33,6 +33,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
     return render(
         "diagnosis.html",
         document=document,
+        could_hide=_could_hide(document),
         verdict=VERDICTS[document.verdict],
         findings=[
             {
@@ -52,6 +53,19 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
         joints=joints,
         hidden=hidden,
     )
+
+
+def _could_hide(document: DiagnosisDocument) -> list[dict[str, str]]:
+    """Rows of the table of what could hide: effect, place, and the sizes from which on it would have been found."""
+    return [
+        {
+            "effect": h.effect.replace("_", " "),
+            "joint": h.joint if h.other is None else f"{h.joint} and {h.other}",
+            "below": ", ".join(f"{name} {value:g} {h.units[name]}".rstrip() for name, value in h.below.items()),
+        }
+        for h in document.could_hide
+        if h.below
+    ]
 
 
 def certainty(finding: Finding) -> str:

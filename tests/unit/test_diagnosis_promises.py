@@ -68,6 +68,18 @@ def test_the_resulting_model_has_no_gap_on_a_new_recording(hidden: HiddenEffect)
     assert again.document.verdict == "no_gap"
 
 
+def test_what_could_hide_does_up_to_the_size_that_is_told_and_no_further() -> None:
+    robot = load_robot("emps")
+    told = diagnosed(recorded(robot, 1, trajectory="emps_1", repeats=1), robot).document
+    assert told.verdict == "no_gap"
+    (spring,) = [h for h in told.could_hide if h.effect == "joint_spring"]
+    for share, found in ((0.2, []), (2.0, ["joint_spring"])):
+        stiffness = share * spring.below["ks"]
+        hidden = HiddenEffect(effect="joint_spring", joint="joint_1", parameters={"stiffness": stiffness})
+        document = diagnosed(recorded(robot, 2, hidden, trajectory="emps_1", repeats=1), robot).document
+        assert [f.effect for f in document.findings] == found, share
+
+
 @cache
 def baseline() -> IdentificationDocument:
     robot = load_robot("tx40")
@@ -98,6 +110,30 @@ def test_the_gain_of_one_drive_is_named() -> None:
     gain = HiddenEffect(effect="drive_gain_error", joint="joint_2", parameters={"error": 0.1})
     findings = [f for f in against_baseline(5, gain) if f.effect == "drive_gain_error"]
     assert [f.joint for f in findings] == ["joint_2"]
+
+
+@pytest.mark.slow
+def test_a_drive_that_gives_twice_its_torque_is_sized_by_what_the_model_with_it_predicts() -> None:
+    """Of the torque that the model without it predicts, which reports half of it, it would be another share."""
+    robot = load_robot("tx40")
+    gain = HiddenEffect(effect="drive_gain_error", joint="joint_1", parameters={"error": 0.96})
+    document = diagnosed(recorded(robot, 8, gain, trajectory="tx40_1", repeats=3), robot).document
+    (finding,) = document.findings
+    assert (finding.effect, finding.joint) == ("drive_gain_error", "joint_1")
+    std = finding.evidence["std"]["gain_error"]
+    assert finding.parameters["gain_error"] == pytest.approx(-0.96 / 1.96, abs=3.0 * std)
+    assert document.simulated is not None
+    before, after = (document.simulated[when]["joint_1"] for when in ("torque_before", "torque_after"))
+    assert after < before
+
+
+@pytest.mark.slow
+def test_like_joints_that_were_exchanged_are_found_though_nothing_else_is_amiss() -> None:
+    robot = load_robot("tx40")
+    both = {"position": 1.0, "torque": 1.0}
+    exchanged = HiddenEffect(effect="joint_order", joint="joint_4", other="joint_5", parameters=both)
+    document = diagnosed(recorded(robot, 5, exchanged, trajectory="tx40_4", repeats=3), robot).document
+    assert [(f.effect, f.joint, f.other) for f in document.findings] == [("joint_order", "joint_4", "joint_5")]
 
 
 @pytest.mark.slow

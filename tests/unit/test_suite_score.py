@@ -100,6 +100,19 @@ def test_nothing_found_is_missed_unless_the_motion_cannot_show_it() -> None:
     assert not score(case(SPRING, baseline=True), silent, HEALTHY).invisible
 
 
+def test_what_a_diagnosis_says_could_hide_is_no_miss_up_to_the_size_that_it_says() -> None:
+    silent = record(before=8.1, after=8.1, verdict="no_gap")
+    silent["truth"] = [{"ks": 3.0}]
+    for below, excused in ((3.1, True), (2.9, False)):
+        entry = {"effect": "joint_spring", "joint": "joint_2", "other": None, "below": {"ks": below}}
+        silent["document"]["could_hide"] = [entry]
+        assert score(case(SPRING), silent, HEALTHY).invisible is excused
+    entry["joint"], entry["below"] = "joint_3", {"ks": 10.0}
+    assert not score(case(SPRING), silent, HEALTHY).invisible
+    silent["truth"], entry["joint"] = [{}], "joint_2"
+    assert not score(case(SPRING), silent, HEALTHY).invisible
+
+
 def test_the_gap_closed_is_measured_above_the_noise_of_the_healthy_twin() -> None:
     whole = record(finding("joint_spring", "joint_2"), before=10.0, after=8.0)["document"]
     assert closed_share(case(SPRING), whole, HEALTHY["document"]) == pytest.approx(1.0)

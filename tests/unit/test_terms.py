@@ -94,6 +94,38 @@ def test_a_simulated_arm_feels_the_torque_that_its_own_motion_gives_a_term(
     assert np.abs(found.q - rigid.q)[:, 0].max() < 0.05 * felt
 
 
+def test_a_term_that_is_more_inertia_than_the_joint_has_itself_is_felt_at_every_instant(
+    robot: RobotConfig, theta: Any
+) -> None:
+    """A load that is computed from the last motion could not hold back a rotor heavier than its link."""
+    model = ArmModel.from_config(robot)
+    q_ref = reference(robot)
+    rotor = 2.0 * float(model.mass_matrix(theta, q_ref[:1])[0, 3, 3])
+    controller = nominal_controller(model, theta, q_ref[::50], DT, 10.0)
+    extended = ArmModel.from_config(with_effects(robot, Effect(effect="rotor_inertia", joint="joint_4")))
+    added = np.zeros(robot.n)
+    added[3] = rotor
+    expected = simulate(model, theta, controller, q_ref, DT, inertia=added)
+    found = simulate_with_terms(extended, np.append(theta, rotor), controller, q_ref, DT, band_hz=30.0)
+    felt = np.abs(expected.q - simulate(model, theta, controller, q_ref, DT).q)[:, 3].max()
+    assert np.abs(found.q - expected.q)[:, 3].max() < 0.01 * felt
+    assert np.linalg.norm(found.tau - expected.tau) < 0.01 * np.linalg.norm(expected.tau)
+
+
+def test_a_drive_that_gives_half_its_torque_moves_an_axis_of_twice_the_parameters_alike() -> None:
+    """Half of what the arm needs is reported; its controller, made for that, moves it as before."""
+    plain = load_robot("emps")
+    model = ArmModel.from_config(plain)
+    values = np.array([95.0, 200.0, 20.0, -3.0])[: model.base.b]
+    t = DT * np.arange(3000)
+    q_ref = (0.1 * np.sin(2 * np.pi * 0.7 * t))[:, None]
+    controller = nominal_controller(model, values, q_ref[::50], DT, 10.0)
+    expected = simulate(model, values, controller, q_ref, DT)
+    halved = ArmModel.from_config(with_effects(plain, Effect(effect="drive_gain_error", joint="joint_1")))
+    found = simulate_with_terms(halved, np.append(2.0 * values, -0.5), controller, q_ref, DT)
+    assert np.linalg.norm(found.tau - expected.tau) < 0.02 * np.linalg.norm(expected.tau)
+
+
 def _on_joint_1(torque: Any, robot: RobotConfig) -> Any:
     joints = np.zeros((torque.size, robot.n))
     joints[:, 0] = torque
