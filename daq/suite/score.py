@@ -33,7 +33,8 @@ class Score:
     missed
         Nothing was found, and nothing left unexplained.
     invisible
-        Missed, and the diagnosis says that these recordings cannot show the effect, at all or of this size.
+        Not found, nothing else in its place and nothing left unexplained, and the diagnosis says that these recordings
+        cannot show the effect, at all or of this size; of a pair one may have been found.
     extra
         Findings beside what is hidden and what comes with it.
     closed
@@ -80,18 +81,21 @@ def score(case: Case, record: Record, healthy: Record | None) -> Score:
             # One effect: what the diagnosis names before all else.
             first = bool(findings) and matches(case.parts[0], findings[0])
         second = all(_among(part, findings) for part in case.parts)
-    missed = document["verdict"] == "no_gap" and bool(case.parts)
     truths = [*record["truth"], *({} for _ in case.parts)]
+    absent = [(p, truth) for p, truth, f in zip(case.parts, truths, matched, strict=False) if f is None]
+    extra = sum(not any(matches(part, f) or _comes_with(part, f) for part in case.parts) for f in findings)
     right = [f for f in matched if f is not None] if known else []
     return Score(
         verdict=document["verdict"],
         first=first,
         second=second,
-        missed=missed,
-        invisible=missed
+        missed=document["verdict"] == "no_gap" and bool(case.parts),
+        invisible=bool(absent)
         and not case.baseline
-        and all(_called_invisible(p, truth, document) for p, truth in zip(case.parts, truths, strict=False)),
-        extra=sum(not any(matches(part, f) or _comes_with(part, f) for part in case.parts) for f in findings),
+        and not extra
+        and document["verdict"] in ("no_gap", "explained")
+        and all(_called_invisible(part, truth, document) for part, truth in absent),
+        extra=extra,
         closed=None if healthy is None else closed_share(case, document, healthy["document"]),
         within=tuple(
             ok

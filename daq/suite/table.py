@@ -224,8 +224,10 @@ def _fate(score: Score) -> str:
 
 
 def _aims(scored: Sequence[Scored]) -> tuple[Aim, ...]:
-    named = [s for c, s in scored if c.kind == "effect" and c.level in AIMED_AT and not s.invisible]
-    pairs = [s for c, s in scored if c.kind == "pair" and c.level in AIMED_AT]
+    single = [s for c, s in scored if c.kind == "effect" and c.level in AIMED_AT]
+    named = [s for s in single if not s.invisible]
+    both = [s for c, s in scored if c.kind == "pair" and c.level in AIMED_AT]
+    pairs = [s for s in both if not s.invisible]
     clean = [s for c, s in scored if not c.parts]
     outside = [_fate(s) for c, s in scored if c.kind == "outside" and c.level in AIMED_AT]
     there = [fate for fate in outside if fate != "absent"]
@@ -239,6 +241,9 @@ def _aims(scored: Sequence[Scored]) -> tuple[Aim, ...]:
         aim("name and place right", [s.first is True for s in named], 0.95),
         aim("name and place right, or second", [s.second is True for s in named], 0.99),
         aim("pairs: both names and places right", [s.first is True for s in pairs], 0.95),
+        aim("name and place right, what it says could hide counted too", [s.first is True for s in single], 0.95),
+        aim("right, or second, what it says could hide counted too", [s.second is True for s in single], 0.99),
+        aim("pairs, what it says could hide counted too", [s.first is True for s in both], 0.95),
         aim("healthy arms called healthy", [s.verdict == "no_gap" for s in clean], 0.99),
         aim(
             "outside the catalogue, in the data: unexplained, or named with low confidence",

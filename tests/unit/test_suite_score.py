@@ -111,6 +111,14 @@ def test_what_a_diagnosis_says_could_hide_is_no_miss_up_to_the_size_that_it_says
     assert not score(case(SPRING), silent, HEALTHY).invisible
     silent["truth"], entry["joint"] = [{}], "joint_2"
     assert not score(case(SPRING), silent, HEALTHY).invisible
+    # Another name in its place is wrong, whatever could hide.
+    other = record(finding("cogging_torque", "joint_2"), truth=[{"ks": 3.0}])
+    other["document"]["could_hide"] = [entry]
+    assert not score(case(SPRING), other, HEALTHY).invisible
+    # One of a pair is found, the other could hide.
+    half = record(finding("coupling_friction", "joint_4", "joint_5"), truth=[{"ks": 3.0}, {}])
+    half["document"]["could_hide"] = [entry]
+    assert score(case(SPRING, SHAFT, kind="pair"), half, HEALTHY).invisible
 
 
 def test_the_gap_closed_is_measured_above_the_noise_of_the_healthy_twin() -> None:
