@@ -30,8 +30,11 @@ from identify.signals.noise_decimation import decimation_from_noise
 TOLERATED_DELAY = 1.0
 """Samples by which torque and position may be apart without a warning."""
 
-ANCHORINGS = 2
-"""Estimates of the arm with its terms before those that depend on its torques are left as they are."""
+ANCHORINGS = 6
+"""Most estimates of the arm with its terms before those that depend on its torques are left as they are."""
+
+ANCHORED = 1e-3
+"""Change of the torques by which they are predicted, over their size, that ends them."""
 
 Progress = Callable[[str, float], None]
 
@@ -186,9 +189,15 @@ def _anchored(
     rigid = model.without_terms()
     decimation = decimation_of("idim-ls", experiments[0].dt, bandwidth, None, samples=lengths, rows=least_rows(model))
     theta = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names).theta
+    before = theta
     for _ in range(ANCHORINGS):
         model = model.anchored(np.concatenate([theta[: rigid.base.b], np.zeros(model.e)]))
-        theta = idim_ls(equations(model, experiments, signals, decimation), model.base.names).theta
+        before, rows = theta[: rigid.base.b], equations(model, experiments, signals, decimation)
+        theta = idim_ls(rows, model.base.names).theta
+        change = [block.x[..., : rigid.base.b] @ (theta[: rigid.base.b] - before) for block in rows]
+        whole = [block.x[..., : rigid.base.b] @ before for block in rows]
+        if sum(float(np.sum(c**2)) for c in change) <= ANCHORED**2 * sum(float(np.sum(w**2)) for w in whole):
+            break
     return model
 
 
