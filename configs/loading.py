@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from configs.errors import ConfigError
-from configs.reading import read_yaml
+from configs.reading import is_file, read_yaml
 from configs.robot import RobotConfig
 from configs.scenario import Scenario
 from configs.session import SessionConfig
@@ -41,11 +41,11 @@ def config_path(name: str | Path) -> Path:
         If there is no such file; names the shipped ones.
     """
     path = Path(name)
-    if path.is_file():
+    if is_file(path):
         return path
     relative = Path(*path.parts[1:]) if path.parts[:1] == ("configs",) else path
     for candidate in (HERE / relative, (HERE / relative).with_suffix(".yaml")):
-        if not path.is_absolute() and candidate.is_file():
+        if not path.is_absolute() and is_file(candidate):
             return candidate
     shipped = ", ".join(sorted(p.name for p in HERE.glob("*.yaml")))
     raise ConfigError(f"{name}: no such file (shipped with armident: {shipped})")
@@ -96,7 +96,7 @@ def load_session(name: str | Path) -> SessionConfig:
 
     def resolved(relative: Path, key: str) -> Path:
         target = base / relative
-        if not target.is_file():
+        if not is_file(target):
             raise ConfigError(f"{path}: {key}: no such file {relative} (looked for {target})")
         return target
 

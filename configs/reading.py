@@ -1,6 +1,8 @@
 """Reads YAML as people mean it: a key once, and no numbers or dates that nobody thought of writing."""
 
+import os.path
 import re
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -14,6 +16,11 @@ _FLOAT = re.compile(
     r"|^[-+]?\.(?:inf|Inf|INF)$|^\.(?:nan|NaN|NAN)$"
 )
 """As in YAML 1.2: YAML 1.1 takes 010 as 8, 1:30 as 90, and 1e-3 as a word."""
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; no error either where its name is too long or its folder may not be entered."""
+    return os.path.isfile(path)
 
 
 class _Loader(yaml.SafeLoader):

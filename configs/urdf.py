@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from configs.base import Frozen
 from configs.denavit_hartenberg import MdhChain, modified_dh
 from configs.errors import ConfigError
+from configs.reading import is_file
 from configs.robot import Drive, Positive
 
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
@@ -119,7 +120,7 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
         If the URDF is wrong or not a serial chain, naming file and element, or what it leaves open is not given.
     """
     file = where.resolve().parent / given.urdf.file
-    if not file.is_file():
+    if not is_file(file):
         raise ConfigError(f"{where}: urdf.file: no such file {given.urdf.file} (looked for {file})")
     joints = read_chain(file, given.urdf.base, given.urdf.tip)
     chain = mdh_of(joints, file)

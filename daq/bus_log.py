@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn
 
 from configs import ConfigError, DataError, RobotConfig, SessionConfig
+from configs.reading import is_file
 from daq.assembler import Assembler, Batch
 from daq.foreign import said
 from daq.recording import Gap, Recording, Stream
@@ -162,7 +163,7 @@ class _Log:
 
 
 def _read(path: Path) -> _Log:
-    if not path.is_file():
+    if not is_file(path):
         raise ConfigError(f"{path}: no such file")
     numbers: dict[str, int] = {}
     parts: list[tuple[Frames, NDArray[np.int64]]] = []

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from configs import ConfigError, DataError, RobotConfig
+from configs.reading import is_file
 from daq.foreign import apart, said
 from daq.polled import on_clock
 from daq.recording import Field, Recording, Stream
@@ -157,7 +158,7 @@ def _known(demand: NDArray[np.float64]) -> slice:
 
 
 def _load(path: Path, robot: RobotConfig) -> Source:
-    if not path.is_file():
+    if not is_file(path):
         raise ConfigError(f"{path}: no such file")
     kind = path.suffix.lower()
     if kind in (".csv", ".txt"):
@@ -231,7 +232,7 @@ def _pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
     columns: Table = {}
     first_line = 1
     for file, base in ((path, "q"), (effort, "tau")):
-        if not file.is_file():
+        if not is_file(file):
             raise ConfigError(f"{file}: no such file")
         _, values, first_line = _csv(file)
         _check_finite(

@@ -1,6 +1,7 @@
 """Where a capture's files go, when a new one is begun, and which old ones make room."""
 
 import datetime
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -72,7 +73,7 @@ def limits(options: RecordingOptions) -> tuple[int | None, int | None]:
 def free_space(directory: Path) -> int | None:
     """Bytes that are free where a directory is or will be; ``None`` if it cannot be told."""
     try:
-        there = next(path for path in (directory.absolute(), *directory.absolute().parents) if path.exists())
+        there = next(path for path in (directory.absolute(), *directory.absolute().parents) if os.path.exists(path))
         return shutil.disk_usage(there).free
     except (OSError, StopIteration):
         return None

@@ -16,6 +16,7 @@ import zenoh
 import zenoh.ext
 
 from configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
+from configs.reading import is_file
 from daq.recording import Recording, join_parts, read_recording
 from daq.zenoh_keys import Block, Keys, assemble, decode_block, decode_event, open_session
 from identify.document import to_json
@@ -92,7 +93,7 @@ class Assembly:
             if missing is None:
                 return recording
         paths = [Path(path) for path in self.end["paths"]]
-        absent = [str(path) for path in paths if not path.is_file()]
+        absent = [str(path) for path in paths if not is_file(path)]
         if absent or not paths:
             where = f"its file {absent[0]} is not here" if absent else "it was not written to a file"
             raise DataError(f"capture {self.capture}: {missing}, and {where}")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from configs import ArmidentError, ConfigError, RobotConfig
+from configs.reading import is_file
 
 HERE = Path(__file__).parent
 clarabel: Any = untyped_clarabel
@@ -199,7 +200,7 @@ def plant_parameters(robot: RobotConfig) -> dict[str, float]:
         If there is no virtual arm of that name, or its joints or couplings are not those of ``robot``.
     """
     path = HERE / f"{robot.name}_inertias.yaml"
-    if not path.is_file():
+    if not is_file(path):
         known = ", ".join(sorted(p.name.removesuffix("_inertias.yaml") for p in HERE.glob("*_inertias.yaml")))
         raise ConfigError(f"robot {robot.name!r}: no virtual arm of that name (there is: {known})")
     parameters = dict(_stored(path))

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from configs import ConfigError, config_path
 from configs.loading import HERE, parse
+from configs.reading import is_file
 from configs.scenario import Scenario
 
 SCENARIOS = HERE / "scenarios"
@@ -21,7 +22,7 @@ def load_scenario(name: str | Path) -> Scenario:
         path = config_path(name)
     except ConfigError:
         path = (SCENARIOS / Path(name).name).with_suffix(".yaml")
-        if not path.is_file():
+        if not is_file(path):
             shipped = ", ".join(sorted(p.name for p in SCENARIOS.glob("*.yaml")))
             raise ConfigError(f"{name}: no such scenario (shipped with armident: {shipped})") from None
     try:

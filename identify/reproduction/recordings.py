@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from configs import ArmidentError, ConfigError, DataError, RobotConfig, config_path, load_robot, load_session
+from configs.reading import is_file
 from daq.recording import read_recording
 from identify.controller.nominal import saturation
 from identify.experiment import Experiment
@@ -106,7 +107,7 @@ def virtual_recording(folder: Path, seed: int = 0, velocity_feedback: bool = Fal
     arguments.append("--velocity-feedback" if velocity_feedback else "--velocity-error")
     name = _digest(session, arguments)
     recording, truth = folder / f"{name}.mcap", folder / f"{name}.json"
-    if not (recording.is_file() and truth.is_file()):
+    if not (is_file(recording) and is_file(truth)):
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -173,7 +174,7 @@ def measured_emps(folder: Path) -> Recorded | None:
         If the file is not what was published.
     """
     file = folder / "emps" / EMPS_FILE
-    if not file.is_file():
+    if not is_file(file):
         return None
     robot = load_robot("emps")
     try:
