@@ -4,10 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from identify.discrepancy.candidates import Candidate, Shapes, candidates
+from identify.discrepancy.candidates import Candidate, Columns, Shapes, candidates
 from identify.discrepancy.state import HELD_OUT_LEVEL, Settings, State
 from identify.discrepancy.trial import deviations, inflation_along
-from identify.discrepancy.whitening import rows_of_joints
+from identify.discrepancy.whitening import rows_of_joints, whitened
 from identify.document import Hideable
 
 Array = NDArray[np.float64]
@@ -45,8 +45,12 @@ def hideable(state: State, settings: Settings) -> list[Hideable]:
 def _smallest(state: State, candidate: Candidate, shapes: Shapes, settings: Settings) -> Array | None:
     """Smallest size (k,) of each linear parameter that would be found; infinite where none would."""
     fit = state.fit
-    columns = state.workshop.columns(candidate.effect, candidate.place, shapes, fit.noise)
-    std = deviations(fit, columns)
+    # As the simulated arm has them: of a size that nobody found the measured one's are no better known.
+    z, held_z = (
+        whitened(state.workshop.band(candidate.effect, candidate.place, shapes, part, "simulated"), fit.noise)
+        for part in ("train", "held")
+    )
+    std = deviations(fit, Columns(z, z, held_z, held_z))
     if std is None:
         return None
     often = float(stats.norm.ppf(POWER))
@@ -54,7 +58,7 @@ def _smallest(state: State, candidate: Candidate, shapes: Shapes, settings: Sett
     train = float(stats.norm.isf(0.5 * settings.false_alarms / tests)) + often
     held = float(stats.norm.isf(HELD_OUT_LEVEL)) + often
     residual = fit.held_residual
-    change = columns.held_z - np.stack([fit.held_at_simulated(a) for a in fit.absorbed(columns.x).T], axis=1)
+    change = held_z - np.stack([fit.held_at_simulated(a) for a in fit.absorbed(z).T], axis=1)
     rows = rows_of_joints([s.y.shape[0] for s in fit.study.held], fit.noise)
     sizes = np.full(std.size, np.inf)
     for k in np.flatnonzero(std > 0.0):
