@@ -19,6 +19,8 @@ from tests.fuzz.targets import TARGETS
 
 STUCK_S = 60.0
 """A process that has not begun another input for so long is killed, s."""
+WARM_UP_S = 600.0
+"""What it has before the first input, while everything is compiled, s."""
 NOTE_S = 0.25
 FOUND = 3
 """What the process of the inputs returns where it found something."""
@@ -78,19 +80,19 @@ def _supervise(target: Target, seconds: float, seed: int) -> int:
         with tempfile.NamedTemporaryFile(prefix="fuzz-state-") as state:
             command = [sys.executable, "-m", "tests.fuzz", "--target", target.name, "--seconds", str(left)]
             process = subprocess.Popen([*command, "--seed", str(seed), "--child", state.name])
-            # By our own clock, not the file's: that one may be set meanwhile. To begin with there is much to compile.
-            begun, last = os.stat(state.name).st_mtime_ns, (0, time.monotonic() + STUCK_S)
+            # By our own clock, not the file's: that one may be set meanwhile.
+            begun, last = os.stat(state.name).st_mtime_ns, (0, time.monotonic())
             while process.poll() is None:
                 time.sleep(NOTE_S)
                 touched = os.stat(state.name).st_mtime_ns
                 if touched not in (last[0], begun):
                     last = touched, time.monotonic()
-                if time.monotonic() - last[1] > STUCK_S:
+                if time.monotonic() - last[1] > (STUCK_S if last[0] else WARM_UP_S):
                     process.send_signal(signal.SIGKILL)
                     process.wait()
             if process.returncode in (0, FOUND):
                 return found + (process.returncode == FOUND)
-            if process.returncode == 1:
+            if process.returncode == 1 or not last[0]:
                 raise SystemExit(f"{target.name}: the inputs could not be made")
             raw = Path(state.name).read_bytes()
             data = raw[8 : 8 + int.from_bytes(raw[:8], "little")]
