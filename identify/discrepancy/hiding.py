@@ -37,7 +37,7 @@ def hideable(state: State, settings: Settings) -> list[Hideable]:
             continue
         tried = shapes.get(candidate.key, candidate.grid[len(candidate.grid) // 2] if candidate.grid else ())
         sizes = _smallest(state, candidate, tried, settings)
-        if sizes is not None:
+        if sizes is not None and np.isfinite(sizes).any():
             found.append(_told(state, candidate, sizes))
     return found
 
@@ -45,7 +45,7 @@ def hideable(state: State, settings: Settings) -> list[Hideable]:
 def _smallest(state: State, candidate: Candidate, shapes: Shapes, settings: Settings) -> Array | None:
     """Smallest size (k,) of each linear parameter that would be found; infinite where none would."""
     fit = state.fit
-    # As the simulated arm has them: of a size that nobody found the measured one's are no better known.
+    # Of the simulated motion: a search has made them already, and the size is that of a chance.
     z, held_z = (
         whitened(state.workshop.band(candidate.effect, candidate.place, shapes, part, "simulated"), fit.noise)
         for part in ("train", "held")

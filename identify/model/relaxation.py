@@ -125,7 +125,7 @@ def _inertia(model: ArmModel, theta: Floats, run: Simulation, torque: Floats, qd
     """What of the terms' torque (N, n) goes with each joint's own acceleration, (n,), where it is worth its while."""
     found = np.sum(torque * qdd, axis=0) / np.maximum(np.sum(qdd * qdd, axis=0), 1e-300)
     postures = run.q[:: max(1, run.q.shape[0] // POSTURES)]
-    own = np.einsum("kjj->kj", model.mass_matrix(theta, postures)).min(axis=0)
+    own = np.maximum(np.einsum("kjj->kj", model.mass_matrix(theta, postures)).min(axis=0), 0.0)
     found = np.maximum(found, (LEAST_INERTIA - 1.0) * own)
     return np.where(np.abs(found) > FELT_INERTIA * own, found, 0.0)
 

@@ -64,7 +64,6 @@ def _could_hide(document: DiagnosisDocument) -> list[dict[str, str]]:
             "below": ", ".join(f"{name} {value:g} {h.units[name]}".rstrip() for name, value in h.below.items()),
         }
         for h in document.could_hide
-        if h.below
     ]
 
 
