@@ -305,10 +305,13 @@ class Farm:
         drive.nmt.halt()
         self.later(seconds, drive.nmt.resume)
 
-    def emcy(self, joint: int, code: int) -> None:
-        """A drive reports an error."""
-        with suppress(can.CanError, OSError):
+    def emcy(self, joint: int, code: int) -> bool:
+        """A drive reports an error; whether its bus was there to take it."""
+        try:
             self._drive(joint).emcy.send(code, 0x81, b"\x01\x02")
+        except (can.CanError, OSError):
+            return False
+        return True
 
     def beside(self, work: Callable[[], object]) -> None:
         """Do something that takes a while."""

@@ -179,8 +179,9 @@ def bus_off(room: Room) -> Expected:
 def emcy(room: Room) -> Expected:
     """A drive reports an error."""
     j = room.joint()
-    room.actions.append((room.at(), lambda: room.farm.emcy(j, 0x4210)))
-    return lambda done: _was_down(done) or (done.counters["emcy"] > 0 and done.marked("EMCY 4210h"))
+    sent: list[bool] = []
+    room.actions.append((room.at(), lambda: sent.append(room.farm.emcy(j, 0x4210))))
+    return lambda done: sent == [False] or (done.counters["emcy"] > 0 and done.marked("EMCY 4210h"))
 
 
 def heartbeat(room: Room) -> Expected:
