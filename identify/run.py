@@ -30,8 +30,11 @@ from identify.signals.noise_decimation import decimation_from_noise
 TOLERATED_DELAY = 1.0
 """Samples by which torque and position may be apart without a warning."""
 
-ANCHORINGS = 6
-"""Most estimates of the arm with its terms before those that depend on its torques are left as they are."""
+ANCHORINGS = 2
+"""Estimates of the arm with its terms before those that depend on its torques are left as they are."""
+
+SHARED = 6
+"""Most of them where terms are shares of these torques."""
 
 ANCHORED = 1e-3
 """Change of the torques by which they are predicted, over their size, that ends them."""
@@ -190,7 +193,7 @@ def _anchored(
     decimation = decimation_of("idim-ls", experiments[0].dt, bandwidth, None, samples=lengths, rows=least_rows(model))
     theta = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names).theta
     before = theta
-    for _ in range(ANCHORINGS):
+    for _ in range(SHARED if any(term.effect.share for term in model.terms) else ANCHORINGS):
         model = model.anchored(np.concatenate([theta[: rigid.base.b], np.zeros(model.e)]))
         before, rows = theta[: rigid.base.b], equations(model, experiments, signals, decimation)
         theta = idim_ls(rows, model.base.names).theta

@@ -103,6 +103,7 @@ EFFECTS = (
         columns=_gain,
         visible=_alone,
         predicts=True,
+        share=True,
         needs="several joints that carry the same link; for a single axis a baseline",
         scope="motor",
         excitation=("load", "accelerations"),

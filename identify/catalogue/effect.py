@@ -133,6 +133,9 @@ class Effect:
         recording, and there are no columns.
     predicts
         Whether the columns depend on the torques that the model predicts, and so on its parameters.
+    share
+        Whether its linear parameter is a share of these torques: fits are repeated until it is one of those that the
+        model with the effect predicts.
     undo
         ``(recorded, at, value)`` to the torque (N,) that a motor really had where the recording says otherwise, for the
         one linear parameter. The columns are what the first order of it makes of the model's torques, which at measured
@@ -162,6 +165,7 @@ class Effect:
     excitation: tuple[str, ...] = field(default=("reversals", "speeds"))
     rewires: bool = False
     predicts: bool = False
+    share: bool = False
     undo: Callable[[Array, Recorded, float], Array] | None = None
     sudden: bool = False
     physical: Callable[[Array, Mapping[str, float]], bool] | None = None

@@ -34,7 +34,7 @@ motion follow the disturbances, so that terms without merit explain a percent or
 
 
 ANCHORINGS = 4
-"""Most times that terms are made anew by what the fit with them predicts."""
+"""Most times that shares of predicted torques are made anew by what the fit with them predicts."""
 
 ANCHORED = 0.1
 """Change of their parameters, in standard deviations, that ends them."""
@@ -191,13 +191,13 @@ def refit(study: Study, robot: RobotConfig, before: Fit | None) -> tuple[Study, 
     moved = changed.resimulated(first.theta)
     if moved is not changed:
         first = fit(moved, first.theta if model.e else None)
-    if any(term.effect.predicts for term in model.terms):
+    if any(term.effect.share for term in model.terms):
         first = _anchored(first)
     return moved, first
 
 
 def _anchored(found: Fit) -> Fit:
-    """Terms that are made of predicted torques by those that the model itself predicts.
+    """Shares of predicted torques by those that the model itself predicts.
 
     A drive that gives half its torque is a share of another torque than the model without it predicts.
     """
