@@ -192,7 +192,6 @@ def _anchored(
     rigid = model.without_terms()
     decimation = decimation_of("idim-ls", experiments[0].dt, bandwidth, None, samples=lengths, rows=least_rows(model))
     theta = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names).theta
-    before = theta
     for _ in range(SHARED if any(term.effect.share for term in model.terms) else ANCHORINGS):
         model = model.anchored(np.concatenate([theta[: rigid.base.b], np.zeros(model.e)]))
         before, rows = theta[: rigid.base.b], equations(model, experiments, signals, decimation)
