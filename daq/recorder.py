@@ -310,6 +310,8 @@ class Recorder:
         with suppress(ArmidentError):
             self._await_answers()
         self._happenings.moving = False
+        for happened in self._receiver.events(last=True):
+            self._happenings.of_bus(happened)
         with suppress(ArmidentError):
             self._hear_drives()
         if self._master is not None:

@@ -134,15 +134,15 @@ class Receiver:
             if not more:
                 return
 
-    def events(self) -> list[BusEvent]:
-        """What happened since the last call."""
+    def events(self, *, last: bool = False) -> list[BusEvent]:
+        """What happened since the last call; errors are told once a second, and all that are left at the ``last``."""
         now = time.monotonic()
         for k, line in enumerate(self._lines):
             if line.down_since is not None and now - line.looked >= LOOK_AGAIN_S:
                 line.looked = now
                 self._look(k, line)
             if line.errors:
-                self._tell_errors(k, line, now)
+                self._tell_errors(k, line, now, last)
         told, self._events = self._events, []
         return told
 
@@ -190,9 +190,9 @@ class Receiver:
         good: Frames = batch[~bad]
         return good
 
-    def _tell_errors(self, k: int, line: _Line, now: float) -> None:
+    def _tell_errors(self, k: int, line: _Line, now: float, last: bool) -> None:
         found = summarise(np.concatenate(line.errors))
-        if all(state is None for state, _ in found) and now - line.told < TELL_ERRORS_S:
+        if not last and all(state is None for state, _ in found) and now - line.told < TELL_ERRORS_S:
             return
         line.errors, line.told = [], now
         kinds: dict[str, BusEventKind] = {"bus_off": "bus_off", "restarted": "bus_restarted"}

@@ -5,7 +5,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from drivers.frames import Frames, frames
+from drivers.bus_errors import NO_ACKNOWLEDGE
+from drivers.frames import ERROR_FLAG, Frames, frames
 from drivers.receiver import BATCH, Receiver
 from drivers.socketcan import RawSocket
 
@@ -39,3 +40,16 @@ def test_a_bus_that_had_nothing_is_asked_again_behind_every_batch_of_another(vca
         # Frames that came while the backlog was read do not wait for its end.
         assert order == [(1, 0), (0, 0), (1, BATCH), (1, 2 * BATCH), (1, 3 * BATCH)]
         assert [bus for bus, _, _ in receiver.drain()] == []
+
+
+def test_errors_that_were_to_be_told_later_are_told_at_the_end(vcan_bus: str) -> None:
+    error = frames(1)
+    error["can_id"], error["length"] = ERROR_FLAG | NO_ACKNOWLEDGE, 8
+    with RawSocket(vcan_bus, filters=()) as other, Receiver([partial(RawSocket, vcan_bus, errors=True)]) as receiver:
+        for told in (1, 0):
+            other.send(error)
+            assert [batch.size for _, batch, _ in receiver.drain()] == [0]
+            assert len(receiver.events()) == told
+        (event,) = receiver.events(last=True)
+        assert (event.kind, event.text) == ("bus_errors", f"bus {vcan_bus}: nobody acknowledges")
+        assert receiver.error_frames == 2
