@@ -280,6 +280,7 @@ def test_a_capture_that_is_over_in_the_middle_of_a_motion_stops_the_arm(vcan_bus
     assert 0.2 < position[-1] < 1.3
     # It overshoots and swings back to where its drives hold it.
     assert abs(position[-1] - held[-1]) < 0.01
+    assert position.max() < 1.3
     velocity = np.diff(position) / 0.002
     assert velocity.max() > 0.3
     assert np.abs(velocity[-20:]).max() < 0.05
