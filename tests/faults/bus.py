@@ -31,7 +31,7 @@ from daq.recording.model import join_parts
 from drivers.vcan import ensure_vcan, remove_vcan
 from tests.faults.check import violations
 from tests.faults.farm import Farm
-from tests.faults.plan import FAULTS, HANDFUL, ORDERED, Outcome, Plan, Room, chosen
+from tests.faults.plan import FAULTS, HANDFUL, ORDERED, ROTATE_S, Outcome, Plan, Room, chosen
 from tests.faults.recorder import Capture, Recorders, result, said, warm
 
 PERIOD_US = 1000
@@ -95,7 +95,7 @@ def session_file(
     data["sync"] = {"role": "producer" if producing else "consumer", "period_us": period_us, "counter": 240}
     if demand:
         data["streams"]["demand"] = {"tpdo": 2, "every": 5, "objects": ["demand"]}
-    data["recording"] = {"rotate_minutes": 0.25 / 60} if rotating else {}
+    data["recording"] = {"rotate_minutes": ROTATE_S / 60} if rotating else {}
     del data["bus"]
     data["buses"] = [{"channel": channel, "bitrate": None} for channel in channels]
     for i, drive in enumerate(data["drives"]):
@@ -163,8 +163,7 @@ class Lane:
         pids: list[int] = []
         room = Room(rng, farm, seconds, self._disk, lambda: pids[0])
         expected = {name: FAULTS[name](room) for name in faults}
-        syncs = round(seconds * 1e6 / PERIOD_US)
-        farm.prepare(room.orders, room.actions, None if producing else syncs)
+        farm.prepare(room.orders, room.actions, None if producing else room.syncs)
         path = session_file(self._folder, f"{self._name}r{number}", self._of(buses), producing, "rotation" in faults)
         out, log = self._disk / f"r{number}a{attempt}", self._folder / f"r{number}a{attempt}"
         out.mkdir()
@@ -185,6 +184,7 @@ class Lane:
             what = [f"the capture ended with {process.exitcode}"]
             if room.orders.full_at_end and UNFINISHED in words and _torn_only(out):
                 what, explained = [f"{what[0]}: {UNFINISHED}"], UNFINISHED
+            shutil.rmtree(out)
             return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words), explained
         try:
             paths, counters = result(log)

@@ -94,7 +94,8 @@ class Orders:
     ``lost`` are not sent, ``twice`` sent twice, ``again`` once more behind the next SYNC, ``late`` sent behind the SYNC
     of that number. ``skipped`` SYNCs are not sent where the farm is their master. ``done`` has the names of the first
     three where they happened: they do not while the farm itself is late. ``spoilt``: it became late while they did.
-    ``done`` also has ``full`` where a disk refused something; ``full_at_end``: it did so until the capture had ended.
+    ``done`` also has ``full`` where a disk refused something; ``full_at_end``: it did so until the capture
+    was to end.
     """
 
     lost: set[tuple[int, int]] = field(default_factory=set)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.recording import Recording
+from daq.recording.unwritten import NOT_WRITTEN
 from drivers.frames import ERROR_FLAG, Frames, frame, frames
 from drivers.objects import COB_NMT, COB_SDO_REQUEST, PDO_NOT_VALID, TPDO_COMMUNICATION, TPDO_MAPPING, NmtCommand
 from tests.faults.farm import Farm, Orders
@@ -19,6 +20,10 @@ SDO_STEP_S = 0.004
 BEHIND = 50
 DISK_LEFT = 1 << 18
 """Bytes left on a disk that will be full: what a round writes until then, and more."""
+NEAR_END = 50
+"""SYNCs before the last one from which on a capture counts as ending."""
+ROTATE_S = 0.25
+"""Age at which a file of a round that rotates is full."""
 FIRST_S = 0.15
 """Faults begin so long after the first SYNC at the earliest."""
 
@@ -69,6 +74,11 @@ class Room:
     def sync_at(self, until_end: float = 0.4) -> int:
         """The SYNC at a random time."""
         return int(self.at(until_end) / self.farm.session.sync_period)
+
+    @property
+    def syncs(self) -> int:
+        """How many SYNCs the round has."""
+        return round(self.seconds / self.farm.session.sync_period)
 
     def joint(self) -> int:
         """A drive that nothing else happens to."""
@@ -260,10 +270,6 @@ def _state(pid: int) -> str:
         return "X"
 
 
-def _has_ended(pid: int) -> bool:
-    return _state(pid) in "ZX"
-
-
 def _stopped(room: Room) -> None:
     begin, length = room.at(1.2), float(room.rng.uniform(0.1, 0.3))
 
@@ -310,13 +316,15 @@ def disk_full(room: Room) -> Expected:
                         pass
         if _while_full(room, length):
             room.orders.done.add("full")
-        room.orders.full_at_end = _has_ended(room.pid())
         filler.unlink()
+        # A capture that still has SYNCs to record ends later than this.
+        ledger = room.farm.lanes[0].ledger
+        room.orders.full_at_end = bool(ledger) and ledger[-1] >= room.syncs - NEAR_END
 
     room.actions.append((room.at(1.1), lambda: room.farm.beside(fill)))
     # While drives are behind rows wait in memory, and there is nothing to write.
     return lambda done: (
-        done.counters["tpdo_late"] > BEHIND or (done.counters["writer.rows_lost"] > 0 and done.gap(None, "not written"))
+        done.counters["tpdo_late"] > BEHIND or (done.counters["writer.rows_lost"] > 0 and done.gap(None, NOT_WRITTEN))
     )
 
 
@@ -332,7 +340,7 @@ def _while_full(room: Room, length: float) -> bool:
     files = list(room.disk.glob("r*/*.mcap"))
     until, last, before, refused = (
         time.monotonic() + length,
-        0.8 * room.seconds / room.farm.session.sync_period,
+        0.8 * room.syncs,
         looks(),
         False,
     )
@@ -347,8 +355,14 @@ def _while_full(room: Room, length: float) -> bool:
 
 def rotation(room: Room) -> Expected:
     """New files are begun meanwhile (the session says so)."""
-    # What waits for a lost answer is written at once when it is given up, into one file.
-    return lambda done: done.files >= 2 or done.gap(None, "lost", "ambiguous order")
+    first = round(ROTATE_S / room.farm.session.sync_period)
+    # What waits for a lost answer is written at once when it is given up, into one file. A disk that refuses the second
+    # file is asked for it again long after the round.
+    return lambda done: (
+        done.files >= 2
+        or done.gap(None, "lost", "ambiguous order")
+        or any(g.reason == NOT_WRITTEN and g.first <= first <= g.last for g in done.recording.gaps)
+    )
 
 
 ANY = (
