@@ -384,10 +384,11 @@ class Farm:
                 lane.prompt = lane.sent_ns < stamp and time.time_ns() - stamp < PROMPT * self._period * 1e9
                 if not self.begun and lane.witness is not None:
                     self._begin()
+                disorderly = bool(lane.repeats) or (lane.prompt and lane.last in self.orders.touched)
                 self._answer(lane, lane.last, int(one["data"][0]))
                 lane.sent_ns = time.time_ns()
-                if self.orders.done and lane.last in self.orders.touched:
-                    self.orders.spoilt |= lane.prompt and lane.sent_ns - stamp >= PROMPT * self._period * 1e9
+                if self.orders.done and disorderly:
+                    self.orders.spoilt |= lane.sent_ns - stamp >= PROMPT * self._period * 1e9
         return 0.005
 
     def _number_of(self, lane: _Lane, counter: int, stamp: int) -> None:
