@@ -45,6 +45,9 @@ Progress = Callable[[str, float], None]
 
 SHARE_OF_ALARMS = 0.1
 """Of the rate of false alarms, for a mistake of wiring that no other gap speaks for."""
+NOTABLY = 0.2
+"""Drop of the logarithm of the held-out errors' power, summed over the joints, that makes a mistake of wiring likelier
+than effects that are no more to believe in: a wrong sign of a wrist looks much like a missing rotor."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +176,7 @@ def _diagnose(
         other = _searched(training, validation, robot, wiring, steps, settings) if alone or found.open else None
         # The mistake itself is one thing more to believe in.
         room = 0 if alone else found.open - 1
-        if other is not None and other.open <= room and other.misfit < found.misfit:
+        if other is not None and other.open <= room and other.misfit < found.misfit - NOTABLY * (other.open == room):
             found = other
         else:
             wiring = None

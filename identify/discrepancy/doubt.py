@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from identify.discrepancy.findings import described
 from identify.discrepancy.search import MOST, Search
 from identify.discrepancy.stanzas import without
-from identify.discrepancy.state import Places, State, nearer, places_of
+from identify.discrepancy.state import Places, State, nearer, places_of, supersedes
 from identify.discrepancy.trial import CLOSE
 from identify.discrepancy.where import Disagreement, Survey, strangers, unexplained
 from identify.document import Finding
@@ -24,7 +24,8 @@ class Outcome:
     state
         The model with what convinces.
     findings, considered
-        What was added to the model, that first which most speaks for; and what was taken out again or never convinced.
+        What was added to the model, that first which closes most of its joint's gap; and what was taken out again or
+        never convinced.
     left
         Dependences of the residual of that model.
     """
@@ -69,13 +70,18 @@ def convincing(search: Search, first: State, final: State, seen: Survey) -> Outc
         search.progress(f"taking out {findings[worst].effect}")
         final = _without(search, first, final, worst, been)
         been.add(places_of(final))
-    ordered = sorted(findings, key=lambda finding: -float(finding.evidence["score"] or 0.0))
+    ordered = sorted(findings, key=_left_open)
     taken_out = _unique(considered, ordered)
     return Outcome(final, tuple(ordered), taken_out, (*left, *_instead_of(search, final, taken_out, left)))
 
 
 def _confidence(finding: Finding) -> float:
     return float(finding.evidence["confidence_with_equals"])
+
+
+def _left_open(finding: Finding) -> float:
+    """Part of its joint's held-out error without it that a finding leaves."""
+    return finding.gap_after / max(finding.gap_before, 1e-300)
 
 
 def _instead_of(
@@ -130,7 +136,9 @@ def _exchanged(
             if trial.candidate.effect.name not in names or joints[trial.candidate.place.joint] != joint:
                 continue
             other = search.with_trial(rest, trial)
-            if other is not None and places_of(other) not in been and nearer(other, final, search.settings.material):
+            if other is None or places_of(other) in been:
+                continue
+            if supersedes(other, final, search.settings.material):
                 return other
     return None
 

@@ -6,20 +6,20 @@ fail although much speaks for it. Simulated once more with the candidate inside,
 nothing of the noise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from configs import DataError
-from identify.discrepancy.candidates import Candidate, Workshop
+from identify.discrepancy.candidates import Candidate, Shapes, Workshop
 from identify.discrepancy.regression import Fit
 from identify.discrepancy.regression import fit as fitted
 from identify.discrepancy.screening import noise_beyond_shapes
 from identify.discrepancy.shaping import both_ends
 from identify.discrepancy.stanzas import added
 from identify.discrepancy.study import Study
-from identify.discrepancy.trial import Trial, judge, refined, screened
+from identify.discrepancy.trial import Trial, best_trial, judge, refined, replaced, screened
 from identify.model.arm import ArmModel
 
 SECOND_LOOKS = 2
@@ -28,11 +28,65 @@ SECOND_LOOKS = 2
 SUSPECT = 20.0
 """Score that makes it worth while: what passes has about ten, without merit there is hardly any."""
 
+APART = 0.9
+"""Values of a nonlinear parameter that differ by less are one."""
+
 
 def suspects(failed: Sequence[Trial]) -> list[Trial]:
     """Trials that failed in spite of their score, those first that have most."""
     able = [t for t in failed if t.candidate.effect.predicts and not t.candidate.effect.sudden and not t.forbidden]
     return sorted((t for t in able if t.score > SUSPECT), key=lambda t: -t.score)[:SECOND_LOOKS]
+
+
+def at_measured_signals(
+    fit: Fit, candidates: Iterable[Candidate], workshop: Workshop, least: float
+) -> list[tuple[Trial, ...]]:
+    """Trials with measured signals as instruments, of what goes with way and speed alone, those that explain most.
+
+    A joint that yields before it slides, or sticks, reverses at other instants in a loop without that: the simulated
+    columns have nothing of the measured ones, and the parameters that they make are of any size. Feedback lets measured
+    ones explain a little without merit, so these trials are no evidence; the loop that they make is one to look in.
+
+    Parameters
+    ----------
+    least
+        Share of a joint's held-out residual power that a trial has to explain.
+
+    Returns
+    -------
+    list
+        Of every candidate the trials at the values that screening finds and next to them on the grid, best first.
+    """
+    tried = []
+    for candidate in candidates:
+        effect = candidate.effect
+        if effect.predicts or effect.sudden or effect.undo is not None:
+            continue
+        measured = replace(candidate, effect=replace(effect, sudden=True))
+        best = best_trial(fit, measured, workshop)
+        if best is None or best.forbidden or best.score < SUSPECT or best.share < least:
+            continue
+        beside = (judge(fit, measured, shapes, workshop) for shapes in _neighbours(fit, candidate, best.shapes))
+        able = sorted([best, *(t for t in beside if t is not None and not t.forbidden)], key=lambda t: -t.score)
+        tried.append(tuple(replace(trial, candidate=candidate) for trial in able))
+    return sorted(tried, key=lambda trials: -trials[0].score)[:SECOND_LOOKS]
+
+
+def _neighbours(fit: Fit, candidate: Candidate, shapes: Shapes) -> list[Shapes]:
+    """The values next to a candidate's continuous shapes on its grid, one at a time."""
+    found = []
+    for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
+        values = sorted({grid[k][1] for grid in candidate.grid})
+        below = [v for v in values if v < APART * shapes[k][1]]
+        above = [v for v in values if v * APART > shapes[k][1]]
+        if free:
+            found += [replaced(shapes, k, v) for v in (*below[-1:], *above[:1])]
+    return found
+
+
+def in_one_of_their_loops(fit: Fit, trials: Iterable[Trial]) -> Trial | None:
+    """The first of some trials that makes a loop which is a better likeness of the arm, judged in it."""
+    return next((again for trial in trials if (again := in_its_loop(fit, trial)) is not None), None)
 
 
 def in_its_loop(fit: Fit, trial: Trial) -> Trial | None:

@@ -10,10 +10,21 @@ from configs import DataError, RobotConfig
 from identify.discrepancy.candidates import Workshop, candidates
 from identify.discrepancy.excess import excesses
 from identify.discrepancy.polishing import polished
-from identify.discrepancy.retrial import in_its_loop, suspects
+from identify.discrepancy.retrial import SUSPECT, at_measured_signals, in_its_loop, in_one_of_their_loops, suspects
 from identify.discrepancy.screening import shortlist
 from identify.discrepancy.stanzas import added, completed, stanza_number, valued, without
-from identify.discrepancy.state import Places, Settings, State, accident, nearer, places_of, refit, takes_over
+from identify.discrepancy.state import (
+    FEEDBACK,
+    Places,
+    Settings,
+    State,
+    accident,
+    nearer,
+    places_of,
+    refit,
+    supersedes,
+    takes_over,
+)
 from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial, best_trial, judge
 from identify.options import CONTROLLERS
@@ -98,26 +109,32 @@ class Search:
         keys = {t.candidate.key for t in passing}
         failed = [t for t in state.trials if t.candidate.key not in keys]
         second = {}
-        for trial in [*suspects(failed), *self._recorded_otherwise(state, passing)]:
-            again = in_its_loop(state.fit, trial)
+        for trials in [*((t,) for t in suspects(failed)), *self._otherwise(state, passing, failed)]:
+            again = in_one_of_their_loops(state.fit, trials)
             if again is not None:
-                second[trial.candidate.key] = again
+                second[again.candidate.key] = again
         known = {t.candidate.key: t for t in state.trials} | second
         return replace(state, trials=_ranked(list(known.values())))
 
-    def _recorded_otherwise(self, state: State, passing: Sequence[Trial]) -> list[Trial]:
-        """Trials of what puts recordings right, at joints that leave more than noise of which nothing explains much.
+    def _otherwise(self, state: State, passing: Sequence[Trial], failed: Sequence[Trial]) -> list[tuple[Trial, ...]]:
+        """Trials to look at again where nothing explains much of what is more than noise.
 
-        A controller identified from recordings that are not right makes a loop in which the right one may score worst.
+        Of what puts recordings right: a controller identified from recordings that are not makes a loop in which the
+        right one may score worst. And of what makes the joint reverse at other instants, also where it failed in spite
+        of its score.
         """
         joints = {
             excess.joint
             for excess in excesses(state.fit, self.settings.false_alarms)
             if all(t.share < EXPLAINED * excess.share for t in passing if t.candidate.place.joint == excess.joint)
         }
-        able = [c for c in candidates(state.workshop) if c.effect.undo is not None and c.place.joint in joints]
-        found = (best_trial(state.fit, candidate, state.workshop) for candidate in able)
-        return [t for t in found if t is not None and not t.forbidden]
+        spoken_for = {t.candidate.key for t in failed if t.score > SUSPECT}
+        every = list(candidates(state.workshop))
+        there = [c for c in every if c.place.joint in joints]
+        recorded = (best_trial(state.fit, c, state.workshop) for c in there if c.effect.undo is not None)
+        able = [(t,) for t in recorded if t is not None and not t.forbidden]
+        other = [c for c in every if c.place.joint in joints or c.key in spoken_for]
+        return [*able, *at_measured_signals(state.fit, other, state.workshop, FEEDBACK)]
 
     def _extended(self, state: State, own: int, been: set[Places]) -> State | None:
         """The state with the best candidate that passes and really makes the held-out error smaller, pruned.
@@ -230,7 +247,7 @@ class Search:
                 if (effect.name, state.study.joints[place.joint]) == (stanza.effect, stanza.joint):
                     continue
                 other = self.with_trial(rest, trial)
-                if other is not None and nearer(other, state, self.settings.material):
+                if other is not None and supersedes(other, state, self.settings.material):
                     self.progress(f"{effect.name} instead of {stanza.effect}")
                     state = other
         return state

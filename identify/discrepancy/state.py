@@ -14,7 +14,7 @@ from identify.catalogue.registry import known
 from identify.catalogue.terms import Term
 from identify.discrepancy.candidates import Workshop
 from identify.discrepancy.lines import residuals
-from identify.discrepancy.regression import Fit, applied, fit
+from identify.discrepancy.regression import Fit, applied, fit, regressors
 from identify.discrepancy.stanzas import stanza_number
 from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial
@@ -33,6 +33,8 @@ FEEDBACK = 0.05
 motion follow the disturbances, so that terms without merit explain a percent or two."""
 
 
+ALIKE = 0.9
+"""Squared error of one loop's motion over that of another down to which they tell nothing."""
 ANCHORINGS = 4
 """Most times that shares of predicted torques are made anew by what the fit with them predicts."""
 
@@ -100,7 +102,7 @@ def nearer(one: State, other: State, material: float) -> bool:
 
     Both count: measured positions, differentiated twice for an elastic joint, may bring more noise than the effect has
     torque, and simulated ones are only as good as the loop. Where they alone are for it, the loop with the effect in it
-    must move more like the arm, too: what a model says of itself is no evidence.
+    must be no worse a likeness of the arm: what a model says of itself is no evidence.
 
     Parameters
     ----------
@@ -110,17 +112,34 @@ def nearer(one: State, other: State, material: float) -> bool:
     closer = one.study.moves_more_like_the_arm_than(other.study, held=True)
     if one.study.recorded != other.study.recorded:
         return closer or _recorded_right(one, other, material)
-    # Relative to each other joint by joint: a wrist's errors are small beside those of a shoulder, or in other units.
-    if np.sum(np.log(_power(one))) < np.sum(np.log(_power(other))):
+    if _closer_at_measured_signals(one, other):
         return True
-    if not closer:
+    if one.study.likeness_lost(other.study, range(one.study.robot.n), held=True) > 1.0 / ALIKE:
         return False
     noise = one.fit.noise
     before = other.fit.errors(other.fit.theta, held=True)
     # Of the error at measured signals, less what of it the change at simulated ones explains: those know no noise.
-    after = [e - c for e, c in zip(before, _change(other, one), strict=True)]
-    was, now = (_whitened_power(e, noise) for e in (before, after))
-    return bool(now.sum() < was.sum() and np.any(now < (1 - material) * was))
+    ways = [[e - c for e, c in zip(before, _change(other, one), strict=True)]]
+    if closer:
+        ways.append(one.fit.errors(one.fit.theta, held=True))
+    was = _whitened_power(before, noise)
+    left = [_whitened_power(errors, noise) for errors in ways]
+    return any(now.sum() < was.sum() and bool(np.any(now < (1 - material) * was)) for now in left)
+
+
+def supersedes(one: State, other: State, material: float) -> bool:
+    """Whether a model comes closer to the held-out torques than another that lacks nothing of it but one effect.
+
+    Of two effects in one place each has its loop, and either may be a likeness: what was measured decides.
+    """
+    if one.study.recorded != other.study.recorded:
+        return nearer(one, other, material)
+    return _closer_at_measured_signals(one, other)
+
+
+def _closer_at_measured_signals(one: State, other: State) -> bool:
+    # Relative to each other joint by joint: a wrist's errors are small beside those of a shoulder, or in other units.
+    return bool(np.sum(np.log(_power(one))) < np.sum(np.log(_power(other))))
 
 
 def _power(state: State) -> Array:
@@ -139,10 +158,14 @@ def _recorded_right(one: State, other: State, material: float) -> bool:
     where = [one.study.joints.index(stanza.joint) for stanza in differ]
     if any(known(stanza.effect).rewires for stanza in differ):
         return False
-    if not one.study.moves_as_much_like_the_arm_as(other.study, where, held=True):
+    lost = one.study.likeness_lost(other.study, where, held=True)
+    if not np.isfinite(lost):
         return False
     was, now = power_put_right(other, one), power_put_right(one, other)
-    return bool(np.sum(np.log(now / was)) < 0.0 and np.any(now < (1 - material) * was))
+    gained = float(np.sum(np.log(now / was)))
+    # What a loop loses that hardly differs from the arm anyhow (a stiff controller) the torques make good.
+    enough = gained < 0.0 if lost < 1.0 / ALIKE else gained + np.log(lost) < 0.0
+    return bool(enough and np.any(now < (1 - material) * was))
 
 
 def power_put_right(state: State, other: State) -> Array:
@@ -158,9 +181,17 @@ def power_put_right(state: State, other: State) -> Array:
 
 
 def _change(before: State, after: State) -> list[Array]:
-    """Change of the held-out torques at simulated signals from one model to another, (M, n) of every stretch."""
-    pairs = zip(before.fit.equations.held, after.fit.equations.held, strict=True)
-    return [applied(z1, after.fit.theta) - applied(z0, before.fit.theta) for (_, z0, _), (_, z1, _) in pairs]
+    """Change of the held-out torques from one model to another at the simulated motion of the second, (M, n) of each.
+
+    Beyond the bandwidth of the controller it is the motion that a model changes and hardly the torque: motions of their
+    own would hide what the models disagree about.
+    """
+    study, theta = before.study, padded(before.fit, before.study.model)
+    changes = []
+    for own, other, (_, z, _) in zip(study.held, after.study.held, after.fit.equations.held, strict=True):
+        there = replace(own, simulated=other.simulated, before=other.before)
+        changes.append(applied(z, after.fit.theta) - applied(regressors(study, there, theta)[1], before.fit.theta))
+    return changes
 
 
 def _whitened_power(errors: Sequence[Array], noise: Sequence[ArModel]) -> Array:

@@ -36,9 +36,6 @@ WORKING_RATE = 20.0
 """Rate at which effects are evaluated, over the frequency up to which model and data are compared."""
 
 
-ALIKE = 0.9
-"""Squared error of one loop's motion over that of another from which on they tell nothing."""
-
 STIFF_LOOP = 1.5
 """Squared error of the motion of a stand-in's loop over that without the model's terms up to which it is no worse."""
 
@@ -120,12 +117,15 @@ class Study:
         one, two = (study.held if held else study.train for study in (self, other))
         return bool(distances(one).sum() < distances(two).sum())
 
-    def moves_as_much_like_the_arm_as(self, other: "Study", joints: Sequence[int], *, held: bool) -> bool:
-        """Whether the two simulated loops are so much alike at some joints that they do not tell which is better."""
+    def likeness_lost(self, other: "Study", joints: Sequence[int], *, held: bool) -> float:
+        """Squared error of this simulated loop's motion at some joints over that of another's.
+
+        Infinite where one of the two is a stand-in, which follows what it sees, and the other one is not.
+        """
         if (self.loop in CONTROLLERS) != (other.loop in CONTROLLERS):
-            return False
+            return float("inf")
         one, two = (distances(study.held if held else study.train)[list(joints)].sum() for study in (self, other))
-        return bool(ALIKE < one / max(two, 1e-300) < 1.0 / ALIKE)
+        return float(one / max(two, 1e-300))
 
     @property
     def sample(self) -> float:
