@@ -16,10 +16,15 @@ Document = dict[str, Any]
 
 STOP_S = 5.0
 TAIL_LINES = 4
+LARGEST = 2 << 30
+"""Bytes of memory of a process that goes on to the next request."""
 
 
 class Room:
     """A process of one room; started when it is first asked, and again after it died.
+
+    The allocator gives back little of what arrays of many sizes took: over hundreds of requests a process grows to
+    several times what one request needs. One that has grown too large is ended after its answer.
 
     Parameters
     ----------
@@ -27,10 +32,12 @@ class Room:
         Run as ``python -m module``.
     log
         File that gets what the process prints on stderr.
+    largest
+        Memory of the process [bytes] above which it is not asked again, but started afresh.
     """
 
-    def __init__(self, module: str, log: Path) -> None:
-        self.module, self.log = module, log
+    def __init__(self, module: str, log: Path, largest: int = LARGEST) -> None:
+        self.module, self.log, self.largest = module, log, largest
         self._process: subprocess.Popen[bytes] | None = None
         self._pending = b""
 
@@ -56,6 +63,8 @@ class Room:
         except TimeoutError as error:
             self.close()
             raise ArmidentError(f"{self.module}: no answer within {seconds:.0f} s") from error
+        if _resident(process.pid) > self.largest:
+            self.close()
         answer: Document = json.loads(line)
         if "error" in answer:
             raise ArmidentError(f"{self.module}: {answer['error']}")
@@ -114,3 +123,12 @@ class Room:
     def _tail(self) -> str:
         lines = [line.strip() for line in self.log.read_text(errors="replace").splitlines() if line.strip()]
         return " | ".join(lines[-TAIL_LINES:]) or "it printed nothing"
+
+
+def _resident(pid: int) -> int:
+    """Memory of a process [bytes]; 0 if it has ended."""
+    try:
+        pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
+    except (FileNotFoundError, ProcessLookupError):
+        return 0
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")

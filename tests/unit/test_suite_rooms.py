@@ -58,6 +58,20 @@ def test_a_room_that_dies_is_an_error_of_its_request_and_starts_again_for_the_ne
         room.close()
 
 
+def test_a_room_that_has_grown_too_large_answers_and_starts_afresh_for_the_next(tmp_path: Path) -> None:
+    unknown = {"id": 1, "do": "nothing", "recording": "none.mcap", "robot": "emps.yaml"}
+    for largest, afresh in ((1 << 20, True), (64 << 30, False)):
+        room = Room(DIAGNOSIS, tmp_path / "diagnosis.log", largest)
+        try:
+            with pytest.raises(ArmidentError, match=r"none\.mcap"):
+                room.ask(unknown, 120)
+            assert (room._process is None) == afresh
+            with pytest.raises(ArmidentError, match=r"none\.mcap"):
+                room.ask(unknown, 120)
+        finally:
+            room.close()
+
+
 def test_a_room_that_does_not_answer_in_time_is_ended(tmp_path: Path) -> None:
     room = Room(DIAGNOSIS, tmp_path / "diagnosis.log")
     try:
