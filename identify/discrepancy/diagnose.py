@@ -62,6 +62,9 @@ class Diagnosis:
         The configuration with the findings added.
     t, measured, before, after
         Held-out instants (M,), s, and torques (M, n): measured, and of the model without and with the findings.
+    lacking
+        The same of the model with all findings but one, for each finding of the document; ``None`` for one that is not
+        a part of the model (wiring, numbers).
     q, qd
         Held-out joint positions and velocities (M, n).
     where
@@ -78,6 +81,7 @@ class Diagnosis:
     measured: Array
     before: Array
     after: Array
+    lacking: tuple[Array | None, ...]
     q: Array
     qd: Array
     where: tuple[Disagreement, ...]
@@ -183,6 +187,7 @@ def _diagnose(
     study, first, outcome, left = found.study, found.first, found.outcome, found.left
     final = outcome.state
     findings = [*([] if wiring is None else miswired(wiring, robot)), *outcome.findings]
+    lacking = [*(None for _ in findings[len(outcome.findings) :]), *(_beside(final, s) for s in outcome.lacking)]
     if baseline is not None:
         steps("numbers")
         findings += outdated(stale_numbers(final.fit, final.workshop, baseline, settings.false_alarms))
@@ -219,9 +224,9 @@ def _diagnose(
         robot=with_values(final),
         t=_continued([s.t for s in held]),
         measured=np.concatenate([s.y for s in held]),
-        # Residuals of the recordings as they were, drawn on them as they have been put right.
-        before=_predicted(first) + np.concatenate([s.y - f.y for s, f in zip(held, first.study.held, strict=True)]),
+        before=_beside(final, first),
         after=_predicted(final),
+        lacking=(*lacking, *(None for _ in findings[len(lacking) :])),
         q=_sampled(final, "q"),
         qd=_sampled(final, "qd"),
         where=found.where,
@@ -286,6 +291,12 @@ def _verdict(findings: Sequence[Finding], left: Sequence[Disagreement]) -> Verdi
 def _predicted(state: State) -> Array:
     """Torques of the model on the held-out data, (M, n)."""
     return np.concatenate([x @ state.fit.theta for x, _, _ in state.fit.equations.held])
+
+
+def _beside(final: State, state: State) -> Array:
+    """Torques of another model (M, n); what it misses of recordings as it has them, on them as they are put right."""
+    pairs = zip(final.study.held, state.study.held, strict=True)
+    return np.asarray(_predicted(state) + np.concatenate([right.y - own.y for right, own in pairs]))
 
 
 def _sampled(state: State, name: str) -> Array:

@@ -26,6 +26,8 @@ class Outcome:
     findings, considered
         What was added to the model, that first which closes most of its joint's gap; and what was taken out again or
         never convinced.
+    lacking
+        The model without each of the findings.
     left
         Dependences of the residual of that model.
     """
@@ -33,6 +35,7 @@ class Outcome:
     state: State
     findings: tuple[Finding, ...]
     considered: tuple[Finding, ...]
+    lacking: tuple[State, ...]
     left: tuple[Disagreement, ...]
 
 
@@ -70,9 +73,12 @@ def convincing(search: Search, first: State, final: State, seen: Survey) -> Outc
         search.progress(f"taking out {findings[worst].effect}")
         final = _without(search, first, final, worst, been)
         been.add(places_of(final))
-    ordered = sorted(findings, key=_left_open)
+    order = sorted(range(len(findings)), key=lambda k: _left_open(findings[k]))
+    ordered = tuple(findings[k] for k in order)
     taken_out = _unique(considered, ordered)
-    return Outcome(final, tuple(ordered), taken_out, (*left, *_instead_of(search, final, taken_out, left)))
+    own = len(first.study.robot.effects)
+    lacking = tuple(search.state(without(final.study.robot, own + k), final) for k in order)
+    return Outcome(final, ordered, taken_out, lacking, (*left, *_instead_of(search, final, taken_out, left)))
 
 
 def _confidence(finding: Finding) -> float:

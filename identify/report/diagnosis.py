@@ -21,7 +21,12 @@ VERDICTS = {
 }
 CERTAIN, LIKELY = 0.95, 0.6
 """Confidence from which a finding is called certain, and likely."""
-BINS = 14
+BINS, FILLED = 14, 5
+"""Bins of a variable, and the fewest samples of one that is drawn."""
+SHOWN = 700
+"""Most samples of one curve: more would be a band of ink."""
+FOLLOWS = 0.6
+"""Share of the power of what a finding adds that its means over a variable have, where it is drawn over that."""
 
 
 def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
@@ -43,9 +48,9 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
                 "sure": certainty(finding),
                 "closed": closed_share(finding, document),
                 "rows": _rows(finding),
-                "picture": _finding_figure(diagnosis, joints.index(finding.joint)),
+                "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking),
             }
-            for finding in document.findings
+            for finding, lacking in zip(document.findings, diagnosis.lacking, strict=True)
         ],
         gaps=_gap_figure(document),
         map=_map_figure(diagnosis, joints),
@@ -111,34 +116,82 @@ def _gap_figure(document: DiagnosisDocument) -> str:
     return picture[0]
 
 
-def _finding_figure(diagnosis: Diagnosis, joint: int) -> str:
-    """The joint's held-out residual without and with the findings: over time, and over what it depends on most."""
-    name = diagnosis.robot.joints[joint].name
-    rest = {
-        "before": diagnosis.measured[:, joint] - diagnosis.before[:, joint],
-        "after": diagnosis.measured[:, joint] - diagnosis.after[:, joint],
-    }
-    unit = _unit(diagnosis, joint)
+def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None) -> str:
+    """The joint's held-out residual without and with a finding: over time, and over what the finding follows.
+
+    Parameters
+    ----------
+    lacking
+        Torques of the model without the finding; ``None`` compares the model as configured with that of all findings.
+    """
+    name, unit = diagnosis.robot.joints[joint].name, _unit(diagnosis, joint)
     seen = [d for d in diagnosis.where if d.joint == name]
+    without = (diagnosis.before if lacking is None else lacking)[:, joint]
+    rest = diagnosis.measured[:, joint] - without
+    added = diagnosis.after[:, joint] - without
+    part = telling_stretch(added)
     with figure(1, 2, 2.7) as (_, axes, picture):
         over_time, over_cause = axes[0]
-        for (label, residual), colour in zip(rest.items(), (MEASURED, MODEL), strict=True):
-            over_time.plot(diagnosis.t, residual, color=colour, linewidth=0.9, label=label)
+        curves = (("without it", rest, MEASURED), ("with it", rest - added, MODEL))
+        for label, residual, colour in curves:
+            over_time.plot(diagnosis.t[part], residual[part], color=colour, linewidth=1.1, label=label)
         over_time.set_title(f"{name}: measured minus predicted torque, data not used for fitting")
         over_time.set_xlabel("s")
         over_time.set_ylabel(unit)
         over_time.legend(frameon=False, ncols=2, fontsize=8.5, loc="upper left")
-        if seen:
+        over_time.axhline(0, color=MUTED, linewidth=0.6)
+        if lacking is None and seen:
             _curve(over_cause, seen[0], unit)
         else:
-            speed = diagnosis.qd[:, joint]
-            for residual, colour in zip(rest.values(), (MEASURED, MODEL), strict=True):
-                centres, means, errors = _binned(speed, residual)
-                over_cause.errorbar(centres, means, errors, color=colour, linewidth=1.4, marker="o", markersize=3)
-            over_cause.set_title("its mean over joint speed, with two standard errors")
-            over_cause.set_xlabel("rad/s" if unit == "N m" else "m/s")
+            _over_cause(over_cause, rest, added, followed_variable(diagnosis, joint, added), unit)
         over_cause.axhline(0, color=MUTED, linewidth=0.6)
     return picture[0]
+
+
+def telling_stretch(added: Array) -> slice:
+    """The samples in a row, as many as a picture can show apart, in which a finding changes most."""
+    if added.size <= SHOWN:
+        return slice(0, added.size)
+    power = np.concatenate([[0.0], np.cumsum(added**2)])
+    begin = int(np.argmax(power[SHOWN:] - power[:-SHOWN]))
+    return slice(begin, begin + SHOWN)
+
+
+def followed_variable(diagnosis: Diagnosis, joint: int, added: Array) -> tuple[str, str, Array]:
+    """What a finding is drawn over, with unit: the plainest variable that it follows, or its own torque."""
+    way = "m" if diagnosis.robot.joints[joint].type == "prismatic" else "rad"
+    for name, unit, x in (
+        ("joint speed", f"{way}/s", diagnosis.qd[:, joint]),
+        ("joint position", way, diagnosis.q[:, joint]),
+        ("time", "s", diagnosis.t),
+    ):
+        if _followed(x, added) >= FOLLOWS:
+            return name, unit, x
+    return "the torque it adds", _unit(diagnosis, joint), added
+
+
+def _followed(x: Array, added: Array) -> float:
+    """Share of the power of a torque that its means over a variable have."""
+    varying = added - added.mean()
+    power = sum(part.size * varying[part].mean() ** 2 for part in _bins(x))
+    return float(power / max(varying @ varying, 1e-300))
+
+
+def _over_cause(axis: Any, rest: Array, added: Array, cause: tuple[str, str, Array], unit: str) -> None:
+    """Means of what is missing, with its spread, and of what a finding adds."""
+    name, unit_of_cause, x = cause
+    bins = _bins(x)
+    centres, mean = ([float(y[part].mean()) for part in bins] for y in (x, added))
+    missing, spread = [rest[part].mean() for part in bins], [rest[part].std() for part in bins]
+    axis.errorbar(
+        centres, missing, spread, color=MUTED, ecolor=MEASURED, linestyle="", marker="o", markersize=4,
+        label="missing without it: mean and spread",
+    )  # fmt: skip
+    axis.plot(centres, mean, color=MODEL, linewidth=1.6, label="what it adds")
+    axis.set_title(f"over {name}")
+    axis.set_xlabel(unit_of_cause)
+    axis.set_ylabel(unit)
+    axis.legend(frameon=False, fontsize=8.5, loc="best")
 
 
 def _unit(diagnosis: Diagnosis, joint: int) -> str:
@@ -192,11 +245,7 @@ def _curve_figure(d: Disagreement, unit: str) -> str:
     return picture[0]
 
 
-def _binned(x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Means of y over equally filled bins of x, with two standard errors."""
-    order = np.argsort(x)
-    parts = [part for part in np.array_split(order, BINS) if part.size > 1]
-    centres = np.array([x[part].mean() for part in parts])
-    means = np.array([y[part].mean() for part in parts])
-    errors = np.array([2 * y[part].std(ddof=1) / np.sqrt(part.size) for part in parts])
-    return centres, means, errors
+def _bins(x: Array) -> list[NDArray[np.intp]]:
+    """Samples of equally wide bins of a variable, as far as there are enough of them."""
+    number = np.digitize(x, np.linspace(x.min(), x.max(), BINS + 1)[1:-1])
+    return [part for k in range(BINS) if (part := np.flatnonzero(number == k)).size >= FILLED]
