@@ -14,19 +14,18 @@ Record = dict[str, Any]
 
 DECIDING = ("configs", "identify", "virtual_robot", "daq/recording")
 """Folders whose code and data decide a result."""
-DECIDING_SUFFIXES = (".py", ".yaml", ".html")
-NOT_DECIDING = ("configs/suite.yaml",)
-"""What of it decides is in the case itself."""
+DECIDING_SUFFIXES = (".py", ".yaml")
+NOT_DECIDING = ("configs/suite.yaml", "identify/report/")
+"""What of the cases decides is in each of them, and a report draws what has been decided."""
 
 
-def code_version() -> str:
+def code_version(root: Path = Path(configs.__file__).parents[1]) -> str:
     """Hash of the code that results depend on."""
-    root = Path(configs.__file__).parents[1]
     digest = hashlib.sha256()
     for folder in DECIDING:
         for path in sorted((root / folder).rglob("*")):
             name = path.relative_to(root).as_posix()
-            if path.suffix in DECIDING_SUFFIXES and name not in NOT_DECIDING:
+            if path.suffix in DECIDING_SUFFIXES and not name.startswith(NOT_DECIDING):
                 digest.update(name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
 

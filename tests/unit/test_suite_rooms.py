@@ -11,7 +11,7 @@ import pytest
 from configs import ArmidentError, DataError
 from daq.suite.lanes import DIAGNOSIS, PLANT
 from daq.suite.room import Room
-from daq.suite.store import Store
+from daq.suite.store import Store, code_version
 
 EMPS = {
     "robot": "emps.yaml", "trajectory": "trajectories/emps_excitation.yaml", "repeats": 1, "period": 1e-3, "seed": 1,
@@ -93,6 +93,20 @@ def test_results_are_found_again_by_the_code_that_made_them_only(tmp_path: Path)
     assert (again.failure("b") or {})["error"] == "it broke"
     assert Store(path, "two").get("a") is None
     assert Store(path, "two", any_version=True).get("a") is not None
+
+
+def test_results_stay_while_only_what_cannot_change_them_does(tmp_path: Path) -> None:
+    def write(name: str, content: str) -> str:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content, encoding="utf-8")
+        return code_version(tmp_path)
+
+    first = write("identify/search.py", "a = 1")
+    for name in ("identify/report/page.py", "configs/suite.yaml", "daq/suite/table.py", "identify/notes.md"):
+        assert write(name, "b = 2") == first, name
+    versions = [write(name, "b = 2") for name in ("identify/search.py", "configs/emps.yaml", "virtual_robot/noise.py")]
+    assert len({first, *versions}) == 4
 
 
 def test_the_line_that_a_stopped_run_left_torn_is_dropped_and_any_other_is_told(tmp_path: Path) -> None:
