@@ -46,8 +46,15 @@ def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tupl
     ------
     DataError
         If the recording is of another robot, lacks a quantity or too many samples, contains NaN, or disagrees with
-        its own counters.
+        its own counters; names the file, where there is one.
     """
+    try:
+        return _converted(recording, robot)
+    except DataError as error:
+        raise error if recording.path is None else DataError(f"{recording.path}: {error}") from error
+
+
+def _converted(recording: Recording, robot: RobotConfig) -> tuple[list[Experiment], list[str]]:
     _check_same_robot(recording.robot, robot)
     _check_counters(recording)
     notes: list[str] = []
@@ -91,7 +98,7 @@ def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tupl
     if not experiments:
         raise DataError(
             f"the recording has no uninterrupted piece of {MIN_PIECE_S} s inside its experiment marks "
-            f"({samples.sync.size} samples in all)"
+            f"({samples.sync.size} samples in all{f'; {recording.missing}' if recording.missing else ''})"
         )
     notes += _signal_notes(experiments, robot)
     notes += _rate_notes(recording)

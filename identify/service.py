@@ -163,7 +163,7 @@ def robot_yaml(robot: RobotConfig) -> str:
 
 def _experiments(recording: Recording, robot: RobotConfig, notes: list[str]) -> list[Experiment]:
     experiments, found = experiments_from_recording(recording, robot)
-    notes += found
+    notes += found if recording.path is None else [f"{recording.path.name}: {note}" for note in found]
     return experiments
 
 

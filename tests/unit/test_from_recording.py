@@ -1,6 +1,7 @@
 """From a recording to experiments: conversions, the reference, gaps, and what is refused."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -137,6 +138,17 @@ def test_not_a_number_is_refused_naming_the_joint(tx40: RobotConfig) -> None:
     broken = replace(recording.samples, raw={**recording.samples.raw, "position": position})
     with pytest.raises(DataError, match="position of joint_3 is not a number at sample 17"):
         experiments_from_recording(replace(recording, streams={**recording.streams, "samples": broken}), tx40)
+
+
+def test_what_is_refused_names_its_file(tx40: RobotConfig) -> None:
+    recording = replace(recording_of(tx40), path=Path("monday.mcap"))
+    with pytest.raises(DataError, match=r"^monday\.mcap: the recording is of robot 'tx40'"):
+        experiments_from_recording(recording, load_robot("emps.yaml"))
+    begun = {name: replace(stream, sync=stream.sync[:9], raw={k: v[:9] for k, v in stream.raw.items()})
+             for name, stream in recording.streams.items()}  # fmt: skip
+    torn = replace(recording, streams=begun, counters={}, marks=(), missing="the file was not finished")
+    with pytest.raises(DataError, match=r"^monday\.mcap: .*9 samples in all; the file was not finished"):
+        experiments_from_recording(torn, tx40)
 
 
 def test_a_joint_that_stands_still_is_named(tx40: RobotConfig) -> None:
