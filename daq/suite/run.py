@@ -13,12 +13,13 @@ from pathlib import Path
 from configs import ArmidentError, ConfigError, load_suite
 from daq.suite.cases import Case, all_cases, chosen, twin
 from daq.suite.lanes import Lanes
+from daq.suite.markdown import report
 from daq.suite.score import score
 from daq.suite.show import progress, show
 from daq.suite.store import Record, Store, code_version
 from daq.suite.table import COLUMNS, HEALTHY_COLUMNS, OUTSIDE_COLUMNS, Scored, Tables, tables
 
-RESULTS, SUMMARY, TABLE = "results.jsonl", "suite.json", "suite.csv"
+RESULTS, SUMMARY, TABLE, REPORT = "results.jsonl", "suite.json", "suite.csv", "suite.md"
 SCHEMA = "armident/suite-result/1"
 SHOWN_FAILURES = 3
 
@@ -73,12 +74,14 @@ def run_suite(options: Chosen, *, as_json: bool = False) -> Tables:
     scored, failed, missing = judged(cases, store)
     result = tables(scored, failed)
     document = summary(result, scored, failed, len(cases))
-    write(options.out, document, result)
+    text = report(result, scored, len(cases), store.version, core_hours(scored, store))
+    write(options.out, document, result, text)
     if as_json:
         sys.stdout.write(json.dumps(document) + "\n")
     else:
         show(result, len(cases) - missing, len(cases))
         print(f"results: {options.out / RESULTS}\nsummary: {options.out / SUMMARY}\ntable:   {options.out / TABLE}")
+        print(f"report:  {options.out / REPORT}")
     if failed:
         told = "; ".join(f"{c.name}: {(store.failure(c.key) or {}).get('error')}" for c in failed[:SHOWN_FAILURES])
         raise ArmidentError(f"{len(failed)} of {len(cases)} cases failed: {told}")
@@ -115,8 +118,14 @@ def summary(result: Tables, scored: Sequence[Scored], failed: Sequence[Case], to
     }
 
 
-def write(out: Path, document: Record, result: Tables) -> None:
-    """Write the summary and, as CSV, the tables."""
+def core_hours(scored: Sequence[Scored], store: Store) -> float:
+    """Time that the cases took, one after the other, h."""
+    records = (store.get(case.key) for case, _ in scored)
+    return sum(sum(record["seconds"].values()) for record in records if record is not None) / 3600.0
+
+
+def write(out: Path, document: Record, result: Tables, report_text: str) -> None:
+    """Write the summary, the tables as CSV, and the report."""
     out.mkdir(parents=True, exist_ok=True)
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
@@ -128,7 +137,8 @@ def write(out: Path, document: Record, result: Tables) -> None:
         if content:
             rows.writerow([title for title, _ in columns])
             rows.writerows([[value(row) for _, value in columns] for row in content])
-    for name, content_text in ((SUMMARY, json.dumps(document, indent=1) + "\n"), (TABLE, text.getvalue())):
+    files = {SUMMARY: json.dumps(document, indent=1) + "\n", TABLE: text.getvalue(), REPORT: report_text}
+    for name, content_text in files.items():
         temporary = out / f".{name}.new"
         temporary.write_text(content_text, encoding="utf-8")
         os.replace(temporary, out / name)

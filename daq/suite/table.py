@@ -199,12 +199,12 @@ def _healthy(scored: Sequence[Scored], failed: Sequence[Case]) -> Iterable[Healt
 def _outside(scored: Sequence[Scored], failed: Sequence[Case]) -> Iterable[Outside]:
     mine = [s for s in scored if s[0].kind == "outside"]
     for (label, level), (cases, lost) in _groups(mine, [c for c in failed if c.kind == "outside"]).items():
-        fates = Counter(_fate(s) for _, s in cases)
-        names = Counter(s.named for _, s in cases if _fate(s) == "named")
+        fates = Counter(fate(s) for _, s in cases)
+        names = Counter(s.named for _, s in cases if fate(s) == "named")
         n = len(cases)
 
-        def part(fate: str, fates: Counter[str] = fates, n: int = n) -> float | None:
-            return fates[fate] / n if n else None
+        def part(of: str, fates: Counter[str] = fates, n: int = n) -> float | None:
+            return fates[of] / n if n else None
 
         yield Outside(
             label, level, n, lost, part("unexplained"), part("low_confidence"), part("named"), part("unseen"),
@@ -213,7 +213,8 @@ def _outside(scored: Sequence[Scored], failed: Sequence[Case]) -> Iterable[Outsi
         )  # fmt: skip
 
 
-def _fate(score: Score) -> str:
+def fate(score: Score) -> str:
+    """What became of an effect without a name: see `Outside`."""
     if score.confidence >= LOW_CONFIDENCE:
         return "named"
     if score.confidence > 0:
@@ -229,8 +230,8 @@ def _aims(scored: Sequence[Scored]) -> tuple[Aim, ...]:
     both = [s for c, s in scored if c.kind == "pair" and c.level in AIMED_AT]
     pairs = [s for s in both if not s.invisible]
     clean = [s for c, s in scored if not c.parts]
-    outside = [_fate(s) for c, s in scored if c.kind == "outside" and c.level in AIMED_AT]
-    there = [fate for fate in outside if fate != "absent"]
+    outside = [fate(s) for c, s in scored if c.kind == "outside" and c.level in AIMED_AT]
+    there = [f for f in outside if f != "absent"]
     closed = [s.closed for s in named if s.closed is not None and s.first]
     parameters = [ok for s in named for ok in s.within]
 

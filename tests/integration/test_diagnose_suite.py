@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from daq.suite.run import RESULTS, SUMMARY, TABLE
+from daq.suite.run import REPORT, RESULTS, SUMMARY, TABLE
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -58,6 +58,9 @@ def test_a_spring_is_found_and_a_run_goes_on_where_it_was(small: Path, tmp_path:
     assert (result["run"], result["not_run"]) == (2, 0)
     assert result["healthy"][0]["alarms"] == 0
     assert "joint_spring,obvious,1" in (out / TABLE).read_text(encoding="utf-8")
+    told = (out / REPORT).read_text(encoding="utf-8")
+    assert "2 of 2 cases" in told
+    assert "| joint_spring | obvious | 1 |" in told
     lines = (out / RESULTS).read_text(encoding="utf-8")
     again = diagnose_suite(*words, "--json")
     assert "2 cases, 2 done before" in again.stderr

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from daq.suite.cases import Case, HiddenPart
+from daq.suite.markdown import report, shortfalls
 from daq.suite.score import Score, closed_share, matches, score, within
 from daq.suite.table import clopper_pearson, tables
 
@@ -181,8 +182,8 @@ def _score(**more: Any) -> Score:
     return Score(**{**base, **more})
 
 
-def test_the_tables_count_what_happened() -> None:
-    scored = [
+def _mixed() -> list[tuple[Case, Score]]:
+    return [
         (case(SPRING, seed=1), _score()),
         (case(SPRING, seed=2), _score(first=False, closed=0.5, within=(False,))),
         (case(SPRING, seed=3), _score(first=False, second=False, missed=True, invisible=True, closed=None, within=())),
@@ -194,6 +195,10 @@ def test_the_tables_count_what_happened() -> None:
         (case(SPRING, kind="outside", seed=4), _score(confidence=0.0, verdict="no_gap")),
         (case(SPRING, kind="outside", seed=5), _score(confidence=0.0, verdict="no_gap", shown=False)),
     ]
+
+
+def test_the_tables_count_what_happened() -> None:
+    scored = _mixed()
     result = tables(scored, [case(SPRING, seed=4)])
     row = result.effects[0]
     assert (row.n, row.failed, row.first, row.second, row.missed) == (3, 1, 0.5, 1.0, 0.0)
@@ -208,6 +213,24 @@ def test_the_tables_count_what_happened() -> None:
     # One of the five is not in the data, one is named, and one overlooked.
     assert aims["outside the catalogue, in the data: unexplained, or named with low confidence"] == 0.5
     assert aims["share of the injected gap closed, mean where named"] == 1.0
+
+
+def test_the_report_names_every_case_that_fell_short() -> None:
+    scored = [*_mixed(), (case(SPRING, level="detectable"), _score(first=False, second=False))]
+    lacks = [(what, said) for _, what, said in shortfalls(scored)]
+    assert lacks == [
+        ("a false alarm", "explained: joint_spring joint_2, 100% closed"),
+        ("second; a parameter beyond three standard deviations", "explained: joint_spring joint_2, 50% closed"),
+        ("could hide, it says", "explained: joint_spring joint_2"),
+        ("named", "explained: joint_spring joint_2, 100% closed"),
+        ("not seen", "no gap: joint_spring joint_2, 100% closed"),
+    ]
+    text = report(tables(scored, []), scored, 20, "abc", 1.25)
+    assert "11 of 20 cases, 1.2 core-hours, code abc" in text
+    # Every table has as many columns in each row as in its heading.
+    for table in text.split("\n\n"):
+        rows = [line for line in table.splitlines() if line.startswith("|")]
+        assert len({row.count("|") for row in rows}) <= 1
 
 
 def test_the_bounds_of_false_alarms_are_clopper_and_pearsons() -> None:
