@@ -6,7 +6,7 @@ from scipy import stats
 
 from identify.discrepancy.candidates import Candidate, Columns, Shapes, candidates
 from identify.discrepancy.state import HELD_OUT_LEVEL, Settings, State
-from identify.discrepancy.trial import deviations, inflation_along
+from identify.discrepancy.trial import deviations, inflation_along, joints_reached
 from identify.discrepancy.whitening import rows_of_joints, whitened
 from identify.document import Hideable
 
@@ -68,8 +68,9 @@ def _smallest(state: State, candidate: Candidate, shapes: Shapes, settings: Sett
             continue
         inflation = inflation_along(own, residual)
         spread = np.sqrt(size * inflation + fit.spread(own)) / size
-        most = max(rows, key=lambda r: float(own[r] @ own[r]))
-        share = np.sqrt(settings.material * float(residual[most] @ residual[most]) / float(own[most] @ own[most]))
+        reached = joints_reached(candidate, held_z[:, k : k + 1], own, rows)
+        powers = np.array([[float(of[r] @ of[r]) for of in (residual, own)] for r in reached])
+        share = np.sqrt(settings.material * float(np.min(powers[:, 0] / np.maximum(powers[:, 1], 1e-300))))
         sizes[k] = max(train * std[k] * np.sqrt(inflation), held * spread, share)
     return sizes
 

@@ -32,10 +32,14 @@ APART = 0.9
 """Values of a nonlinear parameter that differ by less are one."""
 
 
-def suspects(failed: Sequence[Trial]) -> list[Trial]:
-    """Trials that failed in spite of their score, those first that have most."""
+def suspects(failed: Sequence[Trial], no_accident: Sequence[Trial]) -> list[Trial]:
+    """Trials that failed in spite of their score, or although chance does not make them, those first that have most.
+
+    What explains too little to be worth a finding in a loop without it may explain much in its own.
+    """
     able = [t for t in failed if t.candidate.effect.predicts and not t.candidate.effect.sudden and not t.forbidden]
-    return sorted((t for t in able if t.score > SUSPECT), key=lambda t: -t.score)[:SECOND_LOOKS]
+    doubtful = (t for t in able if t.score > SUSPECT or any(t is other for other in no_accident))
+    return sorted(doubtful, key=lambda t: -t.score)[:SECOND_LOOKS]
 
 
 def at_measured_signals(

@@ -109,10 +109,11 @@ class Search:
         keys = {t.candidate.key for t in passing}
         failed = [t for t in state.trials if t.candidate.key not in keys]
         second = {}
-        for trials in [*((t,) for t in suspects(failed)), *self._otherwise(state, passing, failed)]:
+        doubtful = suspects(failed, state.no_accident(self.settings))
+        for trials in [*((t,) for t in doubtful), *self._otherwise(state, passing, failed)]:
             again = in_one_of_their_loops(state.fit, trials)
             if again is not None:
-                second[again.candidate.key] = again
+                second[again.candidate.key] = _settled(state, again)
         known = {t.candidate.key: t for t in state.trials} | second
         return replace(state, trials=_ranked(list(known.values())))
 
@@ -170,9 +171,8 @@ class Search:
         and in that which these make.
         """
         effect = trial.candidate.effect
-        if effect.predicts and not effect.sudden and any(effect.refinable(state.study.robot, trial.candidate.place)):
-            starts = [trial, *(t for t in state.others if t.candidate.key == trial.candidate.key and not t.forbidden)]
-            trial = max((_settled(state, start) for start in starts), key=lambda t: t.score)
+        starts = [trial, *(t for t in state.others if t.candidate.key == trial.candidate.key and not t.forbidden)]
+        trial = max((_settled(state, start) for start in starts), key=lambda t: t.score)
         try:
             robot = added(state.study.robot, trial)
             if effect.undo is not None:
@@ -254,7 +254,13 @@ class Search:
 
 
 def _settled(state: State, trial: Trial) -> Trial:
-    """A trial with its nonlinear parameters sought in the loop that it makes, and in that which these make."""
+    """A trial with its nonlinear parameters sought in the loop that it makes, and in that which these make.
+
+    Those of effects that depend on nothing but the motion, or leap, stay where they are.
+    """
+    effect = trial.candidate.effect
+    if not effect.predicts or effect.sudden or not any(effect.refinable(state.study.robot, trial.candidate.place)):
+        return trial
     for _ in range(LOOPS):
         again = in_its_loop(state.fit, trial)
         if again is None or again.forbidden or again.score < trial.score:

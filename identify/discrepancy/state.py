@@ -82,17 +82,19 @@ class State:
     hidden: frozenset[tuple[str, int, int | None]]
     others: tuple[Trial, ...] = ()
 
-    def passing(self, settings: Settings) -> list[Trial]:
-        """Trials that a finding may come from, best first."""
+    def no_accident(self, settings: Settings) -> list[Trial]:
+        """Trials that chance does not make, however little they explain, best first."""
         level = settings.false_alarms / max(self.tests, 1)
         return [
+            t for t in self.trials if not t.forbidden and t.p_value < level and t.p_held < HELD_OUT_LEVEL and t.gain > 0
+        ]
+
+    def passing(self, settings: Settings) -> list[Trial]:
+        """Trials that a finding may come from, best first."""
+        return [
             t
-            for t in self.trials
-            if not t.forbidden
-            and t.p_value < level
-            and t.p_held < HELD_OUT_LEVEL
-            and t.gain > 0
-            and t.share >= max(settings.material, FEEDBACK if t.candidate.effect.sudden else 0.0)
+            for t in self.no_accident(settings)
+            if t.share >= max(settings.material, FEEDBACK if t.candidate.effect.sudden else 0.0)
             and not (t.candidate.effect.negligible and t.candidate.effect.negligible(t.values, self.study.sample))
         ]
 

@@ -55,7 +55,8 @@ class Trial:
     beside
         The model's own parameters with it, (b,).
     share
-        Share of the whitened held-out residual's power that the change takes away, at the joint that it changes most.
+        Share of the whitened held-out residual's power that the change takes away at a joint: at that of the joints the
+        candidate acts on where it is largest; of what leaps, at the joint that it changes most.
     score
         Gain in log-likelihood over both parts, less what fitting alone gains on the training part.
     contained
@@ -193,7 +194,9 @@ def _judged(
     inflation = inflation_along(change, after)
     variance = size * inflation + fit.spread(change)
     gain = float(before @ before - after @ after)
-    share = _share_of_joint(change, before, after, [s.y.shape[0] for s in fit.study.held], fit.noise)
+    joints = rows_of_joints([s.y.shape[0] for s in fit.study.held], fit.noise)
+    reached = joints_reached(candidate, columns.held_z, change, joints)
+    share = max(1.0 - float(after[r] @ after[r]) / max(float(before[r] @ before[r]), 1e-300) for r in reached)
     fitted = 0.5 * (values.size + len(shapes))
     supported = 0.5 * (statistic + gain)
     return Trial(
@@ -224,13 +227,25 @@ def deviations(fit: Fit, columns: Columns) -> Array | None:
     return None if solution is None else np.where(solution[1] == 0.0, 0.0, solution[2])
 
 
-def _share_of_joint(
-    change: Array, before: Array, after: Array, lengths: Sequence[int], noise: Sequence[ArModel]
-) -> float:
-    """See `Trial.share`; rows (R,) of joint after joint, from stretches of ``lengths`` rows each."""
-    most = max(rows_of_joints(lengths, noise), key=lambda rows: float(change[rows] @ change[rows]))
-    power = float(before[most] @ before[most])
-    return (power - float(after[most] @ after[most])) / max(power, 1e-300)
+def joints_reached(candidate: Candidate, columns: Array, change: Array, joints: Sequence[slice]) -> list[slice]:
+    """Rows of the joints at which an effect may show that it is worth a finding.
+
+    Those that it acts on: a link on a spring stirs the joint before it more than its own. Leaps, which are their own
+    instruments, have to show at the joint that they change most.
+
+    Parameters
+    ----------
+    columns
+        Held-out columns of the candidate, (R, k).
+    change
+        Of the held-out prediction, the model's own parameters included, (R,).
+    joints
+        Rows of every joint.
+    """
+    most = max(joints, key=lambda rows: float(change[rows] @ change[rows]))
+    if candidate.effect.sudden:
+        return [most]
+    return [rows for rows in joints if columns[rows].any()] or [most]
 
 
 def _calmed(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, calm: Sequence[ArModel]) -> Fit:
