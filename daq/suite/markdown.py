@@ -1,6 +1,6 @@
 """The suite's report as Markdown: aims, tables, and every case that fell short."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from daq.suite.table import (
@@ -35,7 +35,7 @@ SHORTFALLS: tuple[tuple[str, Callable[[Scored], bool]], ...] = (
 """What a case can lack, and how to tell."""
 
 
-def report(result: Tables, scored: Sequence[Scored], total: int, version: str, core_hours: float) -> str:
+def report(result: Tables, scored: Sequence[Scored], total: int, versions: Mapping[str, int], core_hours: float) -> str:
     """The report, one Markdown document.
 
     Parameters
@@ -44,13 +44,14 @@ def report(result: Tables, scored: Sequence[Scored], total: int, version: str, c
         Every case that has been run, with its score.
     total
         Cases of the suite.
-    version
-        Of the code that decides the results.
+    versions
+        Of the code that decides the results, and how many cases are of each.
     core_hours
         Time that simulating and diagnosing took, summed over the cases, h.
     """
+    code = ", ".join(f"{version} ({count} cases)" for version, count in versions.items())
     head = (
-        f"{len(scored)} of {total} cases, {core_hours:.1f} core-hours, code {version}. "
+        f"{len(scored)} of {total} cases, {core_hours:.1f} core-hours, code {code}. "
         f"The aims are for {' and '.join(AIMED_AT)} strengths; a case fell short where the last table says so."
     )
     parts = ["# What a diagnosis finds of what is hidden", head]

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -74,7 +75,9 @@ def run_suite(options: Chosen, *, as_json: bool = False) -> Tables:
     scored, failed, missing = judged(cases, store)
     result = tables(scored, failed)
     document = summary(result, scored, failed, len(cases))
-    text = report(result, scored, len(cases), store.version, core_hours(scored, store))
+    records = [record for case, _ in scored if (record := store.get(case.key)) is not None]
+    versions = Counter(str(record["code"]) for record in records)
+    text = report(result, scored, len(cases), versions, core_hours(records))
     write(options.out, document, result, text)
     if as_json:
         sys.stdout.write(json.dumps(document) + "\n")
@@ -118,10 +121,9 @@ def summary(result: Tables, scored: Sequence[Scored], failed: Sequence[Case], to
     }
 
 
-def core_hours(scored: Sequence[Scored], store: Store) -> float:
-    """Time that the cases took, one after the other, h."""
-    records = (store.get(case.key) for case, _ in scored)
-    return sum(sum(record["seconds"].values()) for record in records if record is not None) / 3600.0
+def core_hours(records: Sequence[Record]) -> float:
+    """Time that some cases took, one after the other, h."""
+    return float(sum(sum(record["seconds"].values()) for record in records)) / 3600.0
 
 
 def write(out: Path, document: Record, result: Tables, report_text: str) -> None:

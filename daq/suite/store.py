@@ -78,7 +78,8 @@ class Store:
 
     def add(self, record: Record) -> None:
         """Append a result; it is on disk when this returns."""
-        line = json.dumps({**record, "code": self.version}) + "\n"
+        record = {**record, "code": self.version}
+        line = json.dumps(record) + "\n"
         with self._lock:
             self._records[record["key"]] = record
             self.path.parent.mkdir(parents=True, exist_ok=True)

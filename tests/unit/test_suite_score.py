@@ -225,8 +225,8 @@ def test_the_report_names_every_case_that_fell_short() -> None:
         ("named", "explained: joint_spring joint_2, 100% closed"),
         ("not seen", "no gap: joint_spring joint_2, 100% closed"),
     ]
-    text = report(tables(scored, []), scored, 20, "abc", 1.25)
-    assert "11 of 20 cases, 1.2 core-hours, code abc" in text
+    text = report(tables(scored, []), scored, 20, {"abc": 10, "def": 1}, 1.25)
+    assert "11 of 20 cases, 1.2 core-hours, code abc (10 cases), def (1 cases)" in text
     # Every table has as many columns in each row as in its heading.
     for table in text.split("\n\n"):
         rows = [line for line in table.splitlines() if line.startswith("|")]
