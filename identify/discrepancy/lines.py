@@ -64,13 +64,7 @@ class Line:
 
 def residuals(study: Study, stretches: Sequence[Stretch], theta: Array) -> list[Array]:
     """Torques less those of the model at the working rate, (N, n) each."""
-    model, found = study.model, []
-    for s in stretches:
-        predicted = model.inverse_dynamics(theta, s.measured.q, s.measured.qd, s.measured.qdd)
-        if model.terms:
-            predicted = predicted + study.terms(s, "measured", theta) @ theta[-model.e :]
-        found.append(s.torque - predicted)
-    return found
+    return [s.torque - study.torques(s, "measured", theta) for s in stretches]
 
 
 def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, lowest: float) -> Line | None:

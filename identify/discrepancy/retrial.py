@@ -105,7 +105,8 @@ def in_its_loop(fit: Fit, trial: Trial) -> Trial | None:
     robot = added(study.robot, trial)
     if candidate.effect.undo is not None:
         try:
-            moved = study.of_robot(robot)
+            # That of the fit has been simulated with its parameters, too: likenesses are compared at equal terms.
+            moved = study.of_robot(robot).resimulated(trial.beside)
         except DataError:
             return None
         if not moved.moves_more_like_the_arm_than(study, held=False):

@@ -113,7 +113,7 @@ def nearer(one: State, other: State, material: float) -> bool:
     """
     closer = one.study.moves_more_like_the_arm_than(other.study, held=True)
     if one.study.recorded != other.study.recorded:
-        return closer or _recorded_right(one, other, material)
+        return closer or _recorded_right(one, other, material) or _foretold(one, other, material)
     if _closer_at_measured_signals(one, other):
         return True
     if one.study.likeness_lost(other.study, range(one.study.robot.n), held=True) > 1.0 / ALIKE:
@@ -170,16 +170,48 @@ def _recorded_right(one: State, other: State, material: float) -> bool:
     return bool(enough and np.any(now < (1 - material) * was))
 
 
+def _foretold(one: State, other: State, material: float) -> bool:
+    """Whether a recording put right changes the predicted torques, at simulated motion, to where the held-out ones are.
+
+    Noise of the encoder makes noise of the torque through the controller, in step with it: where that is strong, errors
+    at measured signals speak for whatever takes torques out of step, and hide what a loop gains.
+    """
+    ours, theirs = one.study.recorded, other.study.recorded
+    more = tuple(stanza for stanza in ours if stanza not in theirs)
+    if any(stanza not in ours for stanza in theirs) or any(known(stanza.effect).rewires for stanza in more):
+        return False
+    if one.study.likeness_lost(other.study, range(one.study.robot.n), held=True) > 1.0 / ALIKE:
+        return False
+    study = other.study
+    before, after = [], []
+    for own, right in zip(study.held, one.study.held, strict=True):
+        there = replace(own, simulated=right.simulated, before=right.before)
+        seen, simulated = (
+            _put_right(study.torques(there, kind, other.fit.theta), study, more) for kind in ("measured", "simulated")
+        )
+        change = one.study.torques(right, "simulated", one.fit.theta) - simulated
+        error = right.torque - seen
+        before.append(study.decimation(error))
+        after.append(study.decimation(error - change))
+    was, now = (_whitened_power(errors, other.fit.noise) for errors in (before, after))
+    return bool(now.sum() < was.sum() and np.any(now < (1 - material) * was))
+
+
 def power_put_right(state: State, other: State) -> Array:
     """Squared norm of every joint's held-out errors, put right as the recordings of another state are, too, (n,)."""
     study = state.study
     late = tuple(stanza for stanza in other.study.recorded if not known(stanza.effect).rewires)
-    robot = study.robot.model_copy(update={"effects": late})
     total = np.zeros(study.robot.n)
     for e in residuals(study, study.held, state.fit.theta):
-        (done,) = put_right([Experiment(q=e, tau=e, q_ref=None, dt=study.dt)], robot)
-        total += np.sum(study.decimation(done.tau) ** 2, axis=0)
+        total += np.sum(study.decimation(_put_right(e, study, late)) ** 2, axis=0)
     return np.maximum(total, 1e-300)
+
+
+def _put_right(torque: Array, study: Study, stanzas: tuple[Stanza, ...]) -> Array:
+    """Torques (N, n) at the working rate as they are without what stanzas say of recordings."""
+    robot = study.robot.model_copy(update={"effects": stanzas})
+    (done,) = put_right([Experiment(q=torque, tau=torque, q_ref=None, dt=study.dt)], robot)
+    return done.tau
 
 
 def _change(before: State, after: State) -> list[Array]:

@@ -151,6 +151,12 @@ class Study:
         motion = self.motion(stretch, kind, theta)
         return self.model.term_regressor(motion)[motion.lead :]
 
+    def torques(self, stretch: Stretch, kind: str, theta: Array) -> Array:
+        """Torques (N, n) of the model along a stretch, terms included."""
+        signals: Derivatives = getattr(stretch, kind)
+        rigid = self.model.inverse_dynamics(theta, signals.q, signals.qd, signals.qdd)
+        return rigid + self.terms(stretch, kind, theta) @ theta[-self.model.e :] if self.model.e else rigid
+
     def resimulated(self, theta: Array) -> "Study":
         """The study with the motion that the closed loop makes with its model, terms included, at these parameters.
 
