@@ -124,7 +124,8 @@ def closed_share(case: Case, document: Document, healthy: Document) -> float | N
     """``(before^2 - after^2) / (before^2 - clean^2)`` of the held-out torque errors, over the joints concerned.
 
     Errors of the torques at measured motion, or of the simulated closed loop's, whichever shows the injected gap more
-    clearly: measured motion differentiated once more brings noise that a delay or an elastic joint does not have.
+    clearly. Measured motion differentiated once more brings noise that a delay or an elastic joint does not have: what
+    the findings change is taken at measured or at simulated motion, whichever leaves less.
     In N m or N: an arm that lost half its friction needs less torque, of which the same noise is a larger percentage.
     ``None`` where there is no gap to speak of, or where reported torques have another size than the healthy arm's.
     """
@@ -145,7 +146,8 @@ def _injected(case: Case, document: Document, healthy: Document) -> float:
 def _clearest(case: Case, document: Document, healthy: Document) -> "Powers":
     """Where the gap shows most."""
     views = [_at_measured_motion(case, document, healthy)]
-    if document.get("simulated") and healthy.get("simulated") and not case.baseline:
+    both = [(of.get("simulated") or {}).get("torque_before") for of in (document, healthy)]
+    if all(both) and not case.baseline:
         views.append(_of_the_simulated_loop(case, document, healthy))
     return max(views, key=lambda v: v[0] / max(v[2], 1e-300))
 
@@ -168,7 +170,12 @@ def _at_measured_motion(case: Case, document: Document, healthy: Document) -> Po
             (float(numbers[-1]["gap_after"]) * torque) ** 2,
             float(healthy["gap"]["validation"]["before"]["rms"][place]) ** 2,
         )
-    return power(validation["before"]), power(validation["after"]), power(healthy["gap"]["validation"]["before"])
+    after = power(validation["after"])
+    foretold = (document.get("simulated") or {}).get("torque_foretold")
+    if foretold is not None:
+        torques = _torques(document, "after")
+        after = min(after, sum((foretold[j] * torques[j]) ** 2 for j in _joints(case, foretold)))
+    return power(validation["before"]), after, power(healthy["gap"]["validation"]["before"])
 
 
 def _of_the_simulated_loop(case: Case, document: Document, healthy: Document) -> Powers:

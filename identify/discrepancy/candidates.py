@@ -12,12 +12,14 @@ from identify.catalogue.motion import Motion
 from identify.catalogue.registry import catalogue
 from identify.discrepancy.stretch import Stretch
 from identify.discrepancy.study import Study
-from identify.discrepancy.whitening import whitened
+from identify.discrepancy.whitening import joints_of, whitened
 from identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
 Shapes = tuple[tuple[str, float], ...]
 Key = tuple[str, int, int | None, Shapes, str, str]
+Kept = tuple[Array, bool]
+"""Columns of one stretch: (M, k) of the joint of their place and ``True``, or (M, n, k) of all joints and ``False``."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Workshop:
 
     study: Study
     theta: Array
-    kept: dict[Key, tuple[Array, ...]] = field(default_factory=dict)
+    kept: dict[Key, tuple[Kept, ...]] = field(default_factory=dict)
     _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
 
     def with_theta(self, study: Study, theta: Array) -> "Workshop":
@@ -114,24 +116,68 @@ class Workshop:
         keep
             Whether they may be asked for again.
         """
-        kind = "measured" if effect.sudden else kind
-        key = (effect.name, place.joint, place.other, shapes, part, kind)
-        if key in self.kept:
-            return self.kept[key]
-        made = tuple(self._filtered(effect, place, shapes, self.motion(s, kind)) for s in getattr(self.study, part))
-        if keep:
-            self.kept[key] = made
-        return made
+        (made,) = self._bands(effect, place, (shapes,), part, kind, keep=keep)
+        return tuple(self._of_all_joints(columns, place) for columns in made)
 
-    def _filtered(self, effect: Effect, place: Place, shapes: Shapes, motion: Motion) -> Array:
-        """Columns in the band of the comparison; joints that the effect leaves alone are not filtered."""
-        columns = effect.columns(motion, place, **dict(shapes))[motion.lead :]
-        if columns.ndim == 3:
+    def grid(
+        self, effect: Effect, place: Place, grid: Sequence[Shapes], noise: Sequence[ArModel], *, keep: bool = True
+    ) -> list[tuple[int, Array]]:
+        """Instruments of a whole grid, (R, G k) of every joint that they act on, by its number.
+
+        Whitened columns at the simulated signals of the training data, shape after shape.
+        """
+        made = self._bands(effect, place, grid, "train", "simulated", keep=keep)
+        stretches = range(len(self.study.train))
+        if made[0][0][1]:
+            own = [np.concatenate([columns[s][0] for columns in made], axis=1) for s in stretches]
+            return [(place.joint, np.concatenate([noise[place.joint].whiten(x) for x in own]))]
+        every = [np.concatenate([columns[s][0] for columns in made], axis=2) for s in stretches]
+        acts = sorted({j for x in every for j in joints_of(x)})
+        return [(j, np.concatenate([noise[j].whiten(x[:, j]) for x in every])) for j in acts]
+
+    def _bands(
+        self, effect: Effect, place: Place, grid: Sequence[Shapes], part: str, kind: str, *, keep: bool
+    ) -> list[tuple[Kept, ...]]:
+        """Columns of a grid in the band of the comparison, of every shape and every stretch."""
+        kind = "measured" if effect.sudden else kind
+
+        def key(shapes: Shapes) -> Key:
+            return (effect.name, place.joint, place.other, shapes, part, kind)
+
+        missing = [shapes for shapes in grid if key(shapes) not in self.kept]
+        stretches = [self._filtered(effect, place, missing, self.motion(s, kind)) for s in getattr(self.study, part)]
+        made = {key(shapes): tuple(own[g] for own in stretches) for g, shapes in enumerate(missing)}
+        if keep:
+            self.kept.update(made)
+        return [made[key(shapes)] if key(shapes) in made else self.kept[key(shapes)] for shapes in grid]
+
+    def _filtered(self, effect: Effect, place: Place, grid: Sequence[Shapes], motion: Motion) -> list[Kept]:
+        """Columns of one stretch in the band of the comparison, of every shape."""
+        made = [effect.columns(motion, place, **dict(shapes))[motion.lead :] for shapes in grid]
+        if not made or made[0].ndim == 3:
+            return [(self._decimated(columns), False) for columns in made]
+        # A filter is hardly slower for many columns than for one.
+        sizes = np.cumsum([columns.shape[1] for columns in made])[:-1]
+        band = self.study.decimation(np.concatenate(made, axis=1))
+        return [(columns, True) for columns in np.split(band, sizes, axis=1)]
+
+    def _decimated(self, columns: Array) -> Array:
+        """Columns (N, n, k) in the band; joints that they leave alone are not filtered."""
+        acts = joints_of(columns)
+        if len(acts) == columns.shape[1]:
             return self.study.decimation(columns)
-        own = self.study.decimation(columns)
-        # Joint by joint in memory, as it is whitened.
-        whole = np.zeros((motion.n, own.shape[0], own.shape[1]))
-        whole[place.joint] = own
+        filtered = self.study.decimation(columns[:, acts])
+        whole = np.zeros((filtered.shape[0], *columns.shape[1:]))
+        whole[:, acts] = filtered
+        return whole
+
+    def _of_all_joints(self, kept: Kept, place: Place) -> Array:
+        """Columns (M, n, k), joint by joint in memory, as they are whitened."""
+        columns, own = kept
+        if not own:
+            return columns
+        whole = np.zeros((self.study.robot.n, *columns.shape))
+        whole[place.joint] = columns
         return whole.transpose(1, 0, 2)
 
 

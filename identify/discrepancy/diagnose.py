@@ -72,7 +72,7 @@ class Diagnosis:
     left
         The same of the model with the findings.
     simulated
-        Errors of the simulated closed loop before and after, where it could be simulated.
+        Errors of the simulated closed loop before and after.
     """
 
     document: DiagnosisDocument
@@ -86,7 +86,7 @@ class Diagnosis:
     qd: Array
     where: tuple[Disagreement, ...]
     left: tuple[Disagreement, ...]
-    simulated: SimulatedErrors | None
+    simulated: SimulatedErrors
 
 
 def diagnose(
@@ -216,7 +216,7 @@ def _diagnose(
         warnings=[*notes, *study.warnings],
         not_visible=undetectable(first),
         could_hide=could_hide,
-        simulated=None if simulated is None else simulated.document(),
+        simulated=simulated.document(),
     )
     held = final.study.held
     return Diagnosis(

@@ -19,6 +19,7 @@ from identify.discrepancy.precision import standard_deviations
 from identify.discrepancy.regression import relative_errors
 from identify.discrepancy.retrial import in_loop_of
 from identify.discrepancy.search import Search
+from identify.discrepancy.simulated import foretold_errors
 from identify.discrepancy.stanzas import without
 from identify.discrepancy.state import State, nearer, power_put_right, with_values
 from identify.discrepancy.trial import CLOSE, Trial, judge
@@ -100,6 +101,7 @@ def _finding(
     # What is left is a share of the smaller residual that the finding leaves.
     explained = share / max(share + (1 - share) * remaining, 1e-300) if share > 0 else 0.0
     joint = place.joint
+    foretold_gap = float(foretold_errors(rest, final)[joint])
     return Finding(
         effect=effect.name,
         joint=stanza.joint,
@@ -121,6 +123,7 @@ def _finding(
             "p_value": None if mine is None else mine.p_value,
             "tests": rest.tests,
             "share_of_residual": share,
+            "gap_foretold": foretold_gap if np.isfinite(foretold_gap) else None,
             "std": std,
             "units": _units(effect, study.robot.joints[joint].type == "prismatic"),
             "confidence_with_equals": among * explained,

@@ -68,7 +68,7 @@ def _smallest(state: State, candidate: Candidate, shapes: Shapes, settings: Sett
             continue
         inflation = inflation_along(own, residual)
         spread = np.sqrt(size * inflation + fit.spread(own)) / size
-        reached = joints_reached(candidate, held_z[:, k : k + 1], own, rows)
+        reached = joints_reached(candidate, own, rows)
         powers = np.array([[float(of[r] @ of[r]) for of in (residual, own)] for r in reached])
         share = np.sqrt(settings.material * float(np.min(powers[:, 0] / np.maximum(powers[:, 1], 1e-300))))
         sizes[k] = max(train * std[k] * np.sqrt(inflation), held * spread, share)

@@ -11,7 +11,7 @@ from scipy import linalg
 
 from identify.discrepancy.stretch import Stretch
 from identify.discrepancy.study import Study
-from identify.discrepancy.whitening import ar_models, summed_backwards, whitened
+from identify.discrepancy.whitening import ar_models, rows_of_joints, summed_backwards, whitened
 from identify.estimators.filtering import filter_columns
 from identify.estimators.noise import ArModel
 from identify.estimators.regression import require_excitation
@@ -81,32 +81,48 @@ class Products:
 
     Parameters
     ----------
+    noise
+        That they are whitened by.
     rows
         ``[X, Z, y]`` of every joint's block, whitened.
+    parts
+        ``Z' [X, Z, y]`` of every joint's block.
     zx, zz, zy
         ``Z'X`` and ``Z'Z`` (b, b), ``Z'y`` (b,).
     """
 
+    noise: tuple[ArModel, ...]
     rows: tuple[Array, ...]
+    parts: tuple[Array, ...]
     zx: Array
     zz: Array
     zy: Array
 
     @classmethod
-    def of(cls, equations: Equations, noise: Sequence[ArModel]) -> "Products":
-        """Of the training rows under given noise models."""
+    def of(cls, equations: Equations, noise: Sequence[ArModel], known: "Products | None" = None) -> "Products":
+        """Of the training rows under given noise models.
+
+        Parameters
+        ----------
+        known
+            Products of the same equations: those of joints with the same noise model are taken from there.
+        """
         b = equations.train[0][0].shape[2]
         zx, zz, zy = np.zeros((b, b)), np.zeros((b, b)), np.zeros(b)
-        rows = []
-        for block, ar in zip(equations.blocks, noise, strict=True):
-            taps = np.append(1.0, ar.coefficients) / np.sqrt(ar.variance)
-            white = np.concatenate([filter_columns(taps, part) for part in block.parts])
-            through = white[:, block.x.size : -1].T @ white
+        rows, parts = [], []
+        for j, (block, ar) in enumerate(zip(equations.blocks, noise, strict=True)):
+            if known is not None and known.noise[j] is ar:
+                white, through = known.rows[j], known.parts[j]
+            else:
+                taps = np.append(1.0, ar.coefficients) / np.sqrt(ar.variance)
+                white = np.concatenate([filter_columns(taps, part) for part in block.parts])
+                through = white[:, block.x.size : -1].T @ white
             zx[np.ix_(block.z, block.x)] += through[:, : block.x.size]
             zz[np.ix_(block.z, block.z)] += through[:, block.x.size : -1]
             zy[block.z] += through[:, -1]
             rows.append(white)
-        return cls(tuple(rows), zx, zz, zy)
+            parts.append(through)
+        return cls(tuple(noise), tuple(rows), tuple(parts), zx, zz, zy)
 
     @cached_property
     def scale(self) -> Array:
@@ -147,12 +163,17 @@ class Fit:
 
     def renoised(self, noise: Sequence[ArModel]) -> "Fit":
         """The fit with other noise models; a given theta stays."""
-        return solved(self.study, self.equations, noise, self.theta if self.fixed else None)
+        return solved(self.study, self.equations, noise, self.theta if self.fixed else None, self.products)
 
     def errors(self, theta: Array, *, held: bool) -> list[Array]:
         """``y - X theta`` at measured signals in the band of the comparison, (M, n) of every stretch."""
         rows = self.equations.held if held else self.equations.train
         return [y - applied(x, theta) for x, _, y in rows]
+
+    @cached_property
+    def left(self) -> list[Array]:
+        """What the model leaves of the training rows, (M, n) of every stretch."""
+        return self.errors(self.theta, held=False)
 
     @cached_property
     def train(self) -> Rows:
@@ -170,7 +191,7 @@ class Fit:
     @cached_property
     def residual(self) -> Array:
         """Of the training rows, (R,)."""
-        return whitened(self.errors(self.theta, held=False), self.noise)
+        return whitened(self.left, self.noise)
 
     @cached_property
     def held_residual(self) -> Array:
@@ -221,16 +242,45 @@ class Fit:
             begin += rows.shape[0]
         return rest
 
-    def products_beside(self, instruments: Array) -> tuple[Array, Array]:
-        """``B'B`` (k, k) and ``B' residual`` (k,) of ``B = beside(instruments)``, without making it."""
-        gram, score = instruments.T @ instruments, instruments.T @ self.residual
+    def products_beside(self, columns: Sequence[tuple[int, Array]], count: int) -> tuple[Array, Array]:
+        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = beside(instruments)``, without making it.
+
+        Parameters
+        ----------
+        columns
+            Instruments (R, G k) of each joint that they act on, by its number, group after group.
+        count
+            G.
+        """
+        width = columns[0][1].shape[1]
+        x, z = np.zeros((2, self.theta.size, width))
+        gram, score = np.zeros((count, width // count, width // count)), np.zeros(width)
+        for joint, own in columns:
+            block, rows = self.equations.blocks[joint], self.products.rows[joint]
+            score += own.T @ self.residual[self.rows_of[joint]]
+            groups = own.reshape(own.shape[0], count, -1).transpose(1, 0, 2)
+            gram += groups.transpose(0, 2, 1) @ groups
+            if not self.fixed:
+                through = rows[:, :-1].T @ own
+                x[block.x] += through[: block.x.size]
+                z[block.z] += through[block.x.size :]
         if self.fixed:
-            return gram, score
-        x, z = self._through(instruments)
+            return gram, score.reshape(count, -1)
         inside = self._inside(x)
-        both = inside.T @ z
+
+        def products(right: Array) -> Array:
+            grouped = (part.reshape(self.theta.size, count, -1).transpose(1, 0, 2) for part in (inside, right))
+            left, other = grouped
+            return left.transpose(0, 2, 1) @ other
+
         # The residual has nothing along the model's own instruments.
-        return gram - both - both.T + inside.T @ self.products.zz @ inside, score
+        both = products(z)
+        return gram - both - both.transpose(0, 2, 1) + products(self.products.zz @ inside), score.reshape(count, -1)
+
+    @cached_property
+    def rows_of(self) -> list[slice]:
+        """Where the whitened training rows of each joint are."""
+        return rows_of_joints([y.shape[0] for _, _, y in self.equations.train], self.noise)
 
     @cached_property
     def covariance(self) -> Array:
@@ -278,9 +328,21 @@ def fit(study: Study, theta0: Array | None = None) -> Fit:
     return found
 
 
-def solved(study: Study, equations: Equations, noise: Sequence[ArModel], theta: Array | None = None) -> Fit:
-    """Parameters by instrumental variables under given noise models; a given ``theta`` is kept as it is."""
-    products = Products.of(equations, noise)
+def solved(
+    study: Study,
+    equations: Equations,
+    noise: Sequence[ArModel],
+    theta: Array | None = None,
+    known: Products | None = None,
+) -> Fit:
+    """Parameters by instrumental variables under given noise models; a given ``theta`` is kept as it is.
+
+    Parameters
+    ----------
+    known
+        Products of the same equations under other noise models.
+    """
+    products = Products.of(equations, noise, known)
     if theta is not None:
         return Fit(study, theta, tuple(noise), equations, products, fixed=True)
     estimate = linalg.lu_solve(products.solver, products.zy / products.scale) / products.scale
@@ -323,7 +385,7 @@ def applied(columns: Array, values: Array) -> Array:
     return product
 
 
-def noise_models(errors: Sequence[Array], parameters: int, order: int) -> list[ArModel]:
+def noise_models(errors: Sequence[Array], parameters: float, order: int) -> list[ArModel]:
     """AR model of each joint's residual (6.21 to 6.25), its variance corrected for the parameters estimated."""
     free = 1 - parameters / sum(e.size for e in errors)
     return [ArModel(ar.coefficients, ar.variance / free, ar.aic) for ar in ar_models(errors, order)]

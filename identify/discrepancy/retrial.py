@@ -28,6 +28,9 @@ SECOND_LOOKS = 2
 SUSPECT = 20.0
 """Score that makes it worth while: what passes has about ten, without merit there is hardly any."""
 
+NEAR = 0.5
+"""Score over that of the best one at the same joint from which on two are rivals."""
+
 APART = 0.9
 """Values of a nonlinear parameter that differ by less are one."""
 
@@ -40,6 +43,20 @@ def suspects(failed: Sequence[Trial], no_accident: Sequence[Trial]) -> list[Tria
     able = [t for t in failed if t.candidate.effect.predicts and not t.candidate.effect.sudden and not t.forbidden]
     doubtful = (t for t in able if t.score > SUSPECT or any(t is other for other in no_accident))
     return sorted(doubtful, key=lambda t: -t.score)[:SECOND_LOOKS]
+
+
+def rivals(passing: Sequence[Trial]) -> list[Trial]:
+    """Trials that pass at one joint and are near each other, the best of each joint first.
+
+    Each may have the better of the others in the loop that it makes: a torque that comes late looks like a joint that
+    yields where the arm is simulated with neither.
+    """
+    found: list[Trial] = []
+    for joint in dict.fromkeys(t.candidate.place.joint for t in passing):
+        here = [t for t in passing if t.candidate.place.joint == joint and not t.candidate.effect.sudden]
+        near = [t for t in here if t.score > NEAR * here[0].score]
+        found += near[: SECOND_LOOKS + 1] if len(near) > 1 else []
+    return found
 
 
 def at_measured_signals(

@@ -10,7 +10,14 @@ from configs import DataError, RobotConfig
 from identify.discrepancy.candidates import Workshop, candidates
 from identify.discrepancy.excess import excesses
 from identify.discrepancy.polishing import polished
-from identify.discrepancy.retrial import SUSPECT, at_measured_signals, in_its_loop, in_one_of_their_loops, suspects
+from identify.discrepancy.retrial import (
+    SUSPECT,
+    at_measured_signals,
+    in_its_loop,
+    in_one_of_their_loops,
+    rivals,
+    suspects,
+)
 from identify.discrepancy.screening import shortlist
 from identify.discrepancy.stanzas import added, completed, stanza_number, valued, without
 from identify.discrepancy.state import (
@@ -114,6 +121,10 @@ class Search:
             again = in_one_of_their_loops(state.fit, trials)
             if again is not None:
                 second[again.candidate.key] = _settled(state, again)
+        for trial in rivals(passing):
+            own = in_its_loop(state.fit, trial)
+            if own is not None and own.score > trial.score and not own.forbidden:
+                second[own.candidate.key] = own
         known = {t.candidate.key: t for t in state.trials} | second
         return replace(state, trials=_ranked(list(known.values())))
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from identify.discrepancy.foretold import foretold
 from identify.discrepancy.state import State
 from identify.estimators.auxiliary import AuxiliaryModel
 from identify.preparation import aligned_torque
@@ -15,28 +16,45 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SimulatedErrors:
-    """Errors of simulated velocities and torques on the held-out data, percent of the measured ones, (n,) each."""
+    """Errors of simulated velocities and torques on the held-out data, percent of the measured ones, (n,) each.
+
+    ``torque_foretold`` is the error at measured motion less what the findings change of the torque at simulated motion,
+    see `identify.discrepancy.foretold`. Not a number where a loop diverges, or that cannot be said.
+    """
 
     joints: tuple[str, ...]
     velocity_before: Array
     velocity_after: Array
     torque_before: Array
     torque_after: Array
+    torque_foretold: Array
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> dict[str, Any] | None:
         """As it stands in ``diagnosis.json``."""
-        return {
-            name: dict(zip(self.joints, (float(v) for v in getattr(self, name)), strict=True))
-            for name in ("velocity_before", "velocity_after", "torque_before", "torque_after")
-        }
+        names = ("velocity_before", "velocity_after", "torque_before", "torque_after", "torque_foretold")
+        told = {name: getattr(self, name) for name in names if np.isfinite(getattr(self, name)).all()}
+        return {name: dict(zip(self.joints, map(float, values), strict=True)) for name, values in told.items()} or None
 
 
-def simulated_errors(first: State, final: State) -> SimulatedErrors | None:
-    """Simulate the references with both models; ``None`` where a loop diverges or there is nothing to simulate."""
+def simulated_errors(first: State, final: State) -> SimulatedErrors:
+    """Simulate the references with both models."""
     before, after = _errors(first), _errors(final)
     if before is None or after is None:
-        return None
-    return SimulatedErrors(tuple(first.study.joints), before[0], after[0], before[1], after[1])
+        unknown = np.full(first.study.robot.n, np.nan)
+        before = after = unknown, unknown
+    return SimulatedErrors(
+        tuple(first.study.joints), before[0], after[0], before[1], after[1], foretold_errors(first, final)
+    )
+
+
+def foretold_errors(first: State, final: State) -> Array:
+    """Held-out torque errors of a model less what another one changes at simulated motion, percent, (n,); or nan."""
+    found = foretold(first.study, first.fit.theta, final.study, final.fit.theta)
+    if found is None:
+        return np.full(first.study.robot.n, np.nan)
+    left, torque = (np.concatenate(part) for part in (found.after, [s.y for s in final.study.held]))
+    shares = np.linalg.norm(left, axis=0) / np.maximum(np.linalg.norm(torque, axis=0), 1e-300)
+    return np.asarray(100 * shares)
 
 
 def _errors(state: State) -> tuple[Array, Array] | None:

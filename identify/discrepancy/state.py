@@ -9,10 +9,10 @@ from scipy import stats
 
 from configs import RobotConfig
 from configs.robot import Effect as Stanza
-from identify.catalogue.recorded import put_right
 from identify.catalogue.registry import known
 from identify.catalogue.terms import Term
 from identify.discrepancy.candidates import Workshop
+from identify.discrepancy.foretold import foretold, torque_put_right
 from identify.discrepancy.lines import residuals
 from identify.discrepancy.regression import Fit, applied, fit, regressors
 from identify.discrepancy.stanzas import stanza_number
@@ -20,7 +20,6 @@ from identify.discrepancy.study import Study
 from identify.discrepancy.trial import Trial
 from identify.discrepancy.whitening import rows_of_joints, whitened
 from identify.estimators.noise import ArModel
-from identify.experiment import Experiment
 from identify.model.arm import ArmModel
 
 Array = NDArray[np.float64]
@@ -176,24 +175,12 @@ def _foretold(one: State, other: State, material: float) -> bool:
     Noise of the encoder makes noise of the torque through the controller, in step with it: where that is strong, errors
     at measured signals speak for whatever takes torques out of step, and hide what a loop gains.
     """
-    ours, theirs = one.study.recorded, other.study.recorded
-    more = tuple(stanza for stanza in ours if stanza not in theirs)
-    if any(stanza not in ours for stanza in theirs) or any(known(stanza.effect).rewires for stanza in more):
-        return False
     if one.study.likeness_lost(other.study, range(one.study.robot.n), held=True) > 1.0 / ALIKE:
         return False
-    study = other.study
-    before, after = [], []
-    for own, right in zip(study.held, one.study.held, strict=True):
-        there = replace(own, simulated=right.simulated, before=right.before)
-        seen, simulated = (
-            _put_right(study.torques(there, kind, other.fit.theta), study, more) for kind in ("measured", "simulated")
-        )
-        change = one.study.torques(right, "simulated", one.fit.theta) - simulated
-        error = right.torque - seen
-        before.append(study.decimation(error))
-        after.append(study.decimation(error - change))
-    was, now = (_whitened_power(errors, other.fit.noise) for errors in (before, after))
+    found = foretold(other.study, other.fit.theta, one.study, one.fit.theta)
+    if found is None:
+        return False
+    was, now = (_whitened_power(errors, other.fit.noise) for errors in (found.before, found.after))
     return bool(now.sum() < was.sum() and np.any(now < (1 - material) * was))
 
 
@@ -203,15 +190,8 @@ def power_put_right(state: State, other: State) -> Array:
     late = tuple(stanza for stanza in other.study.recorded if not known(stanza.effect).rewires)
     total = np.zeros(study.robot.n)
     for e in residuals(study, study.held, state.fit.theta):
-        total += np.sum(study.decimation(_put_right(e, study, late)) ** 2, axis=0)
+        total += np.sum(study.decimation(torque_put_right(e, study, late)) ** 2, axis=0)
     return np.maximum(total, 1e-300)
-
-
-def _put_right(torque: Array, study: Study, stanzas: tuple[Stanza, ...]) -> Array:
-    """Torques (N, n) at the working rate as they are without what stanzas say of recordings."""
-    robot = study.robot.model_copy(update={"effects": stanzas})
-    (done,) = put_right([Experiment(q=torque, tau=torque, q_ref=None, dt=study.dt)], robot)
-    return done.tau
 
 
 def _change(before: State, after: State) -> list[Array]:

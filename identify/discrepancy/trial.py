@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from identify.discrepancy.candidates import Candidate, Columns, Shapes, Workshop
-from identify.discrepancy.regression import MAX_AR_ORDER, Fit, noise_models
-from identify.discrepancy.whitening import rows_of_joints
+from identify.discrepancy.regression import MAX_AR_ORDER, Fit, applied, noise_models
+from identify.discrepancy.whitening import joints_of, rows_of_joints
 from identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
@@ -25,6 +25,8 @@ RANK_TOLERANCE = 1e-3
 """Columns that the model nearly contains (relative norm left beside it) cannot be tested."""
 ALONE = 1e-2
 """Part of a column in the directions beside the model below which the model contains it."""
+UNCHANGED = 1e-3
+"""Power of a change over that of the errors up to which their noise model stays."""
 CALM_PASSES = 2
 """Between a candidate's parameters and the noise models that go with it, from calm ones."""
 REFINEMENTS = 12
@@ -55,8 +57,8 @@ class Trial:
     beside
         The model's own parameters with it, (b,).
     share
-        Share of the whitened held-out residual's power that the change takes away at a joint: at that of the joints the
-        candidate acts on where it is largest; of what leaps, at the joint that it changes most.
+        Share of the whitened held-out residual's power that the change takes away at a joint: where it is largest; of
+        what leaps, at the joint that it changes most.
     score
         Gain in log-likelihood over both parts, less what fitting alone gains on the training part.
     contained
@@ -122,29 +124,52 @@ def best_trial(fit: Fit, candidate: Candidate, workshop: Workshop) -> Trial | No
 
 def screened(fit: Fit, candidate: Candidate, workshop: Workshop) -> tuple[float, Shapes] | None:
     """Score statistic of a candidate at the shapes of its grid that fit the training data best, and these shapes."""
-    best: tuple[float, Shapes] | None = None
-    for shapes in candidate.grid:
-        # Columns that go with theta are of no use to the next model, and a grid of them is large.
-        keep = not candidate.effect.predicts
-        columns = workshop.instruments(candidate.effect, candidate.place, shapes, fit.noise, keep=keep)
-        statistic = score_statistic(fit, columns)
-        if statistic is not None and (best is None or statistic > best[0]):
-            best = statistic, shapes
-    return best
-
-
-def score_statistic(fit: Fit, instruments: Array) -> float | None:
-    """Power of the training residual along instruments (R, k) beside the model's own; ``None`` if nothing is left."""
-    scale = np.linalg.norm(instruments, axis=0)
-    if np.any(scale == 0) or not np.isfinite(scale).all():
+    if not candidate.grid:
         return None
-    gram, score = fit.products_beside(instruments / scale)
+    # Columns that go with theta are of no use to the next model, and a grid of them is large.
+    keep = not candidate.effect.predicts
+    columns = workshop.grid(candidate.effect, candidate.place, candidate.grid, fit.noise, keep=keep)
+    statistics = score_statistics(fit, columns, len(candidate.grid))
+    if np.isnan(statistics).all():
+        return None
+    best = int(np.nanargmax(statistics))
+    return float(statistics[best]), candidate.grid[best]
+
+
+def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int) -> Array:
+    """Power of the training residual along groups of instruments beside the model's own, (G,).
+
+    Parameters
+    ----------
+    columns
+        Whitened instruments (R, G k) of each joint that they act on, by its number, group after group.
+    count
+        G.
+
+    Returns
+    -------
+    ndarray
+        Not a number where nothing is left of a group.
+    """
+    if not columns:
+        return np.full(count, np.nan)
+    size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
+    able = np.isfinite(size) & (size > 0.0)
+    scale = np.where(able, size, np.inf)
+    scaled = [(j, np.where(able, own, 0.0) / scale) for j, own in columns]
+    gram, score = fit.products_beside(scaled, count)
     power, right = np.linalg.eigh(gram)
     kept = power > RANK_TOLERANCE**2
-    if not kept.any():
-        return None
-    along = right[:, kept].T @ score
-    return float(np.sum(along**2 / power[kept]))
+    along = np.einsum("gij,gi->gj", right, score)
+    statistics = np.sum(np.where(kept, along**2 / np.where(kept, power, 1.0), 0.0), axis=1)
+    usable = able.reshape(count, -1).all(axis=1) & kept.any(axis=1)
+    return np.where(usable, statistics, np.nan)
+
+
+def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]]) -> float | None:
+    """The same of one group of instruments; ``None`` if nothing is left of it."""
+    found = float(score_statistics(fit, columns, 1)[0])
+    return None if np.isnan(found) else found
 
 
 def judge(
@@ -195,7 +220,7 @@ def _judged(
     variance = size * inflation + fit.spread(change)
     gain = float(before @ before - after @ after)
     joints = rows_of_joints([s.y.shape[0] for s in fit.study.held], fit.noise)
-    reached = joints_reached(candidate, columns.held_z, change, joints)
+    reached = joints_reached(candidate, change, joints)
     share = max(1.0 - float(after[r] @ after[r]) / max(float(before[r] @ before[r]), 1e-300) for r in reached)
     fitted = 0.5 * (values.size + len(shapes))
     supported = 0.5 * (statistic + gain)
@@ -227,32 +252,30 @@ def deviations(fit: Fit, columns: Columns) -> Array | None:
     return None if solution is None else np.where(solution[1] == 0.0, 0.0, solution[2])
 
 
-def joints_reached(candidate: Candidate, columns: Array, change: Array, joints: Sequence[slice]) -> list[slice]:
+def joints_reached(candidate: Candidate, change: Array, joints: Sequence[slice]) -> list[slice]:
     """Rows of the joints at which an effect may show that it is worth a finding.
 
-    Those that it acts on: a link on a spring stirs the joint before it more than its own. Leaps, which are their own
-    instruments, have to show at the joint that they change most.
+    All of them: a link on a spring stirs the joint before it more than its own, and the model's own parameters may have
+    made a compromise at other joints. Leaps, which are their own instruments, have to show at the joint that they
+    change most.
 
     Parameters
     ----------
-    columns
-        Held-out columns of the candidate, (R, k).
     change
         Of the held-out prediction, the model's own parameters included, (R,).
     joints
         Rows of every joint.
     """
-    most = max(joints, key=lambda rows: float(change[rows] @ change[rows]))
     if candidate.effect.sudden:
-        return [most]
-    return [rows for rows in joints if columns[rows].any()] or [most]
+        return [max(joints, key=lambda rows: float(change[rows] @ change[rows]))]
+    return list(joints)
 
 
 def _calmed(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, calm: Sequence[ArModel]) -> Fit:
     """The fit with calm noise models at the joints that a candidate acts on."""
-    columns = np.concatenate(workshop.band(candidate.effect, candidate.place, shapes, "train", "simulated"))
-    acts = [bool(np.any(columns[:, j])) for j in range(columns.shape[1])]
-    return fit.renoised([c if there else own for c, own, there in zip(calm, fit.noise, acts, strict=True)])
+    columns = workshop.band(candidate.effect, candidate.place, shapes, "train", "simulated")
+    acts = {j for c in columns for j in joints_of(c)}
+    return fit.renoised([calm[j] if j in acts else own for j, own in enumerate(fit.noise)])
 
 
 def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) -> tuple[Array, Array] | None:
@@ -267,11 +290,19 @@ def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Work
 def noise_with(
     fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, values: Array, away: Array
 ) -> list[ArModel]:
-    """Noise models of what is left of the training data with a candidate in the model."""
+    """Noise models of what is left of the training data with a candidate in the model.
+
+    Joints whose errors hardly change keep theirs.
+    """
     columns = workshop.band(candidate.effect, candidate.place, shapes, "train", "measured")
-    left = fit.errors(fit.theta - away, held=False)
-    errors = [e - c @ values for e, c in zip(left, columns, strict=True)]
-    return noise_models(errors, fit.theta.size + values.size, MAX_AR_ORDER)
+    change = [applied(c, values) - applied(x, away) for (x, _, _), c in zip(fit.equations.train, columns, strict=True)]
+    power, changed = (sum(np.einsum("mj,mj->j", part, part) for part in parts) for parts in (fit.left, change))
+    other = np.flatnonzero(np.asarray(changed > UNCHANGED * power))
+    left = [(e - c)[:, other] for e, c in zip(fit.left, change, strict=True)]
+    # Each joint bears its part of the parameters.
+    parameters = (fit.theta.size + values.size) * other.size / len(fit.noise)
+    own = dict(zip(other.tolist(), noise_models(left, parameters, MAX_AR_ORDER), strict=True)) if other.size else {}
+    return [own.get(j, kept) for j, kept in enumerate(fit.noise)]
 
 
 def _values(fit: Fit, columns: Columns) -> tuple[float, Array, Array] | None:
@@ -324,7 +355,7 @@ def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[floa
         def loss(logarithm: float, start: Shapes = start, k: int = k) -> float:
             shapes = replaced(start, k, float(np.exp(logarithm)))
             statistic = score_statistic(
-                fit, workshop.instruments(candidate.effect, candidate.place, shapes, fit.noise, keep=False)
+                fit, workshop.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
             )
             return 0.0 if statistic is None else -statistic
 

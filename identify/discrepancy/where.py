@@ -320,8 +320,7 @@ def _passing(fit: Fit, tried: Sequence[Map], workshop: Workshop, level: float) -
     looks: dict[int, list[tuple[float, Map]]] = {}
     for m in tried:
         effect = m.effect()
-        instruments = workshop.instruments(effect, Place(m.joint), (), calm.noise, keep=False)
-        statistic = score_statistic(calm, instruments)
+        statistic = score_statistic(calm, workshop.grid(effect, Place(m.joint), ((),), calm.noise, keep=False))
         if statistic is None:
             continue
         p = float(stats.chi2.sf(statistic, len(effect.linear)))

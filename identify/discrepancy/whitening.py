@@ -44,14 +44,20 @@ def whitened(values: Sequence[Array], noise: Sequence[ArModel]) -> Array:
     """Stack (M, n) or (M, n, k) joint by joint, each joint whitened by its noise model."""
     lengths = [[value.shape[0] - ar.order for value in values] for ar in noise]
     out = np.zeros((sum(map(sum, lengths)), *values[0].shape[2:]))
+    acts = [range(len(noise)) if value.ndim == 2 else joints_of(value) for value in values]
     begin = 0
     for j, (ar, sizes) in enumerate(zip(noise, lengths, strict=True)):
-        for value, size in zip(values, sizes, strict=True):
+        for value, there, size in zip(values, acts, sizes, strict=True):
             # What acts on one joint is zero at all others.
-            if value[:, j].any():
+            if j in there:
                 out[begin : begin + size] = ar.whiten(value[:, j])
             begin += size
     return out
+
+
+def joints_of(columns: Array) -> list[int]:
+    """Numbers of the joints at which columns (M, n, k) are not all zero."""
+    return [int(j) for j in np.flatnonzero(_acting(columns))]
 
 
 def rows_of_joints(lengths: Sequence[int], noise: Sequence[ArModel]) -> list[slice]:
@@ -79,6 +85,20 @@ def summed_backwards(direction: Array, noise: Sequence[ArModel], lengths: Sequen
             weight[:, j] = np.convolve(direction[begin : begin + size], backwards)
             begin += size
     return weights
+
+
+@compiled
+def _acting(columns: Array) -> NDArray[np.bool_]:
+    acting = np.zeros(columns.shape[1], np.bool_)
+    for j in range(columns.shape[1]):
+        for m in range(columns.shape[0]):
+            for k in range(columns.shape[2]):
+                if columns[m, j, k] != 0.0:
+                    acting[j] = True
+                    break
+            if acting[j]:
+                break
+    return acting
 
 
 @compiled

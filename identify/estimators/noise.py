@@ -160,12 +160,21 @@ def _lagged_sums(x: NDArray[np.float64], max_lag: int, first: int) -> NDArray[np
     return sums
 
 
+PIECE = 2048
+"""Numbers that are filtered at a time."""
+
+
 @compiled
 def _convolve(x: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-    order = coefficients.size
+    order, width = coefficients.size, x.shape[1]
     out = x[order:].copy()
-    for k in range(out.shape[0]):
+    # Row after row in memory, a sample earlier is a row before: one long sum for each coefficient, in pieces that stay
+    # in the cache.
+    late, early = out.ravel(), x.ravel()
+    for begin in range(0, late.size, PIECE):
+        piece = late[begin : begin + PIECE]
         for i in range(order):
-            for c in range(x.shape[1]):
-                out[k, c] += coefficients[i] * x[k + order - 1 - i, c]
+            c, before = coefficients[i], early[begin + (order - 1 - i) * width :]
+            for m in range(piece.size):
+                piece[m] += c * before[m]
     return out

@@ -23,6 +23,8 @@ CERTAIN, LIKELY = 0.95, 0.6
 """Confidence from which a finding is called certain, and likely."""
 BINS, FILLED = 14, 5
 """Bins of a variable, and the fewest samples of one that is drawn."""
+NOISELESS = 0.98
+"""Torque error without the noise of measured derivatives, over that with it, from which down it is told, too."""
 SHOWN = 700
 """Most samples of one curve: more would be a band of ink."""
 FOLLOWS = 0.6
@@ -47,6 +49,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
                 "where": finding.joint if finding.other is None else f"{finding.joint} and {finding.other}",
                 "sure": certainty(finding),
                 "closed": closed_share(finding, document),
+                "noisy": (finding.evidence.get("gap_foretold") or np.inf) < NOISELESS * finding.gap_after,
                 "rows": _rows(finding),
                 "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking),
             }
@@ -83,12 +86,18 @@ def certainty(finding: Finding) -> str:
 
 
 def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:
-    """Share of the joint's held-out gap above the noise floor that a finding closes; ``None`` if there is no gap."""
-    floor = document.noise_floor.by_joint[finding.joint]
+    """Share of the joint's held-out gap above the noise floor that a finding closes; ``None`` if there is no gap.
+
+    At measured motion, or with what it changes at simulated motion, where that leaves less: noise that derivatives of
+    measured positions bring is no fault of the model.
+    """
+    foretold = finding.evidence.get("gap_foretold")
+    after = finding.gap_after if foretold is None else min(finding.gap_after, foretold)
+    floor = min(document.noise_floor.by_joint[finding.joint], after)
     gap = finding.gap_before**2 - floor**2
     if gap <= 0:
         return None
-    return float(np.clip((finding.gap_before**2 - finding.gap_after**2) / gap, 0.0, 1.0))
+    return float(np.clip((finding.gap_before**2 - after**2) / gap, 0.0, 1.0))
 
 
 def _rows(finding: Finding) -> list[tuple[str, float, float | None, str]]:

@@ -45,6 +45,17 @@ def test_a_late_torque_of_joint_2_is_found_in_the_loop_that_it_makes(tmp_path: P
     assert told["verdict"] == "explained"
 
 
+@pytest.mark.parametrize("run", [3, 5])
+def test_a_late_torque_is_no_friction_that_yields_where_noise_hides_what_the_loop_gains(
+    run: int, tmp_path: Path
+) -> None:
+    """Put right, the torque has more error at measured signals: there it is in step with the noise of the encoder."""
+    told, hidden = diagnosed(f"effect time_delay joint_3 typical tx40 run {run}", tmp_path)
+    found = told["findings"][0]
+    assert (found["effect"], found["joint"]) == ("time_delay", "joint_3")
+    assert abs(found["parameters"]["delay"] - hidden["delay"]) < 3.0 * found["evidence"]["std"]["delay"]
+
+
 @pytest.mark.parametrize("run", [1, 4])
 def test_a_link_that_swings_beyond_the_bandwidth_is_found_where_measured_positions_bring_more_noise(
     run: int, tmp_path: Path
@@ -56,6 +67,9 @@ def test_a_link_that_swings_beyond_the_bandwidth_is_found_where_measured_positio
     assert 0.5 < found["parameters"]["compliance"] / hidden["compliance"] < 2.0
     errors = told["gap"]["validation"]
     assert errors["after"]["all"] > errors["before"]["all"]  # what makes it hard
+    # Without the noise of the derivatives it is nearer, and that is what is said of it.
+    assert found["evidence"]["gap_foretold"] < 0.97 * found["gap_before"]
+    assert told["simulated"]["torque_foretold"]["joint_1"] == pytest.approx(found["evidence"]["gap_foretold"])
 
 
 @pytest.mark.parametrize("run", [2, 5])

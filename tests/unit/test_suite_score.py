@@ -146,6 +146,18 @@ def test_the_gap_is_looked_at_where_it_shows() -> None:
     assert closed_share(case(SPRING), seen, healthy) == pytest.approx(0.0)
 
 
+def test_what_findings_change_counts_without_the_noise_of_measured_derivatives() -> None:
+    """An elastic joint: measured motion differentiated four times makes the right model's error larger."""
+    found = record(finding("joint_spring", "joint_2"), before=10.0, after=11.0)["document"]
+    assert (closed_share(case(SPRING), found, HEALTHY["document"]) or 0.0) < 0.0
+    found["simulated"] = {"torque_foretold": {f"joint_{k}": 8.0 for k in range(1, 7)}}
+    assert closed_share(case(SPRING), found, HEALTHY["document"]) == pytest.approx(1.0)
+    # Where it is measured motion that leaves less, that counts.
+    found["gap"] = record(before=10.0, after=82.0**0.5)["document"]["gap"]
+    found["simulated"]["torque_foretold"]["joint_2"] = 9.5
+    assert closed_share(case(SPRING), found, HEALTHY["document"]) == pytest.approx(0.5)
+
+
 def test_what_an_effect_brings_with_it_is_no_mistake() -> None:
     bristle = replace(SPRING, brings=("presliding_friction",))
     found = record(finding("joint_spring", "joint_2"), finding("presliding_friction", "joint_2"))
