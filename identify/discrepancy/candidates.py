@@ -153,13 +153,20 @@ class Workshop:
 
     def _filtered(self, effect: Effect, place: Place, grid: Sequence[Shapes], motion: Motion) -> list[Kept]:
         """Columns of one stretch in the band of the comparison, of every shape."""
-        made = [effect.columns(motion, place, **dict(shapes))[motion.lead :] for shapes in grid]
-        if not made or made[0].ndim == 3:
-            return [(self._decimated(columns), False) for columns in made]
-        # A filter is hardly slower for many columns than for one.
-        sizes = np.cumsum([columns.shape[1] for columns in made])[:-1]
-        band = self.study.decimation(np.concatenate(made, axis=1))
-        return [(columns, True) for columns in np.split(band, sizes, axis=1)]
+        narrow: list[Array] = []
+        out: list[Kept] = []
+        for shapes in grid:
+            columns = effect.columns(motion, place, **dict(shapes))[motion.lead :]
+            if columns.ndim == 3:
+                out.append((self._decimated(columns), False))
+            else:
+                narrow.append(columns)
+        if narrow:
+            # A filter is hardly slower for many columns than for one.
+            sizes = np.cumsum([columns.shape[1] for columns in narrow])[:-1]
+            band = self.study.decimation(np.concatenate(narrow, axis=1))
+            out += [(columns, True) for columns in np.split(band, sizes, axis=1)]
+        return out
 
     def _decimated(self, columns: Array) -> Array:
         """Columns (N, n, k) in the band; joints that they leave alone are not filtered."""
