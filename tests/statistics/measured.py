@@ -147,9 +147,12 @@ def said(found: Diagnosis) -> list[str]:
     document = found.document
     gap = document.gap.validation
     lines = [f"{document.verdict}; held-out error {gap.before.all:.2f} -> {gap.after.all:.2f} %"]
-    if found.simulated is not None:
-        torque = found.simulated.torque_before, found.simulated.torque_after
+    torque = found.simulated.torque_before, found.simulated.torque_after
+    if np.isfinite(torque).all():
         lines.append("torques of the simulated loop, error by joint " + " -> ".join(_each(t) for t in torque) + " %")
+    lines.append(
+        "held-out error with what is changed at simulated motion " + _each(found.simulated.torque_foretold) + " %"
+    )
     for f in document.findings:
         where = f.joint if f.other is None else f"{f.joint} and {f.other}"
         values = ", ".join(
