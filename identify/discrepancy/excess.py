@@ -33,6 +33,9 @@ HEADROOM = 4.0
 MATERIAL = 0.05
 """Share of a joint's residual power that must not be noise for it to be a gap."""
 
+TOGETHER = 1 / 3
+"""Part of the chance of a false alarm that is for all joints together."""
+
 SPREAD = 1.5
 """Neighbouring frequencies under a Hann window that count as one."""
 
@@ -71,15 +74,21 @@ def excesses(fit: Fit, alpha: float = 0.01) -> list[Excess]:
     One criterion for every robot: at the frequencies of the motion, octave by octave, power over that of noise has an
     F-distribution if the residual is noise, and the octaves of a joint are combined by Fisher's method. A joint is
     among them if chance makes it so strong with a probability under ``alpha`` over all joints, and at least `MATERIAL`
-    of the residual's power is more than noise.
+    of the residual's power is more than noise. Of several joints a third of ``alpha`` is for what shows at none of them
+    alone (a base that shakes): the joints are combined likewise, and the one that is least like noise stands for all.
 
     Parameters
     ----------
     alpha
         Chance of a false alarm over all joints.
     """
-    every = (excess_of(fit, j, own) for j, own in enumerate(pieces(fit)))
-    return [e for e in every if e is not None and e.p_value < alpha / fit.study.robot.n and e.share >= MATERIAL]
+    looks = (excess_of(fit, j, own) for j, own in enumerate(pieces(fit)))
+    every = [e for e in looks if e is not None]
+    one, several = (1.0 - TOGETHER, TOGETHER) if len(every) > 1 else (1.0, 0.0)
+    material = sorted((e for e in every if e.share >= MATERIAL), key=lambda e: e.p_value)
+    alone = [e for e in material if e.p_value < one * alpha / fit.study.robot.n]
+    together = float(stats.combine_pvalues([e.p_value for e in every]).pvalue) if every else 1.0
+    return sorted(alone or (material[:1] if together < several * alpha else []), key=lambda e: e.joint)
 
 
 def excess_of(fit: Fit, joint: int, pieces: Pieces) -> Excess | None:

@@ -21,7 +21,8 @@ from identify.discrepancy.retrial import in_loop_of
 from identify.discrepancy.search import Search
 from identify.discrepancy.simulated import foretold_errors
 from identify.discrepancy.stanzas import without
-from identify.discrepancy.state import State, nearer, power_put_right, with_values
+from identify.discrepancy.state import State, nearer, power_put_right, share_explained, with_values
+from identify.discrepancy.study import ALIKE
 from identify.discrepancy.trial import CLOSE, Trial, judge
 from identify.discrepancy.where import Disagreement, strangers
 from identify.discrepancy.wiring_check import WiringFinding
@@ -87,6 +88,9 @@ def _finding(
     if mine is not None and effect.undo is not None:
         was, now = power_put_right(rest, final), power_put_right(final, rest)
         share = max(share, float(1.0 - now[place.joint] / was[place.joint]))
+    elif mine is not None and final.study.likeness_lost(rest.study, range(study.robot.n), held=True) < ALIKE:
+        # A loop that moves otherwise without it does not show how much it explains.
+        share = max(share, float(share_explained(final, rest)[place.joint]))
     scores = [] if mine is None else [mine.score, *(_instead(t, final) for t in serious)]
     close = [] if mine is None else [score for score in scores if abs(score - mine.score) < CLOSE]
     # What couples two joints has to account for both.

@@ -75,7 +75,7 @@ def polished(study: Study, robot: RobotConfig, before: Fit) -> RobotConfig:
             after = _fitted(study, _moved(robot, step), found, simulate=gone > FAR)
         except DataError:
             break
-        if not _errors(after) < _errors(found):
+        if not training_errors(after) < training_errors(found):
             break
         robot, found = after.study.robot, after
         if length < SETTLED:
@@ -98,7 +98,7 @@ def _fitted(study: Study, robot: RobotConfig, before: Fit, *, simulate: bool) ->
     return fit(replace(before.study, robot=robot, model=model), padded(before, model))
 
 
-def _errors(fit: Fit) -> float:
+def training_errors(fit: Fit) -> float:
     """Sum over the joints of the logarithms of their training errors' powers."""
     errors = np.concatenate(fit.errors(fit.theta, held=False))
     return float(np.sum(np.log(np.maximum(np.sum(errors**2, axis=0), 1e-300))))

@@ -18,7 +18,7 @@ from identify.discrepancy.regression import fit as fitted
 from identify.discrepancy.screening import noise_beyond_shapes
 from identify.discrepancy.shaping import both_ends
 from identify.discrepancy.stanzas import added
-from identify.discrepancy.study import Study
+from identify.discrepancy.study import ALIKE, Study
 from identify.discrepancy.trial import Trial, best_trial, judge, refined, replaced, screened
 from identify.model.arm import ArmModel
 
@@ -87,16 +87,16 @@ def at_measured_signals(
         best = best_trial(fit, measured, workshop)
         if best is None or best.forbidden or best.score < SUSPECT or best.share < least:
             continue
-        beside = (judge(fit, measured, shapes, workshop) for shapes in _neighbours(fit, candidate, best.shapes))
+        beside = (judge(fit, measured, shapes, workshop) for shapes in neighbours(fit.study, candidate, best.shapes))
         able = sorted([best, *(t for t in beside if t is not None and not t.forbidden)], key=lambda t: -t.score)
         tried.append(tuple(replace(trial, candidate=candidate) for trial in able))
     return sorted(tried, key=lambda trials: -trials[0].score)[:SECOND_LOOKS]
 
 
-def _neighbours(fit: Fit, candidate: Candidate, shapes: Shapes) -> list[Shapes]:
+def neighbours(study: Study, candidate: Candidate, shapes: Shapes) -> list[Shapes]:
     """The values next to a candidate's continuous shapes on its grid, one at a time."""
     found = []
-    for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
+    for k, free in enumerate(candidate.effect.refinable(study.robot, candidate.place)):
         values = sorted({grid[k][1] for grid in candidate.grid})
         below = [v for v in values if v < APART * shapes[k][1]]
         above = [v for v in values if v * APART > shapes[k][1]]
@@ -116,7 +116,8 @@ def in_its_loop(fit: Fit, trial: Trial) -> Trial | None:
     Returns
     -------
     Trial or None
-        ``None`` where that loop diverges or is no better likeness of the arm.
+        ``None`` where that loop diverges or is no better likeness of the arm. That of what depends on the motion alone
+        must be no worse: a joint that its controller holds moves the same with any friction.
     """
     study, candidate = fit.study, trial.candidate
     robot = added(study.robot, trial)
@@ -130,7 +131,8 @@ def in_its_loop(fit: Fit, trial: Trial) -> Trial | None:
             return None
     else:
         whole = replace(study, robot=robot, model=ArmModel.from_config(robot))
-        moved = whole.resimulated(np.concatenate([trial.beside, trial.kept]))
+        worse = 1.0 if candidate.effect.predicts else 1.0 / ALIKE
+        moved = whole.resimulated(np.concatenate([trial.beside, trial.kept]), worse=worse)
         if moved is whole:
             return None
     return in_loop_of(moved, fit, candidate)

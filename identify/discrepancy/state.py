@@ -16,7 +16,7 @@ from identify.discrepancy.foretold import foretold, torque_put_right
 from identify.discrepancy.lines import residuals
 from identify.discrepancy.regression import Fit, applied, fit, regressors
 from identify.discrepancy.stanzas import stanza_number
-from identify.discrepancy.study import Study
+from identify.discrepancy.study import ALIKE, Study
 from identify.discrepancy.trial import Trial
 from identify.discrepancy.whitening import rows_of_joints, whitened
 from identify.estimators.noise import ArModel
@@ -32,8 +32,6 @@ FEEDBACK = 0.05
 motion follow the disturbances, so that terms without merit explain a percent or two."""
 
 
-ALIKE = 0.9
-"""Squared error of one loop's motion over that of another down to which they tell nothing."""
 ANCHORINGS = 4
 """Most times that shares of predicted torques are made anew by what the fit with them predicts."""
 
@@ -167,6 +165,12 @@ def _recorded_right(one: State, other: State, material: float) -> bool:
     # What a loop loses that hardly differs from the arm anyhow (a stiff controller) the torques make good.
     enough = gained < 0.0 if lost < 1.0 / ALIKE else gained + np.log(lost) < 0.0
     return bool(enough and np.any(now < (1 - material) * was))
+
+
+def share_explained(one: State, other: State) -> Array:
+    """Share of every joint's whitened held-out error at measured signals that one model has less than another, (n,)."""
+    was, now = (_whitened_power(s.fit.errors(s.fit.theta, held=True), one.fit.noise) for s in (other, one))
+    return np.asarray(1.0 - now / np.maximum(was, 1e-300))
 
 
 def _foretold(one: State, other: State, material: float) -> bool:

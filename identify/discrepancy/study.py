@@ -36,6 +36,8 @@ WORKING_RATE = 20.0
 """Rate at which effects are evaluated, over the frequency up to which model and data are compared."""
 
 
+ALIKE = 0.9
+"""Squared error of one loop's motion over that of another down to which they tell nothing."""
 STIFF_LOOP = 1.5
 """Squared error of the motion of a stand-in's loop over that without the model's terms up to which it is no worse."""
 
@@ -157,13 +159,15 @@ class Study:
         rigid = self.model.inverse_dynamics(theta, signals.q, signals.qd, signals.qdd)
         return rigid + self.terms(stretch, kind, theta) @ theta[-self.model.e :] if self.model.e else rigid
 
-    def resimulated(self, theta: Array) -> "Study":
+    def resimulated(self, theta: Array, *, worse: float = 1.0) -> "Study":
         """The study with the motion that the closed loop makes with its model, terms included, at these parameters.
 
         Parameters
         ----------
         theta
             (b,).
+        worse
+            Squared error of its motion over that of the loop there is up to which it is taken.
 
         Returns
         -------
@@ -184,7 +188,7 @@ class Study:
 
         train = moved(self.train)
         # A stand-in follows the measured motion whatever the arm: there it must only not be led astray.
-        bound = distances(self.train).sum() * (1.0 if self.loop in CONTROLLERS else STIFF_LOOP)
+        bound = distances(self.train).sum() * (worse if self.loop in CONTROLLERS else STIFF_LOOP)
         if not distances(train).sum() < bound:
             return self
         return replace(self, train=train, held=moved(self.held))

@@ -211,20 +211,22 @@ def beyond_noise(fit: Fit, left: Sequence[Disagreement], alpha: float = 0.01) ->
     alpha
         Chance of a false alarm over all joints and tests.
     """
-    found, each = list(left), alpha / 3
-    for excess in excesses(fit, each):
+    found = list(left)
+    for excess in excesses(fit, alpha / 2):
         joint = fit.study.joints[excess.joint]
         named = sum(d.share for d in left if d.joint == joint and d.kind != "frequency")
         if named < 0.5 * excess.share:
             found.append(_moving(joint, excess))
-    slow = _lines(fit, each / fit.study.robot.n, SLOWEST * lowest_frequency(fit.study))
+    slow = _lines(fit, alpha / 6 / fit.study.robot.n, SLOWEST * lowest_frequency(fit.study))
     found += [line for line in slow if line.share >= MATERIAL and line.joint not in {d.joint for d in found}]
     # What leaps has tails of its own.
     told = {d.joint for d in found} | {
         fit.study.joints[t.place.joint] for t in fit.study.model.terms if t.effect.sudden
     }
     found += [
-        _bursting(fit.study.joints[j], own) for j, own in bursts(fit, each).items() if fit.study.joints[j] not in told
+        _bursting(fit.study.joints[j], own)
+        for j, own in bursts(fit, alpha / 3).items()
+        if fit.study.joints[j] not in told
     ]
     return sorted(found, key=lambda d: -d.share)
 

@@ -137,6 +137,40 @@ def test_a_spring_is_found_beside_friction_that_is_far_stronger(strength: str, t
     assert told["gap"]["validation"]["after"]["all"] < 0.5
 
 
+def test_friction_far_from_where_it_seems_is_found_where_the_arm_sticks_and_its_model_does_not(tmp_path: Path) -> None:
+    """Four fifths of the torque are error before; steps downhill from the first look end in a hollow beside it.
+
+    The simulated loop without the friction moves so differently that the friction explains nothing in it.
+    """
+    told, hidden = diagnosed("pair joint_spring joint_1 and stribeck_friction joint_1 obvious emps run 1", tmp_path)
+    found = {f["effect"]: f for f in told["findings"]}
+    assert set(found) == {"joint_spring", "stribeck_friction"}
+    assert told["verdict"] == "explained"
+    spring = found["joint_spring"]
+    assert abs(spring["parameters"]["ks"] - hidden["ks"]) < 3.0 * spring["evidence"]["std"]["ks"]
+    errors = told["gap"]["validation"]
+    assert errors["before"]["all"] > 70.0
+    assert errors["after"]["all"] < 1.0
+
+
+def test_friction_of_a_joint_that_moves_the_same_without_it_is_looked_for_in_its_own_loop(tmp_path: Path) -> None:
+    """With it the simulated wrist follows the arm neither better nor worse; the torque of its reversals differs."""
+    case = "pair asymmetric_viscous_friction joint_2 and stribeck_friction joint_5 typical tx40 run 5"
+    told, _ = diagnosed(case, tmp_path)
+    assert {(f["effect"], f["joint"]) for f in told["findings"]} == {
+        ("asymmetric_viscous_friction", "joint_2"),
+        ("stribeck_friction", "joint_5"),
+    }
+    assert told["verdict"] == "explained"
+
+
+def test_what_shows_at_no_joint_alone_shows_at_all_of_them_together(tmp_path: Path) -> None:
+    """A base that shakes: a thousandth by chance is no alarm at the worst of six joints, but is one over all."""
+    told, _ = diagnosed("outside base_vibration joint_1 typical tx40 run 5", tmp_path)
+    assert told["verdict"] == "unexplained"
+    assert [rest["varies_with"] for rest in told["unexplained"]] == ["motion"]
+
+
 @pytest.mark.parametrize("run", [3, 4])
 def test_a_saturated_drive_is_found_where_a_stiff_loop_moves_the_same_without_it(run: int, tmp_path: Path) -> None:
     """Simulated and measured velocity differ by a ten-thousandth either way; the torques by five times."""
