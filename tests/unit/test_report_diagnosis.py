@@ -50,6 +50,16 @@ def test_every_finding_has_a_picture_of_its_own_in_a_page_that_needs_no_other_fi
             assert f'<td>{name}</td><td class="n">{value:.4g}</td>' in page
 
 
+def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: Diagnosis) -> None:
+    told = diagnosis.document.simulated
+    assert told is not None
+    assert "Simulated closed loop" in diagnosis_report(diagnosis, diagnosis.document)
+    partly = diagnosis.document.model_copy(update={"simulated": {"torque_foretold": told["torque_foretold"]}})
+    page = diagnosis_report(diagnosis, partly)
+    assert "Simulated closed loop" not in page
+    assert "Where model and data disagree" in page
+
+
 def test_a_finding_is_drawn_over_what_it_follows(diagnosis: Diagnosis) -> None:
     over = {}
     for finding, lacking in zip(diagnosis.document.findings, diagnosis.lacking, strict=True):
