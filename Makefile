@@ -10,9 +10,9 @@ PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13; do \
 	"$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo "$$p"; break; }; done)
 # compiled kernels are kept here: the folder is writable in the vcan guest too
 export NUMBA_CACHE_DIR := $(CURDIR)/.cache/numba
-SOURCES := configs drivers daq identify virtual_robot tests
+SOURCES := src configs drivers daq identify virtual_robot tests
 PYTEST := $(PY) -m pytest
-WITH_VCAN := $(PY) -m drivers.vcan -n 2 --
+WITH_VCAN := $(PY) -m armident.drivers.vcan -n 2 --
 
 .PHONY: help install demo test check lint vcan suite bench lock clean
 
@@ -61,7 +61,7 @@ test: lint ## everything, the tests on vcan included
 	failed=
 	$(PYTEST) -n auto --dist loadfile -m "not vcan" 2>&1 | tee .cache/tests.log || failed=1
 	bus=
-	if $(PY) -m drivers.vcan -n 2 --setup; then bus="$(WITH_VCAN)"; fi
+	if $(PY) -m armident.drivers.vcan -n 2 --setup; then bus="$(WITH_VCAN)"; fi
 	$$bus $(PYTEST) -m vcan tests/integration 2>&1 | tee .cache/tests-vcan.log || failed=1
 	echo
 	echo "Skipped, or failing as expected:"
@@ -69,7 +69,7 @@ test: lint ## everything, the tests on vcan included
 	[ -z "$$failed" ]
 
 vcan: install ## fetch what the vcan guest needs, where this kernel has no SocketCAN
-	@$(PY) -m drivers.vcan --setup
+	@$(PY) -m armident.drivers.vcan --setup
 
 suite: install ## hide effects in virtual arms and count what is found (SUITE="--quick" passes options), two hours
 	@$(VENV)/bin/armident diagnose-suite $(SUITE)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from configs.errors import ConfigError
-from configs.robot import Mdh
+from armident.configs.errors import ConfigError
+from armident.configs.robot import Mdh
 
 PARALLEL = 1e-6
 """Axes whose angle is below this (rad) are parallel: a micrometre per metre, less than any arm is built to."""

@@ -7,7 +7,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from configs.errors import ArmidentError
+from armident.configs.errors import ArmidentError
 
 Document = dict[str, Any]
 

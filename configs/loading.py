@@ -6,14 +6,14 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from configs.errors import ConfigError
-from configs.reading import is_file, read_yaml
-from configs.robot import RobotConfig
-from configs.scenario import Scenario
-from configs.session import SessionConfig
-from configs.suite import SuiteConfig
-from configs.trajectory import Trajectory
-from configs.urdf import UrdfGeometry, geometry_from_urdf
+from armident.configs.errors import ConfigError
+from armident.configs.reading import is_file, read_yaml
+from armident.configs.robot import RobotConfig
+from armident.configs.scenario import Scenario
+from armident.configs.session import SessionConfig
+from armident.configs.suite import SuiteConfig
+from armident.configs.trajectory import Trajectory
+from armident.configs.urdf import UrdfGeometry, geometry_from_urdf
 
 HERE = Path(__file__).parent
 KINDS: dict[str, type[BaseModel]] = {
@@ -54,8 +54,8 @@ def config_path(name: str | Path) -> Path:
 def load_robot(name: str | Path) -> RobotConfig:
     """A robot configuration from a file.
 
-    Where the file has a key ``urdf`` (see `configs.urdf`), joints and geometry come from there: ``joints`` then only
-    adds to them, by name, and ``gravity`` is that of the URDF's base link.
+    Where the file has a key ``urdf`` (see `armident.configs.urdf`), joints and geometry come from there:
+    ``joints`` then only adds to them, by name, and ``gravity`` is that of the URDF's base link.
 
     Raises
     ------

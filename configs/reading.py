@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from configs.errors import ConfigError
+from armident.configs.errors import ConfigError
 
 _NOT_MEANT = {"tag:yaml.org,2002:timestamp", "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"}
 _INT = re.compile(r"^[-+]?(?:0|[1-9][0-9_]*|0x[0-9a-fA-F_]+)$")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from configs.base import Frozen
+from armident.configs.base import Frozen
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=64)]
 Positive = Annotated[float, Field(gt=0)]
@@ -126,7 +126,7 @@ class Controller(Frozen):
 
 
 class Preprocessing(Frozen):
-    """Filters of a published least-squares fit, applied as published; see ``identify.signals.classical``.
+    """Filters of a published least-squares fit, applied as published; see ``armident.identify.signals.classical``.
 
     Parameters
     ----------

@@ -4,8 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from configs.base import Frozen
-from configs.robot import Name
+from armident.configs.base import Frozen
+from armident.configs.robot import Name
 
 
 class HiddenEffect(Frozen):

@@ -5,8 +5,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from configs.base import Frozen
-from configs.robot import Name, Positive
+from armident.configs.base import Frozen
+from armident.configs.robot import Name, Positive
 
 ObjectName = Literal["position", "velocity", "current", "torque", "demand", "status"]
 Every = Annotated[int, Field(ge=1, le=240)]

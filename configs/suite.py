@@ -5,8 +5,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from configs.base import Frozen
-from configs.robot import Name, Positive
+from armident.configs.base import Frozen
+from armident.configs.robot import Name, Positive
 
 Expression = str | float
 Level = Literal["detectable", "typical", "obvious"]
@@ -42,7 +42,7 @@ class SuiteEffect(Frozen):
     effect
         Its name.
     parameters
-        Of the virtual arm, as expressions in ``s`` (the strength) and in what `virtual_robot.batch` knows of the joint:
+        Of the virtual arm, as expressions in ``s`` (the strength) and in what the virtual arm knows of the joint:
         ``fv``, ``fc``, ``ia``, ``inertia``, ``speed``, ``torque``, ``span``, ``ratio``.
     strength
         ``s`` at which the effect is just detectable, by robot and place.

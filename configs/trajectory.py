@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from configs.base import Frozen
-from configs.errors import ConfigError
-from configs.robot import RobotConfig
+from armident.configs.base import Frozen
+from armident.configs.errors import ConfigError
+from armident.configs.robot import RobotConfig
 
 RAMP_SHARE = 0.4
 """Share of a move spent accelerating; as much again decelerating, the rest at constant speed."""

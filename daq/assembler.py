@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
-from daq.books import (
+from armident.configs import DataError
+from armident.daq.books import (
     COUNT_NAMES,
     COUNTER,
     ORIGIN,
@@ -25,10 +25,10 @@ from daq.books import (
     open_books,
     room_for,
 )
-from daq.gaps import SYNC_LOST, OpenGaps
-from daq.matching import EVER, count_sync, finish, match
-from daq.recording import Gap
-from drivers.objects import COB_SDO_REQUEST
+from armident.daq.gaps import SYNC_LOST, OpenGaps
+from armident.daq.matching import EVER, count_sync, finish, match
+from armident.daq.recording import Gap
+from armident.drivers.objects import COB_SDO_REQUEST
 
 UNSENT = "pack not complete"
 """SYNCs after the last packed TPDO: no drive was to send their samples any more."""

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn
 
-from configs import ConfigError, DataError, RobotConfig, SessionConfig
-from configs.reading import is_file
-from daq.assembler import Assembler, Batch
-from daq.foreign import said
-from daq.recording import Gap, Recording, Stream
-from daq.streams import CapturedStream, bus_numbers, captured_streams
-from drivers.frames import Frames, frames
-from drivers.objects import COB_SYNC
+from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
+from armident.configs.reading import is_file
+from armident.daq.assembler import Assembler, Batch
+from armident.daq.foreign import said
+from armident.daq.recording import Gap, Recording, Stream
+from armident.daq.streams import CapturedStream, bus_numbers, captured_streams
+from armident.drivers.frames import Frames, frames
+from armident.drivers.objects import COB_SYNC
 
 SUFFIXES = (".log", ".asc", ".blf", ".trc")
 """Kinds of logs: candump -l, Vector's text and binary, PEAK's."""

@@ -10,23 +10,23 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from configs import ArmidentError, SessionConfig
-from configs.session import Bus
-from daq.facts import host_facts
-from daq.journal import Line, Voice
-from daq.order import Order, prepare
-from daq.publisher import Publisher
-from daq.recorder import Recorder
-from daq.recording import Mark, QueuedSeries
-from daq.reload import Change, Reloader
-from daq.sink import Sink
-from daq.storage import Tidiness, capture_stamp, gathered, kept_around, limits, open_series
-from daq.systemd import Notifier
-from daq.zenoh_keys import Keys
-from drivers.eavesdropper import Eavesdropper
-from drivers.frames import FrameBus
-from drivers.receiver import Receiver
-from drivers.udp import NOTE, open_bus
+from armident.configs import ArmidentError, SessionConfig
+from armident.configs.session import Bus
+from armident.daq.facts import host_facts
+from armident.daq.journal import Line, Voice
+from armident.daq.order import Order, prepare
+from armident.daq.publisher import Publisher
+from armident.daq.recorder import Recorder
+from armident.daq.recording import Mark, QueuedSeries
+from armident.daq.reload import Change, Reloader
+from armident.daq.sink import Sink
+from armident.daq.storage import Tidiness, capture_stamp, gathered, kept_around, limits, open_series
+from armident.daq.systemd import Notifier
+from armident.daq.zenoh_keys import Keys
+from armident.drivers.eavesdropper import Eavesdropper
+from armident.drivers.frames import FrameBus
+from armident.drivers.receiver import Receiver
+from armident.drivers.udp import NOTE, open_bus
 
 __all__ = ["Captured", "Order", "capture", "prepare", "run_capture"]
 

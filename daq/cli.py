@@ -87,7 +87,7 @@ def _reported(function: Callable[..., Any]) -> Callable[..., Any]:
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
-            from configs.errors import ArmidentError
+            from armident.configs.errors import ArmidentError
 
             if os.environ.get(DEBUG_VARIABLE):
                 traceback.print_exc()

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from daq.recording import Recording
+    from armident.daq.recording import Recording
 
 
 def capture(
@@ -28,7 +28,7 @@ def capture(
 
     Example: armident capture --config tx40_cell.yaml --out recordings
     """
-    from daq.capture import run_capture
+    from armident.daq.capture import run_capture
 
     run_capture(config, out, duration, listen_only, as_json, sniff)
 
@@ -46,8 +46,8 @@ def command(
 
     Example: armident command mark "gripper changed" --config cell.yaml
     """
-    from configs import ConfigError, load_robot, load_session
-    from daq.remote import COMMANDS, Command, send_command
+    from armident.configs import ConfigError, load_robot, load_session
+    from armident.daq.remote import COMMANDS, Command, send_command
 
     known = next((each for each in COMMANDS if each == name), None)
     if known is None:
@@ -81,10 +81,10 @@ def import_(
 
     Example: armident import DATA_EMPS.mat --config emps.yaml --out emps.mcap
     """
-    from configs import ConfigError, load_robot, load_session
-    from daq.bus_log import SUFFIXES, recording_from_log
-    from daq.importing import import_recording
-    from daq.recording import write_recording
+    from armident.configs import ConfigError, load_robot, load_session
+    from armident.daq.bus_log import SUFFIXES, recording_from_log
+    from armident.daq.importing import import_recording
+    from armident.daq.recording import write_recording
 
     if file.suffix.lower() in SUFFIXES:
         if effort is not None or motor_side or rate is not None or names or polled:
@@ -133,8 +133,8 @@ def export(
 
     Example: armident export tx40.mcap --out tx40.csv
     """
-    from daq.exporting import export_recording
-    from daq.recording import read_recording
+    from armident.daq.exporting import export_recording
+    from armident.daq.recording import read_recording
 
     read = read_recording(recording)
     if read.missing is not None:
@@ -153,7 +153,7 @@ def doctor(
 
     Example: armident doctor --config cell.yaml
     """
-    from daq.doctor import doctor as examine
+    from armident.daq.doctor import doctor as examine
 
     examine(config, print, as_json)
 
@@ -170,7 +170,7 @@ def heal(
     """
     import json
 
-    from daq.recording import heal_recording
+    from armident.daq.recording import heal_recording
 
     healed = [heal_recording(path) for path in recordings]
     if as_json:
@@ -201,7 +201,7 @@ def demo(
 
     Example: armident demo --out demo
     """
-    from daq.demo import demo as run_demo
+    from armident.daq.demo import demo as run_demo
 
     run_demo(out=out, keep_going=keep_going, quick=quick)
 
@@ -232,7 +232,7 @@ def diagnose_suite(
 
     Example: armident diagnose-suite --quick --out suite
     """
-    from daq.suite.run import Chosen, list_suite, run_suite
+    from armident.daq.suite.run import Chosen, list_suite, run_suite
 
     def words(text: str) -> tuple[str, ...]:
         return tuple(word.strip() for word in text.split(",") if word.strip())

@@ -17,8 +17,8 @@ from typing import Any, NoReturn
 
 import yaml
 
-from configs import ArmidentError, ConfigError, SessionConfig, load_session
-from drivers.vcan import ensure_vcan, have_socketcan, launcher_available, launcher_command
+from armident.configs import ArmidentError, ConfigError, SessionConfig, load_session
+from armident.drivers.vcan import ensure_vcan, have_socketcan, launcher_available, launcher_command
 
 CELL = "tx40_cell.yaml"
 SCENARIO = "scenarios/tx40_worn_joint2.yaml"
@@ -139,7 +139,7 @@ def _start_over_in_guest(out: Path, keep_going: bool, quick: bool) -> NoReturn:
 
 
 def _armident() -> list[str]:
-    return [sys.executable, "-m", "daq.cli"]
+    return [sys.executable, "-m", "armident.daq.cli"]
 
 
 def _first_chapter(session: SessionConfig, out: Path, say: Say) -> tuple[Identified, SessionConfig]:

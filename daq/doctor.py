@@ -12,16 +12,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
-from configs.session import Bus
-from daq.clock import clock_state
-from daq.storage import gathered
-from daq.streams import captured_streams
-from daq.zenoh_keys.session import configuration, endpoints
-from drivers.bus_load import check_fits
-from drivers.socketcan import RECEIVE_BUFFER, RawSocket
-from drivers.stamps import has_hardware_stamps
-from drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
+from armident.configs import (
+    ArmidentError,
+    ConfigError,
+    RobotConfig,
+    SessionConfig,
+    load_robot,
+    load_session,
+    load_trajectory,
+)
+from armident.configs.session import Bus
+from armident.daq.clock import clock_state
+from armident.daq.storage import gathered
+from armident.daq.streams import captured_streams
+from armident.daq.zenoh_keys.session import configuration, endpoints
+from armident.drivers.bus_load import check_fits
+from armident.drivers.socketcan import RECEIVE_BUFFER, RawSocket
+from armident.drivers.stamps import has_hardware_stamps
+from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 
 Verdict = Literal["ok", "warning", "failed"]
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, DataError
-from daq.bus_log import SUFFIXES as LOG_SUFFIXES
-from daq.bus_log import write_log
-from daq.recording import Recording, Stream
+from armident.configs import ConfigError, DataError
+from armident.daq.bus_log import SUFFIXES as LOG_SUFFIXES
+from armident.daq.bus_log import write_log
+from armident.daq.recording import Recording, Stream
 
 
 def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
@@ -127,6 +127,6 @@ def _write_mat(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) 
 
 
 def _write_rosbag(recording: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
-    from daq.rosbag import write_joint_states
+    from armident.daq.rosbag import write_joint_states
 
     write_joint_states(path, [joint.name for joint in recording.robot.joints], recording.samples.t_ns, table)

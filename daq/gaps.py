@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.books import AMBIGUOUS, LOST, NO_SYNC, WRONG_LENGTH, WRONG_MAPPING
-from daq.recording import Gap
+from armident.daq.books import AMBIGUOUS, LOST, NO_SYNC, WRONG_LENGTH, WRONG_MAPPING
+from armident.daq.recording import Gap
 
 SYNC_LOST = "SYNC not received"
 REASONS = {

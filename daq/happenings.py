@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 
-from configs import ArmidentError, SessionConfig
-from daq.assembler import Assembler
-from daq.journal import Line
-from daq.order import Order
-from daq.sink import Sink
-from drivers.master import DriveEvent
-from drivers.receiver import BusEvent
+from armident.configs import ArmidentError, SessionConfig
+from armident.daq.assembler import Assembler
+from armident.daq.journal import Line
+from armident.daq.order import Order
+from armident.daq.sink import Sink
+from armident.drivers.master import DriveEvent
+from armident.drivers.receiver import BusEvent
 
 COUNTED = ("emcy", "heartbeat_lost", "rebooted", "mapping_changed", "bus_down", "bus_off", "sync_stopped")
 SYNC_STOPPED_S = 0.2

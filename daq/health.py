@@ -4,17 +4,17 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 
-from configs import SessionConfig
-from configs.session import MetricsOptions
-from daq.assembler import Assembler
-from daq.clock import clock_state
-from daq.jitter import SyncJitter, worst
-from daq.metrics import Metrics, Value
-from daq.order import Order
-from daq.publisher import Publisher
-from daq.sink import Sink
-from daq.storage import free_space
-from drivers.receiver import Receiver
+from armident.configs import SessionConfig
+from armident.configs.session import MetricsOptions
+from armident.daq.assembler import Assembler
+from armident.daq.clock import clock_state
+from armident.daq.jitter import SyncJitter, worst
+from armident.daq.metrics import Metrics, Value
+from armident.daq.order import Order
+from armident.daq.publisher import Publisher
+from armident.daq.sink import Sink
+from armident.daq.storage import free_space
+from armident.drivers.receiver import Receiver
 
 SLOW_DISK_S = 1.0
 """Rows of so long that wait for the disk are worth a line."""

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, DataError, RobotConfig
-from configs.reading import is_file
-from daq.foreign import apart, said
-from daq.polled import on_clock
-from daq.recording import Field, Recording, Stream
-from daq.recording.model import Quantity, Side
+from armident.configs import ConfigError, DataError, RobotConfig
+from armident.configs.reading import is_file
+from armident.daq.foreign import apart, said
+from armident.daq.polled import on_clock
+from armident.daq.recording import Field, Recording, Stream
+from armident.daq.recording.model import Quantity, Side
 
 NAMES: Mapping[str, tuple[str, ...]] = {
     "time": ("t", "time", "times"),
@@ -87,7 +87,7 @@ def import_recording(
         Names of this file by quantity (``time, position, torque, current, voltage, demand``); ``-`` leaves one out.
     polled
         The rows were read from a controller of ``rate_hz`` without waiting for its samples, so that some are repeated
-        and some missed: they are put back on its clock (`daq.polled`).
+        and some missed: they are put back on its clock (`armident.daq.polled`).
 
     Raises
     ------
@@ -178,7 +178,7 @@ def _load(path: Path, robot: RobotConfig) -> Source:
     if kind == ".parquet":
         return Source(path, _numeric(_parquet(path)))
     if kind == ".mcap":
-        from daq.rosbag import read_joint_states
+        from armident.daq.rosbag import read_joint_states
 
         return Source(path, read_joint_states(path, robot))
     raise ConfigError(

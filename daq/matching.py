@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from daq.books import (
+from armident.daq.books import (
     BORROWED,
     COUNTER,
     EVERY,
@@ -50,9 +50,9 @@ from daq.books import (
     Books,
     Decided,
 )
-from daq.numbering import advance
-from daq.settling import settle_all, slot_of
-from drivers.objects import PDOS, SDO_DOWNLOAD, TPDO_COMMUNICATION, TPDO_MAPPING
+from armident.daq.numbering import advance
+from armident.daq.settling import settle_all, slot_of
+from armident.drivers.objects import PDOS, SDO_DOWNLOAD, TPDO_COMMUNICATION, TPDO_MAPPING
 
 EVER = int(np.iinfo(np.int64).max)
 

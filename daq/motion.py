@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig, SessionConfig, Trajectory
-from configs.trajectory import RAMP_SHARE, Move
-from daq.streams import bus_numbers, counts_per_si, node_ids
-from drivers.objects import rpdo_cob
-from drivers.sync import SetpointPlan
+from armident.configs import RobotConfig, SessionConfig, Trajectory
+from armident.configs.trajectory import RAMP_SHARE, Move
+from armident.daq.streams import bus_numbers, counts_per_si, node_ids
+from armident.drivers.objects import rpdo_cob
+from armident.drivers.sync import SetpointPlan
 
 APPROACH_SHARE = 0.5
 """Largest share of the joints' velocity and acceleration limits used on the way to the start."""

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from daq.books import BORROWED, COUNTER, FORGOTTEN, ORIGIN, STRAYED, SYNC, TIME, TORN, UNSEEN
+from armident.daq.books import BORROWED, COUNTER, FORGOTTEN, ORIGIN, STRAYED, SYNC, TIME, TORN, UNSEEN
 
 _EARLY = 0.25
 """By how much of a turn of the counter the time between two SYNCs may be too short, as their stamps say."""

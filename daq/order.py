@@ -4,12 +4,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from configs import ConfigError, RobotConfig, SessionConfig, Trajectory, load_robot, load_session, load_trajectory
-from daq.sniffing import sniff
-from daq.streams import CapturedStream, bus_numbers, captured_streams, node_ids
-from drivers.bus_load import check_fits
-from drivers.frames import Filter
-from drivers.objects import COB_MASK, COB_SDO_REQUEST, COB_SYNC
+from armident.configs import (
+    ConfigError,
+    RobotConfig,
+    SessionConfig,
+    Trajectory,
+    load_robot,
+    load_session,
+    load_trajectory,
+)
+from armident.daq.sniffing import sniff
+from armident.daq.streams import CapturedStream, bus_numbers, captured_streams, node_ids
+from armident.drivers.bus_load import check_fits
+from armident.drivers.frames import Filter
+from armident.drivers.objects import COB_MASK, COB_SDO_REQUEST, COB_SYNC
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import median_filter
 
-from configs import DataError
+from armident.configs import DataError
 
 WINDOW = 21
 """Increments whose median is the usual one: odd, far shorter than any motion, and more than a burst of misses."""

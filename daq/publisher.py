@@ -9,9 +9,9 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from configs import SessionConfig
-from daq.remote import Commands
-from daq.zenoh_keys import Block, Keys, encode_block, open_session
+from armident.configs import SessionConfig
+from armident.daq.remote import Commands
+from armident.daq.zenoh_keys import Block, Keys, encode_block, open_session
 
 _EVENTS_KEPT = 64
 _MOST_EVENTS = 4096

@@ -9,25 +9,25 @@ from contextlib import ExitStack, suppress
 
 import numpy as np
 
-from configs import ArmidentError, SessionConfig
-from daq.assembler import LATE_S, Assembler
-from daq.happenings import Happenings
-from daq.health import Health
-from daq.jitter import SyncJitter, worst
-from daq.motion import Motion, Standstill, plan_motion
-from daq.order import Order
-from daq.publisher import Publisher
-from daq.remote import Command
-from daq.sink import Sink
-from daq.systemd import Notifier
-from drivers.bcm import KernelSync
-from drivers.eavesdropper import Eavesdropper
-from drivers.frames import BusDown
-from drivers.master import DriveEvent, DriveMaster
-from drivers.priority import ahead
-from drivers.receiver import Receiver
-from drivers.sync import SyncProducer
-from drivers.temperature import TemperaturePoll
+from armident.configs import ArmidentError, SessionConfig
+from armident.daq.assembler import LATE_S, Assembler
+from armident.daq.happenings import Happenings
+from armident.daq.health import Health
+from armident.daq.jitter import SyncJitter, worst
+from armident.daq.motion import Motion, Standstill, plan_motion
+from armident.daq.order import Order
+from armident.daq.publisher import Publisher
+from armident.daq.remote import Command
+from armident.daq.sink import Sink
+from armident.daq.systemd import Notifier
+from armident.drivers.bcm import KernelSync
+from armident.drivers.eavesdropper import Eavesdropper
+from armident.drivers.frames import BusDown
+from armident.drivers.master import DriveEvent, DriveMaster
+from armident.drivers.priority import ahead
+from armident.drivers.receiver import Receiver
+from armident.drivers.sync import SyncProducer
+from armident.drivers.temperature import TemperaturePoll
 
 HEALTH_S = 1.0
 REST_S = 0.01

@@ -10,9 +10,9 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from configs import ArmidentError, ConfigError, SessionConfig, load_robot, load_session
-from daq.journal import Line
-from daq.order import Order
+from armident.configs import ArmidentError, ConfigError, SessionConfig, load_robot, load_session
+from armident.daq.journal import Line
+from armident.daq.order import Order
 
 CHANGEABLE = (
     "recording.rotate_mb",

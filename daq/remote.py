@@ -7,8 +7,8 @@ from typing import Literal, get_args
 
 import zenoh
 
-from configs import ArmidentError, ConfigError, DataError, SessionConfig
-from daq.zenoh_keys import Keys, open_session
+from armident.configs import ArmidentError, ConfigError, DataError, SessionConfig
+from armident.daq.zenoh_keys import Keys, open_session
 
 CommandName = Literal["save", "mark", "reload", "stop"]
 COMMANDS: tuple[CommandName, ...] = get_args(CommandName)

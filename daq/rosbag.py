@@ -9,8 +9,8 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 from numpy.typing import NDArray
 
-from configs import DataError, RobotConfig
-from daq.foreign import said
+from armident.configs import DataError, RobotConfig
+from armident.daq.foreign import said
 
 TOPIC = "/joint_states"
 _TYPE = "sensor_msgs/msg/JointState"

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from daq.books import (
+from armident.daq.books import (
     AMBIGUOUS,
     BASE,
     BEHIND,

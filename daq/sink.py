@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig, SessionConfig
-from daq.assembler import Batch, Rows
-from daq.publisher import Publisher
-from daq.recording import Gap, Mark, QueuedSeries
-from daq.recording.model import MarkKind
-from daq.streams import CapturedStream
-from daq.zenoh_keys import Block, encode_event
-from daq.zenoh_keys.codec import end_content, start_content
+from armident.configs import RobotConfig, SessionConfig
+from armident.daq.assembler import Batch, Rows
+from armident.daq.publisher import Publisher
+from armident.daq.recording import Gap, Mark, QueuedSeries
+from armident.daq.recording.model import MarkKind
+from armident.daq.streams import CapturedStream
+from armident.daq.zenoh_keys import Block, encode_event
+from armident.daq.zenoh_keys.codec import end_content, start_content
 
 PIECE_NS = 200_000_000
 """So much recorded time is written and published at once, however much became certain together."""

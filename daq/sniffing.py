@@ -15,13 +15,13 @@ import canopen
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, SessionConfig
-from configs.session import Bus, DriveNode, Stream
-from drivers import objects as od
-from drivers.frames import FD_FRAME, Frames, fd_length
-from drivers.objects import COB_SYNC, OBJECTS, TpdoLayout
-from drivers.receiver import Receiver
-from drivers.udp import open_bus
+from armident.configs import ConfigError, SessionConfig
+from armident.configs.session import Bus, DriveNode, Stream
+from armident.drivers import objects as od
+from armident.drivers.frames import FD_FRAME, Frames, fd_length
+from armident.drivers.objects import COB_SYNC, OBJECTS, TpdoLayout
+from armident.drivers.receiver import Receiver
+from armident.drivers.udp import open_bus
 
 SYNC_WAIT_S = 10.0
 """How long a bus may be silent before we give up."""

@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
 
-from configs import RobotConfig, SessionConfig
-from configs.session import RecordingOptions, Trigger
-from daq.recording import QueuedSeries, RecordingSeries, RecordingWriter, TriggeredSeries
-from daq.recording.retention import Janitor, prune
-from daq.streams import CapturedStream
+from armident.configs import RobotConfig, SessionConfig
+from armident.configs.session import RecordingOptions, Trigger
+from armident.daq.recording import QueuedSeries, RecordingSeries, RecordingWriter, TriggeredSeries
+from armident.daq.recording.retention import Janitor, prune
+from armident.daq.streams import CapturedStream
 
 
 def open_series(

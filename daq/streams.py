@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, RobotConfig, SessionConfig
-from configs.session import ObjectName
-from daq.assembler import Rows, TpdoStream
-from daq.recording import Field, StreamLayout
-from daq.recording.model import Quantity
-from drivers.frames import fd_length
-from drivers.objects import OBJECTS, TpdoLayout, tpdo_cob
+from armident.configs import ConfigError, RobotConfig, SessionConfig
+from armident.configs.session import ObjectName
+from armident.daq.assembler import Rows, TpdoStream
+from armident.daq.recording import Field, StreamLayout
+from armident.daq.recording.model import Quantity
+from armident.drivers.frames import fd_length
+from armident.drivers.objects import OBJECTS, TpdoLayout, tpdo_cob
 
 
 @dataclass(frozen=True)

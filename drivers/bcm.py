@@ -4,11 +4,11 @@ import socket
 import struct
 from typing import Self
 
-from configs.errors import ConfigError
-from configs.session import Bus
-from drivers.frames import BusDown
-from drivers.objects import COB_SYNC
-from drivers.socketcan import RawSocket
+from armident.configs.errors import ConfigError
+from armident.configs.session import Bus
+from armident.drivers.frames import BusDown
+from armident.drivers.objects import COB_SYNC
+from armident.drivers.socketcan import RawSocket
 
 TX_SETUP = 1
 SETTIMER, STARTTIMER = 0x1, 0x2

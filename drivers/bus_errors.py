@@ -2,7 +2,7 @@
 
 from typing import Any, Literal
 
-from drivers.frames import Frames
+from armident.drivers.frames import Frames
 
 BusState = Literal["bus_off", "restarted", "passive", "warning", "active"]
 

@@ -6,10 +6,10 @@ bit rate, all between the bit rate switch and the CRC delimiter at the data bit 
 
 from dataclasses import dataclass
 
-from configs import ConfigError, SessionConfig
-from configs.session import Bus
-from drivers.frames import fd_length
-from drivers.objects import COB_SYNC, SETPOINT, TpdoLayout
+from armident.configs import ConfigError, SessionConfig
+from armident.configs.session import Bus
+from armident.drivers.frames import fd_length
+from armident.drivers.objects import COB_SYNC, SETPOINT, TpdoLayout
 
 CRC_15 = 0x4599
 TAIL_BITS = 13
@@ -143,7 +143,7 @@ def check_fits(session: SessionConfig, where: str = "session") -> None:
         if bus.bitrate is None or worst_load(session, bus) <= 1.0:
             continue
         # What would fit is worked out only where something does not.
-        from drivers.bus_plan import alternatives
+        from armident.drivers.bus_plan import alternatives
 
         speed = f"{bus.bitrate / 1e6:g}" + (f"/{bus.data_bitrate / 1e6:g}" if bus.data_bitrate else "")
         found = "; ".join(f"{option.text} would fit" for option in alternatives(session))

@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from configs import SessionConfig
-from configs.errors import ConfigError
-from configs.session import Bus
-from drivers.bus_load import fits, fitting_period
-from drivers.objects import FD_PDO_BYTES, MAPPED_OBJECTS, TpdoLayout
+from armident.configs import SessionConfig
+from armident.configs.errors import ConfigError
+from armident.configs.session import Bus
+from armident.drivers.bus_load import fits, fitting_period
+from armident.drivers.objects import FD_PDO_BYTES, MAPPED_OBJECTS, TpdoLayout
 
 DATA_BITRATES = (2_000_000, 5_000_000, 8_000_000)
 """Data bit rates that CAN FD controllers commonly offer."""

@@ -25,8 +25,8 @@ def bus_load(
     from rich.console import Console
     from rich.table import Table
 
-    from configs import ConfigError, load_session
-    from drivers.bus_load import bus_loads, check_fits
+    from armident.configs import ConfigError, load_session
+    from armident.drivers.bus_load import bus_loads, check_fits
 
     session = load_session(config)
     if data_bitrate is not None and bitrate is None:

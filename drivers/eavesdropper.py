@@ -2,11 +2,11 @@
 
 from typing import Self
 
-from configs.session import SessionConfig
-from drivers.emcy import read_emergencies
-from drivers.master import DriveEvent
-from drivers.objects import COB_EMCY
-from drivers.side_socket import SideSocket
+from armident.configs.session import SessionConfig
+from armident.drivers.emcy import read_emergencies
+from armident.drivers.master import DriveEvent
+from armident.drivers.objects import COB_EMCY
+from armident.drivers.side_socket import SideSocket
 
 
 class Eavesdropper:

@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from drivers.frames import Frames
-from drivers.objects import COB_EMCY
+from armident.drivers.frames import Frames
+from armident.drivers.objects import COB_EMCY
 
 EMCY_TEXTS: dict[int, str] = {
     0x0000: "error reset or no error",

@@ -2,11 +2,11 @@
 
 import time
 
-from configs.errors import ArmidentError, ConfigError
-from drivers import objects as od
-from drivers.emcy import emcy_text
-from drivers.objects import Control, DriveState
-from drivers.sdo import DriveSdo
+from armident.configs.errors import ArmidentError, ConfigError
+from armident.drivers import objects as od
+from armident.drivers.emcy import emcy_text
+from armident.drivers.objects import Control, DriveState
+from armident.drivers.sdo import DriveSdo
 
 ENABLE_TIMEOUT = 3.0
 """Longest wait for a drive to reach the next state of CiA 402, s."""

@@ -5,7 +5,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from configs.errors import ArmidentError
+from armident.configs.errors import ArmidentError
 
 FRAME = np.dtype(
     [

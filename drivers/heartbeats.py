@@ -5,9 +5,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from configs.session import Bus
-from drivers.objects import COB_HEARTBEAT
-from drivers.side_socket import SideSocket
+from armident.configs.session import Bus
+from armident.drivers.objects import COB_HEARTBEAT
+from armident.drivers.side_socket import SideSocket
 
 HELD_UP_S = 0.1
 """Whoever looks less often than this was held up."""

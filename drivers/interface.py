@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from configs.errors import ConfigError
-from drivers.frames import BusDown
-from drivers.messages import FD_MTU
+from armident.configs.errors import ConfigError
+from armident.drivers.frames import BusDown
+from armident.drivers.messages import FD_MTU
 
 SYSFS = Path("/sys/class/net")
 _IFF_UP = 1

@@ -2,11 +2,11 @@
 
 import logging
 
-from configs.errors import ConfigError
-from configs.robot import Joint, RobotConfig
-from configs.session import SessionConfig
-from drivers import objects as od
-from drivers.sdo import DriveSdo
+from armident.configs.errors import ConfigError
+from armident.configs.robot import Joint, RobotConfig
+from armident.configs.session import SessionConfig
+from armident.drivers import objects as od
+from armident.drivers.sdo import DriveSdo
 
 log = logging.getLogger(__name__)
 

@@ -12,17 +12,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Self
 
-from configs.errors import ArmidentError, ConfigError
-from configs.robot import RobotConfig
-from configs.session import DriveNode, SessionConfig
-from drivers import objects as od
-from drivers.enabling import POLL_INTERVAL, enable_drive, stand_still, state_of
-from drivers.frames import BusDown
-from drivers.heartbeats import Silences
-from drivers.mapping import check_drive, map_drive, mapping_differs
-from drivers.network import NodeNetwork
-from drivers.objects import Control, DriveState, NmtCommand, NmtState
-from drivers.sdo import DriveSdo
+from armident.configs.errors import ArmidentError, ConfigError
+from armident.configs.robot import RobotConfig
+from armident.configs.session import DriveNode, SessionConfig
+from armident.drivers import objects as od
+from armident.drivers.enabling import POLL_INTERVAL, enable_drive, stand_still, state_of
+from armident.drivers.frames import BusDown
+from armident.drivers.heartbeats import Silences
+from armident.drivers.mapping import check_drive, map_drive, mapping_differs
+from armident.drivers.network import NodeNetwork
+from armident.drivers.objects import Control, DriveState, NmtCommand, NmtState
+from armident.drivers.sdo import DriveSdo
 
 NMT_TIMEOUT = 2.0
 """Longest wait for a heartbeat that reports the NMT state commanded, s."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drivers.frames import FD_FLAG, FD_FRAME, FRAME, Frames
+from armident.drivers.frames import FD_FLAG, FD_FRAME, FRAME, Frames
 
 _MESSAGE = np.dtype(
     {

@@ -12,15 +12,15 @@ import can
 import canopen
 from canopen.network import MessageListener
 
-from configs.errors import ArmidentError, ConfigError
-from configs.session import Bus, DriveNode
-from drivers import objects as od
-from drivers.emcy import Emergency, read_emergencies
-from drivers.frames import BusDown
-from drivers.heartbeats import HeartbeatSocket
-from drivers.objects import NmtCommand
-from drivers.side_socket import SideSocket
-from drivers.socketcan import RawSocket
+from armident.configs.errors import ArmidentError, ConfigError
+from armident.configs.session import Bus, DriveNode
+from armident.drivers import objects as od
+from armident.drivers.emcy import Emergency, read_emergencies
+from armident.drivers.frames import BusDown
+from armident.drivers.heartbeats import HeartbeatSocket
+from armident.drivers.objects import NmtCommand
+from armident.drivers.side_socket import SideSocket
+from armident.drivers.socketcan import RawSocket
 
 REOPEN_S = 0.25
 """How often a bus that is down is tried again."""

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs.errors import ConfigError
-from configs.robot import Drive
-from configs.session import ObjectName
+from armident.configs.errors import ConfigError
+from armident.configs.robot import Drive
+from armident.configs.session import ObjectName
 
 PDO_BYTES = 8
 """Data bytes of a classic CAN frame, and so the most a PDO can carry."""

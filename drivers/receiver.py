@@ -8,9 +8,9 @@ from typing import Literal, Self
 
 import numpy as np
 
-from configs.errors import ArmidentError
-from drivers.bus_errors import summarise
-from drivers.frames import ERROR_FLAG, BusDown, FrameBus, Frames, frames
+from armident.configs.errors import ArmidentError
+from armident.drivers.bus_errors import summarise
+from armident.drivers.frames import ERROR_FLAG, BusDown, FrameBus, Frames, frames
 
 BATCH = 4096
 DRAINS = 16

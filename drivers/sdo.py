@@ -8,10 +8,10 @@ import can
 import canopen
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
-from configs.errors import ArmidentError, ConfigError
-from configs.session import DriveNode, SessionConfig
-from drivers.frames import BusDown
-from drivers.socketcan import RawSocket
+from armident.configs.errors import ArmidentError, ConfigError
+from armident.configs.session import DriveNode, SessionConfig
+from armident.drivers.frames import BusDown
+from armident.drivers.socketcan import RawSocket
 
 for _logger in ("canopen", "can"):
     # Their warnings repeat on stderr what our exceptions say in one line.

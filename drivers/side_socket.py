@@ -3,11 +3,11 @@
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
-from configs.errors import ArmidentError
-from configs.session import Bus
-from drivers.frames import BusDown, FrameBus, Frames, frames
-from drivers.objects import COB_MASK
-from drivers.udp import open_bus
+from armident.configs.errors import ArmidentError
+from armident.configs.session import Bus
+from armident.drivers.frames import BusDown, FrameBus, Frames, frames
+from armident.drivers.objects import COB_MASK
+from armident.drivers.udp import open_bus
 
 BATCH = 256
 

@@ -13,11 +13,11 @@ import time
 from collections.abc import Sequence
 from typing import Self
 
-from configs.errors import ConfigError
-from drivers import interface
-from drivers.frames import ERROR_FLAG, FRAME, BusDown, Filter, Frames, frame, frames
-from drivers.messages import DROP_CONTROL_BYTES, Messages
-from drivers.stamps import (
+from armident.configs.errors import ConfigError
+from armident.drivers import interface
+from armident.drivers.frames import ERROR_FLAG, FRAME, BusDown, Filter, Frames, frame, frames
+from armident.drivers.messages import DROP_CONTROL_BYTES, Messages
+from armident.drivers.stamps import (
     RAW_HARDWARE,
     RX_HARDWARE,
     RX_SOFTWARE,

@@ -22,13 +22,13 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from configs.session import Bus
-from drivers.frames import BusDown, FrameBus, frames
-from drivers.objects import COB_SYNC
-from drivers.priority import be_punctual
-from drivers.setpoints import SetpointPlan
-from drivers.socketcan import RawSocket
-from drivers.sync_loop import (
+from armident.configs.session import Bus
+from armident.drivers.frames import BusDown, FrameBus, frames
+from armident.drivers.objects import COB_SYNC
+from armident.drivers.priority import be_punctual
+from armident.drivers.setpoints import SetpointPlan
+from armident.drivers.socketcan import RawSocket
+from armident.drivers.sync_loop import (
     BIN_NS,
     BINS,
     ERROR,
@@ -46,7 +46,7 @@ from drivers.sync_loop import (
     Loop,
     is_knot,
 )
-from drivers.udp import open_bus
+from armident.drivers.udp import open_bus
 
 __all__ = ["SetpointPlan", "SyncProducer", "SyncStats"]
 

@@ -8,8 +8,8 @@ import numpy as np
 from numba import carray, njit, types
 from numpy.typing import NDArray
 
-from drivers.objects import COB_SYNC
-from drivers.socketcan import Messages
+from armident.drivers.objects import COB_SYNC
+from armident.drivers.socketcan import Messages
 
 MAX_LATE_PERIODS = 10
 """Lateness, in periods, beyond which the time grid moves instead of being caught up with."""

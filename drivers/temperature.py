@@ -4,8 +4,8 @@ import threading
 import time
 from collections.abc import Sequence
 
-from configs.errors import ArmidentError
-from drivers.sdo import DriveSdo
+from armident.configs.errors import ArmidentError
+from armident.drivers.sdo import DriveSdo
 
 CODES = {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I"}
 """Types of an object, as ``struct`` names them."""

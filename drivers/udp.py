@@ -10,10 +10,10 @@ from typing import Self
 import can
 import numpy as np
 
-from configs.errors import ConfigError
-from configs.session import Bus
-from drivers.frames import ERROR_FLAG, BusDown, Filter, FrameBus, Frames
-from drivers.socketcan import RawSocket
+from armident.configs.errors import ConfigError
+from armident.configs.session import Bus
+from armident.drivers.frames import ERROR_FLAG, BusDown, Filter, FrameBus, Frames
+from armident.drivers.socketcan import RawSocket
 
 NOTE = "udp_multicast carries the bus over UDP and may lose frames: fit for low rates, not for measuring"
 """What a program says in one line when it runs on this bus."""

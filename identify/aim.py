@@ -6,12 +6,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from configs import ConfigError, RobotConfig
-from identify.catalogue.effect import Effect, Place
-from identify.catalogue.motion import Motion
-from identify.catalogue.registry import known
-from identify.discrepancy.candidates import Shapes, grid, places
-from identify.signals.decimate import Decimation
+from armident.configs import ConfigError, RobotConfig
+from armident.identify.catalogue.effect import Effect, Place
+from armident.identify.catalogue.motion import Motion
+from armident.identify.catalogue.registry import known
+from armident.identify.discrepancy.candidates import Shapes, grid, places
+from armident.identify.signals.decimate import Decimation
 
 Array = NDArray[np.float64]
 

@@ -50,7 +50,7 @@ def identify(
 
     Example: armident identify tx40.mcap --out results
     """
-    from identify.service import identify_command
+    from armident.identify.service import identify_command
 
     chosen = {
         "method": method,
@@ -78,7 +78,7 @@ def worker(
 
     Example: armident worker --config configs/tx40_cell.yaml
     """
-    from identify.worker import run_worker
+    from armident.identify.worker import run_worker
 
     code = run_worker(config, once=once, out=out)
     if code:
@@ -109,7 +109,7 @@ def diagnose(
 
     Example: armident diagnose monday.mcap --validate tuesday.mcap
     """
-    from identify.service import diagnose_command
+    from armident.identify.service import diagnose_command
 
     chosen = {"false_alarms": false_alarms, "material": material}
     code = diagnose_command(recordings, config, validate, baseline, chosen, out, as_json=json)
@@ -125,7 +125,7 @@ def effects(
 
     Example: armident effects stribeck_friction
     """
-    from identify.catalogue.listing import effects_command
+    from armident.identify.catalogue.listing import effects_command
 
     effects_command(name, as_json=json)
 
@@ -156,7 +156,7 @@ def history(
 
     Example: armident history recordings/*.identification/identification.json --plot history.png
     """
-    from identify.history_command import history_command
+    from armident.identify.history_command import history_command
 
     code = history_command(documents or [], database, robot, cell, parameter or [], plot, false_alarms, as_json=json)
     if code:
@@ -200,7 +200,7 @@ def trajectory(
 
     Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
-    from identify.trajectory_command import trajectory_command
+    from armident.identify.trajectory_command import trajectory_command
 
     trajectory_command(
         config, out, duration, seed, known, evaluations, wanted, joint, against, shape, harmonics, picture, look_at
@@ -218,6 +218,6 @@ def reproduce(
 
     Example: armident reproduce --tables 5.2,6.7
     """
-    from identify.reproduction.command import reproduce_command
+    from armident.identify.reproduction.command import reproduce_command
 
     reproduce_command(tables, measured, out, quick, as_json=json)

@@ -8,22 +8,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, DataError, RobotConfig
-from identify.controller.crc import JointResponse, identify_crc
-from identify.controller.nominal import known_controller, nominal_controller, saturation
-from identify.controller.parametric import ControlLaw, identify_parametric
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.followed import FollowedMotion
-from identify.experiment import Experiment
-from identify.methods import MEASURED
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
-from identify.model.simulation import Simulation
-from identify.options import Options
-from identify.preparation import PIV_CUTOFF
-from identify.signals.bandpass import butterworth
-from identify.signals.decimate import Decimation
-from identify.signals.differentiate import Derivatives
+from armident.configs import ConfigError, DataError, RobotConfig
+from armident.identify.controller.crc import JointResponse, identify_crc
+from armident.identify.controller.nominal import known_controller, nominal_controller, saturation
+from armident.identify.controller.parametric import ControlLaw, identify_parametric
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.followed import FollowedMotion
+from armident.identify.experiment import Experiment
+from armident.identify.methods import MEASURED
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.simulation import Simulation
+from armident.identify.options import Options
+from armident.identify.preparation import PIV_CUTOFF
+from armident.identify.signals.bandpass import butterworth
+from armident.identify.signals.decimate import Decimation
+from armident.identify.signals.differentiate import Derivatives
 
 RUNAWAY = 3.0
 """A simulated joint that is this many times faster than the measured one ever was has diverged."""

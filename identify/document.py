@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-import configs
-from configs import ConfigError, DataError, RobotConfig
-from daq.recording import Recording
+from armident import configs
+from armident.configs import ConfigError, DataError, RobotConfig
+from armident.daq.recording import Recording
 
 if TYPE_CHECKING:
-    from identify.result import Identification
+    from armident.identify.result import Identification
 
 LIBRARIES = ("armident", "numpy", "scipy", "numba")
 T = TypeVar("T", bound=BaseModel)
@@ -395,7 +395,7 @@ def schema_text(kind: type[Document]) -> str:
 
 
 def main() -> None:
-    """Write the schema files: ``python -m identify.document``."""
+    """Write the schema files: ``python -m armident.identify.document``."""
     for name, kind in SCHEMA_FILES.items():
         write_atomically(Path(configs.__file__).parent / name, schema_text(kind))
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from configs import DataError
-from identify.document import IdentificationDocument, Parameter
+from armident.configs import DataError
+from armident.identify.document import IdentificationDocument, Parameter
 
 Array = NDArray[np.float64]
 

@@ -3,7 +3,8 @@
 The trajectory is a sequence of point-to-point moves within the limits, or a finite Fourier sum per joint. Waypoints and
 paces, or coefficients, are improved by random search on the information in the base regressor, weighted by the torque
 noise of each joint:
-the smallest geometric mean of the standard deviations, with a condition number under `identify.moves.CONDITION`.
+the smallest geometric mean of the standard deviations, with a condition number under
+`armident.identify.moves.CONDITION`.
 The condition number alone would choose slow moves, whose gravity torques are as small as their inertial ones.
 
 With an aim the search looks for the smallest standard deviations of the linear parameters of one effect instead, or of
@@ -18,13 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import butter, sosfiltfilt
 
-from configs import ConfigError, RobotConfig, Trajectory
-from identify.aim import Aim, aim_for
-from identify.fourier import FourierSearch
-from identify.model.arm import ArmModel
-from identify.model.chain import Floats
-from identify.moves import CUTOFF, SEARCH_RATE, Search, equations_of, motion_of, slow_share
-from identify.signals.decimate import design
+from armident.configs import ConfigError, RobotConfig, Trajectory
+from armident.identify.aim import Aim, aim_for
+from armident.identify.fourier import FourierSearch
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.chain import Floats
+from armident.identify.moves import CUTOFF, SEARCH_RATE, Search, equations_of, motion_of, slow_share
+from armident.identify.signals.decimate import design
 
 Shape = Literal["moves", "fourier"]
 C = TypeVar("C")
@@ -50,8 +51,8 @@ class Design:
         Predicted standard deviation of each base parameter, shape (b,), in its unit; ``None`` if the noise is
         neither known nor supposed.
     slow_share
-        Share of the samples of each joint, shape (n,), slower than `identify.moves.SLOW` of its velocity limit: they
-        say little about its friction.
+        Share of the samples of each joint, shape (n,), slower than `armident.identify.moves.SLOW` of its
+        velocity limit: they say little about its friction.
     """
 
     trajectory: Trajectory
@@ -161,7 +162,7 @@ def aimed_at(
     Raises
     ------
     ConfigError
-        See `identify.aim.aim_for`; or if ``joint`` or ``against`` stand alone.
+        See `armident.identify.aim.aim_for`; or if ``joint`` or ``against`` stand alone.
     """
     if wanted is None:
         for option, value in (("--joint", joint), ("--against", against)):

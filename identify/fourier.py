@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from configs import Trajectory
-from configs.trajectory import Fourier
-from identify.model.chain import Floats
-from identify.moves import Search
+from armident.configs import Trajectory
+from armident.configs.trajectory import Fourier
+from armident.identify.model.chain import Floats
+from armident.identify.moves import Search
 
 HIGHEST_HZ = 1.6
 """Highest harmonic: above it a joint that keeps its velocity limit hardly moves."""

@@ -5,9 +5,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError, RobotConfig
-from daq.recording import Recording, Stream
-from identify.experiment import Experiment
+from armident.configs import DataError, RobotConfig
+from armident.daq.recording import Recording, Stream
+from armident.identify.experiment import Experiment
 
 MAX_MISSING_SHARE = 0.05
 """Samples an experiment may lack; with more, what is left no longer is the motion that was designed."""

@@ -10,10 +10,10 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from configs import ConfigError
-from daq.recording import Recording
-from identify.document import IdentificationDocument, from_json, to_json
-from identify.drift import Drift
+from armident.configs import ConfigError
+from armident.daq.recording import Recording
+from armident.identify.document import IdentificationDocument, from_json, to_json
+from armident.identify.drift import Drift
 
 DEFAULT = "sqlite:///history.sqlite"
 _STAMP = re.compile(r"(\d{8}T\d{6})-\d{3}Z")

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from configs import ConfigError
-from identify.document import IdentificationDocument, load_document
-from identify.drift import Drift, Inconclusive, compare
-from identify.history import History, Run, recorded_at
+from armident.configs import ConfigError
+from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.drift import Drift, Inconclusive, compare
+from armident.identify.history import History, Run, recorded_at
 
 DRIFTED = 4
 """Exit code: done, and the last run is of a changed arm."""

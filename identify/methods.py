@@ -7,20 +7,20 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.clie import clie
-from identify.estimators.cloe import cloe
-from identify.estimators.diagnostics import Diagnostics, diagnose_estimate
-from identify.estimators.didim import didim
-from identify.estimators.idim_iv import idim_iv
-from identify.estimators.idim_piv import idim_piv
-from identify.estimators.regression import Block, Estimate, joint_variances
-from identify.estimators.sep_pem import sep_pem
-from identify.options import Method, Options
-from identify.preparation import LS_CUTOFF, PIV_CUTOFF, Prepared, decimated_rows, sufficient
-from identify.signals.decimate import Decimation, design
-from identify.signals.delay import TorqueDelay, torque_delay
-from identify.signals.differentiate import Derivatives
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.clie import clie
+from armident.identify.estimators.cloe import cloe
+from armident.identify.estimators.diagnostics import Diagnostics, diagnose_estimate
+from armident.identify.estimators.didim import didim
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.estimators.idim_piv import idim_piv
+from armident.identify.estimators.regression import Block, Estimate, joint_variances
+from armident.identify.estimators.sep_pem import sep_pem
+from armident.identify.options import Method, Options
+from armident.identify.preparation import LS_CUTOFF, PIV_CUTOFF, Prepared, decimated_rows, sufficient
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.delay import TorqueDelay, torque_delay
+from armident.identify.signals.differentiate import Derivatives
 
 CONTRADICTION = 5.0
 """Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before it is disbelieved."""

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from configs import RobotConfig, Trajectory
-from configs.trajectory import RAMP_SHARE, Move
-from identify.aim import Aim, weighted
-from identify.catalogue.motion import Motion
-from identify.model.arm import ArmModel
-from identify.model.chain import Floats
-from identify.signals.decimate import Decimation, design
+from armident.configs import RobotConfig, Trajectory
+from armident.configs.trajectory import RAMP_SHARE, Move
+from armident.identify.aim import Aim, weighted
+from armident.identify.catalogue.motion import Motion
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.chain import Floats
+from armident.identify.signals.decimate import Decimation, design
 
 PEAK_VELOCITY = 1.0 / (1.0 - RAMP_SHARE)
 """Peak velocity of a move of unit length and duration."""

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
 
-from configs import ConfigError
-from identify.estimators.regression import MAX_AR_ORDER
-from identify.signals.differentiate import NVR_RULES, NvrRule
+from armident.configs import ConfigError
+from armident.identify.estimators.regression import MAX_AR_ORDER
+from armident.identify.signals.differentiate import NVR_RULES, NvrRule
 
 Method = Literal["idim-piv", "idim-iv", "idim-ls", "didim", "clie", "cloe", "sep-pem"]
 METHODS: tuple[Method, ...] = get_args(Method)

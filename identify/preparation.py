@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from configs.robot import Preprocessing
-from identify.estimators.regression import Block, filtered_regressor
-from identify.experiment import Experiment
-from identify.model.arm import ArmModel
-from identify.signals.bandpass import butterworth, central_difference
-from identify.signals.classical import chebyshev_decimate, kept_samples
-from identify.signals.decimate import Decimation, design
-from identify.signals.differentiate import Derivatives
+from armident.configs.robot import Preprocessing
+from armident.identify.estimators.regression import Block, filtered_regressor
+from armident.identify.experiment import Experiment
+from armident.identify.model.arm import ArmModel
+from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.classical import chebyshev_decimate, kept_samples
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.differentiate import Derivatives
 
 LS_CUTOFF = 2.0
 """Cut-off of the least-squares decimation in closed-loop bandwidths (thesis 2.3.1: ``w_Fp >= 2 w_dyn``)."""

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from configs import DataError, RobotConfig
-from identify.document import IdentificationDocument
-from identify.model.arm import ArmModel
-from identify.preparation import LS_CUTOFF
+from armident.configs import DataError, RobotConfig
+from armident.identify.document import IdentificationDocument
+from armident.identify.model.arm import ArmModel
+from armident.identify.preparation import LS_CUTOFF
 
 FREQUENCIES = 4096
 """Points of the noise spectra."""

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig
-from identify.estimators.diagnostics import Diagnostics
-from identify.estimators.noise import whiteness
-from identify.estimators.regression import Block, Estimate, residuals
-from identify.model.arm import ArmModel
-from identify.model.consistent import ConsistentParameters
-from identify.options import Options
-from identify.signals.delay import TorqueDelay
+from armident.configs import RobotConfig
+from armident.identify.estimators.diagnostics import Diagnostics
+from armident.identify.estimators.noise import whiteness
+from armident.identify.estimators.regression import Block, Estimate, residuals
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.consistent import ConsistentParameters
+from armident.identify.options import Options
+from armident.identify.signals.delay import TorqueDelay
 
 Array = NDArray[np.float64]
 

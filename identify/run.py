@@ -9,23 +9,23 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from configs import DataError, RobotConfig
-from identify.catalogue.recorded import put_right
-from identify.closed_loop import RELEVANT, closed_loop, velocity_error
-from identify.estimators.diagnostics import diagnose_estimate
-from identify.estimators.essential import essential_parameters
-from identify.estimators.idim_ls import idim_ls
-from identify.experiment import Experiment
-from identify.methods import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
-from identify.model.arm import ArmModel
-from identify.model.consistent import nearest_consistent
-from identify.options import CONTROLLERS, Options
-from identify.preparation import Prepared, aligned_torque, equations, least_rows, published_equations
-from identify.result import Array, Identification, make_result
-from identify.signals.bandwidth import motion_bandwidth
-from identify.signals.delay import HELD, TorqueDelay
-from identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
-from identify.signals.noise_decimation import decimation_from_noise
+from armident.configs import DataError, RobotConfig
+from armident.identify.catalogue.recorded import put_right
+from armident.identify.closed_loop import RELEVANT, closed_loop, velocity_error
+from armident.identify.estimators.diagnostics import diagnose_estimate
+from armident.identify.estimators.essential import essential_parameters
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.experiment import Experiment
+from armident.identify.methods import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.consistent import nearest_consistent
+from armident.identify.options import CONTROLLERS, Options
+from armident.identify.preparation import Prepared, aligned_torque, equations, least_rows, published_equations
+from armident.identify.result import Array, Identification, make_result
+from armident.identify.signals.bandwidth import motion_bandwidth
+from armident.identify.signals.delay import HELD, TorqueDelay
+from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
+from armident.identify.signals.noise_decimation import decimation_from_noise
 
 TOLERATED_DELAY = 1.0
 """Samples by which torque and position may be apart without a warning."""

@@ -8,9 +8,9 @@ from typing import Any
 
 import yaml
 
-from configs import DataError, RobotConfig, load_robot
-from daq.recording import Recording, read_recording
-from identify.document import (
+from armident.configs import DataError, RobotConfig, load_robot
+from armident.daq.recording import Recording, read_recording
+from armident.identify.document import (
     IdentificationDocument,
     identification_document,
     load_document,
@@ -18,11 +18,11 @@ from identify.document import (
     to_json,
     write_atomically,
 )
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from identify.options import Options, parse_decimation, parse_nvr
-from identify.result import Identification
-from identify.run import identify_experiment
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.options import Options, parse_decimation, parse_nvr
+from armident.identify.result import Identification
+from armident.identify.run import identify_experiment
 
 FOUND = 4
 """Exit code: done, and the answer is that something changed or stays unexplained."""
@@ -70,7 +70,7 @@ def identify_recording(
 
 def write_identification(outcome: Outcome, out: Path) -> tuple[Path, Path]:
     """Write ``identification.json`` and ``report.html`` into a folder; returns their paths."""
-    from identify.report.identification import identification_report
+    from armident.identify.report.identification import identification_report
 
     document, report = out / "identification.json", out / "report.html"
     write_atomically(document, to_json(outcome.document))
@@ -82,7 +82,7 @@ def identify_command(
     path: Path, config: Path | None, chosen: Mapping[str, Any], out: Path | None, *, as_json: bool
 ) -> None:
     """Carry out ``armident identify``; ``chosen`` are the fields of `Options` as the user wrote them."""
-    from identify.terminal import identification_table, progress, warn
+    from armident.identify.terminal import identification_table, progress, warn
 
     as_written = {"nvr": parse_nvr(chosen.get("nvr")), "decimation": parse_decimation(chosen.get("decimation"))}
     options = Options(**{**chosen, **as_written})
@@ -110,10 +110,10 @@ def diagnose_command(
     as_json: bool,
 ) -> int:
     """Carry out ``armident diagnose``; ``chosen`` are the fields of its `Settings`; returns the exit code."""
-    from identify.discrepancy.diagnose import diagnose
-    from identify.discrepancy.state import Settings
-    from identify.report.diagnosis import diagnosis_report
-    from identify.terminal import diagnosis_table, progress, warn
+    from armident.identify.discrepancy.diagnose import diagnose
+    from armident.identify.discrepancy.state import Settings
+    from armident.identify.report.diagnosis import diagnosis_report
+    from armident.identify.terminal import diagnosis_table, progress, warn
 
     numbers = None if baseline is None else load_document(baseline, IdentificationDocument)
     recordings = [read_recording(path) for path in paths]

@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from configs import RobotConfig
-from identify.document import DiagnosisDocument, IdentificationDocument
-from identify.model.arm import ArmModel
+from armident.configs import RobotConfig
+from armident.identify.document import DiagnosisDocument, IdentificationDocument
+from armident.identify.model.arm import ArmModel
 
 SHOW_AFTER_S = 2.0
 """Work that takes no longer needs no progress."""

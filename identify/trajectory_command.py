@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from configs import ConfigError, RobotConfig, load_robot, load_trajectory
-from identify.aim import Aim
-from identify.document import IdentificationDocument, load_document, write_atomically
-from identify.excitation import ASSUMED_NOISE, Design, Shape, aimed_at, assess, design_trajectory
-from identify.model.arm import ArmModel
-from identify.prior import Prior, prior_from
-from identify.terminal import design_table, progress, wanted_table
-from identify.trajectory_picture import check_name, draw
+from armident.configs import ConfigError, RobotConfig, load_robot, load_trajectory
+from armident.identify.aim import Aim
+from armident.identify.document import IdentificationDocument, load_document, write_atomically
+from armident.identify.excitation import ASSUMED_NOISE, Design, Shape, aimed_at, assess, design_trajectory
+from armident.identify.model.arm import ArmModel
+from armident.identify.prior import Prior, prior_from
+from armident.identify.terminal import design_table, progress, wanted_table
+from armident.identify.trajectory_picture import check_name, draw
 
 SHAPES: tuple[Shape, ...] = ("moves", "fourier")
 

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from configs import ConfigError, RobotConfig
-from identify.excitation import PERIOD, Design
-from identify.moves import motion_of
+from armident.configs import ConfigError, RobotConfig
+from armident.identify.excitation import PERIOD, Design
+from armident.identify.moves import motion_of
 
 SUFFIXES = (".png", ".svg", ".pdf")
 LINE, LIMIT, OUTSIDE = "#2a5d8f", "#b5403a", "#f6dfdd"

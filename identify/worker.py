@@ -15,13 +15,13 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
-from configs.reading import is_file
-from daq.recording import Recording, join_parts, read_recording
-from daq.zenoh_keys import Block, Keys, assemble, decode_block, decode_event, open_session
-from identify.document import to_json
-from identify.options import Options
-from identify.service import identify_recording, write_identification
+from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
+from armident.configs.reading import is_file
+from armident.daq.recording import Recording, join_parts, read_recording
+from armident.daq.zenoh_keys import Block, Keys, assemble, decode_block, decode_event, open_session
+from armident.identify.document import to_json
+from armident.identify.options import Options
+from armident.identify.service import identify_recording, write_identification
 
 MAX_WAITING_S = 10.0
 """How long after its end event an experiment waits for blocks that are still on their way."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from drivers.vcan import ensure_vcan, have_socketcan, remove_vcan
+from armident.drivers.vcan import ensure_vcan, have_socketcan, remove_vcan
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 NO_SOCKETCAN = "no SocketCAN in this kernel; run through `make test`"

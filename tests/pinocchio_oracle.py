@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from configs import Joint, Limits, Mdh, RobotConfig
-from identify.model.arm import ArmModel
+from armident.configs import Joint, Limits, Mdh, RobotConfig
+from armident.identify.model.arm import ArmModel
 
 Floats = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from configs.denavit_hartenberg import MdhChain
-from configs.urdf import UrdfJoint, rotation
+from armident.configs.denavit_hartenberg import MdhChain
+from armident.configs.urdf import UrdfJoint, rotation
 
 Floats = NDArray[np.float64]
 

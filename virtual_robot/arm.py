@@ -5,13 +5,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from configs import ConfigError, RobotConfig
-from configs.scenario import Scenario
-from virtual_robot import servo
-from virtual_robot.effects import hidden_effects
-from virtual_robot.effects.signals import Signals
-from virtual_robot.noise import Noise
-from virtual_robot.plant import BRAKE, Plant
+from armident.configs import ConfigError, RobotConfig
+from armident.configs.scenario import Scenario
+from armident.virtual_robot import servo
+from armident.virtual_robot.effects import hidden_effects
+from armident.virtual_robot.effects.signals import Signals
+from armident.virtual_robot.noise import Noise
+from armident.virtual_robot.plant import BRAKE, Plant
 
 Raw32 = NDArray[np.int32]
 Raw16 = NDArray[np.int16]
@@ -50,7 +50,7 @@ class Arm:
     sync_period
         Time between two SYNC, s: a multiple of the drives' control period; ``None``: one of them.
     seed, noise
-        Noise of the size measured (see ``virtual_robot.noise``), ``noise`` scales its amplitude.
+        Noise of the size measured (see ``armident.virtual_robot.noise``), ``noise`` scales its amplitude.
     scenario
         Hidden effects.
     velocity_feedback

@@ -1,4 +1,4 @@
-"""Recordings of virtual arms by the hundred: ``python -m virtual_robot.batch`` answers one request a line.
+"""Recordings of virtual arms by the hundred: ``python -m armident.virtual_robot.batch`` answers one request a line.
 
 A request is ``{robot, trajectory, repeats, period, seed, effects, out}``; ``effects`` is a list of ``{effect, joint,
 other, parameters, strength, truth, hide}`` whose parameters and truth may be expressions; with ``hide`` false the arm
@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from configs import RobotConfig, Trajectory, load_robot, load_trajectory
-from configs.exchange import Document, serve
-from configs.expression import evaluate
-from configs.scenario import HiddenEffect, Scenario
-from daq.recording import write_recording
-from virtual_robot.inertias import plant_parameters
-from virtual_robot.offline import simulate_recording
-from virtual_robot.plant import Plant
+from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.configs.exchange import Document, serve
+from armident.configs.expression import evaluate
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.daq.recording import write_recording
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.offline import simulate_recording
+from armident.virtual_robot.plant import Plant
 
 
 def joint_scale(robot: RobotConfig, joint: int, q: tuple[float, ...]) -> dict[str, float]:

@@ -41,13 +41,13 @@ def robot(
     Example: armident robot --config tx40_cell.yaml --scenario scenarios/tx40_worn_joint2.yaml
     """
     if list_effects:
-        from virtual_robot.effects import describe_effects
+        from armident.virtual_robot.effects import describe_effects
 
         print(describe_effects())
         return
 
-    from configs import ConfigError
-    from virtual_robot.run import record_robot, run_robot
+    from armident.configs import ConfigError
+    from armident.virtual_robot.run import record_robot, run_robot
 
     if to_file is None and (trajectory is not None or encoder_counts is not None):
         raise ConfigError("--trajectory and --encoder-counts belong to --to-file")

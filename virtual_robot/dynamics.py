@@ -9,9 +9,9 @@ import math
 import numpy as np
 from numba import njit
 
-from virtual_robot.effects.bristles import bristle_rate
-from virtual_robot.effects.forces import CODES, effect_torque
-from virtual_robot.effects.gears import gear_torque
+from armident.virtual_robot.effects.bristles import bristle_rate
+from armident.virtual_robot.effects.forces import CODES, effect_torque
+from armident.virtual_robot.effects.gears import gear_torque
 
 SUBSTEPS = 6
 """Inner steps per control period of 200 us: 33 us against the 50 us time constant of joint 6 at standstill."""

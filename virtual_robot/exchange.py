@@ -7,8 +7,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drivers.frames import BIT_RATE_SWITCH, FD_FLAG, fd_length, frames
-from drivers.objects import (
+from armident.drivers.frames import BIT_RATE_SWITCH, FD_FLAG, fd_length, frames
+from armident.drivers.objects import (
     COB_SYNC,
     CONTROLWORD,
     CURRENT_ACTUAL,
@@ -23,8 +23,8 @@ from drivers.objects import (
     VELOCITY_ACTUAL,
     DriveState,
 )
-from virtual_robot.arm import Motion
-from virtual_robot.node import FOLLOWING_ERROR, Drive
+from armident.virtual_robot.arm import Motion
+from armident.virtual_robot.node import FOLLOWING_ERROR, Drive
 
 POSITION, CURRENT, DEMAND, STATUS, VELOCITY, ERROR, CONSTANT = range(7)
 """Rows of the live values; objects that do not move get rows of their own from ``CONSTANT`` on."""

@@ -3,7 +3,7 @@
 Table B.4 gives fourteen essential base inertial values; the links need sixty standard ones. A semidefinite
 programme chooses them: every link's pseudo-inertia positive definite (Wensing, Kim, Slotine 2018), rotor
 inertias positive, the essential values met, everything else small. Regenerate the data file with
-``python -m virtual_robot.inertias``.
+``python -m armident.virtual_robot.inertias``.
 """
 
 from collections.abc import Mapping
@@ -17,8 +17,8 @@ import yaml
 from numpy.typing import NDArray
 from scipy import sparse
 
-from configs import ArmidentError, ConfigError, RobotConfig
-from configs.reading import is_file
+from armident.configs import ArmidentError, ConfigError, RobotConfig
+from armident.configs.reading import is_file
 
 HERE = Path(__file__).parent
 clarabel: Any = untyped_clarabel
@@ -222,7 +222,7 @@ def main() -> None:
     """Solve and write the data file of the virtual TX40."""
     parameters = solve() | {f"off{j}": 0.0 for j in range(1, JOINTS + 1)} | FRICTION | {"iam6": IAM6}
     lines = [
-        "# Standard parameters of the virtual TX40, joint side, SI. Generated: python -m virtual_robot.inertias",
+        "# Standard parameters of the virtual TX40, joint side, SI. From python -m armident.virtual_robot.inertias",
         "# Inertias about the frame origins (MDH frames of table B.1); friction of table B.4.",
         f"rest: [{', '.join(f'{x:.6g}' for x in REST)}]  # posture at power-on, rad",
         "parameters:",

@@ -9,15 +9,15 @@ import can
 import canopen
 import numpy as np
 
-from configs import ConfigError
-from configs.session import Bus
-from drivers.frames import BusDown, frames
-from drivers.objects import COB_MASK, COB_NMT, COB_SDO_REQUEST, COB_SYNC
-from drivers.socketcan import RECEIVE_TIMEOUT, RawSocket
-from drivers.udp import open_bus
-from virtual_robot.arm import Motion
-from virtual_robot.exchange import Exchange
-from virtual_robot.node import Drive
+from armident.configs import ConfigError
+from armident.configs.session import Bus
+from armident.drivers.frames import BusDown, frames
+from armident.drivers.objects import COB_MASK, COB_NMT, COB_SDO_REQUEST, COB_SYNC
+from armident.drivers.socketcan import RECEIVE_TIMEOUT, RawSocket
+from armident.drivers.udp import open_bus
+from armident.virtual_robot.arm import Motion
+from armident.virtual_robot.exchange import Exchange
+from armident.virtual_robot.node import Drive
 
 PDO_FILTERS = ((0x180, 0x780), (0x200, 0x700), (0x300, 0x700), (0x400, 0x700), (0x500, 0x780))
 """Identifiers 180h to 57Fh, which PDOs may have; a socket does not receive what it sends itself."""

@@ -1,6 +1,6 @@
 """The state machine of a CiA 402 drive (CiA 402 part 2): controlword in, statusword out."""
 
-from drivers.objects import STATE_CODES, Control, DriveState
+from armident.drivers.objects import STATE_CODES, Control, DriveState
 
 VOLTAGE_ENABLED = 0x0010
 REMOTE = 0x0200

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pinocchio
 
-from configs import RobotConfig
+from armident.configs import RobotConfig
 
 pin: Any = pinocchio
 

@@ -14,9 +14,9 @@ from canopen.objectdictionary import ODArray
 from canopen.sdo.exceptions import SdoAbortedError
 from canopen.sdo.server import SdoServer
 
-from configs import ConfigError
-from configs.robot import Joint
-from drivers.objects import (
+from armident.configs import ConfigError
+from armident.configs.robot import Joint
+from armident.drivers.objects import (
     COB_HEARTBEAT,
     COB_SDO_REQUEST,
     COB_SDO_RESPONSE,
@@ -49,8 +49,8 @@ from drivers.objects import (
     NmtState,
     rated_milliamperes,
 )
-from virtual_robot.arm import Motion
-from virtual_robot.machine import MOVING, next_state, statusword
+from armident.virtual_robot.arm import Motion
+from armident.virtual_robot.machine import MOVING, next_state, statusword
 
 ABORT_UNSUPPORTED = 0x06010000
 ABORT_NOT_MAPPABLE = 0x06040041

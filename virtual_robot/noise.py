@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from configs import RobotConfig
+from armident.configs import RobotConfig
 
 
 @dataclass(frozen=True)

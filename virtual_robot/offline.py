@@ -5,11 +5,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, RobotConfig, Trajectory
-from configs.scenario import Scenario
-from daq.recording import Field, Mark, Recording, Stream
-from virtual_robot import servo
-from virtual_robot.arm import Arm, counts_per_si
+from armident.configs import ConfigError, RobotConfig, Trajectory
+from armident.configs.scenario import Scenario
+from armident.daq.recording import Field, Mark, Recording, Stream
+from armident.virtual_robot import servo
+from armident.virtual_robot.arm import Arm, counts_per_si
 
 Effort = Literal["current", "voltage", "torque"]
 

@@ -7,16 +7,16 @@ import numpy as np
 import pinocchio
 from numpy.typing import ArrayLike, NDArray
 
-from configs import ConfigError, RobotConfig
-from configs.scenario import Scenario
-from virtual_robot import dynamics
-from virtual_robot.effects import Hidden, hidden_effects
-from virtual_robot.effects.bodies import add_rotors, change_bodies, hanging, hinge_damping, shaking
-from virtual_robot.effects.bristles import bristle_table, sliding_level
-from virtual_robot.effects.forces import force_table
-from virtual_robot.effects.gears import gear_rows, twist_under
-from virtual_robot.inertias import plant_parameters
-from virtual_robot.model import build_model
+from armident.configs import ConfigError, RobotConfig
+from armident.configs.scenario import Scenario
+from armident.virtual_robot import dynamics
+from armident.virtual_robot.effects import Hidden, hidden_effects
+from armident.virtual_robot.effects.bodies import add_rotors, change_bodies, hanging, hinge_damping, shaking
+from armident.virtual_robot.effects.bristles import bristle_table, sliding_level
+from armident.virtual_robot.effects.forces import force_table
+from armident.virtual_robot.effects.gears import gear_rows, twist_under
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.model import build_model
 
 pin: Any = pinocchio
 

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, DataError, RobotConfig
-from daq.recording import Recording, Stream
-from virtual_robot.arm import Raw32, counts_per_si
+from armident.configs import ConfigError, DataError, RobotConfig
+from armident.daq.recording import Recording, Stream
+from armident.virtual_robot.arm import Raw32, counts_per_si
 
 RATE_TOLERANCE = 1e-3
 """Relative difference allowed between the recording's sample rate and the SYNC rate."""

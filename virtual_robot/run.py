@@ -9,16 +9,16 @@ from types import FrameType
 
 from numpy.typing import ArrayLike
 
-from configs import ConfigError, RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
-from daq.recording import read_recording, write_recording
-from virtual_robot import servo
-from virtual_robot.arm import Arm, Motion
-from virtual_robot.inertias import base_parameters, plant_parameters, rest_posture
-from virtual_robot.offline import simulate_recording, with_encoder_counts
-from virtual_robot.plant import Plant
-from virtual_robot.replay import Replay
-from virtual_robot.scenario import load_scenario
-from virtual_robot.server import Server
+from armident.configs import ConfigError, RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
+from armident.daq.recording import read_recording, write_recording
+from armident.virtual_robot import servo
+from armident.virtual_robot.arm import Arm, Motion
+from armident.virtual_robot.inertias import base_parameters, plant_parameters, rest_posture
+from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
+from armident.virtual_robot.plant import Plant
+from armident.virtual_robot.replay import Replay
+from armident.virtual_robot.scenario import load_scenario
+from armident.virtual_robot.server import Server
 
 
 def run_robot(

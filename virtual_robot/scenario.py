@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from configs import ConfigError, config_path
-from configs.loading import HERE, parse
-from configs.reading import is_file
-from configs.scenario import Scenario
+from armident.configs import ConfigError, config_path
+from armident.configs.loading import HERE, parse
+from armident.configs.reading import is_file
+from armident.configs.scenario import Scenario
 
 SCENARIOS = HERE / "scenarios"
 

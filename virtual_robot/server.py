@@ -9,13 +9,13 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig, SessionConfig
-from drivers.frames import frames
-from drivers.objects import DriveState
-from drivers.socketcan import RECEIVE_TIMEOUT, RawSocket
-from virtual_robot.arm import Motion, counts_per_si
-from virtual_robot.line import BATCH, Line
-from virtual_robot.node import Drive
+from armident.configs import RobotConfig, SessionConfig
+from armident.drivers.frames import frames
+from armident.drivers.objects import DriveState
+from armident.drivers.socketcan import RECEIVE_TIMEOUT, RawSocket
+from armident.virtual_robot.arm import Motion, counts_per_si
+from armident.virtual_robot.line import BATCH, Line
+from armident.virtual_robot.node import Drive
 
 TOGETHER_S = 0.05
 """How long a SYNC of one bus waits for that of another, before the arm moves on without it."""

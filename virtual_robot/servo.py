@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from configs import ConfigError, RobotConfig
+from armident.configs import ConfigError, RobotConfig
 
 CONTROL_PERIOD = 200e-6
 """Period of position, velocity and current command, s."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig
+from armident.configs import RobotConfig
 
 FOLLOWING_S = 0.1
 """A joint may lag behind its demand by what it covers in this time at its velocity limit, s."""

@@ -9,15 +9,15 @@ from types import FrameType
 
 import numpy as np
 
-from configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session
-from configs.session import Bus
-from daq.guard.limits import FOLLOWING_S, limits_of
-from daq.guard.watch import Alarm, Watch
-from daq.streams import bus_numbers, node_ids
-from drivers.frames import BusDown, FrameBus, Frames, frames
-from drivers.objects import COB_MASK, COB_SDO_REQUEST, CONTROLWORD, Control, rpdo_cob, stop_rpdo
-from drivers.priority import be_punctual
-from drivers.udp import open_bus
+from armident.configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session
+from armident.configs.session import Bus
+from armident.daq.guard.limits import FOLLOWING_S, limits_of
+from armident.daq.guard.watch import Alarm, Watch
+from armident.daq.streams import bus_numbers, node_ids
+from armident.drivers.frames import BusDown, FrameBus, Frames, frames
+from armident.drivers.objects import COB_MASK, COB_SDO_REQUEST, CONTROLWORD, Control, rpdo_cob, stop_rpdo
+from armident.drivers.priority import be_punctual
+from armident.drivers.udp import open_bus
 
 BATCH = 512
 LOOK_S = 0.02

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from configs import ConfigError, RobotConfig, SessionConfig
-from configs.session import Stream
-from daq.guard.limits import (
+from armident.configs import ConfigError, RobotConfig, SessionConfig
+from armident.configs.session import Stream
+from armident.daq.guard.limits import (
     HEARTBEAT_MARGIN_S,
     HEARTBEATS_MISSED,
     TORQUE_PEAK,
@@ -16,10 +16,10 @@ from daq.guard.limits import (
     VELOCITY_S,
     Limits,
 )
-from daq.streams import bus_numbers, counts_per_si, node_ids
-from drivers.emcy import emcy_text
-from drivers.frames import Frames
-from drivers.objects import (
+from armident.daq.streams import bus_numbers, counts_per_si, node_ids
+from armident.drivers.emcy import emcy_text
+from armident.drivers.frames import Frames
+from armident.drivers.objects import (
     COB_EMCY,
     COB_HEARTBEAT,
     COB_NMT,

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from configs import ArmidentError, ConfigError, DataError
-from daq.recording import mcap_format as mcap
-from daq.recording.layout import StreamLayout
-from daq.recording.reader import (
+from armident.configs import ArmidentError, ConfigError, DataError
+from armident.daq.recording import mcap_format as mcap
+from armident.daq.recording.layout import StreamLayout
+from armident.daq.recording.reader import (
     HEALED,
     checked_record,
     damaged_text,
@@ -20,8 +20,8 @@ from daq.recording.reader import (
     torn_text,
     uncompressed,
 )
-from daq.recording.summary import Summary
-from daq.recording.writer import CHECK, COUNTERS
+from armident.daq.recording.summary import Summary
+from armident.daq.recording.writer import CHECK, COUNTERS
 
 _COPY = 1 << 24
 """Bytes copied at a time."""

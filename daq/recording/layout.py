@@ -15,9 +15,9 @@ import numpy as np
 from google.protobuf import descriptor_pb2
 from numpy.typing import NDArray
 
-from configs import DataError
-from daq.recording.mcap_format import MESSAGE, RECORD_HEAD
-from daq.recording.model import Field, Quantity, Side, Stream
+from armident.configs import DataError
+from armident.daq.recording.mcap_format import MESSAGE, RECORD_HEAD
+from armident.daq.recording.model import Field, Quantity, Side, Stream
 
 _PROTO = descriptor_pb2.FieldDescriptorProto
 _WIRE = {

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig
-from daq.recording.layout import StreamLayout
-from daq.recording.model import Field
+from armident.configs import RobotConfig
+from armident.daq.recording.layout import StreamLayout
+from armident.daq.recording.model import Field
 
 PREFIX = "si_"
 """How the topics begin: ``/si_samples`` shows ``/samples``."""

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError, RobotConfig, SessionConfig
+from armident.configs import DataError, RobotConfig, SessionConfig
 
 Quantity = Literal["position", "velocity", "current", "voltage", "torque", "demand", "status"]
 Side = Literal["motor", "joint"]

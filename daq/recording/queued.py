@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.recording.model import Gap, Mark
-from daq.recording.series import RecordingSeries
-from daq.recording.triggered import TriggeredSeries
-from daq.recording.unwritten import STANDS_STILL, Spans
+from armident.daq.recording.model import Gap, Mark
+from armident.daq.recording.series import RecordingSeries
+from armident.daq.recording.triggered import TriggeredSeries
+from armident.daq.recording.unwritten import STANDS_STILL, Spans
 
 MOST_WAITING_BYTES = 128 << 20
 """Rows that may wait for the disk: some six minutes of six axes at 5 kHz."""

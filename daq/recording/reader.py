@@ -15,12 +15,12 @@ import zstandard
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from configs import ConfigError, DataError, RobotConfig, SessionConfig
-from daq.recording import mcap_format as mcap
-from daq.recording.layout import StreamLayout
-from daq.recording.model import Gap, Mark, Recording, Stream, gap_from, mark_from
-from daq.recording.rows import Rows
-from daq.recording.writer import CHECK, COUNTERS, GAPS_TOPIC, MARKS_TOPIC, SCHEMA
+from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
+from armident.daq.recording import mcap_format as mcap
+from armident.daq.recording.layout import StreamLayout
+from armident.daq.recording.model import Gap, Mark, Recording, Stream, gap_from, mark_from
+from armident.daq.recording.rows import Rows
+from armident.daq.recording.writer import CHECK, COUNTERS, GAPS_TOPIC, MARKS_TOPIC, SCHEMA
 
 _LARGEST_CHUNK = 1 << 28
 _LEAST_ROW, _MOST_RESERVED = 2, 1 << 25

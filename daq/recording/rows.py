@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.recording.layout import StreamLayout
+from armident.daq.recording.layout import StreamLayout
 
 _FEWEST = 4096
 

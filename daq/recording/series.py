@@ -9,10 +9,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError
-from daq.recording.model import Gap, Mark
-from daq.recording.unwritten import Spans
-from daq.recording.writer import RecordingWriter
+from armident.configs import ConfigError
+from armident.daq.recording.model import Gap, Mark
+from armident.daq.recording.unwritten import Spans
+from armident.daq.recording.writer import RecordingWriter
 
 RETRY_NS = 10_000_000_000
 """Time until the next attempt, where a new file could not be begun, ns."""

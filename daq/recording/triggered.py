@@ -10,10 +10,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError
-from daq.recording.model import Gap, Mark
-from daq.recording.series import RETRY_NS, RecordingSeries
-from daq.recording.unwritten import Spans
+from armident.configs import ConfigError
+from armident.daq.recording.model import Gap, Mark
+from armident.daq.recording.series import RETRY_NS, RecordingSeries
+from armident.daq.recording.unwritten import Spans
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.recording.model import Gap
+from armident.daq.recording.model import Gap
 
 NOT_WRITTEN = "not written"
 """Samples that were received, but the disk did not take them."""

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from configs import ConfigError
-from configs.suite import LEVELS, Level, SuiteConfig, SuiteEffect
+from armident.configs import ConfigError
+from armident.configs.suite import LEVELS, Level, SuiteConfig, SuiteEffect
 
 Kind = Literal["clean", "clean_baseline", "effect", "pair", "outside"]
 

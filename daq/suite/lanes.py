@@ -9,12 +9,12 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from configs import ArmidentError
-from daq.suite.cases import BASELINE_SEED, Case, HiddenPart, twin
-from daq.suite.room import Room
-from daq.suite.store import Record, Store
+from armident.configs import ArmidentError
+from armident.daq.suite.cases import BASELINE_SEED, Case, HiddenPart, twin
+from armident.daq.suite.room import Room
+from armident.daq.suite.store import Record, Store
 
-PLANT, DIAGNOSIS = "virtual_robot.batch", "identify.discrepancy.batch"
+PLANT, DIAGNOSIS = "armident.virtual_robot.batch", "armident.identify.discrepancy.batch"
 PATIENCE_S = 900.0
 """For one answer; the first one of a machine waits for the compiler."""
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from daq.suite.table import (
+from armident.daq.suite.table import (
     AIM_COLUMNS,
     AIMED_AT,
     CLOSED,

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from configs import ArmidentError
+from armident.configs import ArmidentError
 
 Document = dict[str, Any]
 

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from configs import ArmidentError, ConfigError, load_suite
-from daq.suite.cases import Case, all_cases, chosen, twin
-from daq.suite.lanes import Lanes
-from daq.suite.markdown import report
-from daq.suite.score import score
-from daq.suite.show import progress, show
-from daq.suite.store import Record, Store, code_version
-from daq.suite.table import COLUMNS, HEALTHY_COLUMNS, OUTSIDE_COLUMNS, Scored, Tables, tables
+from armident.configs import ArmidentError, ConfigError, load_suite
+from armident.daq.suite.cases import Case, all_cases, chosen, twin
+from armident.daq.suite.lanes import Lanes
+from armident.daq.suite.markdown import report
+from armident.daq.suite.score import score
+from armident.daq.suite.show import progress, show
+from armident.daq.suite.store import Record, Store, code_version
+from armident.daq.suite.table import COLUMNS, HEALTHY_COLUMNS, OUTSIDE_COLUMNS, Scored, Tables, tables
 
 RESULTS, SUMMARY, TABLE, REPORT = "results.jsonl", "suite.json", "suite.csv", "suite.md"
 SCHEMA = "armident/suite-result/1"

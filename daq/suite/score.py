@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from daq.suite.cases import Case, HiddenPart
-from daq.suite.store import Record
+from armident.daq.suite.cases import Case, HiddenPart
+from armident.daq.suite.store import Record
 
 Document = dict[str, Any]
 

@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from daq.suite.cases import Case
-from daq.suite.lanes import Done
-from daq.suite.store import Record
-from daq.suite.table import AIM_COLUMNS, COLUMNS, HEALTHY_COLUMNS, OUTSIDE_COLUMNS, Tables
+from armident.daq.suite.cases import Case
+from armident.daq.suite.lanes import Done
+from armident.daq.suite.store import Record
+from armident.daq.suite.table import AIM_COLUMNS, COLUMNS, HEALTHY_COLUMNS, OUTSIDE_COLUMNS, Tables
 
 PLAIN_EVERY_S = 30.0
 """Between two lines of progress where stderr is no terminal."""

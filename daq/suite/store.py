@@ -7,8 +7,8 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import configs
-from configs import DataError
+from armident import configs
+from armident.configs import DataError
 
 Record = dict[str, Any]
 

@@ -8,9 +8,9 @@ from typing import Any
 
 from scipy import stats
 
-from configs.suite import LEVELS
-from daq.suite.cases import Case
-from daq.suite.score import LOW_CONFIDENCE, Score
+from armident.configs.suite import LEVELS
+from armident.daq.suite.cases import Case
+from armident.daq.suite.score import LOW_CONFIDENCE, Score
 
 Scored = tuple[Case, Score]
 CLOSED = 0.9

@@ -1,8 +1,8 @@
 """What is said on Zenoh: keys, blocks of samples, events, and how a session is opened."""
 
-from daq.zenoh_keys.codec import Block, assemble, decode_block, decode_event, encode_block, encode_event
-from daq.zenoh_keys.keys import Keys
-from daq.zenoh_keys.session import open_session
+from armident.daq.zenoh_keys.codec import Block, assemble, decode_block, decode_event, encode_block, encode_event
+from armident.daq.zenoh_keys.keys import Keys
+from armident.daq.zenoh_keys.session import open_session
 
 __all__ = [
     "Block",

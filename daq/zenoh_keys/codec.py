@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError, RobotConfig, SessionConfig
-from daq.recording import Gap, Mark, Recording, Stream, StreamLayout
-from daq.recording.model import gap_from, mark_from
+from armident.configs import DataError, RobotConfig, SessionConfig
+from armident.daq.recording import Gap, Mark, Recording, Stream, StreamLayout
+from armident.daq.recording.model import gap_from, mark_from
 
 VERSION = 1
 EVENT_SCHEMA = "armident/event/1"

@@ -7,7 +7,7 @@ from typing import Literal
 
 import zenoh
 
-from configs import ConfigError, SessionConfig
+from armident.configs import ConfigError, SessionConfig
 
 Role = Literal["capture", "worker", "observer"]
 

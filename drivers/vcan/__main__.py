@@ -1,18 +1,18 @@
-"""``python -m drivers.vcan [-n BUSES] [-m MEMORY] [--guest] -- COMMAND``: run a command where vcan buses are up."""
+"""``python -m armident.drivers.vcan [-n BUSES] [-m MEMORY] [--guest] -- COMMAND``: run with vcan buses."""
 
 import argparse
 import os
 import sys
 
-from configs.errors import ArmidentError
-from drivers.vcan import guest, interfaces, packages
+from armident.configs.errors import ArmidentError
+from armident.drivers.vcan import guest, interfaces, packages
 
 CANNOT_RUN = 125
 
 
 def main() -> int:
     """Run the command natively where this kernel has vcan buses for us, in a guest where it has not."""
-    parser = argparse.ArgumentParser(prog="python -m drivers.vcan", description=main.__doc__)
+    parser = argparse.ArgumentParser(prog="python -m armident.drivers.vcan", description=main.__doc__)
     parser.add_argument("-n", dest="buses", type=int, default=1, metavar="BUSES", help="how many: vcan0 and on (1)")
     parser.add_argument("-m", dest="memory", default="4096M", help="memory of a guest (4096M)")
     parser.add_argument("--guest", action="store_true", help="use a guest even where this kernel has SocketCAN")
@@ -31,7 +31,7 @@ def main() -> int:
             os.execvp(command[0], command)
         return guest.run(command, options.buses, options.memory)
     except (ArmidentError, OSError) as error:
-        print(f"drivers.vcan: {error}", file=sys.stderr)
+        print(f"armident.drivers.vcan: {error}", file=sys.stderr)
         return CANNOT_RUN
 
 

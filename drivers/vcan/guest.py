@@ -22,8 +22,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from configs.errors import ArmidentError
-from drivers.vcan import packages
+from armident.configs.errors import ArmidentError
+from armident.drivers.vcan import packages
 
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE_S = 15.0
@@ -42,7 +42,7 @@ def launcher_available() -> str | None:
 
 def launcher_command(command: Sequence[str], buses: int = 1) -> list[str]:
     """The command line that runs ``command`` where ``vcan0`` to ``vcan{buses - 1}`` are up."""
-    return [sys.executable, "-m", "drivers.vcan", "-n", str(buses), "--", *command]
+    return [sys.executable, "-m", "armident.drivers.vcan", "-n", str(buses), "--", *command]
 
 
 def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable: Sequence[Path] = ()) -> int:

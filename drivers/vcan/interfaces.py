@@ -4,7 +4,7 @@ import socket
 import subprocess
 from pathlib import Path
 
-from configs.errors import ConfigError
+from armident.configs.errors import ConfigError
 
 NETWORK = Path("/sys/class/net")
 IFF_UP = 1

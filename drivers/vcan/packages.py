@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from configs.errors import ArmidentError
+from armident.configs.errors import ArmidentError
 
 GUEST_PACKAGES = ("user-mode-linux", "libc6")
 HOST_PACKAGES = ("patchelf", "busybox-static", "can-utils")

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from identify.catalogue.effect import Effect, Linear, Place, Recorded, Shape, motor_limit
-from identify.catalogue.motion import Motion
+from armident.identify.catalogue.effect import Effect, Linear, Place, Recorded, Shape, motor_limit
+from armident.identify.catalogue.motion import Motion
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig
-from identify.catalogue.motion import Motion
+from armident.configs import RobotConfig
+from armident.identify.catalogue.motion import Motion
 
 Array = NDArray[np.float64]
 
@@ -127,10 +127,10 @@ class Effect:
     together
         Whether several of one effect on one joint are one finding (the harmonics of a periodic torque).
     excitation
-        What a trajectory that is to show the effect must have plenty of; see `identify.excitation`.
+        What a trajectory that is to show the effect must have plenty of; see `armident.identify.excitation`.
     rewires
-        Whether the effect is an exchange of signals instead of a torque: `identify.catalogue.wiring` undoes it in the
-        recording, and there are no columns.
+        Whether the effect is an exchange of signals instead of a torque:
+        `armident.identify.catalogue.wiring` undoes it in the recording, and there are no columns.
     predicts
         Whether the columns depend on the torques that the model predicts, and so on its parameters.
     share

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.catalogue.effect import Effect, Linear, Place
-from identify.catalogue.motion import Motion
-from identify.model.chain import INERTIAL
+from armident.identify.catalogue.effect import Effect, Linear, Place
+from armident.identify.catalogue.motion import Motion
+from armident.identify.model.chain import INERTIAL
 
 Array = NDArray[np.float64]
 

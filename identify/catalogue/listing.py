@@ -4,8 +4,8 @@ import json
 import sys
 from typing import Any
 
-from identify.catalogue.effect import Effect
-from identify.catalogue.registry import catalogue, known
+from armident.identify.catalogue.effect import Effect
+from armident.identify.catalogue.registry import catalogue, known
 
 ALWAYS: tuple[tuple[str, str, str], ...] = (
     ("viscous friction", "fv<joint> (N m s/rad, N s/m)", "in every model"),

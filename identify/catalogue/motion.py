@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from identify.model.compiled import compiled
+from armident.identify.model.compiled import compiled
 
 if TYPE_CHECKING:
-    from identify.model.arm import ArmModel
+    from armident.identify.model.arm import ArmModel
 
 Array = NDArray[np.float64]
 

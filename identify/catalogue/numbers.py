@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.catalogue.effect import Effect, Linear, Place
-from identify.catalogue.friction import TORQUE, VISCOUS
-from identify.catalogue.link import by_numbers
-from identify.catalogue.motion import Motion
+from armident.identify.catalogue.effect import Effect, Linear, Place
+from armident.identify.catalogue.friction import TORQUE, VISCOUS
+from armident.identify.catalogue.link import by_numbers
+from armident.identify.catalogue.motion import Motion
 
 Array = NDArray[np.float64]
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from configs import RobotConfig
-from configs.robot import Effect as Stanza
-from identify.catalogue.effect import Recorded, motor_limit
-from identify.catalogue.registry import known
-from identify.catalogue.wiring import rewired
-from identify.experiment import Experiment
+from armident.configs import RobotConfig
+from armident.configs.robot import Effect as Stanza
+from armident.identify.catalogue.effect import Recorded, motor_limit
+from armident.identify.catalogue.registry import known
+from armident.identify.catalogue.wiring import rewired
+from armident.identify.experiment import Experiment
 
 
 def of_recording(stanza: Stanza) -> bool:

@@ -3,9 +3,9 @@
 from functools import cache
 from importlib.metadata import entry_points
 
-from configs import ConfigError
-from identify.catalogue import drive, friction, link, numbers, transmission, wiring
-from identify.catalogue.effect import Effect
+from armident.configs import ConfigError
+from armident.identify.catalogue import drive, friction, link, numbers, transmission, wiring
+from armident.identify.catalogue.effect import Effect
 
 ENTRY_POINTS = "armident.effects"
 """Group of the entry points by which a package adds effects: each names an `Effect`, or a sequence of them."""

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from identify.catalogue.effect import Shape
-from identify.catalogue.motion import Motion
+from armident.identify.catalogue.effect import Shape
+from armident.identify.catalogue.motion import Motion
 
 SHARES = (0.0, 0.25, 0.5, 0.75)
 """Of the least inertia that a joint has along a motion."""

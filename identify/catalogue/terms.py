@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, RobotConfig
-from configs.robot import Effect as Stanza
-from identify.catalogue.effect import Effect, Linear, Place
-from identify.catalogue.motion import Motion
-from identify.catalogue.recorded import of_recording
-from identify.catalogue.registry import known
+from armident.configs import ConfigError, RobotConfig
+from armident.configs.robot import Effect as Stanza
+from armident.identify.catalogue.effect import Effect, Linear, Place
+from armident.identify.catalogue.motion import Motion
+from armident.identify.catalogue.recorded import of_recording
+from armident.identify.catalogue.registry import known
 
 Array = NDArray[np.float64]
 

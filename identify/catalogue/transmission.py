@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.catalogue.effect import Effect, Linear, Place, Shape
-from identify.catalogue.motion import Motion
-from identify.catalogue.rotor import ROTOR
-from identify.model.compiled import compiled
+from armident.identify.catalogue.effect import Effect, Linear, Place, Shape
+from armident.identify.catalogue.motion import Motion
+from armident.identify.catalogue.rotor import ROTOR
+from armident.identify.model.compiled import compiled
 
 Array = NDArray[np.float64]
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, RobotConfig
-from identify.catalogue.effect import Effect, Place
-from identify.catalogue.motion import Motion
-from identify.experiment import Experiment
+from armident.configs import ConfigError, RobotConfig
+from armident.identify.catalogue.effect import Effect, Place
+from armident.identify.catalogue.motion import Motion
+from armident.identify.experiment import Experiment
 
 Array = NDArray[np.float64]
 

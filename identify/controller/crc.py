@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from configs import DataError
-from identify.estimators.noise import ArModel, fit_ar
-from identify.model.controller import DiscreteController
+from armident.configs import DataError
+from armident.identify.estimators.noise import ArModel, fit_ar
+from armident.identify.model.controller import DiscreteController
 
 LENGTHS = (1, 2, 3, 5, 8, 12, 20)
 """Impulse-response lengths tried; the thesis settles between 3 and 20 (table 5.12)."""

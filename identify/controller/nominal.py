@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ConfigError, DataError, RobotConfig
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
+from armident.configs import ConfigError, DataError, RobotConfig
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
 
 STIFFNESS = 8.0
 """Natural frequency of the stand-in, in closed-loop bandwidths of the robot."""

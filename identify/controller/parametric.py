@@ -7,11 +7,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.controller.crc import HELD_OUT, IdentifiedController, JointResponse
-from identify.controller.law import UNITS, Array, Stretch, Structure, gains, loop_ratios, simulate_law, taps
-from identify.controller.riv import LawFit, fit_law, refined_iv
-from identify.model.controller import DiscreteController
+from armident.configs import DataError
+from armident.identify.controller.crc import HELD_OUT, IdentifiedController, JointResponse
+from armident.identify.controller.law import UNITS, Array, Stretch, Structure, gains, loop_ratios, simulate_law, taps
+from armident.identify.controller.riv import LawFit, fit_law, refined_iv
+from armident.identify.model.controller import DiscreteController
 
 WORTH = 1e-5
 """Share of the torque's variance that an addition to the law has to explain on held-out data (0.3 % in amplitude),"""
@@ -64,7 +64,7 @@ class ControlLaw(JointResponse):
     structure
         What the law contains.
     gains
-        Those of :func:`identify.controller.law.gains`.
+        Those of :func:`armident.identify.controller.law.gains`.
     saturated
         Samples that were left out.
     iterations, converged

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from configs import DataError
-from identify.controller.law import Array, Stretch, Structure, columns, integral_slopes, low_pass, simulate_law
-from identify.estimators.noise import WHITE, ArModel, fit_ar
+from armident.configs import DataError
+from armident.identify.controller.law import Array, Stretch, Structure, columns, integral_slopes, low_pass, simulate_law
+from armident.identify.estimators.noise import WHITE, ArModel, fit_ar
 
 ITERATIONS = 40
 """Iterations at most."""

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from configs import DataError
-from identify.catalogue.effect import Effect, Place
-from identify.discrepancy.regression import MAX_AR_ORDER, Fit
-from identify.document import IdentificationDocument
-from identify.estimators.regression import COVARIANCE_PASSES, Block, noise_models
+from armident.configs import DataError
+from armident.identify.catalogue.effect import Effect, Place
+from armident.identify.discrepancy.regression import MAX_AR_ORDER, Fit
+from armident.identify.document import IdentificationDocument
+from armident.identify.estimators.regression import COVARIANCE_PASSES, Block, noise_models
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Diagnoses by the hundred: ``python -m identify.discrepancy.batch`` answers one request a line.
+"""Diagnoses by the hundred: ``python -m armident.identify.discrepancy.batch`` answers one request a line.
 
 Requests are ``{do: diagnose, recording, robot, leave_out, baseline}``, answered by the document of the diagnosis, and
 ``{do: identify, recording, robot, out}``, which writes ``identification.json``.
@@ -8,11 +8,11 @@ import json
 import time
 from pathlib import Path
 
-from configs import ConfigError, RobotConfig, load_robot
-from configs.exchange import Document, serve
-from daq.recording import read_recording
-from identify.document import IdentificationDocument, load_document, reference, to_json, write_atomically
-from identify.from_recording import experiments_from_recording
+from armident.configs import ConfigError, RobotConfig, load_robot
+from armident.configs.exchange import Document, serve
+from armident.daq.recording import read_recording
+from armident.identify.document import IdentificationDocument, load_document, reference, to_json, write_atomically
+from armident.identify.from_recording import experiments_from_recording
 
 
 def reduced(robot: RobotConfig, leave_out: str | None, joints: list[str]) -> RobotConfig:
@@ -53,14 +53,14 @@ def answer(request: Document) -> Document:
     robot = reduced(load_robot(request["robot"]), request.get("leave_out"), request.get("joints", []))
     recording = read_recording(Path(request["recording"]))
     if request["do"] == "identify":
-        from identify.service import identify_recording
+        from armident.identify.service import identify_recording
 
         document = identify_recording(recording, robot).document
         write_atomically(Path(request["out"]), to_json(document))
         return {"identification": request["out"], "seconds": time.perf_counter() - begin}
     if request["do"] != "diagnose":
         raise ConfigError(f"do: expected diagnose or identify, found {request['do']!r}")
-    from identify.discrepancy.diagnose import diagnose
+    from armident.identify.discrepancy.diagnose import diagnose
 
     baseline = request.get("baseline")
     numbers = None if baseline is None else load_document(Path(baseline), IdentificationDocument)

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from identify.discrepancy.lines import lowest_frequency, residuals
-from identify.discrepancy.maps import SIDE, hats
-from identify.discrepancy.regression import Fit
-from identify.signals.decimate import design
+from armident.identify.discrepancy.lines import lowest_frequency, residuals
+from armident.identify.discrepancy.maps import SIDE, hats
+from armident.identify.discrepancy.regression import Fit
+from armident.identify.signals.decimate import design
 
 Array = NDArray[np.float64]
 

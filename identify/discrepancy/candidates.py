@@ -7,13 +7,13 @@ from itertools import combinations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.catalogue.effect import Effect, Place
-from identify.catalogue.motion import Motion
-from identify.catalogue.registry import catalogue
-from identify.discrepancy.stretch import Stretch
-from identify.discrepancy.study import Study
-from identify.discrepancy.whitening import joints_of, whitened
-from identify.estimators.noise import ArModel
+from armident.identify.catalogue.effect import Effect, Place
+from armident.identify.catalogue.motion import Motion
+from armident.identify.catalogue.registry import catalogue
+from armident.identify.discrepancy.stretch import Stretch
+from armident.identify.discrepancy.study import Study
+from armident.identify.discrepancy.whitening import joints_of, whitened
+from armident.identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
 Shapes = tuple[tuple[str, float], ...]

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from identify.catalogue.registry import catalogue
-from identify.discrepancy.baseline import Change, Comparison
-from identify.discrepancy.candidates import Workshop, places
-from identify.discrepancy.trial import CLOSE
+from armident.identify.catalogue.registry import catalogue
+from armident.identify.discrepancy.baseline import Change, Comparison
+from armident.identify.discrepancy.candidates import Workshop, places
+from armident.identify.discrepancy.trial import CLOSE
 
 STRUCTURAL = {
     "drive_gain_error": "another torque per ampere than in the baseline",

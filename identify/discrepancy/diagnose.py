@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from configs import RobotConfig
-from identify.discrepancy.doubt import Outcome, convincing
-from identify.discrepancy.findings import (
+from armident.configs import RobotConfig
+from armident.identify.discrepancy.doubt import Outcome, convincing
+from armident.identify.discrepancy.findings import (
     experiment_to_separate,
     gap_of,
     miswired,
@@ -18,16 +18,16 @@ from identify.discrepancy.findings import (
     outdated,
     undetectable,
 )
-from identify.discrepancy.hiding import hideable
-from identify.discrepancy.numbers import stale_numbers
-from identify.discrepancy.regression import relative_errors
-from identify.discrepancy.search import Search
-from identify.discrepancy.simulated import SimulatedErrors, simulated_errors
-from identify.discrepancy.state import Settings, State, with_values
-from identify.discrepancy.study import Study, build_study
-from identify.discrepancy.where import Disagreement, beyond_noise, survey, where
-from identify.discrepancy.wiring_check import WiringFinding, find_wiring
-from identify.document import (
+from armident.identify.discrepancy.hiding import hideable
+from armident.identify.discrepancy.numbers import stale_numbers
+from armident.identify.discrepancy.regression import relative_errors
+from armident.identify.discrepancy.search import Search
+from armident.identify.discrepancy.simulated import SimulatedErrors, simulated_errors
+from armident.identify.discrepancy.state import Settings, State, with_values
+from armident.identify.discrepancy.study import Study, build_study
+from armident.identify.discrepancy.where import Disagreement, beyond_noise, survey, where
+from armident.identify.discrepancy.wiring_check import WiringFinding, find_wiring
+from armident.identify.document import (
     BeforeAfter,
     DiagnosisDocument,
     Finding,
@@ -38,7 +38,7 @@ from identify.document import (
     Verdict,
     versions,
 )
-from identify.experiment import Experiment
+from armident.identify.experiment import Experiment
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from identify.discrepancy.findings import described
-from identify.discrepancy.search import MOST, Search
-from identify.discrepancy.stanzas import without
-from identify.discrepancy.state import Places, State, nearer, places_of, supersedes
-from identify.discrepancy.trial import CLOSE
-from identify.discrepancy.where import Disagreement, Survey, strangers, unexplained
-from identify.document import Finding
+from armident.identify.discrepancy.findings import described
+from armident.identify.discrepancy.search import MOST, Search
+from armident.identify.discrepancy.stanzas import without
+from armident.identify.discrepancy.state import Places, State, nearer, places_of, supersedes
+from armident.identify.discrepancy.trial import CLOSE
+from armident.identify.discrepancy.where import Disagreement, Survey, strangers, unexplained
+from armident.identify.document import Finding
 
 CONVINCING = 0.5
 """Confidence, with that of effects which do just as well, under which a name is more probably wrong than right."""

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from identify.discrepancy.lines import lowest_frequency
-from identify.discrepancy.regression import Fit
-from identify.discrepancy.repeats import repeats
+from armident.identify.discrepancy.lines import lowest_frequency
+from armident.identify.discrepancy.regression import Fit
+from armident.identify.discrepancy.repeats import repeats
 
 Array = NDArray[np.float64]
 Pieces = tuple[Sequence[Array], Sequence[Array] | None]

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from identify.catalogue.effect import Effect
+from armident.identify.catalogue.effect import Effect
 
 CONTAINS = {
     "slow": "slow moves, under a twentieth of the joint's top speed",

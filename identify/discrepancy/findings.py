@@ -6,27 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from configs import RobotConfig
-from configs.robot import Effect as Stanza
-from identify.catalogue.effect import Effect
-from identify.catalogue.recorded import of_recording
-from identify.catalogue.registry import catalogue, known
-from identify.catalogue.terms import place_of
-from identify.discrepancy.candidates import Candidate, places
-from identify.discrepancy.experiment import recommended_experiment
-from identify.discrepancy.numbers import NumbersFinding
-from identify.discrepancy.precision import standard_deviations
-from identify.discrepancy.regression import relative_errors
-from identify.discrepancy.retrial import in_loop_of
-from identify.discrepancy.search import Search
-from identify.discrepancy.simulated import foretold_errors
-from identify.discrepancy.stanzas import without
-from identify.discrepancy.state import State, nearer, power_put_right, share_explained, with_values
-from identify.discrepancy.study import ALIKE
-from identify.discrepancy.trial import CLOSE, Trial, judge
-from identify.discrepancy.where import Disagreement, strangers
-from identify.discrepancy.wiring_check import WiringFinding
-from identify.document import Alternative, Finding, Gap, Invisible
+from armident.configs import RobotConfig
+from armident.configs.robot import Effect as Stanza
+from armident.identify.catalogue.effect import Effect
+from armident.identify.catalogue.recorded import of_recording
+from armident.identify.catalogue.registry import catalogue, known
+from armident.identify.catalogue.terms import place_of
+from armident.identify.discrepancy.candidates import Candidate, places
+from armident.identify.discrepancy.experiment import recommended_experiment
+from armident.identify.discrepancy.numbers import NumbersFinding
+from armident.identify.discrepancy.precision import standard_deviations
+from armident.identify.discrepancy.regression import relative_errors
+from armident.identify.discrepancy.retrial import in_loop_of
+from armident.identify.discrepancy.search import Search
+from armident.identify.discrepancy.simulated import foretold_errors
+from armident.identify.discrepancy.stanzas import without
+from armident.identify.discrepancy.state import State, nearer, power_put_right, share_explained, with_values
+from armident.identify.discrepancy.study import ALIKE
+from armident.identify.discrepancy.trial import CLOSE, Trial, judge
+from armident.identify.discrepancy.where import Disagreement, strangers
+from armident.identify.discrepancy.wiring_check import WiringFinding
+from armident.identify.document import Alternative, Finding, Gap, Invisible
 
 Array = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from configs.robot import Effect as Stanza
-from identify.catalogue.recorded import put_right
-from identify.catalogue.registry import known
-from identify.discrepancy.study import Study
-from identify.experiment import Experiment
+from armident.configs.robot import Effect as Stanza
+from armident.identify.catalogue.recorded import put_right
+from armident.identify.catalogue.registry import known
+from armident.identify.discrepancy.study import Study
+from armident.identify.experiment import Experiment
 
 Array = NDArray[np.float64]
 

@@ -4,11 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from identify.discrepancy.candidates import Candidate, Columns, Shapes, candidates
-from identify.discrepancy.state import HELD_OUT_LEVEL, Settings, State
-from identify.discrepancy.trial import deviations, inflation_along, joints_reached
-from identify.discrepancy.whitening import rows_of_joints, whitened
-from identify.document import Hideable
+from armident.identify.discrepancy.candidates import Candidate, Columns, Shapes, candidates
+from armident.identify.discrepancy.state import HELD_OUT_LEVEL, Settings, State
+from armident.identify.discrepancy.trial import deviations, inflation_along, joints_reached
+from armident.identify.discrepancy.whitening import rows_of_joints, whitened
+from armident.identify.document import Hideable
 
 Array = NDArray[np.float64]
 

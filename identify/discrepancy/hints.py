@@ -1,6 +1,6 @@
 """What a dependence of the residual tells whoever stands at the machine."""
 
-from identify.discrepancy.maps import Kind
+from armident.identify.discrepancy.maps import Kind
 
 HINTS: dict[Kind, str] = {
     "velocity": (

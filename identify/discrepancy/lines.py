@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from identify.discrepancy.stretch import Stretch
-from identify.discrepancy.study import BAND, Study
+from armident.identify.discrepancy.stretch import Stretch
+from armident.identify.discrepancy.study import BAND, Study
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.catalogue.effect import Effect, Linear, Place
-from identify.catalogue.motion import Motion
-from identify.discrepancy.study import Study
+from armident.identify.catalogue.effect import Effect, Linear, Place
+from armident.identify.catalogue.motion import Motion
+from armident.identify.discrepancy.study import Study
 
 Array = NDArray[np.float64]
 

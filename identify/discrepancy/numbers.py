@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from identify.catalogue.effect import Effect
-from identify.discrepancy.baseline import Change, Comparison, cautious, compared
-from identify.discrepancy.candidates import Workshop
-from identify.discrepancy.changes import STRUCTURAL, changes, p_value, ranked
-from identify.discrepancy.regression import Fit, relative_errors
-from identify.discrepancy.trial import CLOSE, newey_west
-from identify.document import IdentificationDocument
+from armident.identify.catalogue.effect import Effect
+from armident.identify.discrepancy.baseline import Change, Comparison, cautious, compared
+from armident.identify.discrepancy.candidates import Workshop
+from armident.identify.discrepancy.changes import STRUCTURAL, changes, p_value, ranked
+from armident.identify.discrepancy.regression import Fit, relative_errors
+from armident.identify.discrepancy.trial import CLOSE, newey_west
+from armident.identify.document import IdentificationDocument
 
 Array = NDArray[np.float64]
 

@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError, RobotConfig
-from identify.catalogue.effect import Shape
-from identify.catalogue.registry import known
-from identify.catalogue.terms import Term
-from identify.discrepancy.candidates import Shapes, Workshop
-from identify.discrepancy.regression import Fit, fit
-from identify.discrepancy.stanzas import stanza_number
-from identify.discrepancy.state import padded, refit
-from identify.discrepancy.study import Study
-from identify.discrepancy.whitening import whitened
-from identify.model.arm import ArmModel
+from armident.configs import DataError, RobotConfig
+from armident.identify.catalogue.effect import Shape
+from armident.identify.catalogue.registry import known
+from armident.identify.catalogue.terms import Term
+from armident.identify.discrepancy.candidates import Shapes, Workshop
+from armident.identify.discrepancy.regression import Fit, fit
+from armident.identify.discrepancy.stanzas import stanza_number
+from armident.identify.discrepancy.state import padded, refit
+from armident.identify.discrepancy.study import Study
+from armident.identify.discrepancy.whitening import whitened
+from armident.identify.model.arm import ArmModel
 
 Array = NDArray[np.float64]
 

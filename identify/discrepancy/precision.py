@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.catalogue.terms import Term
-from identify.discrepancy.candidates import Workshop
-from identify.discrepancy.regression import Fit
-from identify.discrepancy.state import State
-from identify.discrepancy.trial import newey_west
-from identify.estimators.noise import ArModel
+from armident.identify.catalogue.terms import Term
+from armident.identify.discrepancy.candidates import Workshop
+from armident.identify.discrepancy.regression import Fit
+from armident.identify.discrepancy.state import State
+from armident.identify.discrepancy.trial import newey_west
+from armident.identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from identify.discrepancy.stretch import Stretch
-from identify.discrepancy.study import Study
-from identify.discrepancy.whitening import ar_models, rows_of_joints, summed_backwards, whitened
-from identify.estimators.filtering import filter_columns
-from identify.estimators.noise import ArModel
-from identify.estimators.regression import require_excitation
+from armident.identify.discrepancy.stretch import Stretch
+from armident.identify.discrepancy.study import Study
+from armident.identify.discrepancy.whitening import ar_models, rows_of_joints, summed_backwards, whitened
+from armident.identify.estimators.filtering import filter_columns
+from armident.identify.estimators.noise import ArModel
+from armident.identify.estimators.regression import require_excitation
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import interpolate, signal
 
-from identify.discrepancy.study import Study
+from armident.identify.discrepancy.study import Study
 
 Array = NDArray[np.float64]
 

@@ -11,16 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from configs import DataError
-from identify.discrepancy.candidates import Candidate, Shapes, Workshop
-from identify.discrepancy.regression import Fit
-from identify.discrepancy.regression import fit as fitted
-from identify.discrepancy.screening import noise_beyond_shapes
-from identify.discrepancy.shaping import both_ends
-from identify.discrepancy.stanzas import added
-from identify.discrepancy.study import ALIKE, Study
-from identify.discrepancy.trial import Trial, best_trial, judge, refined, replaced, screened
-from identify.model.arm import ArmModel
+from armident.configs import DataError
+from armident.identify.discrepancy.candidates import Candidate, Shapes, Workshop
+from armident.identify.discrepancy.regression import Fit
+from armident.identify.discrepancy.regression import fit as fitted
+from armident.identify.discrepancy.screening import noise_beyond_shapes
+from armident.identify.discrepancy.shaping import both_ends
+from armident.identify.discrepancy.stanzas import added
+from armident.identify.discrepancy.study import ALIKE, Study
+from armident.identify.discrepancy.trial import Trial, best_trial, judge, refined, replaced, screened
+from armident.identify.model.arm import ArmModel
 
 SECOND_LOOKS = 2
 """Most candidates of one state that are looked at again."""

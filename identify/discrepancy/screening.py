@@ -8,13 +8,13 @@ position, speed and time have been taken out of. Trials start from it and end wi
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.catalogue.motion import Motion
-from identify.discrepancy.candidates import Candidate, Shapes, Workshop
-from identify.discrepancy.maps import hats
-from identify.discrepancy.regression import MAX_AR_ORDER, Fit, noise_models
-from identify.discrepancy.shaping import both_ends
-from identify.discrepancy.trial import refined, screened
-from identify.estimators.noise import ArModel
+from armident.identify.catalogue.motion import Motion
+from armident.identify.discrepancy.candidates import Candidate, Shapes, Workshop
+from armident.identify.discrepancy.maps import hats
+from armident.identify.discrepancy.regression import MAX_AR_ORDER, Fit, noise_models
+from armident.identify.discrepancy.shaping import both_ends
+from armident.identify.discrepancy.trial import refined, screened
+from armident.identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError, RobotConfig
-from identify.discrepancy.candidates import Workshop, candidates
-from identify.discrepancy.excess import excesses
-from identify.discrepancy.polishing import polished, training_errors
-from identify.discrepancy.retrial import (
+from armident.configs import DataError, RobotConfig
+from armident.identify.discrepancy.candidates import Workshop, candidates
+from armident.identify.discrepancy.excess import excesses
+from armident.identify.discrepancy.polishing import polished, training_errors
+from armident.identify.discrepancy.retrial import (
     SUSPECT,
     at_measured_signals,
     in_its_loop,
@@ -19,9 +19,9 @@ from identify.discrepancy.retrial import (
     rivals,
     suspects,
 )
-from identify.discrepancy.screening import shortlist
-from identify.discrepancy.stanzas import added, completed, stanza_number, valued, without
-from identify.discrepancy.state import (
+from armident.identify.discrepancy.screening import shortlist
+from armident.identify.discrepancy.stanzas import added, completed, stanza_number, valued, without
+from armident.identify.discrepancy.state import (
     FEEDBACK,
     Places,
     Settings,
@@ -33,9 +33,9 @@ from identify.discrepancy.state import (
     supersedes,
     takes_over,
 )
-from identify.discrepancy.study import Study
-from identify.discrepancy.trial import Trial, best_trial, judge
-from identify.options import CONTROLLERS
+from armident.identify.discrepancy.study import Study
+from armident.identify.discrepancy.trial import Trial, best_trial, judge
+from armident.identify.options import CONTROLLERS
 
 Array = NDArray[np.float64]
 

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from identify.discrepancy.candidates import Candidate, Shapes, Workshop
-from identify.discrepancy.regression import Fit
-from identify.discrepancy.trial import directions_beside, replaced
-from identify.discrepancy.whitening import whitened
+from armident.identify.discrepancy.candidates import Candidate, Shapes, Workshop
+from armident.identify.discrepancy.regression import Fit
+from armident.identify.discrepancy.trial import directions_beside, replaced
+from armident.identify.discrepancy.whitening import whitened
 
 Array = NDArray[np.float64]
 

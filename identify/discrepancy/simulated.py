@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.discrepancy.foretold import foretold
-from identify.discrepancy.state import State
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.preparation import aligned_torque
+from armident.identify.discrepancy.foretold import foretold
+from armident.identify.discrepancy.state import State
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.preparation import aligned_torque
 
 Array = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ class SimulatedErrors:
     """Errors of simulated velocities and torques on the held-out data, percent of the measured ones, (n,) each.
 
     ``torque_foretold`` is the error at measured motion less what the findings change of the torque at simulated motion,
-    see `identify.discrepancy.foretold`. Not a number where a loop diverges, or that cannot be said.
+    see `armident.identify.discrepancy.foretold`. Not a number where a loop diverges, or that cannot be said.
     """
 
     joints: tuple[str, ...]

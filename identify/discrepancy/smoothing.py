@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.discrepancy.candidates import Columns
-from identify.discrepancy.regression import Fit
-from identify.discrepancy.trial import directions_beside
+from armident.identify.discrepancy.candidates import Columns
+from armident.identify.discrepancy.regression import Fit
+from armident.identify.discrepancy.trial import directions_beside
 
 Array = NDArray[np.float64]
 

@@ -1,10 +1,10 @@
 """Robot configurations with the findings of a search as stanzas."""
 
-from configs import RobotConfig
-from identify.catalogue.recorded import of_recording
-from identify.catalogue.registry import known
-from identify.catalogue.terms import stanza_of
-from identify.discrepancy.trial import Trial
+from armident.configs import RobotConfig
+from armident.identify.catalogue.recorded import of_recording
+from armident.identify.catalogue.registry import known
+from armident.identify.catalogue.terms import stanza_of
+from armident.identify.discrepancy.trial import Trial
 
 
 def added(robot: RobotConfig, trial: Trial) -> RobotConfig:

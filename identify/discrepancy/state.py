@@ -7,20 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from configs import RobotConfig
-from configs.robot import Effect as Stanza
-from identify.catalogue.registry import known
-from identify.catalogue.terms import Term
-from identify.discrepancy.candidates import Workshop
-from identify.discrepancy.foretold import foretold, torque_put_right
-from identify.discrepancy.lines import residuals
-from identify.discrepancy.regression import Fit, applied, fit, regressors
-from identify.discrepancy.stanzas import stanza_number
-from identify.discrepancy.study import ALIKE, Study
-from identify.discrepancy.trial import Trial
-from identify.discrepancy.whitening import rows_of_joints, whitened
-from identify.estimators.noise import ArModel
-from identify.model.arm import ArmModel
+from armident.configs import RobotConfig
+from armident.configs.robot import Effect as Stanza
+from armident.identify.catalogue.registry import known
+from armident.identify.catalogue.terms import Term
+from armident.identify.discrepancy.candidates import Workshop
+from armident.identify.discrepancy.foretold import foretold, torque_put_right
+from armident.identify.discrepancy.lines import residuals
+from armident.identify.discrepancy.regression import Fit, applied, fit, regressors
+from armident.identify.discrepancy.stanzas import stanza_number
+from armident.identify.discrepancy.study import ALIKE, Study
+from armident.identify.discrepancy.trial import Trial
+from armident.identify.discrepancy.whitening import rows_of_joints, whitened
+from armident.identify.estimators.noise import ArModel
+from armident.identify.model.arm import ArmModel
 
 Array = NDArray[np.float64]
 Places = tuple[tuple[str, str, str], ...]

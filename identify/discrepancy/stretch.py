@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.signals.differentiate import Derivatives
+from armident.identify.signals.differentiate import Derivatives
 
 Array = NDArray[np.float64]
 

@@ -6,23 +6,23 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError, RobotConfig
-from configs.robot import Effect as Stanza
-from identify.catalogue.motion import Motion
-from identify.catalogue.recorded import of_recording, put_right
-from identify.catalogue.registry import known
-from identify.closed_loop import closed_loop
-from identify.discrepancy.stretch import KINDS, Stretch, at_rows, distances, rows_before
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.idim_ls import idim_ls
-from identify.experiment import Experiment
-from identify.methods import decimation_of
-from identify.model.arm import ArmModel
-from identify.options import CONTROLLERS, Options
-from identify.preparation import aligned_torque, equations, least_rows
-from identify.signals.bandwidth import motion_bandwidth
-from identify.signals.decimate import Decimation, design
-from identify.signals.differentiate import Derivatives, differentiate
+from armident.configs import DataError, RobotConfig
+from armident.configs.robot import Effect as Stanza
+from armident.identify.catalogue.motion import Motion
+from armident.identify.catalogue.recorded import of_recording, put_right
+from armident.identify.catalogue.registry import known
+from armident.identify.closed_loop import closed_loop
+from armident.identify.discrepancy.stretch import KINDS, Stretch, at_rows, distances, rows_before
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.experiment import Experiment
+from armident.identify.methods import decimation_of
+from armident.identify.model.arm import ArmModel
+from armident.identify.options import CONTROLLERS, Options
+from armident.identify.preparation import aligned_torque, equations, least_rows
+from armident.identify.signals.bandwidth import motion_bandwidth
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.differentiate import Derivatives, differentiate
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,8 @@ class Study:
     signals
         Derivatives of their positions at the recorded rate.
     rigid
-        Regressors that all models of the study share, made once (see `identify.discrepancy.regression.regressors`).
+        Regressors that all models of the study share, made once; see
+        `armident.identify.discrepancy.regression.regressors`.
     """
 
     robot: RobotConfig
@@ -173,7 +174,7 @@ class Study:
         -------
         Study
             The same where that loop diverges, or follows the arm less closely than the one there is: large additions to
-            the compiled loop may be too stiff for it (see `identify.model.relaxation`).
+            the compiled loop may be too stiff for it (see `armident.identify.model.relaxation`).
         """
         auxiliary = replace(self.auxiliary.fresh(), model=self.model.anchored(theta), anchor=None)
         runs = auxiliary.simulate(theta)

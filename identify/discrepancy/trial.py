@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from identify.discrepancy.candidates import Candidate, Columns, Shapes, Workshop
-from identify.discrepancy.regression import MAX_AR_ORDER, Fit, applied, noise_models
-from identify.discrepancy.whitening import joints_of, rows_of_joints
-from identify.estimators.noise import ArModel
+from armident.identify.discrepancy.candidates import Candidate, Columns, Shapes, Workshop
+from armident.identify.discrepancy.regression import MAX_AR_ORDER, Fit, applied, noise_models
+from armident.identify.discrepancy.whitening import joints_of, rows_of_joints
+from armident.identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
 

@@ -7,18 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from identify.catalogue.effect import Place
-from identify.discrepancy.bursts import Bursts, bursts
-from identify.discrepancy.candidates import Candidate, Workshop
-from identify.discrepancy.excess import Excess, excesses
-from identify.discrepancy.hints import hint_of, unit_of
-from identify.discrepancy.lines import lowest_frequency, of_references, residuals, strongest_line
-from identify.discrepancy.maps import Kind, Map, maps
-from identify.discrepancy.regression import Equation, Equations, Fit, solved
-from identify.discrepancy.screening import noise_beyond_shapes
-from identify.discrepancy.smoothing import smoothed
-from identify.discrepancy.trial import Trial, directions_beside, judge, noise_with, score_statistic
-from identify.estimators.noise import ArModel
+from armident.identify.catalogue.effect import Place
+from armident.identify.discrepancy.bursts import Bursts, bursts
+from armident.identify.discrepancy.candidates import Candidate, Workshop
+from armident.identify.discrepancy.excess import Excess, excesses
+from armident.identify.discrepancy.hints import hint_of, unit_of
+from armident.identify.discrepancy.lines import lowest_frequency, of_references, residuals, strongest_line
+from armident.identify.discrepancy.maps import Kind, Map, maps
+from armident.identify.discrepancy.regression import Equation, Equations, Fit, solved
+from armident.identify.discrepancy.screening import noise_beyond_shapes
+from armident.identify.discrepancy.smoothing import smoothed
+from armident.identify.discrepancy.trial import Trial, directions_beside, judge, noise_with, score_statistic
+from armident.identify.estimators.noise import ArModel
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Autoregressive noise of all joints at once: models, whitening and its transpose.
 
-The same estimates as `identify.estimators.noise`, for a search that makes them by the thousand.
+The same estimates as `armident.identify.estimators.noise`, for a search that makes them by the thousand.
 """
 
 import math
@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.estimators.noise import ArModel
-from identify.model.compiled import compiled
+from armident.identify.estimators.noise import ArModel
+from armident.identify.model.compiled import compiled
 
 Array = NDArray[np.float64]
 

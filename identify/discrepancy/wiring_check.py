@@ -14,17 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize, stats
 
-from configs import DataError, RobotConfig
-from configs.robot import Effect as Stanza
-from identify.catalogue.recorded import put_right
-from identify.catalogue.wiring import SIGNALS, exchanges
-from identify.experiment import Experiment
-from identify.methods import decimation_of
-from identify.model.arm import ArmModel
-from identify.preparation import aligned_torque, least_rows
-from identify.signals.bandwidth import motion_bandwidth
-from identify.signals.decimate import Decimation, design
-from identify.signals.differentiate import Derivatives, differentiate
+from armident.configs import DataError, RobotConfig
+from armident.configs.robot import Effect as Stanza
+from armident.identify.catalogue.recorded import put_right
+from armident.identify.catalogue.wiring import SIGNALS, exchanges
+from armident.identify.experiment import Experiment
+from armident.identify.methods import decimation_of
+from armident.identify.model.arm import ArmModel
+from armident.identify.preparation import aligned_torque, least_rows
+from armident.identify.signals.bandwidth import motion_bandwidth
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.differentiate import Derivatives, differentiate
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ class WiringFinding:
     Parameters
     ----------
     stanzas
-        For the ``effects`` of a robot configuration: `identify.catalogue.wiring.rewired` undoes them.
+        For the ``effects`` of a robot configuration: `armident.identify.catalogue.wiring.rewired` undoes them.
     words
         What each means, in plain language.
     p_values

@@ -9,16 +9,16 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.estimators.regression import Block, filtered_regressor
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
-from identify.model.physical import damp_to_physical
-from identify.model.relaxation import simulate_with_terms
-from identify.model.simulation import Simulation
-from identify.signals.bandpass import butterworth
-from identify.signals.decimate import Decimation
-from identify.signals.differentiate import Derivatives
+from armident.configs import DataError
+from armident.identify.estimators.regression import Block, filtered_regressor
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.physical import damp_to_physical
+from armident.identify.model.relaxation import simulate_with_terms
+from armident.identify.model.simulation import Simulation
+from armident.identify.signals.bandpass import butterworth
+from armident.identify.signals.decimate import Decimation
+from armident.identify.signals.differentiate import Derivatives
 
 HALVINGS = 8
 """Step halvings towards the last estimate that could be simulated."""

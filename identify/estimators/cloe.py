@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.output_error import output_error
-from identify.estimators.regression import ITERATIONS, Block, Estimate
+from armident.configs import DataError
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.output_error import output_error
+from armident.identify.estimators.regression import ITERATIONS, Block, Estimate
 
 
 def cloe(

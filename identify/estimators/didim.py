@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.regression import (
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.regression import (
     ITERATIONS,
     Block,
     Estimate,
@@ -20,7 +20,7 @@ from identify.estimators.regression import (
     stacked,
     whitened_residuals,
 )
-from identify.estimators.sensitivity import torque_sensitivities
+from armident.identify.estimators.sensitivity import torque_sensitivities
 
 
 def didim(

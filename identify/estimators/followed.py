@@ -7,12 +7,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
-from identify.model.simulation import Simulation
-from identify.signals.bandpass import central_difference
-from identify.signals.decimate import Decimation
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.simulation import Simulation
+from armident.identify.signals.bandpass import central_difference
+from armident.identify.signals.decimate import Decimation
 
 
 @dataclass

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.noise import ArModel, fit_spectrum
-from identify.estimators.regression import Block
-from identify.model.controller import DiscreteController
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.noise import ArModel, fit_spectrum
+from armident.identify.estimators.regression import Block
+from armident.identify.model.controller import DiscreteController
 
 FREQUENCIES = 2048
 """Points of the controller's frequency response, zero to the Nyquist frequency of the decimated equations."""

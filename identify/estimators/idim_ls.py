@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from identify.estimators.regression import (
+from armident.identify.estimators.regression import (
     Block,
     Estimate,
     inverse_gram,

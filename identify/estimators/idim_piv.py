@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.grey_box import InverseController
-from identify.estimators.iv_products import IvProducts, iv_products
-from identify.estimators.noise import ArModel
-from identify.estimators.regression import (
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.grey_box import InverseController
+from armident.identify.estimators.iv_products import IvProducts, iv_products
+from armident.identify.estimators.noise import ArModel
+from armident.identify.estimators.regression import (
     ITERATIONS,
     MAX_AR_ORDER,
     Block,

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from identify.estimators.filtering import filter_columns
-from identify.estimators.noise import ArModel
-from identify.estimators.regression import Block
-from identify.estimators.triangular import triangularize
-from identify.signals.decimate import Decimation
+from armident.identify.estimators.filtering import filter_columns
+from armident.identify.estimators.noise import ArModel
+from armident.identify.estimators.regression import Block
+from armident.identify.estimators.triangular import triangularize
+from armident.identify.signals.decimate import Decimation
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.model.compiled import compiled
+from armident.identify.model.compiled import compiled
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from identify.estimators.auxiliary import AuxiliaryModel, Response
-from identify.estimators.didim import solve_didim
-from identify.estimators.noise import ArModel
-from identify.estimators.regression import (
+from armident.identify.estimators.auxiliary import AuxiliaryModel, Response
+from armident.identify.estimators.didim import solve_didim
+from armident.identify.estimators.noise import ArModel
+from armident.identify.estimators.regression import (
     TOLERANCE,
     Block,
     Estimate,
@@ -21,8 +21,8 @@ from identify.estimators.regression import (
     weighted_rows,
     whitened,
 )
-from identify.estimators.sensitivity import Array, Arrays, difference_steps, sensitivities, weighted_columns
-from identify.estimators.triangular import triangularize
+from armident.identify.estimators.sensitivity import Array, Arrays, difference_steps, sensitivities, weighted_columns
+from armident.identify.estimators.triangular import triangularize
 
 Signal = Callable[[Response], Arrays]
 

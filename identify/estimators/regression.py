@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, signal
 
-from configs import DataError
-from identify.estimators.noise import WHITE, ArModel, fit_ar, lagged_sums
-from identify.estimators.triangular import triangularize
-from identify.model.arm import ArmModel
-from identify.model.kernels import fill_regressor
-from identify.signals.decimate import Decimation
-from identify.signals.differentiate import Derivatives
+from armident.configs import DataError
+from armident.identify.estimators.noise import WHITE, ArModel, fit_ar, lagged_sums
+from armident.identify.estimators.triangular import triangularize
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.kernels import fill_regressor
+from armident.identify.signals.decimate import Decimation
+from armident.identify.signals.differentiate import Derivatives
 
 ITERATIONS = 20
 """Most iterations of an iterative estimator."""

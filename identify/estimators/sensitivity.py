@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.estimators.auxiliary import AuxiliaryModel, Response
-from identify.estimators.noise import ArModel
-from identify.estimators.regression import Block, column_norms, error_variances, unweighted, weighted_rows
-from identify.estimators.triangular import triangularize
+from armident.configs import DataError
+from armident.identify.estimators.auxiliary import AuxiliaryModel, Response
+from armident.identify.estimators.noise import ArModel
+from armident.identify.estimators.regression import Block, column_norms, error_variances, unweighted, weighted_rows
+from armident.identify.estimators.triangular import triangularize
 
 Array = NDArray[np.float64]
 Arrays = Sequence[Array]

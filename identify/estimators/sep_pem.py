@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.didim import solve_didim
-from identify.estimators.regression import (
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.didim import solve_didim
+from armident.identify.estimators.regression import (
     COVARIANCE_PASSES,
     ITERATIONS,
     MAX_AR_ORDER,

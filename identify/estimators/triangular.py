@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.model.compiled import compiled
+from armident.identify.model.compiled import compiled
 
 _ROWS = 64
 """Rows eliminated at a time: with a hundred columns they fit the second-level cache."""

@@ -8,11 +8,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from configs import ArmidentError, RobotConfig
-from identify.catalogue.motion import Motion
-from identify.catalogue.terms import Term, terms_of
-from identify.model.base_parameters import BaseParameters, base_parameters, with_terms
-from identify.model.chain import (
+from armident.configs import ArmidentError, RobotConfig
+from armident.identify.catalogue.motion import Motion
+from armident.identify.catalogue.terms import Term, terms_of
+from armident.identify.model.base_parameters import BaseParameters, base_parameters, with_terms
+from armident.identify.model.chain import (
     INERTIAL,
     Chain,
     Columns,
@@ -23,7 +23,7 @@ from identify.model.chain import (
     standard_names,
     values_of,
 )
-from identify.model.kernels import (
+from armident.identify.model.kernels import (
     fill_forward_dynamics,
     fill_inverse_dynamics,
     fill_mass_matrices,

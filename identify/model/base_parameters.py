@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from configs import RobotConfig
-from identify.model.chain import Chain, Columns, Floats, Ints
-from identify.model.kernels import fill_regressor
-from identify.model.khalil import Form, evaluate, khalil_rules, lengths_of, text_of
+from armident.configs import RobotConfig
+from armident.identify.model.chain import Chain, Columns, Floats, Ints
+from armident.identify.model.kernels import fill_regressor
+from armident.identify.model.khalil import Form, evaluate, khalil_rules, lengths_of, text_of
 
 KEEP_FIRST = ("xx", "xy", "xz", "yz", "zz", "mx", "my", "m*", "fv", "fc", "off", "ia", "yy", "mz", "m")
 """Within a link, the order in which columns may stay: that of tables B.2 and B.3. ``m*``: prismatic joints."""

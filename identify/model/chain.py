@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig
+from armident.configs import RobotConfig
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg, sparse, stats
 
-from configs import ArmidentError, DataError
-from identify.model.arm import ArmModel
-from identify.model.chain import INERTIAL, Floats, Ints
+from armident.configs import ArmidentError, DataError
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.chain import INERTIAL, Floats, Ints
 
 clarabel: Any = untyped_clarabel
 

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from identify.model.chain import Floats
+from armident.identify.model.chain import Floats
 
 
 @dataclass(frozen=True, eq=False)

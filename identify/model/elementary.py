@@ -7,8 +7,8 @@ units in the last place for arguments up to 1e5.
 
 import numpy as np
 
-from identify.model.chain import Floats
-from identify.model.compiled import inlined
+from armident.identify.model.chain import Floats
+from armident.identify.model.compiled import inlined
 
 LANES = 4
 """Arrays are as long as the next multiple of this, so that no element is left to a scalar loop."""

@@ -6,9 +6,9 @@ acceleration ``-g`` of the base. Vectors of link j are written in frame j, scala
 
 import numpy as np
 
-from identify.model.chain import Chain, Columns, Floats, Values
-from identify.model.compiled import compiled, inlined
-from identify.model.elementary import padded, sines_cosines
+from armident.identify.model.chain import Chain, Columns, Floats, Values
+from armident.identify.model.compiled import compiled, inlined
+from armident.identify.model.elementary import padded, sines_cosines
 
 TWO_OVER_PI = 2.0 / np.pi
 

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from configs import RobotConfig
-from identify.model.chain import INERTIAL, Chain, Floats, cos_sin
+from armident.configs import RobotConfig
+from armident.identify.model.chain import INERTIAL, Chain, Floats, cos_sin
 
 Monomial = tuple[tuple[str, int], ...]
 Polynomial = dict[Monomial, float]

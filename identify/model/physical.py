@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from identify.model.arm import ArmModel
-from identify.model.chain import Floats
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.chain import Floats
 
 SMALLEST_EIGENVALUE = 1e-6
 """Smallest eigenvalue of the mass matrix that counts as positive, as a share of its largest."""

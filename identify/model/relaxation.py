@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from identify.model.arm import ArmModel
-from identify.model.chain import Floats
-from identify.model.controller import DiscreteController
-from identify.model.simulation import Simulation, simulate
-from identify.signals.bandpass import butterworth
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.chain import Floats
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.simulation import Simulation, simulate
+from armident.identify.signals.bandpass import butterworth
 
 ROUNDS = 16
 """Most simulations."""
@@ -55,7 +55,7 @@ def simulate_with_terms(
     band_hz: float = np.inf,
     **initial: Any,
 ) -> Simulation:
-    """Simulate like :func:`identify.model.simulation.simulate`, the terms of the model included.
+    """Simulate like :func:`armident.identify.model.simulation.simulate`, the terms of the model included.
 
     Parameters
     ----------

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from identify.model.arm import ArmModel
-from identify.model.chain import Chain, Floats, Ints, Values
-from identify.model.compiled import compiled, inlined
-from identify.model.controller import DiscreteController
-from identify.model.elementary import arctangents, padded
-from identify.model.kernels import TWO_OVER_PI, cholesky, fill_mass_matrix, rigid_torque, solve_factored, turn
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.chain import Chain, Floats, Ints, Values
+from armident.identify.model.compiled import compiled, inlined
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.elementary import arctangents, padded
+from armident.identify.model.kernels import TWO_OVER_PI, cholesky, fill_mass_matrix, rigid_torque, solve_factored, turn
 
 GAMMA = 1.0 / (2.0 + np.sqrt(2.0))
 """Rosenbrock parameter that makes the two-stage method of order two L-stable."""

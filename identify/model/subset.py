@@ -3,9 +3,9 @@
 from collections.abc import Collection
 from dataclasses import replace
 
-from configs import ConfigError
-from identify.model.arm import ArmModel
-from identify.model.chain import columns_of
+from armident.configs import ConfigError
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.chain import columns_of
 
 
 def restricted_to(model: ArmModel, names: Collection[str]) -> ArmModel:

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from configs import ConfigError, DataError
-from identify.document import IdentificationDocument, load_document, to_json, write_atomically
-from identify.history import History
+from armident.configs import ConfigError, DataError
+from armident.identify.document import IdentificationDocument, load_document, to_json, write_atomically
+from armident.identify.history import History
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from identify.reidentify.asked import Asked
+from armident.identify.reidentify.asked import Asked
 
 
 def reidentify(
@@ -47,11 +47,11 @@ def reidentify(
     """
     asked = Asked(config, baseline, store, out, false_alarms, scheduler, workers)
     if recordings is None:
-        from identify.reidentify.run import reidentify_command
+        from armident.identify.reidentify.run import reidentify_command
 
         code = reidentify_command(asked, as_json=json)
     else:
-        from identify.reidentify.fleet import fleet_command
+        from armident.identify.reidentify.fleet import fleet_command
 
         code = fleet_command(recordings, asked, as_json=json)
     if code:

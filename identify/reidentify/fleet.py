@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from configs import ArmidentError, ConfigError, DataError, RobotConfig, load_robot
-from daq.recording import Recording, read_recording
-from identify.document import IdentificationDocument, from_json, load_document, to_json
-from identify.drift import Drift, compare
-from identify.history import History
-from identify.options import Options
-from identify.reidentify.asked import Asked
-from identify.reidentify.verdict import told
-from identify.service import identify_recording, write_identification
+from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, load_robot
+from armident.daq.recording import Recording, read_recording
+from armident.identify.document import IdentificationDocument, from_json, load_document, to_json
+from armident.identify.drift import Drift, compare
+from armident.identify.history import History
+from armident.identify.options import Options
+from armident.identify.reidentify.asked import Asked
+from armident.identify.reidentify.verdict import told
+from armident.identify.service import identify_recording, write_identification
 
 if TYPE_CHECKING:
     from distributed import Client

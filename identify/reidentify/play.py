@@ -13,8 +13,8 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, Protocol
 
-from configs import ArmidentError, ConfigError, DataError
-from daq.recording import Recording, join_parts, read_recording
+from armident.configs import ArmidentError, ConfigError, DataError
+from armident.daq.recording import Recording, join_parts, read_recording
 
 READY_S = 120.0
 """How long the guard may take to be ready: its loop may have to be compiled."""
@@ -56,7 +56,7 @@ def start_process(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Proce
 
     Signals of the terminal reach us alone: the guard has to have its own before the capture has one.
     """
-    command = [sys.executable, "-m", "daq.cli", *words]
+    command = [sys.executable, "-m", "armident.daq.cli", *words]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True)
 
 

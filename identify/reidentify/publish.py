@@ -7,8 +7,8 @@ from typing import Any, Self
 
 import zenoh
 
-from configs import ConfigError, RobotConfig, SessionConfig
-from daq.zenoh_keys import Keys, open_session
+from armident.configs import ConfigError, RobotConfig, SessionConfig
+from armident.daq.zenoh_keys import Keys, open_session
 
 LINGER_S = 1.0
 """How long a result stays on offer after it was published: peers that connect late ask for it."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from configs import (
+from armident.configs import (
     ArmidentError,
     ConfigError,
     DataError,
@@ -19,20 +19,20 @@ from configs import (
     load_session,
     load_trajectory,
 )
-from daq.recording import Recording
-from identify.document import DiagnosisDocument, IdentificationDocument, from_json, to_json
-from identify.drift import Drift, Inconclusive, compare
-from identify.history import History
-from identify.model.arm import ArmModel
-from identify.moves import motion_of
-from identify.options import Options
-from identify.prior import prior_from
-from identify.reidentify.asked import Asked
-from identify.reidentify.baseline import Baseline, baseline_of
-from identify.reidentify.play import Say, Start, play, start_process
-from identify.reidentify.publish import Announcer
-from identify.reidentify.verdict import found, told
-from identify.service import identify_recording, write_identification
+from armident.daq.recording import Recording
+from armident.identify.document import DiagnosisDocument, IdentificationDocument, from_json, to_json
+from armident.identify.drift import Drift, Inconclusive, compare
+from armident.identify.history import History
+from armident.identify.model.arm import ArmModel
+from armident.identify.moves import motion_of
+from armident.identify.options import Options
+from armident.identify.prior import prior_from
+from armident.identify.reidentify.asked import Asked
+from armident.identify.reidentify.baseline import Baseline, baseline_of
+from armident.identify.reidentify.play import Say, Start, play, start_process
+from armident.identify.reidentify.publish import Announcer
+from armident.identify.reidentify.verdict import found, told
+from armident.identify.service import identify_recording, write_identification
 
 DRIFTED = 4
 """Exit code: done, and the arm has changed."""
@@ -227,7 +227,7 @@ def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Ou
     command = ["diagnose", str(recording.path), "--config", str(job.session.robot), "--baseline", str(numbers)]
     try:
         done = subprocess.run(
-            [sys.executable, "-m", "daq.cli", *command, "--out", str(folder), "--json"],
+            [sys.executable, "-m", "armident.daq.cli", *command, "--out", str(folder), "--json"],
             capture_output=True,
             text=True,
             timeout=DIAGNOSIS_S,

@@ -4,9 +4,9 @@ import re
 
 import numpy as np
 
-from configs import RobotConfig
-from identify.document import DiagnosisDocument
-from identify.drift import Drift
+from armident.configs import RobotConfig
+from armident.identify.document import DiagnosisDocument
+from armident.identify.drift import Drift
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
 CLEAR = 2.0

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.discrepancy.diagnose import Diagnosis
-from identify.discrepancy.where import Disagreement
-from identify.document import DiagnosisDocument, Finding
-from identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
+from armident.identify.discrepancy.diagnose import Diagnosis
+from armident.identify.discrepancy.where import Disagreement
+from armident.identify.document import DiagnosisDocument, Finding
+from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 
 Array = NDArray[np.float64]
 

@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig
-from daq.recording import Recording
-from identify.document import IdentificationDocument
-from identify.report.page import BAND, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
-from identify.result import Identification
+from armident.configs import RobotConfig
+from armident.daq.recording import Recording
+from armident.identify.document import IdentificationDocument
+from armident.identify.report.page import BAND, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
+from armident.identify.result import Identification
 
 Array = NDArray[np.float64]
 

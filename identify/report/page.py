@@ -32,7 +32,7 @@ STYLE: Any = {
 }
 
 _TEMPLATES = Environment(
-    loader=PackageLoader("identify.report", "templates"),
+    loader=PackageLoader("armident.identify.report", "templates"),
     autoescape=select_autoescape(default=True),
     undefined=StrictUndefined,
     trim_blocks=True,

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from identify.reproduction.emps_derivatives import Row, table_5_2
-from identify.reproduction.laboratory import Case, Laboratory, Method, Run
-from identify.reproduction.recordings import Recorded
-from identify.reproduction.reference import reference_tables
-from identify.reproduction.tables import Cell, Column, Source, Table
+from armident.identify.reproduction.emps_derivatives import Row, table_5_2
+from armident.identify.reproduction.laboratory import Case, Laboratory, Method, Run
+from armident.identify.reproduction.recordings import Recorded
+from armident.identify.reproduction.reference import reference_tables
+from armident.identify.reproduction.tables import Cell, Column, Source, Table
 
 SIMULATIONS, SIMULATIONS_QUICK = 100, 3
 """Noise realisations of table 5.2, the thesis's number and what is enough for two digits."""

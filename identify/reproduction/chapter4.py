@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.estimators.sensitivity import Sensitivity, sensitivity
-from identify.reproduction.aircraft import DURATION, SAMPLING_HZ, aircraft_sensitivity
-from identify.reproduction.bench import Bench, TableFunction, estimates, figures, iterations
-from identify.reproduction.laboratory import Case, Laboratory, Run
-from identify.reproduction.tables import Table
+from armident.identify.estimators.sensitivity import Sensitivity, sensitivity
+from armident.identify.reproduction.aircraft import DURATION, SAMPLING_HZ, aircraft_sensitivity
+from armident.identify.reproduction.bench import Bench, TableFunction, estimates, figures, iterations
+from armident.identify.reproduction.laboratory import Case, Laboratory, Run
+from armident.identify.reproduction.tables import Table
 
 Array = NDArray[np.float64]
 

@@ -3,14 +3,14 @@
 from dataclasses import replace
 from typing import Literal
 
-from configs import DataError
-from identify.controller.crc import PREWHITENING_ORDER
-from identify.reproduction.bench import Bench, TableFunction, estimates, figures, iterations
-from identify.reproduction.emps_protocol import evidence, inferred_rows
-from identify.reproduction.laboratory import Case, Method
-from identify.reproduction.tables import Column, Table
-from identify.reproduction.two_stages import TwoStages, structure_given, two_stages
-from identify.signals.differentiate import NvrRule
+from armident.configs import DataError
+from armident.identify.controller.crc import PREWHITENING_ORDER
+from armident.identify.reproduction.bench import Bench, TableFunction, estimates, figures, iterations
+from armident.identify.reproduction.emps_protocol import evidence, inferred_rows
+from armident.identify.reproduction.laboratory import Case, Method
+from armident.identify.reproduction.tables import Column, Table
+from armident.identify.reproduction.two_stages import TwoStages, structure_given, two_stages
+from armident.identify.signals.differentiate import NvrRule
 
 GOOD = Case("bandpass")
 """The bandwidth is known: 50 Hz and 20 Hz (5.3.1)."""

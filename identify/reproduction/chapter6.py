@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from identify.estimators.noise import ArModel
-from identify.reproduction.bench import Bench, TableFunction, estimates, figures, iterations
-from identify.reproduction.chapter5 import GOOD, POOR_IV
-from identify.reproduction.laboratory import PIV_CUTOFF_HZ, Case, Laboratory, Run
-from identify.reproduction.reference import REFERENCE, reference_tables
-from identify.reproduction.tables import Table
-from identify.result import relative_errors
+from armident.identify.estimators.noise import ArModel
+from armident.identify.reproduction.bench import Bench, TableFunction, estimates, figures, iterations
+from armident.identify.reproduction.chapter5 import GOOD, POOR_IV
+from armident.identify.reproduction.laboratory import PIV_CUTOFF_HZ, Case, Laboratory, Run
+from armident.identify.reproduction.reference import REFERENCE, reference_tables
+from armident.identify.reproduction.tables import Table
+from armident.identify.result import relative_errors
 
 UNDECIMATED = Case(cutoff_hz=None, midway=True)
 """The residual as it is, for its noise model (6.2.1)."""

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.estimators.noise import whiteness
-from identify.estimators.regression import Estimate
-from identify.reproduction.bench import Bench
-from identify.reproduction.chapter4 import singular_values
-from identify.reproduction.chapter5 import GOOD, IMPULSE_RESPONSES, NOTHING, OWN_RESPONSES, POOR_IV, smoothed
-from identify.reproduction.chapter6 import (
+from armident.configs import DataError
+from armident.identify.estimators.noise import whiteness
+from armident.identify.estimators.regression import Estimate
+from armident.identify.reproduction.bench import Bench
+from armident.identify.reproduction.chapter4 import singular_values
+from armident.identify.reproduction.chapter5 import GOOD, IMPULSE_RESPONSES, NOTHING, OWN_RESPONSES, POOR_IV, smoothed
+from armident.identify.reproduction.chapter6 import (
     COARSE,
     COARSE_CARELESS,
     COARSE_ROUGH,
@@ -21,8 +21,8 @@ from identify.reproduction.chapter6 import (
     degraded,
     nearest,
 )
-from identify.reproduction.emps_controller import controllers_on_emps
-from identify.reproduction.laboratory import Case, Laboratory, Run
+from armident.identify.reproduction.emps_controller import controllers_on_emps
+from armident.identify.reproduction.laboratory import Case, Laboratory, Run
 
 Array = NDArray[np.float64]
 

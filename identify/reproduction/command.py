@@ -3,16 +3,16 @@
 import sys
 from pathlib import Path
 
-from configs import ConfigError
-from identify.document import write_atomically
-from identify.reproduction import chapter4, chapter5, chapter6
-from identify.reproduction.bench import SIMULATIONS, SIMULATIONS_QUICK, Bench, TableFunction
-from identify.reproduction.claims import Claim, judged
-from identify.reproduction.laboratory import Laboratory
-from identify.reproduction.printing import document, markdown, print_tables
-from identify.reproduction.recordings import EMPS_SESSION, measured_emps, measured_recording, virtual_recording
-from identify.reproduction.tables import Table
-from identify.terminal import Report, progress
+from armident.configs import ConfigError
+from armident.identify.document import write_atomically
+from armident.identify.reproduction import chapter4, chapter5, chapter6
+from armident.identify.reproduction.bench import SIMULATIONS, SIMULATIONS_QUICK, Bench, TableFunction
+from armident.identify.reproduction.claims import Claim, judged
+from armident.identify.reproduction.laboratory import Laboratory
+from armident.identify.reproduction.printing import document, markdown, print_tables
+from armident.identify.reproduction.recordings import EMPS_SESSION, measured_emps, measured_recording, virtual_recording
+from armident.identify.reproduction.tables import Table
+from armident.identify.terminal import Report, progress
 
 TABLES: dict[str, TableFunction] = {**chapter4.TABLES, **chapter5.TABLES, **chapter6.TABLES}
 SLOW = ("4.1", "4.2", "4.3")

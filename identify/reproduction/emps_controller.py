@@ -4,19 +4,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.closed_loop import RUNAWAY
-from identify.controller.crc import identify_crc
-from identify.controller.parametric import identify_parametric
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.didim import didim
-from identify.estimators.idim_iv import idim_iv
-from identify.estimators.idim_ls import idim_ls
-from identify.estimators.regression import Estimate
-from identify.model.arm import ArmModel
-from identify.preparation import LS_CUTOFF, equations
-from identify.reproduction.recordings import Recorded
-from identify.signals.decimate import design
-from identify.signals.differentiate import differentiate
+from armident.identify.closed_loop import RUNAWAY
+from armident.identify.controller.crc import identify_crc
+from armident.identify.controller.parametric import identify_parametric
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.didim import didim
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.regression import Estimate
+from armident.identify.model.arm import ArmModel
+from armident.identify.preparation import LS_CUTOFF, equations
+from armident.identify.reproduction.recordings import Recorded
+from armident.identify.signals.decimate import design
+from armident.identify.signals.differentiate import differentiate
 
 MODE_HZ = 20.0
 """Highest mode of the closed loop (5.1.4)."""

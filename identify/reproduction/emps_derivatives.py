@@ -14,9 +14,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.signals.bandpass import butterworth
-from identify.signals.differentiate import NVR_BY_HAND, Derivatives, differentiate
+from armident.configs import DataError
+from armident.identify.signals.bandpass import butterworth
+from armident.identify.signals.differentiate import NVR_BY_HAND, Derivatives, differentiate
 
 MASS = 96.0
 """kg."""

@@ -28,7 +28,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.reproduction.emps_derivatives import (
+from armident.identify.reproduction.emps_derivatives import (
     CUTOFF_HZ,
     SNR_DB,
     THESIS,
@@ -41,9 +41,9 @@ from identify.reproduction.emps_derivatives import (
     relative_errors,
     simulate_emps,
 )
-from identify.signals.bandpass import butterworth, central_difference
-from identify.signals.differentiate import Derivatives, NvrRule, differentiate
-from identify.signals.irwsm import irwsm
+from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.differentiate import Derivatives, NvrRule, differentiate
+from armident.identify.signals.irwsm import irwsm
 
 Array = NDArray[np.float64]
 

@@ -8,31 +8,31 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.closed_loop import RUNAWAY, initial_parameters
-from identify.controller.crc import IdentifiedController, identify_crc
-from identify.controller.nominal import saturation
-from identify.controller.parametric import identify_parametric
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.clie import clie
-from identify.estimators.cloe import cloe
-from identify.estimators.didim import didim
-from identify.estimators.idim_iv import idim_iv
-from identify.estimators.idim_ls import idim_ls
-from identify.estimators.idim_piv import idim_piv
-from identify.estimators.regression import MAX_AR_ORDER, Block, Estimate
-from identify.estimators.sep_pem import sep_pem
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
-from identify.model.simulation import Simulation
-from identify.model.subset import restricted_to
-from identify.preparation import equations
-from identify.reproduction.recordings import Recorded
-from identify.reproduction.reference import essential_names
-from identify.reproduction.tables import Cell, Column, Source
-from identify.result import relative_errors
-from identify.signals.bandpass import butterworth, central_difference
-from identify.signals.decimate import Decimation, design
-from identify.signals.differentiate import Derivatives, NvrRule, differentiate, encoder_resolution
+from armident.identify.closed_loop import RUNAWAY, initial_parameters
+from armident.identify.controller.crc import IdentifiedController, identify_crc
+from armident.identify.controller.nominal import saturation
+from armident.identify.controller.parametric import identify_parametric
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.clie import clie
+from armident.identify.estimators.cloe import cloe
+from armident.identify.estimators.didim import didim
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.idim_piv import idim_piv
+from armident.identify.estimators.regression import MAX_AR_ORDER, Block, Estimate
+from armident.identify.estimators.sep_pem import sep_pem
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.simulation import Simulation
+from armident.identify.model.subset import restricted_to
+from armident.identify.preparation import equations
+from armident.identify.reproduction.recordings import Recorded
+from armident.identify.reproduction.reference import essential_names
+from armident.identify.reproduction.tables import Cell, Column, Source
+from armident.identify.result import relative_errors
+from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.differentiate import Derivatives, NvrRule, differentiate, encoder_resolution
 
 Array = NDArray[np.float64]
 T = TypeVar("T")

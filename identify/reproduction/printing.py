@@ -9,8 +9,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table as Grid
 
-from identify.reproduction.claims import Claim
-from identify.reproduction.tables import Cell, Column, Source, Table
+from armident.identify.reproduction.claims import Claim
+from armident.identify.reproduction.tables import Cell, Column, Source, Table
 
 SCHEMA = "armident/reproduction/1"
 SOURCES: tuple[Source, ...] = ("thesis", "virtual", "measured", "arm")

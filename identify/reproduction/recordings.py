@@ -14,17 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from configs import ArmidentError, ConfigError, DataError, RobotConfig, config_path, load_robot, load_session
-from configs.reading import is_file
-from daq.recording import read_recording
-from identify.controller.nominal import saturation
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from identify.model.controller import DiscreteController
+from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, config_path, load_robot, load_session
+from armident.configs.reading import is_file
+from armident.daq.recording import read_recording
+from armident.identify.controller.nominal import saturation
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.model.controller import DiscreteController
 
 SESSION = "tx40_cell.yaml"
 EMPS_SESSION = "emps_cell.yaml"
-COMMAND = (sys.executable, "-m", "daq.cli", "robot")
+COMMAND = (sys.executable, "-m", "armident.daq.cli", "robot")
 
 MEASURED_POSITIONS, MEASURED_TORQUES = "pos_read_data.csv", "curr_data.csv"
 MEASURED_PERIOD = 2e-4

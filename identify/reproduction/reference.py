@@ -5,10 +5,10 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from configs import config_path
-from configs.base import Frozen
-from configs.loading import parse
-from identify.reproduction.tables import Cell, Column
+from armident.configs import config_path
+from armident.configs.base import Frozen
+from armident.configs.loading import parse
+from armident.identify.reproduction.tables import Cell, Column
 
 FILE = "reference/thesis_tables.yaml"
 

@@ -6,15 +6,15 @@ from typing import Literal
 
 import numpy as np
 
-from configs import DataError
-from identify.closed_loop import initial_parameters
-from identify.controller.crc import IdentifiedController
-from identify.controller.law import Structure
-from identify.controller.nominal import saturation
-from identify.controller.parametric import ControlLaw, identify_parametric
-from identify.estimators.idim_iv import idim_iv
-from identify.reproduction.laboratory import Case, Laboratory, Run
-from identify.result import relative_errors
+from armident.configs import DataError
+from armident.identify.closed_loop import initial_parameters
+from armident.identify.controller.crc import IdentifiedController
+from armident.identify.controller.law import Structure
+from armident.identify.controller.nominal import saturation
+from armident.identify.controller.parametric import ControlLaw, identify_parametric
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.reproduction.laboratory import Case, Laboratory, Run
+from armident.identify.result import relative_errors
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from configs import DataError
+from armident.configs import DataError
 
 
 def butterworth(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from configs import DataError
+from armident.configs import DataError
 
 POWER_SHARE = 0.95
 """Share of the power of the velocity that lies below the bandwidth of the motion."""

@@ -7,7 +7,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy import signal
 
-from configs import DataError
+from armident.configs import DataError
 
 STOPBAND_DB = 70.0
 """Attenuation beyond the Nyquist frequency of the decimated signal."""

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from identify.estimators.noise import ArModel
-from identify.estimators.regression import (
+from armident.identify.estimators.noise import ArModel
+from armident.identify.estimators.regression import (
     Block,
     filtered_regressor,
     instrumental_variable,
@@ -26,10 +26,10 @@ from identify.estimators.regression import (
     unweighted,
     weighted_rows,
 )
-from identify.experiment import Experiment
-from identify.model.arm import ArmModel
-from identify.signals.decimate import Decimation
-from identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.experiment import Experiment
+from armident.identify.model.arm import ArmModel
+from armident.identify.signals.decimate import Decimation
+from armident.identify.signals.differentiate import Derivatives, differentiate
 
 HELD = 0.5
 """Delay in samples of a drive that reports the torque it holds until the next sample."""

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError, RobotConfig
-from identify.signals.bandpass import butterworth, central_difference
-from identify.signals.irwsm import automatic_nvr, cross_validated_nvr, irwsm, optimal_nvr
+from armident.configs import DataError, RobotConfig
+from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.irwsm import automatic_nvr, cross_validated_nvr, irwsm, optimal_nvr
 
 Method = Literal["irwsm", "irwsm2", "bandpass"]
 
@@ -64,8 +64,8 @@ def differentiate(
         ``bandpass``: zero-phase Butterworth of order 4 at five times ``bandwidth_hz``, then central differences.
     nvr
         Noise-variance ratio, one for all joints or one per joint, or the rule to find it: ``automatic`` (the same as
-        ``None``, see :func:`identify.signals.irwsm.automatic_nvr`), ``cross-validation``, ``likelihood`` (thesis
-        5.21) or ``tracking-error`` (5.26, 5.27).
+        ``None``, see :func:`armident.identify.signals.irwsm.automatic_nvr`), ``cross-validation``, ``likelihood``
+        (thesis 5.21) or ``tracking-error`` (5.26, 5.27).
     bandwidth_hz
         Closed-loop bandwidth, Hz; needed by ``bandpass``.
     q_ref

@@ -19,7 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
+from armident.configs import DataError
 
 LOG10_NVR_RANGE = {2: (-12.0, 4.0), 3: (-14.0, 4.0)}
 """Where the ratio is searched; below, third-order factors lose definiteness (about 1e-16)."""

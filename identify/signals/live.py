@@ -3,7 +3,7 @@
 The model is that of the smoother (thesis section 5.1.2) in its kinematic form: the highest derivative is driven by
 white noise, the state holds position and derivatives at the sampling instant itself, so nothing has to be moved by
 half a sample. With the unit of time one sample and that of variance the measurement's, only the noise-variance ratio
-is left, and its meaning is that of :mod:`identify.signals.irwsm`: the same spectrum, ``NVR / w^(2 order)``.
+is left, and its meaning is that of :mod:`armident.identify.signals.irwsm`: the same spectrum, ``NVR / w^(2 order)``.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from configs import DataError
+from armident.configs import DataError
 
 PRIOR = 1e10
 """Variance of the unknown derivatives at the first sample, in units of the measurement's variance."""

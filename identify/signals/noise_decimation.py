@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.estimators.noise import fit_ar
+from armident.configs import DataError
+from armident.identify.estimators.noise import fit_ar
 
 MAX_ORDER = 250
 """Highest order tried: twice the decimation that the thesis chose by hand."""

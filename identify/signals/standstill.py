@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.signals.decimate import Decimation
-from identify.signals.differentiate import Derivatives
+from armident.configs import DataError
+from armident.identify.signals.decimate import Decimation
+from armident.identify.signals.differentiate import Derivatives
 
 SLOW_SHARE = 0.02
 """Speed in root mean squares of a joint's velocity below which a sample counts as slow."""

@@ -21,12 +21,12 @@ from typing import Any
 import can
 import numpy as np
 
-from configs import load_robot, load_session
-from daq.recording import read_recording
-from daq.streams import captured_streams
-from drivers.receiver import Receiver
-from drivers.socketcan import RawSocket
-from drivers.vcan import ensure_vcan, remove_vcan
+from armident.configs import load_robot, load_session
+from armident.daq.recording import read_recording
+from armident.daq.streams import captured_streams
+from armident.drivers.receiver import Receiver
+from armident.drivers.socketcan import RawSocket
+from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.benchmarks.harness import Row
 from tests.faults.bus import session_file
 from tests.faults.sender import Sender

@@ -8,17 +8,17 @@ from tests.benchmarks.harness import Row
 
 MEASURE = """
 import json, resource, time
-from configs import config_path, load_robot, load_trajectory
-from identify.discrepancy.candidates import candidates
-from identify.discrepancy.diagnose import diagnose
-from identify.discrepancy.search import Search
-from identify.discrepancy.state import Settings
-from identify.discrepancy.study import build_study
-from identify.from_recording import experiments_from_recording
-from identify.options import Options
-from identify.run import identify_experiment
-from virtual_robot.offline import simulate_recording
-from virtual_robot.scenario import load_scenario
+from armident.configs import config_path, load_robot, load_trajectory
+from armident.identify.discrepancy.candidates import candidates
+from armident.identify.discrepancy.diagnose import diagnose
+from armident.identify.discrepancy.search import Search
+from armident.identify.discrepancy.state import Settings
+from armident.identify.discrepancy.study import build_study
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.options import Options
+from armident.identify.run import identify_experiment
+from armident.virtual_robot.offline import simulate_recording
+from armident.virtual_robot.scenario import load_scenario
 
 robot = load_robot("tx40")
 folder = config_path("tx40.yaml").parent

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import load_robot
-from daq.recording import Field, RecordingWriter, StreamLayout
+from armident.configs import load_robot
+from armident.daq.recording import Field, RecordingWriter, StreamLayout
 from tests.benchmarks.harness import Row
 
 RATE = 5000
@@ -27,7 +27,7 @@ CHUNK = 500
 READ = """
 import sys, time
 from pathlib import Path
-from daq.recording import read_recording
+from armident.daq.recording import read_recording
 
 def kilobytes(name):
     # What getrusage calls the peak is that of whoever started this process, if that had more.

@@ -5,7 +5,7 @@ import time
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from identify.signals.irwsm import irwsm, optimal_nvr
+from armident.identify.signals.irwsm import irwsm, optimal_nvr
 from tests.benchmarks.harness import Row, best_of
 
 SAMPLES = 50_000

@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from configs import load_robot, load_trajectory
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
-from identify.model.simulation import simulate
+from armident.configs import load_robot, load_trajectory
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.simulation import simulate
 from tests.benchmarks.harness import Row, best_of
 from tests.pinocchio_oracle import TO_OURS, pinocchio_model, random_parameters
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from configs import load_robot
+from armident.configs import load_robot
+from armident.virtual_robot.arm import Arm
+from armident.virtual_robot.inertias import rest_posture
+from armident.virtual_robot.servo import CONTROL_PERIOD
 from tests.benchmarks.harness import Row, best_of
-from virtual_robot.arm import Arm
-from virtual_robot.inertias import rest_posture
-from virtual_robot.servo import CONTROL_PERIOD
 
 PERIODS = 10_000
 

@@ -15,10 +15,10 @@ import can
 import numpy as np
 from numba import njit
 
-from drivers.frames import frames
-from drivers.socketcan import Messages, RawSocket
-from drivers.sync_loop import monotonic_ns, send_messages, sleep_until
-from drivers.vcan import ensure_vcan
+from armident.drivers.frames import frames
+from armident.drivers.socketcan import Messages, RawSocket
+from armident.drivers.sync_loop import monotonic_ns, send_messages, sleep_until
+from armident.drivers.vcan import ensure_vcan
 from tests.benchmarks.harness import Row
 
 NEEDS_VCAN = True

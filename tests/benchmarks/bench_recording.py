@@ -13,8 +13,8 @@ from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
-from configs import load_robot
-from daq.recording import Field, RecordingWriter, StreamLayout, read_recording
+from armident.configs import load_robot
+from armident.daq.recording import Field, RecordingWriter, StreamLayout, read_recording
 from tests.benchmarks.harness import Row
 
 SAMPLES = 50_000

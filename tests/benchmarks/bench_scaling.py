@@ -11,12 +11,12 @@ SECONDS = (10, 100, 1000)
 MEASURE = """
 import json, resource, sys, time
 import numpy as np
-from configs import config_path, load_robot, load_trajectory
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from identify.options import Options
-from identify.run import identify_experiment
-from virtual_robot.offline import simulate_recording
+from armident.configs import config_path, load_robot, load_trajectory
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.options import Options
+from armident.identify.run import identify_experiment
+from armident.virtual_robot.offline import simulate_recording
 
 robot = load_robot("tx40")
 trajectory = load_trajectory(str(config_path("tx40.yaml").parent / "trajectories" / "tx40_excitation.yaml"))

@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 from types import ModuleType
 
-from drivers.vcan import launcher_command
+from armident.drivers.vcan import launcher_command
 from tests.benchmarks.harness import Row
 
 HERE = Path(__file__).parent

@@ -3,7 +3,7 @@
 Each round is a short capture at 1 kHz of six drives whose samples say which SYNC they answer, on one bus or two, with
 one to three faults at random times (the first of them by turns). An independent socket counts the SYNCs of the
 bus. Afterwards every SYNC has to be received or in the gap list, none twice, every value of its SYNC, and the faults
-named. Runs under ``python -m drivers.vcan``.
+named. Runs under ``python -m armident.drivers.vcan``.
 """
 
 import argparse
@@ -25,10 +25,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from configs import config_path, load_robot, load_session
-from daq.recording import read_recording
-from daq.recording.model import join_parts
-from drivers.vcan import ensure_vcan, remove_vcan
+from armident.configs import config_path, load_robot, load_session
+from armident.daq.recording import read_recording
+from armident.daq.recording.model import join_parts
+from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.faults.check import violations
 from tests.faults.farm import Farm
 from tests.faults.plan import FAULTS, HANDFUL, ORDERED, ROTATE_S, Outcome, Plan, Room, chosen

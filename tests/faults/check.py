@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.recording import Recording
-from daq.recording.model import Stream
+from armident.daq.recording import Recording
+from armident.daq.recording.model import Stream
 from tests.faults.farm import current_of, demand_of, position_of
 from tests.faults.plan import Outcome
 

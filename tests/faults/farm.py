@@ -20,9 +20,9 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig, SessionConfig
-from drivers.frames import BusDown, Frames, frames
-from drivers.objects import (
+from armident.configs import RobotConfig, SessionConfig
+from armident.drivers.frames import BusDown, Frames, frames
+from armident.drivers.objects import (
     COB_SYNC,
     CURRENT_ACTUAL,
     POSITION_ACTUAL,
@@ -31,9 +31,9 @@ from drivers.objects import (
     TPDO_COMMUNICATION,
     DriveState,
 )
-from drivers.socketcan import RawSocket
-from virtual_robot.line import Line
-from virtual_robot.node import Drive
+from armident.drivers.socketcan import RawSocket
+from armident.virtual_robot.line import Line
+from armident.virtual_robot.node import Drive
 
 SIOCGIFFLAGS, SIOCSIFFLAGS, IFF_UP = 0x8913, 0x8914, 1
 COUNTER = 240

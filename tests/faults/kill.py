@@ -4,7 +4,7 @@ Each round captures what six drives send at 1 to 5 kHz and is ended by SIGKILL, 
 over all the time, every third with a drive that does not answer now and then. By the kill an independent socket on the
 bus has heard some SYNCs; those that the files do not account for afterwards are what it cost, at most 100 ms of them.
 Every file opens torn, is healed by ``heal_recording``, and says the same as before; other MCAP readers then open it
-too. Runs under ``python -m drivers.vcan``.
+too. Runs under ``python -m armident.drivers.vcan``.
 """
 
 import argparse
@@ -25,11 +25,11 @@ import numpy as np
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
-from daq.recording import heal_recording, read_recording
-from daq.recording.model import join_parts
-from drivers.objects import COB_MASK, COB_SYNC
-from drivers.socketcan import RawSocket
-from drivers.vcan import ensure_vcan, remove_vcan
+from armident.daq.recording import heal_recording, read_recording
+from armident.daq.recording.model import join_parts
+from armident.drivers.objects import COB_MASK, COB_SYNC
+from armident.drivers.socketcan import RawSocket
+from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.faults.bus import session_file
 from tests.faults.farm import drained
 from tests.faults.recorder import Recorders, said, warm

@@ -10,10 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.recording import Recording
-from daq.recording.unwritten import NOT_WRITTEN
-from drivers.frames import ERROR_FLAG, Frames, frame, frames
-from drivers.objects import COB_NMT, COB_SDO_REQUEST, PDO_NOT_VALID, TPDO_COMMUNICATION, TPDO_MAPPING, NmtCommand
+from armident.daq.recording import Recording
+from armident.daq.recording.unwritten import NOT_WRITTEN
+from armident.drivers.frames import ERROR_FLAG, Frames, frame, frames
+from armident.drivers.objects import (
+    COB_NMT,
+    COB_SDO_REQUEST,
+    PDO_NOT_VALID,
+    TPDO_COMMUNICATION,
+    TPDO_MAPPING,
+    NmtCommand,
+)
 from tests.faults.farm import Farm, Orders
 
 SDO_STEP_S = 0.004

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from configs import ArmidentError
-from daq.assembler import Assembler, TpdoStream
-from daq.capture import run_capture
-from drivers import sync_loop
-from drivers.frames import frames
-from drivers.socketcan import RawSocket
+from armident.configs import ArmidentError
+from armident.daq.assembler import Assembler, TpdoStream
+from armident.daq.capture import run_capture
+from armident.drivers import sync_loop
+from armident.drivers.frames import frames
+from armident.drivers.socketcan import RawSocket
 
 
 def warm() -> None:

@@ -3,8 +3,8 @@
 Six buses with SYNC and a drive each at 5 kHz, sent by one process from prepared frames (a virtual arm beside it is more
 than a guest with one CPU can do), recorded by ``armident capture --listen-only``. Afterwards every SYNC that was
 sent has to be a row with the values of its SYNC. Prints rows, gaps, drops, CPU and memory over time. Runs under
-``python -m drivers.vcan``; a guest takes long to read what it has recorded: with ``--out FOLDER`` there, ``--judge
-FOLDER`` does it outside.
+``python -m armident.drivers.vcan``; a guest takes long to read what it has recorded: with ``--out FOLDER`` there,
+``--judge FOLDER`` does it outside.
 """
 
 import argparse
@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.recording import read_recording
-from drivers.vcan import ensure_vcan, remove_vcan
+from armident.daq.recording import read_recording
+from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.faults.bus import session_file
 from tests.faults.sender import FAILED, SHIFTED, WORST_NS, Sender, current_of, position_of
 
-ARMIDENT = [sys.executable, "-c", "from daq.cli import main; main()"]
+ARMIDENT = [sys.executable, "-c", "from armident.daq.cli import main; main()"]
 LOOK_S = 10.0
 TICKS = os.sysconf("SC_CLK_TCK")
 

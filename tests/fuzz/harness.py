@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from types import FrameType
 
-from configs import ArmidentError, ConfigError, DataError
+from armident.configs import ArmidentError, ConfigError, DataError
 from tests.fuzz.mutate import Mutator
 
 CORPUS = Path(__file__).parent / "corpus"

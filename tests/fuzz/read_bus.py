@@ -11,14 +11,14 @@ import canopen
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import ArmidentError, ConfigError, load_session
-from configs.session import Temperature
-from daq.assembler import Assembler, TpdoStream
-from daq.sniffing import survey
-from drivers import objects as od
-from drivers.bus_errors import summarise
-from drivers.frames import FRAME
-from drivers.sdo import DriveSdo
+from armident.configs import ArmidentError, ConfigError, load_session
+from armident.configs.session import Temperature
+from armident.daq.assembler import Assembler, TpdoStream
+from armident.daq.sniffing import survey
+from armident.drivers import objects as od
+from armident.drivers.bus_errors import summarise
+from armident.drivers.frames import FRAME
+from armident.drivers.sdo import DriveSdo
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import spoil_bytes
 from tests.property.test_daq_assembler import JOINTS, PERIOD_NS, STREAMS, Faults, bus

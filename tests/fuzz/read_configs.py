@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from configs import load_robot, load_session, load_suite, load_trajectory
-from configs.loading import HERE
-from configs.reading import read_yaml
+from armident.configs import load_robot, load_session, load_suite, load_trajectory
+from armident.configs.loading import HERE
+from armident.configs.reading import read_yaml
+from armident.virtual_robot.scenario import load_scenario
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import either, spoil_text, spoil_tree
 from tests.urdf_chains import random_urdf
-from virtual_robot.scenario import load_scenario
 
 Load = Callable[[Path], BaseModel]
 URDF_ROBOT = """schema: armident/robot/1

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from configs import RobotConfig, SessionConfig, load_robot, load_session
-from daq.bus_log import recording_from_log
-from daq.exporting import export_recording
-from daq.importing import import_recording
-from daq.recording import Recording, read_recording, write_recording
+from armident.configs import RobotConfig, SessionConfig, load_robot, load_session
+from armident.daq.bus_log import recording_from_log
+from armident.daq.exporting import export_recording
+from armident.daq.importing import import_recording
+from armident.daq.recording import Recording, read_recording, write_recording
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import Mutator, either, spoil_bytes, spoil_text
 from tests.unit.test_daq_recording import make_recording

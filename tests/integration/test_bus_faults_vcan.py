@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daq.recording import read_recording
-from drivers.frames import ERROR_FLAG, frame, frames
-from drivers.objects import NmtCommand
-from drivers.receiver import BusEvent, Receiver
-from drivers.socketcan import RawSocket
-from drivers.vcan import ensure_vcan, remove_vcan
+from armident.daq.recording import read_recording
+from armident.drivers.frames import ERROR_FLAG, frame, frames
+from armident.drivers.objects import NmtCommand
+from armident.drivers.receiver import BusEvent, Receiver
+from armident.drivers.socketcan import RawSocket
+from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.integration.test_several_buses_vcan import (
     SLOW,
     every_sync_is_accounted_for,

@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 import yaml
 
-from configs import config_path, load_robot
-from daq.assembler import LATE_S
-from daq.capture import capture, prepare
-from daq.recording import read_recording
-from daq.streams import counts_per_si
+from armident.configs import config_path, load_robot
+from armident.daq.assembler import LATE_S
+from armident.daq.capture import capture, prepare
+from armident.daq.recording import read_recording
+from armident.daq.streams import counts_per_si
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
 
-ARMIDENT = [sys.executable, "-c", "from daq.cli import main; main()"]
+ARMIDENT = [sys.executable, "-c", "from armident.daq.cli import main; main()"]
 COUNTED = ("samples.expected", "samples.rows", "samples.in_gaps", "kernel_drops")
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from configs import ArmidentError
-from daq.demo import _running
+from armident.configs import ArmidentError
+from armident.daq.demo import _running
 
 LONGEST_S = 280
 
@@ -45,7 +45,7 @@ def test_processes_do_not_outlive_the_demo(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(LONGEST_S + 20)
 def test_the_first_chapter_ends_with_a_report_and_a_table(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "daq.cli", "demo", "--quick", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "armident.daq.cli", "demo", "--quick", "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     last = done.stdout.strip().splitlines()[-1]

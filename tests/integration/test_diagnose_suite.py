@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from daq.suite.run import REPORT, RESULTS, SUMMARY, TABLE
+from armident.daq.suite.run import REPORT, RESULTS, SUMMARY, TABLE
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 
 def diagnose_suite(*words: str) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "daq.cli", "diagnose-suite", *words]
+    command = [sys.executable, "-m", "armident.daq.cli", "diagnose-suite", *words]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 

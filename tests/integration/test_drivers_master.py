@@ -11,12 +11,12 @@ import canopen
 import pytest
 from canopen.sdo import SdoAbortedError
 
-from configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session
-from drivers import objects as od
-from drivers.frames import BusDown, frames
-from drivers.master import DriveEvent, DriveMaster
-from drivers.objects import Control, DriveState
-from drivers.socketcan import RawSocket
+from armident.configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session
+from armident.drivers import objects as od
+from armident.drivers.frames import BusDown, frames
+from armident.drivers.master import DriveEvent, DriveMaster
+from armident.drivers.objects import Control, DriveState
+from armident.drivers.socketcan import RawSocket
 
 pytestmark = pytest.mark.vcan
 

@@ -5,10 +5,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from drivers.bus_errors import NO_ACKNOWLEDGE
-from drivers.frames import ERROR_FLAG, Frames, frames
-from drivers.receiver import BATCH, Receiver
-from drivers.socketcan import RawSocket
+from armident.drivers.bus_errors import NO_ACKNOWLEDGE
+from armident.drivers.frames import ERROR_FLAG, Frames, frames
+from armident.drivers.receiver import BATCH, Receiver
+from armident.drivers.socketcan import RawSocket
 
 pytestmark = pytest.mark.vcan
 

@@ -6,9 +6,9 @@ import time
 import numpy as np
 import pytest
 
-from configs import ConfigError
-from drivers.frames import BIT_RATE_SWITCH, FD_FLAG, BusDown, Frames, frame, frames
-from drivers.socketcan import BATCH, RawSocket
+from armident.configs import ConfigError
+from armident.drivers.frames import BIT_RATE_SWITCH, FD_FLAG, BusDown, Frames, frame, frames
+from armident.drivers.socketcan import BATCH, RawSocket
 
 pytestmark = pytest.mark.vcan
 

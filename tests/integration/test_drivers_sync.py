@@ -8,12 +8,12 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from configs.session import Bus
-from drivers.bcm import KernelSync
-from drivers.frames import BusDown, Frames, frames
-from drivers.objects import COB_SYNC
-from drivers.socketcan import RawSocket
-from drivers.sync import SetpointPlan, SyncProducer
+from armident.configs.session import Bus
+from armident.drivers.bcm import KernelSync
+from armident.drivers.frames import BusDown, Frames, frames
+from armident.drivers.objects import COB_SYNC
+from armident.drivers.socketcan import RawSocket
+from armident.drivers.sync import SetpointPlan, SyncProducer
 
 pytestmark = pytest.mark.vcan
 

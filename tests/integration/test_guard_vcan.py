@@ -14,12 +14,12 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from configs import ArmidentError, config_path, load_robot
-from daq.guard.run import guard
-from daq.streams import counts_per_si
-from drivers.frames import frame, frames
-from drivers.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC, rpdo_cob, tpdo_cob
-from drivers.socketcan import RawSocket
+from armident.configs import ArmidentError, config_path, load_robot
+from armident.daq.guard.run import guard
+from armident.daq.streams import counts_per_si
+from armident.drivers.frames import frame, frames
+from armident.drivers.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC, rpdo_cob, tpdo_cob
+from armident.drivers.socketcan import RawSocket
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 import zenoh
 
-from configs import RobotConfig, SessionConfig, load_robot, load_session
-from daq.assembler import Batch, Rows
-from daq.publisher import Publisher
-from daq.recording import Gap, read_recording
-from daq.sink import Sink
-from daq.storage import open_series
-from daq.streams import captured_streams
-from daq.zenoh_keys import Keys, decode_block, open_session
+from armident.configs import RobotConfig, SessionConfig, load_robot, load_session
+from armident.daq.assembler import Batch, Rows
+from armident.daq.publisher import Publisher
+from armident.daq.recording import Gap, read_recording
+from armident.daq.sink import Sink
+from armident.daq.storage import open_series
+from armident.daq.streams import captured_streams
+from armident.daq.zenoh_keys import Keys, decode_block, open_session
 
 ROWS, EVERY_S, SECONDS = 100, 0.02, 3.0
 """Six axes at 5 kHz, taken every 20 ms."""
@@ -30,8 +30,8 @@ MEMORY = 150_000_000
 LISTENER = """
 import sys, threading, time
 import zenoh, zenoh.ext
-from configs import load_session
-from daq.zenoh_keys import Keys, open_session
+from armident.configs import load_session
+from armident.daq.zenoh_keys import Keys, open_session
 role, cell = sys.argv[1:]
 session = load_session("tx40_cell.yaml").model_copy(update={"cell": cell})
 keys = Keys(cell, "tx40")

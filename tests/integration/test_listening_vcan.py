@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from configs import config_path
-from daq.recording import read_recording
-from drivers.frames import Frames, frame, frames
-from drivers.objects import COB_EMCY
-from drivers.socketcan import RawSocket
+from armident.configs import config_path
+from armident.daq.recording import read_recording
+from armident.drivers.frames import Frames, frame, frames
+from armident.drivers.objects import COB_EMCY
+from armident.drivers.socketcan import RawSocket
 from tests.integration.test_several_buses_vcan import session_file, start
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]

@@ -15,15 +15,15 @@ import pytest
 import sqlalchemy as sa
 import yaml
 
-from daq.recording import read_recording
-from drivers.frames import Frames, frame, frames
-from drivers.objects import COB_EMCY, DriveState, drive_state
-from drivers.socketcan import RawSocket
+from armident.daq.recording import read_recording
+from armident.drivers.frames import Frames, frame, frames
+from armident.drivers.objects import COB_EMCY, DriveState, drive_state
+from armident.drivers.socketcan import RawSocket
 from tests.statistics.weeks import WORN, cell_file
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(280)]
 
-ARMIDENT = [sys.executable, "-m", "daq.cli"]
+ARMIDENT = [sys.executable, "-m", "armident.daq.cli"]
 QUICK = {"sync": {"period_us": 2000}}
 
 

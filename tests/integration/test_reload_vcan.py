@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
-from daq.recording import join_parts, read_recording
+from armident.daq.recording import join_parts, read_recording
 from tests.integration.test_capture_vcan import robot, run, session_file, wait_for_file
 
 __all__ = ["robot"]

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import yaml
 
-from configs import config_path
-from daq.recording import Recording, read_recording
-from drivers.vcan import ensure_vcan, remove_vcan
+from armident.configs import config_path
+from armident.daq.recording import Recording, read_recording
+from armident.drivers.vcan import ensure_vcan, remove_vcan
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
 
-ARMIDENT = [sys.executable, "-c", "from daq.cli import main; main()"]
+ARMIDENT = [sys.executable, "-c", "from armident.daq.cli import main; main()"]
 SLOW = {"role": "producer", "period_us": 1000, "counter": 240}
 
 

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import yaml
 
-from configs import config_path
-from daq.recording import read_recording
+from armident.configs import config_path
+from armident.daq.recording import read_recording
 from tests.tx40_reference import TABLE_B4, published_estimate
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.timeout(280)]
 
-ARMIDENT = [sys.executable, "-m", "daq.cli"]
+ARMIDENT = [sys.executable, "-m", "armident.daq.cli"]
 PLAYED_S = 7.6
 """The arm stands still from 7.5 s on."""
 

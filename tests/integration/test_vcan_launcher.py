@@ -10,8 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from configs.errors import ConfigError
-from drivers.vcan import ensure_vcan, have_socketcan, launcher_available, launcher_command, packages, remove_vcan
+from armident.configs.errors import ConfigError
+from armident.drivers.vcan import (
+    ensure_vcan,
+    have_socketcan,
+    launcher_available,
+    launcher_command,
+    packages,
+    remove_vcan,
+)
 
 IN_THE_GUEST = "ARMIDENT_GUEST" in os.environ
 REASON = "inside the guest already" if IN_THE_GUEST else launcher_available()
@@ -133,7 +140,7 @@ def test_a_torn_package_is_one_line_and_leaves_nothing_behind(tmp_path: Path) ->
     for name in packages.GUEST_PACKAGES + packages.HOST_PACKAGES:
         (debs / f"{name}_1_amd64.deb").write_bytes(b"!<arch>\n")
     environment = {**os.environ, "VCAN_CACHE": str(tmp_path / "cache"), "VCAN_DEBS": str(debs)}
-    line = [sys.executable, "-m", "drivers.vcan", "--guest", "--", "true"]
+    line = [sys.executable, "-m", "armident.drivers.vcan", "--guest", "--", "true"]
     done = subprocess.run(line, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 125
     assert done.stderr.count("\n") == 1

@@ -16,20 +16,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import SessionConfig, Trajectory, load_robot, load_session
-from configs.trajectory import Move
-from daq.recording import write_recording
-from drivers.frames import frames
-from drivers.master import DriveMaster
-from drivers.objects import COB_MASK, COB_SYNC, Control, DriveState, NmtCommand, drive_state
-from drivers.socketcan import RawSocket
-from drivers.sync import SetpointPlan, SyncProducer
-from virtual_robot.offline import simulate_recording
+from armident.configs import SessionConfig, Trajectory, load_robot, load_session
+from armident.configs.trajectory import Move
+from armident.daq.recording import write_recording
+from armident.drivers.frames import frames
+from armident.drivers.master import DriveMaster
+from armident.drivers.objects import COB_MASK, COB_SYNC, Control, DriveState, NmtCommand, drive_state
+from armident.drivers.socketcan import RawSocket
+from armident.drivers.sync import SetpointPlan, SyncProducer
+from armident.virtual_robot.offline import simulate_recording
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-RUN = "import sys; from pathlib import Path; from virtual_robot.cli import robot; robot(config=Path(sys.argv[1]), "
+RUN = "import sys; from pathlib import Path; from armident.virtual_robot.cli import robot; "
+RUN += "robot(config=Path(sys.argv[1]), "
 
 
 @dataclass

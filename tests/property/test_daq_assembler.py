@@ -8,8 +8,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from daq.assembler import SYNC_LOST, Assembler, Batch, TpdoStream
-from daq.recording import Gap
+from armident.daq.assembler import SYNC_LOST, Assembler, Batch, TpdoStream
+from armident.daq.recording import Gap
 
 FRAME = np.dtype([("t_ns", "<i8"), ("can_id", "<u4"), ("length", "u1"), ("data", "u1", (8,))])
 JOINTS = ("joint_1", "joint_2", "joint_3")

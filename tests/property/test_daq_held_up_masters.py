@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from daq.assembler import Assembler, Batch, TpdoStream
-from drivers.frames import Frames, frames
+from armident.daq.assembler import Assembler, Batch, TpdoStream
+from armident.drivers.frames import Frames, frames
 
 PERIOD_NS = 200_000
 OVERFLOW = 240

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from configs import DataError
-from daq.assembler import SYNC_LOST, UNSENT, Assembler, Batch, TpdoStream
-from daq.recording import Gap
-from drivers.frames import FD_FRAME
+from armident.configs import DataError
+from armident.daq.assembler import SYNC_LOST, UNSENT, Assembler, Batch, TpdoStream
+from armident.daq.recording import Gap
+from armident.drivers.frames import FD_FRAME
 
 JOINTS = ("joint_1", "joint_2", "joint_3", "joint_4")
 BUS_OF = (0, 0, 1, 2)

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from configs import ConfigError, RobotConfig, load_robot
-from configs.urdf import mdh_of, read_chain
-from identify.model.arm import ArmModel
-from identify.model.base_parameters import independent_columns
-from identify.model.chain import chain_of, columns_of, standard_names
-from identify.model.khalil import evaluate, khalil_rules, lengths_of
+from armident.configs import ConfigError, RobotConfig, load_robot
+from armident.configs.urdf import mdh_of, read_chain
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.base_parameters import independent_columns
+from armident.identify.model.chain import chain_of, columns_of, standard_names
+from armident.identify.model.khalil import evaluate, khalil_rules, lengths_of
 from tests.pinocchio_oracle import TO_OURS, Floats, pinocchio_model, random_parameters, random_robot
 from tests.urdf_chains import configuration, link_frames, random_urdf
 

@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from identify.signals.irwsm import automatic_nvr, kept_share
-from identify.signals.live import VelocityFilter
+from armident.identify.signals.irwsm import automatic_nvr, kept_share
+from armident.identify.signals.live import VelocityFilter
 
 DT = 1e-3
 seeds = st.integers(0, 2**32 - 1)

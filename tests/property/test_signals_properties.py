@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identify.estimators.noise import ArModel, fit_ar
-from identify.signals.decimate import design
-from identify.signals.irwsm import irwsm, negative_log_likelihood, optimal_nvr
+from armident.identify.estimators.noise import ArModel, fit_ar
+from armident.identify.signals.decimate import design
+from armident.identify.signals.irwsm import irwsm, negative_log_likelihood, optimal_nvr
 
 seeds = st.integers(0, 2**32 - 1)
 orders = st.sampled_from([2, 3])

@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from configs import RobotConfig, Trajectory, config_path, load_robot, load_trajectory
-from identify.from_recording import experiments_from_recording
-from identify.model.arm import ArmModel
-from identify.options import METHODS, Method, Options
-from identify.run import identify_experiment
+from armident.configs import RobotConfig, Trajectory, config_path, load_robot, load_trajectory
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.model.arm import ArmModel
+from armident.identify.options import METHODS, Method, Options
+from armident.identify.run import identify_experiment
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.offline import simulate_recording
 from tests.tx40_reference import TABLE_B4
-from virtual_robot.inertias import plant_parameters
-from virtual_robot.offline import simulate_recording
 
 Floats = NDArray[np.float64]
 

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from configs import RobotConfig, load_robot
-from configs.loading import parse
-from daq.importing import import_recording
-from identify.discrepancy.diagnose import Diagnosis, diagnose
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
+from armident.configs import RobotConfig, load_robot
+from armident.configs.loading import parse
+from armident.daq.importing import import_recording
+from armident.identify.discrepancy.diagnose import Diagnosis, diagnose
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
 from tests.conftest import REPOSITORY
 
 FORCE_PER_VOLT = 35.15065

@@ -1,8 +1,8 @@
 """Is the same arm called the same, week after week? Runs on vcan, then ``reidentify`` of them, and of a worn arm.
 
-``python -m drivers.vcan -n 2 -- python -m tests.statistics.weeks record --runs 200 --out weeks`` moves a virtual TX40
-as often along the shipped trajectory as ``reidentify`` does, with guard and capture as processes of their own. Every
-bus has an arm of its own with other noise, and a last run has a tenth more friction in joint 2.
+``python -m armident.drivers.vcan -n 2 -- python -m tests.statistics.weeks record --runs 200 --out weeks`` moves a
+virtual TX40 as often along the shipped trajectory as ``reidentify`` does, with guard and capture as processes of their
+own. Every bus has an arm of its own with other noise, and a last run has a tenth more friction in joint 2.
 ``python -m tests.statistics.weeks judge --out weeks`` identifies them all by ``armident reidentify --recordings`` and
 compares them with the first at the default setting. A campaign that was stopped goes on where it was. Exit code 1 if
 an unchanged arm was called changed, or the worn one was not.
@@ -26,8 +26,8 @@ from typing import IO, Any
 import numpy as np
 import yaml
 
-from configs import ArmidentError, config_path
-from identify.reidentify.play import play
+from armident.configs import ArmidentError, config_path
+from armident.identify.reidentify.play import play
 
 PERIOD_US = 2000
 """SYNC period: six axes on a bus of a guest with one CPU, beside guard, capture and arm."""
@@ -39,7 +39,7 @@ WORN = {
     "description": "a tenth more friction in joint 2",
     "effects": [{"effect": "friction_drift", "joint": "joint_2", "parameters": {"change": 0.1, "time_constant": 1e-6}}],
 }
-PRELOADED = ("daq.capture", "daq.guard.run", "virtual_robot.run")
+PRELOADED = ("armident.daq.capture", "armident.daq.guard.run", "armident.virtual_robot.run")
 
 
 def cell_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
@@ -58,7 +58,7 @@ def cell_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
 
 
 class Forked:
-    """An armident command in a process that has imported everything already, as `identify.reidentify.play` wants it."""
+    """An armident command in a process that has imported everything already."""
 
     def __init__(self, words: Sequence[str], out: int, err: int) -> None:
         self._process = _server().Process(target=_command, args=(list(words), _Passed(out), _Passed(err)))
@@ -96,7 +96,7 @@ class _Passed:
 
 
 def start_forked(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Forked:
-    """As `identify.reidentify.play.start_process`."""
+    """As `armident.identify.reidentify.play.start_process`."""
     return Forked(words, out.fileno(), err.fileno())
 
 
@@ -107,7 +107,7 @@ def _server() -> ForkServerContext:
 
 
 def _command(words: list[str], out: _Passed, err: _Passed) -> None:
-    from daq.cli import main
+    from armident.daq.cli import main
 
     for number, file in ((1, out), (2, err)):
         os.dup2(file.descriptor, number)
@@ -169,7 +169,7 @@ def judge(out: Path, name: str, *options: str) -> tuple[list[dict[str, Any]], in
     """Identify and compare all recordings of a name; what came of each, and the exit code."""
     store = f"sqlite:///{out.resolve()}/{name}.sqlite"
     (out / f"{name}.sqlite").unlink(missing_ok=True)
-    command = [sys.executable, "-m", "daq.cli", "reidentify", "--recordings", str(out / f"{name}[0-9]*.mcap")]
+    command = [sys.executable, "-m", "armident.daq.cli", "reidentify", "--recordings", str(out / f"{name}[0-9]*.mcap")]
     command += ["--store", store, "--workers", "1", "--out", str(out / "results"), "--json", *options]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     return json.loads(done.stdout)["runs"] if done.stdout else [], done.returncode

@@ -2,7 +2,7 @@
 
 import pytest
 
-from configs import RobotConfig, load_robot
+from armident.configs import RobotConfig, load_robot
 
 
 @pytest.fixture(scope="session")

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from configs import load_robot
-from configs.robot import Effect as Stanza
-from identify.catalogue.effect import Place
-from identify.catalogue.friction import dahl
-from identify.catalogue.motion import Motion
-from identify.catalogue.recorded import put_right
-from identify.catalogue.registry import catalogue
-from identify.catalogue.rotor import rotors
-from identify.catalogue.transmission import crossing, swinging
-from identify.experiment import Experiment
-from identify.model.arm import ArmModel
-from virtual_robot.inertias import plant_parameters
+from armident.configs import load_robot
+from armident.configs.robot import Effect as Stanza
+from armident.identify.catalogue.effect import Place
+from armident.identify.catalogue.friction import dahl
+from armident.identify.catalogue.motion import Motion
+from armident.identify.catalogue.recorded import put_right
+from armident.identify.catalogue.registry import catalogue
+from armident.identify.catalogue.rotor import rotors
+from armident.identify.catalogue.transmission import crossing, swinging
+from armident.identify.experiment import Experiment
+from armident.identify.model.arm import ArmModel
+from armident.virtual_robot.inertias import plant_parameters
 
 DT = 1e-3
 OMEGA = 2 * np.pi * 0.8

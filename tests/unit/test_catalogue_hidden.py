@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from configs import RobotConfig, Trajectory, load_robot, load_trajectory
-from configs.scenario import HiddenEffect, Scenario
-from identify.discrepancy.search import Search
-from identify.discrepancy.state import Settings
-from identify.discrepancy.study import build_study
-from identify.from_recording import experiments_from_recording
-from virtual_robot.offline import simulate_recording
+from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.identify.discrepancy.search import Search
+from armident.identify.discrepancy.state import Settings
+from armident.identify.discrepancy.study import build_study
+from armident.identify.from_recording import experiments_from_recording
+from armident.virtual_robot.offline import simulate_recording
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 

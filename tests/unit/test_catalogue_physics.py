@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from identify.catalogue.registry import known
+from armident.identify.catalogue.registry import known
 
 
 @pytest.mark.parametrize(("value", "knee", "allowed"), [(-5.0, 0.02, False), (5.0, 0.02, True), (-5.0, 0.3, True)])

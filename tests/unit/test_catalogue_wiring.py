@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from configs import ConfigError, Trajectory, load_robot, load_trajectory
-from configs.robot import Effect
-from configs.scenario import HiddenEffect, Scenario
-from identify.catalogue.wiring import exchanges, rewired
-from identify.from_recording import experiments_from_recording
-from virtual_robot.offline import simulate_recording
+from armident.configs import ConfigError, Trajectory, load_robot, load_trajectory
+from armident.configs.robot import Effect
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.identify.catalogue.wiring import exchanges, rewired
+from armident.identify.from_recording import experiments_from_recording
+from armident.virtual_robot.offline import simulate_recording
 
 
 def short() -> Trajectory:

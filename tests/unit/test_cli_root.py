@@ -10,11 +10,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from configs.errors import ArmidentError, ConfigError, DataError
-from daq.cli import DEBUG_VARIABLE, GROUP, application
+from armident.configs.errors import ArmidentError, ConfigError, DataError
+from armident.daq.cli import DEBUG_VARIABLE, GROUP, application
 
 HEAVY = {"numpy", "scipy", "numba", "pydantic", "yaml", "zenoh", "matplotlib", "canopen", "can", "pinocchio", "rich"}
-ROOT_IN_A_PROCESS = [sys.executable, "-m", "daq.cli"]
+ROOT_IN_A_PROCESS = [sys.executable, "-m", "armident.daq.cli"]
 
 
 def refuse(kind: str) -> None:
@@ -129,7 +129,7 @@ def test_calling_one_command_does_not_load_the_others() -> None:
 def test_help_imports_nothing_heavy() -> None:
     script = (
         "import sys\n"
-        "from daq.cli import main\n"
+        "from armident.daq.cli import main\n"
         "try:\n    main(['--help'])\n"
         "except SystemExit as end:\n    assert not end.code\n"
         f"print('HEAVY', sorted({HEAVY!r} & sys.modules.keys()))\n"

@@ -5,14 +5,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from configs import load_robot, load_trajectory
-from identify import methods
-from identify.estimators.idim_piv import idim_piv
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from identify.options import Method, Options
-from identify.run import identify_experiment
-from virtual_robot.offline import simulate_recording
+from armident.configs import load_robot, load_trajectory
+from armident.identify import methods
+from armident.identify.estimators.idim_piv import idim_piv
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.options import Method, Options
+from armident.identify.run import identify_experiment
+from armident.virtual_robot.offline import simulate_recording
 
 SLOW = 0.002
 """Sampling period, s, at which the identified controller of the TX40 swings in simulation."""

@@ -8,9 +8,17 @@ import numpy as np
 import pytest
 import yaml
 
-from configs import ConfigError, RobotConfig, config_path, load_robot, load_session, load_suite, load_trajectory
-from configs.loading import HERE, parse
-from configs.reading import read_yaml
+from armident.configs import (
+    ConfigError,
+    RobotConfig,
+    config_path,
+    load_robot,
+    load_session,
+    load_suite,
+    load_trajectory,
+)
+from armident.configs.loading import HERE, parse
+from armident.configs.reading import read_yaml
 
 TX40 = yaml.safe_load((HERE / "tx40.yaml").read_text())
 

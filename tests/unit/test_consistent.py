@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-import identify.model.consistent as consistent
-from configs import DataError, load_robot
-from identify.model.arm import ArmModel
-from identify.model.consistent import identifiability, nearest_consistent, non_negative, pseudo_inertias
+import armident.identify.model.consistent as consistent
+from armident.configs import DataError, load_robot
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.consistent import identifiability, nearest_consistent, non_negative, pseudo_inertias
+from armident.virtual_robot.inertias import plant_parameters
 from tests.pinocchio_oracle import random_parameters, random_robot
-from virtual_robot.inertias import plant_parameters
 
 Array = NDArray[np.float64]
 

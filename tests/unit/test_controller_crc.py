@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.controller.crc import identify_crc
+from armident.configs import DataError
+from armident.identify.controller.crc import identify_crc
 
 DT = 1e-3
 STEPS = 20000

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from configs import DataError
-from identify.controller.law import Stretch, Structure, columns, simulate_law, taps
-from identify.controller.parametric import ControlLaw, identify_parametric
-from identify.controller.riv import refined_iv
+from armident.configs import DataError
+from armident.identify.controller.law import Stretch, Structure, columns, simulate_law, taps
+from armident.identify.controller.parametric import ControlLaw, identify_parametric
+from armident.identify.controller.riv import refined_iv
 
 Floats = NDArray[np.float64]
 

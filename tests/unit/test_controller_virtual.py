@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import RobotConfig, config_path, load_robot, load_trajectory
-from identify.controller.crc import IdentifiedController, identify_crc
-from identify.controller.nominal import saturation
-from identify.controller.parametric import ControlLaw, identify_parametric
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.idim_iv import idim_iv
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from identify.model.arm import ArmModel
-from identify.model.simulation import Simulation, simulate
-from identify.preparation import equations
-from identify.signals.decimate import design
-from identify.signals.differentiate import Derivatives, differentiate
-from virtual_robot.inertias import plant_parameters
-from virtual_robot.offline import simulate_recording
-from virtual_robot.plant import Plant
-from virtual_robot.servo import CONTROL_PERIOD, VELOCITY_FILTER_HZ, gains
+from armident.configs import RobotConfig, config_path, load_robot, load_trajectory
+from armident.identify.controller.crc import IdentifiedController, identify_crc
+from armident.identify.controller.nominal import saturation
+from armident.identify.controller.parametric import ControlLaw, identify_parametric
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.simulation import Simulation, simulate
+from armident.identify.preparation import equations
+from armident.identify.signals.decimate import design
+from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.offline import simulate_recording
+from armident.virtual_robot.plant import Plant
+from armident.virtual_robot.servo import CONTROL_PERIOD, VELOCITY_FILTER_HZ, gains
 
 Floats = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from configs import ConfigError, DataError, load_robot, load_session
-from daq.bus_log import SUFFIXES, recording_from_log, write_log
-from daq.cli import application
-from daq.recording import Recording, Stream, read_recording, write_recording
-from daq.streams import captured_streams
+from armident.configs import ConfigError, DataError, load_robot, load_session
+from armident.daq.bus_log import SUFFIXES, recording_from_log, write_log
+from armident.daq.cli import application
+from armident.daq.recording import Recording, Stream, read_recording, write_recording
+from armident.daq.streams import captured_streams
 
 SESSION = load_session("tx40_cell.yaml")
 ROBOT = load_robot(SESSION.robot)

@@ -11,10 +11,10 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from configs import config_path
-from daq.cli import application
-from daq.doctor import Check, examine
-from daq.systemd import Notifier
+from armident.configs import config_path
+from armident.daq.cli import application
+from armident.daq.doctor import Check, examine
+from armident.daq.systemd import Notifier
 from tests.integration.test_capture_vcan import session_file
 
 SYSTEMD = config_path("tx40_cell.yaml").parent / "systemd"

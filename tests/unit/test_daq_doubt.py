@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.assembler import Assembler, Batch, TpdoStream
-from drivers.frames import frames
+from armident.daq.assembler import Assembler, Batch, TpdoStream
+from armident.drivers.frames import frames
 
 PERIOD = 1_000_000
 T0 = 1_700_000_000_000_000_000

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daq.foreign import apart
+from armident.daq.foreign import apart
 
 
 def test_arrays_arrive_and_what_is_none_stays_behind() -> None:

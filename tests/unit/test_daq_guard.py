@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
-from daq.guard.limits import limits_of
-from daq.guard.watch import Watch
-from daq.streams import bus_numbers, counts_per_si, node_ids
-from drivers.frames import Frames, frames
-from drivers.objects import COB_SYNC, TpdoLayout, rpdo_cob, tpdo_cob
+from armident.configs import RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
+from armident.daq.guard.limits import limits_of
+from armident.daq.guard.watch import Watch
+from armident.daq.streams import bus_numbers, counts_per_si, node_ids
+from armident.drivers.frames import Frames, frames
+from armident.drivers.objects import COB_SYNC, TpdoLayout, rpdo_cob, tpdo_cob
 
 NOW = 1_000_000_000
 

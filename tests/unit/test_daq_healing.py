@@ -14,9 +14,9 @@ from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 from typer.testing import CliRunner
 
-from configs import ConfigError, DataError
-from daq.cli import application
-from daq.recording import Recording, heal_recording, read_recording
+from armident.configs import ConfigError, DataError
+from armident.daq.cli import application
+from armident.daq.recording import Recording, heal_recording, read_recording
 from tests.unit.test_daq_recording import make_recording, write_chunked
 
 
@@ -149,7 +149,7 @@ WRITE_UNTIL_KILLED = """
 import sys
 from pathlib import Path
 from tests.unit.test_daq_recording import make_recording
-from daq.recording import RecordingWriter, StreamLayout
+from armident.daq.recording import RecordingWriter, StreamLayout
 recording = make_recording(20_000)
 joints = [joint.name for joint in recording.robot.joints]
 layouts = [StreamLayout.of(s, joints) for s in recording.streams.values()]

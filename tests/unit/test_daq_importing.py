@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from configs import ConfigError, DataError, load_robot
-from daq.exporting import columns, export_recording
-from daq.importing import import_recording
-from daq.recording import Recording, read_recording, write_recording
+from armident.configs import ConfigError, DataError, load_robot
+from armident.daq.exporting import columns, export_recording
+from armident.daq.importing import import_recording
+from armident.daq.recording import Recording, read_recording, write_recording
 
 TX40 = load_robot("tx40.yaml")
 HEADER = ",".join(["t", *(f"q{j}" for j in range(1, 7)), *(f"tau{j}" for j in range(1, 7))])

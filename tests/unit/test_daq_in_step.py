@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from daq.assembler import IN_STEP_S, SYNC_LOST, Assembler, Batch, TpdoStream
-from daq.recording import Gap
-from drivers.frames import Frames, frames
+from armident.daq.assembler import IN_STEP_S, SYNC_LOST, Assembler, Batch, TpdoStream
+from armident.daq.recording import Gap
+from armident.drivers.frames import Frames, frames
 
 PERIOD_NS = 1_000_000
 PERIOD_S = PERIOD_NS * 1e-9

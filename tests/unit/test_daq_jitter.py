@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from daq.jitter import SyncJitter, worst
-from drivers.frames import Frames, frames
+from armident.daq.jitter import SyncJitter, worst
+from armident.drivers.frames import Frames, frames
 
 PERIOD_NS = 200_000
 

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from daq.clock import clock_state
-from daq.journal import Line, entry
+from armident.daq.clock import clock_state
+from armident.daq.journal import Line, entry
 
 SAY = """
 import sys
 from pathlib import Path
-from daq.journal import Line, Voice
+from armident.daq.journal import Line, Voice
 voice = Voice({"cell": "press_7", "robot": "tx40"}, Path(sys.argv[1]))
 voice("warning: the disk is full")
 voice(Line("node 2 (joint_2): EMCY 2310h", event="emcy", axis="joint_2", bus="can0", sync=17, code=0x2310))

@@ -7,7 +7,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from daq.recording import RecordingWriter, StreamLayout, heal_recording, read_recording
+from armident.daq.recording import RecordingWriter, StreamLayout, heal_recording, read_recording
 from tests.unit.test_daq_recording import make_recording
 
 ROWS = 5000

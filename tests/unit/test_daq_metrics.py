@@ -6,8 +6,8 @@ import urllib.request
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from configs import ConfigError
-from daq.metrics import Metrics
+from armident.configs import ConfigError
+from armident.daq.metrics import Metrics
 
 
 def scraped(metrics: Metrics) -> dict[str, tuple[str, dict[str, str], float]]:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import load_robot, load_session
-from daq.motion import REST_SPAN_S, REST_STEP_S, SHAKE_COUNTS, Standstill
-from daq.streams import counts_per_si
+from armident.configs import load_robot, load_session
+from armident.daq.motion import REST_SPAN_S, REST_STEP_S, SHAKE_COUNTS, Standstill
+from armident.daq.streams import counts_per_si
 
 SESSION, ROBOT = load_session("tx40_cell.yaml"), load_robot("tx40.yaml")
 SPAN = round(REST_SPAN_S / SESSION.sync_period)

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from daq.assembler import SYNC_LOST, Assembler, TpdoStream
-from daq.recording import Gap
-from drivers.frames import Frames, frames
+from armident.daq.assembler import SYNC_LOST, Assembler, TpdoStream
+from armident.daq.recording import Gap
+from armident.drivers.frames import Frames, frames
 
 PERIOD_NS = 200_000
 OVERFLOW = 240

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from configs import ConfigError
-from configs.session import RecordingOptions
-from daq.recording import (
+from armident.configs import ConfigError
+from armident.configs.session import RecordingOptions
+from armident.daq.recording import (
     Gap,
     Mark,
     QueuedSeries,
@@ -22,8 +22,8 @@ from daq.recording import (
     queued,
     read_recording,
 )
-from daq.recording.unwritten import NOT_WRITTEN
-from daq.storage import gathered
+from armident.daq.recording.unwritten import NOT_WRITTEN
+from armident.daq.storage import gathered
 from tests.unit.test_daq_recording import make_recording
 from tests.unit.test_daq_series import NAME, beginner, write
 

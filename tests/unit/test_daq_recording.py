@@ -16,9 +16,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from configs import ConfigError, DataError, SessionConfig, config_path, load_robot
-from configs.loading import parse
-from daq.recording import (
+from armident.configs import ConfigError, DataError, SessionConfig, config_path, load_robot
+from armident.configs.loading import parse
+from armident.daq.recording import (
     Field,
     Gap,
     Mark,
@@ -29,7 +29,7 @@ from daq.recording import (
     read_recording,
     write_recording,
 )
-from daq.recording import mcap_format as mcap
+from armident.daq.recording import mcap_format as mcap
 
 T0 = 1_700_000_000_000_000_000
 

@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 import yaml
 
-from configs import ConfigError, SessionConfig, load_robot, load_session
-from configs.loading import HERE
-from daq.order import Order
-from daq.recording import read_recording
-from daq.reload import Reloader, differences
-from daq.storage import limits, open_series
-from daq.streams import captured_streams
+from armident.configs import ConfigError, SessionConfig, load_robot, load_session
+from armident.configs.loading import HERE
+from armident.daq.order import Order
+from armident.daq.recording import read_recording
+from armident.daq.reload import Reloader, differences
+from armident.daq.storage import limits, open_series
+from armident.daq.streams import captured_streams
 from tests.unit.test_daq_recording import make_recording
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from configs import ConfigError, DataError, SessionConfig, config_path
-from configs.loading import parse
-from daq.remote import Command, Commands, send_command
-from daq.zenoh_keys import Keys, open_session
+from armident.configs import ConfigError, DataError, SessionConfig, config_path
+from armident.configs.loading import parse
+from armident.daq.remote import Command, Commands, send_command
+from armident.daq.zenoh_keys import Keys, open_session
 
 
 def session(commands: bool) -> SessionConfig:

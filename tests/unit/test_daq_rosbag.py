@@ -9,10 +9,10 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 from numpy.typing import NDArray
 
-from configs import DataError, load_robot
-from daq.importing import import_recording
-from daq.recording import write_recording
-from daq.rosbag import DEFINITION, TOPIC, read_joint_states, write_joint_states
+from armident.configs import DataError, load_robot
+from armident.daq.importing import import_recording
+from armident.daq.recording import write_recording
+from armident.daq.rosbag import DEFINITION, TOPIC, read_joint_states, write_joint_states
 
 TX40 = load_robot("tx40.yaml")
 NAMES = [joint.name for joint in TX40.joints]

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from configs import ConfigError
-from daq.recording import (
+from armident.configs import ConfigError
+from armident.daq.recording import (
     Mark,
     QueuedSeries,
     Recording,
@@ -21,7 +21,7 @@ from daq.recording import (
     heal_recording,
     read_recording,
 )
-from daq.recording.retention import Janitor, prune
+from armident.daq.recording.retention import Janitor, prune
 from tests.unit.test_daq_recording import make_recording
 
 NAME = "tx40-20260101T000000-000Z"

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daq.assembler import Batch, Rows
-from daq.recording import Gap
-from daq.sink import PIECE_NS, pieces
+from armident.daq.assembler import Batch, Rows
+from armident.daq.recording import Gap
+from armident.daq.sink import PIECE_NS, pieces
 
 PERIOD_NS = 200_000
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from configs import ConfigError, SessionConfig, load_session
-from daq.sniffing import default_mapping, sniffed, survey
-from drivers.frames import Frames, frames
+from armident.configs import ConfigError, SessionConfig, load_session
+from armident.daq.sniffing import default_mapping, sniffed, survey
+from armident.drivers.frames import Frames, frames
 
 SYNCS = 500
 

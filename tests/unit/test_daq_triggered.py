@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from configs import ConfigError, DataError
-from daq.recording import (
+from armident.configs import ConfigError, DataError
+from armident.daq.recording import (
     Gap,
     Mark,
     Recording,

@@ -13,11 +13,11 @@ import zenoh.ext
 from hypothesis import given
 from hypothesis import strategies as st
 
-from configs import ConfigError, DataError, SessionConfig, config_path, load_robot
-from configs.loading import parse
-from daq.publisher import Publisher
-from daq.recording import Field, Gap, Mark, StreamLayout, read_recording, write_recording
-from daq.zenoh_keys import (
+from armident.configs import ConfigError, DataError, SessionConfig, config_path, load_robot
+from armident.configs.loading import parse
+from armident.daq.publisher import Publisher
+from armident.daq.recording import Field, Gap, Mark, StreamLayout, read_recording, write_recording
+from armident.daq.zenoh_keys import (
     Block,
     Keys,
     assemble,
@@ -27,7 +27,7 @@ from daq.zenoh_keys import (
     encode_event,
     open_session,
 )
-from daq.zenoh_keys.codec import end_content, start_content
+from armident.daq.zenoh_keys.codec import end_content, start_content
 
 ROBOT = load_robot("tx40.yaml")
 JOINTS = tuple(joint.name for joint in ROBOT.joints)

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from configs import load_robot
-from identify.discrepancy.diagnose import Diagnosis
-from identify.discrepancy.findings import gap_of
-from identify.discrepancy.search import Search
-from identify.discrepancy.state import Settings
-from identify.discrepancy.study import build_study
-from identify.document import Gap
+from armident.configs import load_robot
+from armident.identify.discrepancy.diagnose import Diagnosis
+from armident.identify.discrepancy.findings import gap_of
+from armident.identify.discrepancy.search import Search
+from armident.identify.discrepancy.state import Settings
+from armident.identify.discrepancy.study import build_study
+from armident.identify.document import Gap
 from tests.statistics.measured import MACHINES, tx40
 
 

@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from configs import RobotConfig, Trajectory, load_robot, load_trajectory
-from configs.scenario import HiddenEffect, Scenario
-from daq.recording import Recording, write_recording
-from identify.discrepancy.diagnose import Diagnosis, diagnose
-from identify.document import Finding, IdentificationDocument
-from identify.from_recording import experiments_from_recording
-from identify.service import identify_recording
-from virtual_robot.offline import simulate_recording
+from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.daq.recording import Recording, write_recording
+from armident.identify.discrepancy.diagnose import Diagnosis, diagnose
+from armident.identify.document import Finding, IdentificationDocument
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.service import identify_recording
+from armident.virtual_robot.offline import simulate_recording
 
-ARMIDENT = [sys.executable, "-m", "daq.cli"]
+ARMIDENT = [sys.executable, "-m", "armident.daq.cli"]
 PLUGIN = '''
 import numpy as np
-from identify.catalogue.effect import Effect, Linear, Shape
+from armident.identify.catalogue.effect import Effect, Linear, Shape
 
 
 def columns(motion, place, position):

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal, stats
 
-from identify.estimators.diagnostics import (
+from armident.identify.estimators.diagnostics import (
     WEAK_F,
     breusch_pagan,
     diagnose_estimate,
@@ -18,9 +18,9 @@ from identify.estimators.diagnostics import (
     nested_f_test,
     residual_tests,
 )
-from identify.estimators.idim_ls import idim_ls
-from identify.estimators.noise import WHITE, ArModel
-from identify.estimators.regression import (
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.noise import WHITE, ArModel
+from armident.identify.estimators.regression import (
     Block,
     Estimate,
     instrumental_variable,

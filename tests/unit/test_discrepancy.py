@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
-from configs.robot import Effect
-from configs.scenario import HiddenEffect, Scenario
-from identify.catalogue.effect import Place
-from identify.catalogue.registry import catalogue
-from identify.catalogue.terms import stanza_of
-from identify.discrepancy.diagnose import Diagnosis, diagnose
-from identify.from_recording import experiments_from_recording
-from identify.model.arm import ArmModel
-from identify.options import Options
-from identify.service import identify_recording, robot_yaml
-from virtual_robot.offline import simulate_recording
+from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.configs.robot import Effect
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.identify.catalogue.effect import Place
+from armident.identify.catalogue.registry import catalogue
+from armident.identify.catalogue.terms import stanza_of
+from armident.identify.discrepancy.diagnose import Diagnosis, diagnose
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.model.arm import ArmModel
+from armident.identify.options import Options
+from armident.identify.service import identify_recording, robot_yaml
+from armident.virtual_robot.offline import simulate_recording
 
 REPEATS = 3
 
@@ -71,7 +71,7 @@ def test_held_out_error_of_the_joint_falls_with_every_finding(robot: RobotConfig
 
 
 def test_a_diagnosed_model_is_a_robot_configuration_again(robot: RobotConfig) -> None:
-    from configs.loading import parse
+    from armident.configs.loading import parse
 
     stanza = Effect(effect="stribeck_friction", joint="joint_4", parameters={"velocity": 0.04, "fst": 0.5})
     changed = robot.model_copy(update={"effects": (stanza,)})

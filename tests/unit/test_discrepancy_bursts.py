@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal
 
-from identify.discrepancy.bursts import MATERIAL, Bursts, bursts_of
+from armident.identify.discrepancy.bursts import MATERIAL, Bursts, bursts_of
 
 Array = NDArray[np.float64]
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from configs.loading import load_suite
-from daq.suite.cases import all_cases
-from identify.discrepancy import batch
-from virtual_robot.batch import record
+from armident.configs.loading import load_suite
+from armident.daq.suite.cases import all_cases
+from armident.identify.discrepancy import batch
+from armident.virtual_robot.batch import record
 
 pytestmark = pytest.mark.timeout(600)
 

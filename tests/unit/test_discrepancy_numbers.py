@@ -5,18 +5,18 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from configs import DataError, RobotConfig, Trajectory, load_robot, load_trajectory
-from configs.scenario import HiddenEffect, Scenario
-from daq.recording import Recording
-from identify.discrepancy.baseline import cautious, compared
-from identify.discrepancy.candidates import Workshop
-from identify.discrepancy.numbers import NumbersFinding, stale_numbers
-from identify.discrepancy.regression import Fit, fit
-from identify.discrepancy.study import build_study
-from identify.document import IdentificationDocument
-from identify.from_recording import experiments_from_recording
-from identify.service import identify_recording
-from virtual_robot.offline import simulate_recording
+from armident.configs import DataError, RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.daq.recording import Recording
+from armident.identify.discrepancy.baseline import cautious, compared
+from armident.identify.discrepancy.candidates import Workshop
+from armident.identify.discrepancy.numbers import NumbersFinding, stale_numbers
+from armident.identify.discrepancy.regression import Fit, fit
+from armident.identify.discrepancy.study import build_study
+from armident.identify.document import IdentificationDocument
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.service import identify_recording
+from armident.virtual_robot.offline import simulate_recording
 
 REPEATS = 2
 Recorded = Callable[..., Recording]

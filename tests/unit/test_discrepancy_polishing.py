@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from configs import load_robot, load_trajectory
-from configs.robot import Effect
-from configs.scenario import HiddenEffect, Scenario
-from identify.discrepancy.polishing import polished
-from identify.discrepancy.regression import fit
-from identify.discrepancy.state import refit
-from identify.discrepancy.study import Study, build_study
-from identify.from_recording import experiments_from_recording
-from virtual_robot.offline import simulate_recording
+from armident.configs import load_robot, load_trajectory
+from armident.configs.robot import Effect
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.identify.discrepancy.polishing import polished
+from armident.identify.discrepancy.regression import fit
+from armident.identify.discrepancy.state import refit
+from armident.identify.discrepancy.study import Study, build_study
+from armident.identify.from_recording import experiments_from_recording
+from armident.virtual_robot.offline import simulate_recording
 
 LINK, RESONANCE = 0.7 * 95.0, 12.0
 """Mass on the spring, kg, and its frequency behind a motor that is held, Hz."""

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import RobotConfig, load_robot, load_trajectory
-from configs.scenario import HiddenEffect, Scenario
-from daq.importing import import_recording
-from identify.discrepancy.diagnose import Diagnosis, diagnose
-from identify.discrepancy.excess import HEADROOM, MATERIAL, excess_of, excesses, pieces
-from identify.discrepancy.lines import lowest_frequency
-from identify.discrepancy.regression import Fit, fit
-from identify.discrepancy.repeats import repeats
-from identify.discrepancy.study import Study, build_study
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from identify.reproduction.recordings import measured_emps
-from virtual_robot.offline import simulate_recording
+from armident.configs import RobotConfig, load_robot, load_trajectory
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.daq.importing import import_recording
+from armident.identify.discrepancy.diagnose import Diagnosis, diagnose
+from armident.identify.discrepancy.excess import HEADROOM, MATERIAL, excess_of, excesses, pieces
+from armident.identify.discrepancy.lines import lowest_frequency
+from armident.identify.discrepancy.regression import Fit, fit
+from armident.identify.discrepancy.repeats import repeats
+from armident.identify.discrepancy.study import Study, build_study
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.reproduction.recordings import measured_emps
+from armident.virtual_robot.offline import simulate_recording
 
 Array = NDArray[np.float64]
 

@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from configs import load_robot, load_trajectory
-from configs.robot import Effect
-from configs.scenario import HiddenEffect, Scenario
-from identify.discrepancy.candidates import Workshop, candidates
-from identify.discrepancy.foretold import foretold
-from identify.discrepancy.regression import Fit, Products
-from identify.discrepancy.state import refit
-from identify.discrepancy.study import Study, build_study
-from identify.discrepancy.trial import directions_beside, noise_with, score_statistics
-from identify.discrepancy.whitening import joints_of
-from identify.from_recording import experiments_from_recording
-from virtual_robot.offline import simulate_recording
+from armident.configs import load_robot, load_trajectory
+from armident.configs.robot import Effect
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.identify.discrepancy.candidates import Workshop, candidates
+from armident.identify.discrepancy.foretold import foretold
+from armident.identify.discrepancy.regression import Fit, Products
+from armident.identify.discrepancy.state import refit
+from armident.identify.discrepancy.study import Study, build_study
+from armident.identify.discrepancy.trial import directions_beside, noise_with, score_statistics
+from armident.identify.discrepancy.whitening import joints_of
+from armident.identify.from_recording import experiments_from_recording
+from armident.virtual_robot.offline import simulate_recording
 
 DELAY = 0.006
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from configs import load_robot, load_trajectory
-from configs.robot import Effect
-from identify.discrepancy.study import Study, build_study
-from identify.from_recording import experiments_from_recording
-from virtual_robot.offline import simulate_recording
+from armident.configs import load_robot, load_trajectory
+from armident.configs.robot import Effect
+from armident.identify.discrepancy.study import Study, build_study
+from armident.identify.from_recording import experiments_from_recording
+from armident.virtual_robot.offline import simulate_recording
 
 
 @pytest.fixture(scope="module")

@@ -8,20 +8,20 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from configs import load_robot, load_trajectory
-from configs.scenario import HiddenEffect, Scenario
-from identify.catalogue.registry import catalogue
-from identify.discrepancy.candidates import Workshop
-from identify.discrepancy.experiment import CONTAINS, recommended_experiment
-from identify.discrepancy.hints import HINTS, hint_of
-from identify.discrepancy.lines import strongest_line
-from identify.discrepancy.maps import hats, maps
-from identify.discrepancy.regression import Fit, fit
-from identify.discrepancy.study import build_study
-from identify.discrepancy.where import Disagreement, unexplained, where
-from identify.from_recording import experiments_from_recording
-from identify.reproduction.recordings import measured_emps
-from virtual_robot.offline import simulate_recording
+from armident.configs import load_robot, load_trajectory
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.identify.catalogue.registry import catalogue
+from armident.identify.discrepancy.candidates import Workshop
+from armident.identify.discrepancy.experiment import CONTAINS, recommended_experiment
+from armident.identify.discrepancy.hints import HINTS, hint_of
+from armident.identify.discrepancy.lines import strongest_line
+from armident.identify.discrepancy.maps import hats, maps
+from armident.identify.discrepancy.regression import Fit, fit
+from armident.identify.discrepancy.study import build_study
+from armident.identify.discrepancy.where import Disagreement, unexplained, where
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.reproduction.recordings import measured_emps
+from armident.virtual_robot.offline import simulate_recording
 
 BUMP = 5.0
 """Height of the hidden bump, N m; the noise of joint 2 in the band of the comparison is 3 N m."""

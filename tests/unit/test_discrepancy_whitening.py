@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from identify.discrepancy.whitening import ar_models, summed_backwards, whitened
-from identify.estimators.noise import ArModel, fit_ar
+from armident.identify.discrepancy.whitening import ar_models, summed_backwards, whitened
+from armident.identify.estimators.noise import ArModel, fit_ar
 
 Array = NDArray[np.float64]
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from configs import DataError, RobotConfig, load_robot, load_trajectory
-from configs.robot import Effect
-from identify.catalogue.wiring import rewired
-from identify.discrepancy.wiring_check import find_wiring
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from virtual_robot.offline import simulate_recording
+from armident.configs import DataError, RobotConfig, load_robot, load_trajectory
+from armident.configs.robot import Effect
+from armident.identify.catalogue.wiring import rewired
+from armident.identify.discrepancy.wiring_check import find_wiring
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.virtual_robot.offline import simulate_recording
 
 POSITION, TORQUE, BOTH = {"position": 1.0}, {"torque": 1.0}, {"position": 1.0, "torque": 1.0}
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import configs
-from configs import ConfigError, DataError
-from identify.document import (
+from armident import configs
+from armident.configs import ConfigError, DataError
+from armident.identify.document import (
     SCHEMA_FILES,
     BeforeAfter,
     DiagnosisDocument,
@@ -46,7 +46,7 @@ def diagnosis() -> DiagnosisDocument:
 @pytest.mark.parametrize("name", sorted(SCHEMA_FILES))
 def test_shipped_schema_is_the_one_of_the_code(name: str) -> None:
     text = (Path(configs.__file__).parent / name).read_text(encoding="utf-8")
-    assert text == schema_text(SCHEMA_FILES[name]), "run: python -m identify.document"
+    assert text == schema_text(SCHEMA_FILES[name]), "run: python -m armident.identify.document"
 
 
 def test_a_document_survives_being_written_and_read(tmp_path: Path) -> None:

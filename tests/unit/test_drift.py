@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from configs import DataError
-from identify.document import IdentificationDocument, Parameter, RecordingReference
-from identify.drift import FALSE_ALARMS, Inconclusive, _holm, compare
+from armident.configs import DataError
+from armident.identify.document import IdentificationDocument, Parameter, RecordingReference
+from armident.identify.drift import FALSE_ALARMS, Inconclusive, _holm, compare
 
 NAMES = [f"p{k}" for k in range(30)]
 TRUTH = np.linspace(0.5, 20.0, 30)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from configs import ConfigError
-from configs.session import Bus
-from drivers.frames import FRAME, frame, frames
-from drivers.sync import SetpointPlan
-from drivers.udp import open_bus
-from drivers.vcan import have_socketcan
+from armident.configs import ConfigError
+from armident.configs.session import Bus
+from armident.drivers.frames import FRAME, frame, frames
+from armident.drivers.sync import SetpointPlan
+from armident.drivers.udp import open_bus
+from armident.drivers.vcan import have_socketcan
 
 
 def test_a_frame_ends_with_the_sixteen_bytes_of_the_kernel() -> None:

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from configs import ConfigError, SessionConfig, load_session
-from drivers.bus_load import check_fits, exact_bits, fd_frame_bits, fits, fitting_period, frame_bits, loads
-from drivers.bus_plan import alternatives
-from drivers.frames import FD_LENGTHS
+from armident.configs import ConfigError, SessionConfig, load_session
+from armident.drivers.bus_load import check_fits, exact_bits, fd_frame_bits, fits, fitting_period, frame_bits, loads
+from armident.drivers.bus_plan import alternatives
+from armident.drivers.frames import FD_LENGTHS
 
 
 def on_a_physical_bus(period_us: int, drives: int = 6) -> SessionConfig:
@@ -123,7 +123,7 @@ def test_each_bus_carries_its_own_drives_and_every_sync() -> None:
 
 def table(*options: str) -> str:
     """What the command prints, with its errors."""
-    command = [sys.executable, "-m", "daq.cli", "bus-load", *options]
+    command = [sys.executable, "-m", "armident.daq.cli", "bus-load", *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     return done.stdout + done.stderr
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drivers.bus_errors import describe, summarise
-from drivers.frames import ERROR_FLAG, Frames, frames
+from armident.drivers.bus_errors import describe, summarise
+from armident.drivers.frames import ERROR_FLAG, Frames, frames
 
 
 def error(classes: int, detail: int = 0) -> Frames:

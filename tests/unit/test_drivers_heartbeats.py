@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivers.heartbeats import Silences
+from armident.drivers.heartbeats import Silences
 
 BEATS = 0.05
 

@@ -7,11 +7,11 @@ from canopen.objectdictionary import ODArray, ODVariable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from configs import ConfigError, config_path
-from drivers import objects as od
-from drivers.emcy import emcy_text
-from drivers.mapping import interpolation_period
-from drivers.objects import DriveState, TpdoLayout, drive_state
+from armident.configs import ConfigError, config_path
+from armident.drivers import objects as od
+from armident.drivers.emcy import emcy_text
+from armident.drivers.mapping import interpolation_period
+from armident.drivers.objects import DriveState, TpdoLayout, drive_state
 
 EDS = str(config_path("eds/cia402_servo.eds"))
 

@@ -3,7 +3,7 @@
 import os
 import threading
 
-from drivers.priority import HIGHEST, ahead, be_punctual
+from armident.drivers.priority import HIGHEST, ahead, be_punctual
 
 
 def niceness(thread: int) -> int:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drivers.messages import DROP_CONTROL_BYTES, HARDWARE_CONTROL, STAMP_CONTROL
-from drivers.stamps import InterfaceClock, has_hardware_stamps
+from armident.drivers.messages import DROP_CONTROL_BYTES, HARDWARE_CONTROL, STAMP_CONTROL
+from armident.drivers.stamps import InterfaceClock, has_hardware_stamps
 
 PERIOD_NS = 200_000
 START = 1_700_000_000_000_000_000

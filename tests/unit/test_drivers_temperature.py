@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import pytest
 
-from configs import ConfigError
-from configs.session import Temperature
-from drivers import objects as od
-from drivers.temperature import ANSWER_S, TemperaturePoll
+from armident.configs import ConfigError
+from armident.configs.session import Temperature
+from armident.drivers import objects as od
+from armident.drivers.temperature import ANSWER_S, TemperaturePoll
 from tests.fuzz.read_bus import LyingDrive, new_drive
 
 PLACE = Temperature(index=0x2030, subindex=2, type="int16", scale=0.1, every_s=1.0)

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from configs import ConfigError
-from configs.session import Bus
-from drivers.frames import Frames, frames
-from drivers.sync import SetpointPlan, SyncProducer
-from drivers.udp import UdpBus, open_bus
+from armident.configs import ConfigError
+from armident.configs.session import Bus
+from armident.drivers.frames import Frames, frames
+from armident.drivers.sync import SetpointPlan, SyncProducer
+from armident.drivers.udp import UdpBus, open_bus
 
 CHANNEL = "239.74.163.77"
 # Every group on the machine shares one port: identifiers that nothing else here uses keep other buses out.

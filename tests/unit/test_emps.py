@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from configs import load_robot
-from identify.experiment import Experiment
-from identify.model.arm import ArmModel
-from identify.options import ControllerName, Options
-from identify.preparation import published_equations
-from identify.result import Identification
-from identify.run import identify_experiment
+from armident.configs import load_robot
+from armident.identify.experiment import Experiment
+from armident.identify.model.arm import ArmModel
+from armident.identify.options import ControllerName, Options
+from armident.identify.preparation import published_equations
+from armident.identify.result import Identification
+from armident.identify.run import identify_experiment
 
 FORCE_PER_VOLT = 35.15065
 NAMES = ("m1", "fv1", "fc1", "off1")

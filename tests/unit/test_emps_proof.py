@@ -15,24 +15,24 @@ import pytest
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
-from configs import DataError, RobotConfig, load_robot
-from configs.robot import Effect
-from identify.controller.crc import identify_crc
-from identify.controller.parametric import identify_parametric
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.didim import didim
-from identify.estimators.idim_iv import idim_iv
-from identify.experiment import Experiment
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
-from identify.model.simulation import Simulation, simulate
-from identify.options import Options
-from identify.preparation import equations, published_equations
-from identify.result import relative_errors
-from identify.run import identify_experiment
-from identify.signals.bandpass import butterworth, central_difference
-from identify.signals.decimate import design
-from identify.signals.differentiate import differentiate
+from armident.configs import DataError, RobotConfig, load_robot
+from armident.configs.robot import Effect
+from armident.identify.controller.crc import identify_crc
+from armident.identify.controller.parametric import identify_parametric
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.didim import didim
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.experiment import Experiment
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.simulation import Simulation, simulate
+from armident.identify.options import Options
+from armident.identify.preparation import equations, published_equations
+from armident.identify.result import relative_errors
+from armident.identify.run import identify_experiment
+from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.decimate import design
+from armident.identify.signals.differentiate import differentiate
 
 Floats = NDArray[np.float64]
 

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from configs import load_robot
-from identify.experiment import Experiment
-from identify.methods import decimation_of
-from identify.model.arm import ArmModel
-from identify.options import Method
-from identify.preparation import (
+from armident.configs import load_robot
+from armident.identify.experiment import Experiment
+from armident.identify.methods import decimation_of
+from armident.identify.model.arm import ArmModel
+from armident.identify.options import Method
+from armident.identify.preparation import (
     EQUATIONS_PER_PARAMETER,
     LS_CUTOFF,
     PIV_CUTOFF,
@@ -21,8 +21,8 @@ from identify.preparation import (
     least_rows,
     sufficient,
 )
-from identify.signals.decimate import design
-from identify.signals.differentiate import differentiate
+from armident.identify.signals.decimate import design
+from armident.identify.signals.differentiate import differentiate
 
 DT = 5e-3
 SAMPLES = (5000, 5000)

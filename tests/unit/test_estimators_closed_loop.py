@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.estimators.clie import clie
-from identify.estimators.cloe import cloe
-from identify.estimators.didim import didim
-from identify.estimators.idim_iv import idim_iv
-from identify.estimators.idim_ls import idim_ls
-from identify.estimators.idim_piv import idim_piv
-from identify.estimators.noise import whiteness
-from identify.estimators.regression import Estimate
-from identify.estimators.sensitivity import sensitivity
-from identify.estimators.sep_pem import sep_pem
+from armident.configs import DataError
+from armident.identify.estimators.clie import clie
+from armident.identify.estimators.cloe import cloe
+from armident.identify.estimators.didim import didim
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.idim_piv import idim_piv
+from armident.identify.estimators.noise import whiteness
+from armident.identify.estimators.regression import Estimate
+from armident.identify.estimators.sensitivity import sensitivity
+from armident.identify.estimators.sep_pem import sep_pem
 from tests.unit.two_joint_arm import Recorded, masked, model, recorded, start
 
 Start = NDArray[np.float64]

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from configs import load_robot
-from identify.estimators.followed import FollowedMotion
-from identify.estimators.idim_iv import idim_iv
-from identify.estimators.idim_ls import idim_ls
-from identify.experiment import Experiment
-from identify.model.arm import ArmModel
-from identify.preparation import equations
-from identify.signals.bandpass import butterworth, central_difference
-from identify.signals.decimate import design
-from identify.signals.differentiate import Derivatives
+from armident.configs import load_robot
+from armident.identify.estimators.followed import FollowedMotion
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.experiment import Experiment
+from armident.identify.model.arm import ArmModel
+from armident.identify.preparation import equations
+from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.decimate import design
+from armident.identify.signals.differentiate import Derivatives
 
 DT = 1e-3
 THETA = np.array([95.0, 200.0, 20.0, -3.0])
@@ -36,7 +36,7 @@ def axis(seed: int) -> tuple[ArmModel, Experiment]:
 def test_idim_iv_takes_the_bias_from_a_mass_that_noisy_derivatives_make_too_small(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("identify.preparation.aligned_torque", lambda tau: tau)  # force sampled, not held
+    monkeypatch.setattr("armident.identify.preparation.aligned_torque", lambda tau: tau)  # force sampled, not held
     model, experiment = axis(seed)
     decimation = design(DT, 40.0)
     qd = central_difference(experiment.q, DT)

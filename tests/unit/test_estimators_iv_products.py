@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identify.estimators.filtering import filter_columns
-from identify.estimators.iv_products import CHUNK_ROWS, iv_products
-from identify.estimators.noise import ArModel
-from identify.estimators.regression import Block, instrumental_variable, iv_covariance, stacked, weighted_rows
+from armident.identify.estimators.filtering import filter_columns
+from armident.identify.estimators.iv_products import CHUNK_ROWS, iv_products
+from armident.identify.estimators.noise import ArModel
+from armident.identify.estimators.regression import Block, instrumental_variable, iv_covariance, stacked, weighted_rows
 
 Floats = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal
 
-from identify.estimators.noise import ArModel, fit_ar, fit_spectrum, lagged_sums, whiteness
-from identify.estimators.regression import (
+from armident.identify.estimators.noise import ArModel, fit_ar, fit_spectrum, lagged_sums, whiteness
+from armident.identify.estimators.regression import (
     LONG_SERIES,
     Block,
     absorbed_sums,

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.estimators.essential import essential_parameters
-from identify.estimators.idim_ls import idim_ls
-from identify.estimators.noise import ArModel
-from identify.estimators.regression import (
+from armident.configs import DataError
+from armident.identify.estimators.essential import essential_parameters
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.noise import ArModel
+from armident.identify.estimators.regression import (
     Block,
     instrumental_variable,
     inverse_gram,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from identify.estimators.triangular import triangularize
+from armident.identify.estimators.triangular import triangularize
 
 
 def test_factor_and_projections_are_those_of_a_qr_decomposition() -> None:

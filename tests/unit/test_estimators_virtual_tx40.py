@@ -9,27 +9,27 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import config_path, load_robot, load_trajectory
-from identify.closed_loop import initial_parameters
-from identify.controller.nominal import saturation
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.clie import clie
-from identify.estimators.cloe import cloe
-from identify.estimators.didim import didim
-from identify.estimators.idim_iv import idim_iv
-from identify.estimators.idim_ls import idim_ls
-from identify.estimators.regression import Block, Estimate
-from identify.estimators.sensitivity import sensitivity
-from identify.from_recording import experiments_from_recording
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
-from identify.preparation import equations
-from identify.signals.decimate import design
-from identify.signals.differentiate import differentiate
-from virtual_robot import servo
-from virtual_robot.inertias import plant_parameters
-from virtual_robot.offline import simulate_recording
-from virtual_robot.plant import Plant
+from armident.configs import config_path, load_robot, load_trajectory
+from armident.identify.closed_loop import initial_parameters
+from armident.identify.controller.nominal import saturation
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.clie import clie
+from armident.identify.estimators.cloe import cloe
+from armident.identify.estimators.didim import didim
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.regression import Block, Estimate
+from armident.identify.estimators.sensitivity import sensitivity
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
+from armident.identify.preparation import equations
+from armident.identify.signals.decimate import design
+from armident.identify.signals.differentiate import differentiate
+from armident.virtual_robot import servo
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.offline import simulate_recording
+from armident.virtual_robot.plant import Plant
 
 Floats = NDArray[np.float64]
 Iterative = Callable[[list[Block], AuxiliaryModel, Floats], Estimate]

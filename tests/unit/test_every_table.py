@@ -5,9 +5,9 @@ import pytest
 from scipy import signal
 from scipy.linalg import expm
 
-from configs import ConfigError
-from configs.loading import parse
-from identify.reproduction.aircraft import (
+from armident.configs import ConfigError
+from armident.configs.loading import parse
+from armident.identify.reproduction.aircraft import (
     DOUBLET,
     DOUBLET_HZ,
     ELEVATOR,
@@ -17,13 +17,13 @@ from identify.reproduction.aircraft import (
     STATE,
     aircraft_sensitivity,
 )
-from identify.reproduction.bench import Bench
-from identify.reproduction.chapter4 import table_4_8
-from identify.reproduction.chapter5 import FEEDBACK, table_5_3, table_5_4
-from identify.reproduction.command import TABLES, make_bench
-from identify.reproduction.printing import document, markdown
-from identify.reproduction.reference import REFERENCE, ReferenceTables, reference_tables
-from identify.reproduction.tables import Table
+from armident.identify.reproduction.bench import Bench
+from armident.identify.reproduction.chapter4 import table_4_8
+from armident.identify.reproduction.chapter5 import FEEDBACK, table_5_3, table_5_4
+from armident.identify.reproduction.command import TABLES, make_bench
+from armident.identify.reproduction.printing import document, markdown
+from armident.identify.reproduction.reference import REFERENCE, ReferenceTables, reference_tables
+from armident.identify.reproduction.tables import Table
 
 NUMBERS = [f"{chapter}.{k}" for chapter, last in ((4, 8), (5, 14), (6, 8)) for k in range(1, last + 1)]
 """The list of tables at the head of the thesis."""

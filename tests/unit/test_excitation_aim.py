@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import yaml
 
-from configs import ConfigError, config_path, load_robot, load_trajectory
-from identify.cli import trajectory as trajectory_command
-from identify.excitation import aimed_at, assess, design_trajectory
-from identify.model.arm import ArmModel
+from armident.configs import ConfigError, config_path, load_robot, load_trajectory
+from armident.identify.cli import trajectory as trajectory_command
+from armident.identify.excitation import aimed_at, assess, design_trajectory
+from armident.identify.model.arm import ArmModel
 
 NOISE = np.sqrt([1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523])
 """Standard deviation of the torque noise of the TX40, N m (thesis table 6.3)."""

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from configs import ConfigError
-from configs.expression import evaluate
+from armident.configs import ConfigError
+from armident.configs.expression import evaluate
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from configs import DataError, RobotConfig, load_robot
-from daq.recording import Field, Mark, Recording, Stream
-from identify.from_recording import MAX_MISSING_SHARE, experiments_from_recording
+from armident.configs import DataError, RobotConfig, load_robot
+from armident.daq.recording import Field, Mark, Recording, Stream
+from armident.identify.from_recording import MAX_MISSING_SHARE, experiments_from_recording
 
 RATE = 5000.0
 COUNTS = 1000.0

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import DataError, RobotConfig, load_robot
-from configs.robot import Effect
-from identify.experiment import Experiment
-from identify.model.arm import ArmModel
-from identify.options import Options
-from identify.run import identify_experiment
+from armident.configs import DataError, RobotConfig, load_robot
+from armident.configs.robot import Effect
+from armident.identify.experiment import Experiment
+from armident.identify.model.arm import ArmModel
+from armident.identify.options import Options
+from armident.identify.run import identify_experiment
 
 ROBOT = load_robot("kuka_lwr4").model_copy(update={"effects": ()})
 DT = 5e-3

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import RobotConfig, Trajectory
-from configs.scenario import Scenario
-from configs.trajectory import Move
+from armident.configs import RobotConfig, Trajectory
+from armident.configs.scenario import Scenario
+from armident.configs.trajectory import Move
+from armident.virtual_robot.arm import Arm
+from armident.virtual_robot.effects import EFFECTS, hidden_effects
+from armident.virtual_robot.effects.signals import Signals
+from armident.virtual_robot.offline import simulate_recording
+from armident.virtual_robot.plant import Plant, pin
 from tests.unit.hidden import hide
-from virtual_robot.arm import Arm
-from virtual_robot.effects import EFFECTS, hidden_effects
-from virtual_robot.effects.signals import Signals
-from virtual_robot.offline import simulate_recording
-from virtual_robot.plant import Plant, pin
 
 PERIOD = 200e-6
 Q = np.array([0.3, 0.4, 1.1, -0.5, 0.7, 0.2])

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from configs import RobotConfig
-from configs.scenario import Scenario
+from armident.configs import RobotConfig
+from armident.configs.scenario import Scenario
+from armident.virtual_robot.inertias import rest_posture
+from armident.virtual_robot.plant import Plant
 from tests.unit.hidden import hide
-from virtual_robot.inertias import rest_posture
-from virtual_robot.plant import Plant
 
 PERIOD = 200e-6
 FV2, FC2 = 5.50, 8.24

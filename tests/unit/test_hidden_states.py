@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from configs import ConfigError, RobotConfig
-from configs.scenario import HiddenEffect, Scenario
-from virtual_robot.inertias import plant_parameters
-from virtual_robot.plant import Plant
+from armident.configs import ConfigError, RobotConfig
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.plant import Plant
 
 PERIOD = 200e-6
 HOLD = 5
@@ -234,7 +234,7 @@ def test_stribeck_and_presliding_of_one_joint_share_a_bristle(emps: RobotConfig)
 
 def test_a_bristle_needs_coulomb_friction_to_stand_for(emps: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     smooth = plant_parameters(emps) | {"fc1": 0.0}
-    monkeypatch.setattr("virtual_robot.plant.plant_parameters", lambda robot: smooth)
+    monkeypatch.setattr("armident.virtual_robot.plant.plant_parameters", lambda robot: smooth)
     with pytest.raises(ConfigError, match=r"effects\[0\]: joint_1 has no Coulomb friction"):
         Plant(emps, [0.0], hide(entry("presliding_friction", deflection=1e-4)))
 

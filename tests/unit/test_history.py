@@ -11,10 +11,10 @@ import pytest
 import sqlalchemy as sa
 from typer.testing import CliRunner
 
-from configs import ConfigError
-from daq.cli import application
-from identify.document import IdentificationDocument, to_json
-from identify.history import History, recorded_at
+from armident.configs import ConfigError
+from armident.daq.cli import application
+from armident.identify.document import IdentificationDocument, to_json
+from armident.identify.history import History, recorded_at
 from tests.unit.test_drift import TRUTH, C, identified
 
 WEEK = datetime.timedelta(days=7)

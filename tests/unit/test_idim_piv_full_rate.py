@@ -9,24 +9,24 @@ from numpy.typing import NDArray
 from scipy import signal
 from threadpoolctl import threadpool_limits
 
-from configs import config_path, load_robot, load_trajectory
-from identify.closed_loop import closed_loop
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.idim_ls import idim_ls
-from identify.estimators.idim_piv import idim_piv
-from identify.estimators.iv_products import iv_products
-from identify.estimators.regression import Block, Estimate, filtered_regressor
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from identify.methods import decimation_of
-from identify.model.arm import ArmModel
-from identify.options import Options
-from identify.preparation import PIV_CUTOFF, equations
-from identify.run import identify_experiment
-from identify.signals.decimate import design
-from identify.signals.differentiate import Derivatives, differentiate
-from virtual_robot.inertias import plant_parameters
-from virtual_robot.offline import simulate_recording
+from armident.configs import config_path, load_robot, load_trajectory
+from armident.identify.closed_loop import closed_loop
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.idim_piv import idim_piv
+from armident.identify.estimators.iv_products import iv_products
+from armident.identify.estimators.regression import Block, Estimate, filtered_regressor
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.methods import decimation_of
+from armident.identify.model.arm import ArmModel
+from armident.identify.options import Options
+from armident.identify.preparation import PIV_CUTOFF, equations
+from armident.identify.run import identify_experiment
+from armident.identify.signals.decimate import design
+from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.offline import simulate_recording
 
 Floats = NDArray[np.float64]
 

@@ -17,26 +17,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from configs import RobotConfig, load_robot
-from configs.robot import Effect
-from daq.importing import import_recording
-from daq.recording import read_recording, write_recording
-from identify.catalogue.registry import known
-from identify.estimators.followed import FollowedMotion
-from identify.estimators.idim_iv import idim_iv
-from identify.estimators.idim_ls import idim_ls
-from identify.estimators.regression import Block
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from identify.methods import decimation_of
-from identify.model.arm import ArmModel
-from identify.options import Options
-from identify.preparation import LS_CUTOFF, PIV_CUTOFF, decimated_rows, equations, least_rows
-from identify.result import Identification, relative_errors
-from identify.run import identify_experiment
-from identify.signals.bandpass import butterworth
-from identify.signals.decimate import Decimation, design
-from identify.signals.differentiate import Derivatives, differentiate
+from armident.configs import RobotConfig, load_robot
+from armident.configs.robot import Effect
+from armident.daq.importing import import_recording
+from armident.daq.recording import read_recording, write_recording
+from armident.identify.catalogue.registry import known
+from armident.identify.estimators.followed import FollowedMotion
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.regression import Block
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.methods import decimation_of
+from armident.identify.model.arm import ArmModel
+from armident.identify.options import Options
+from armident.identify.preparation import LS_CUTOFF, PIV_CUTOFF, decimated_rows, equations, least_rows
+from armident.identify.result import Identification, relative_errors
+from armident.identify.run import identify_experiment
+from armident.identify.signals.bandpass import butterworth
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.differentiate import Derivatives, differentiate
 
 KUKA = load_robot("kuka_lwr4")
 PANDA = load_robot("panda")
@@ -257,7 +257,7 @@ def test_half_a_sample_between_position_and_sensor_torque_makes_no_difference(
     panda: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held = least_squares([panda], PANDA).relative_error_pct
-    monkeypatch.setattr("identify.preparation.aligned_torque", lambda tau: tau)
+    monkeypatch.setattr("armident.identify.preparation.aligned_torque", lambda tau: tau)
     assert least_squares([panda], PANDA).relative_error_pct == pytest.approx(held, abs=0.02)
 
 

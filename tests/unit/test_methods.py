@@ -6,16 +6,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from configs import ConfigError, config_path, load_robot, load_trajectory
-from daq.recording import Recording
-from identify.document import to_json
-from identify.methods import MEASURED
-from identify.model.arm import ArmModel
-from identify.options import METHODS, Method, Options, parse_decimation, parse_nvr
-from identify.report.identification import identification_report
-from identify.service import Outcome, identify_recording
-from virtual_robot.inertias import plant_parameters
-from virtual_robot.offline import simulate_recording
+from armident.configs import ConfigError, config_path, load_robot, load_trajectory
+from armident.daq.recording import Recording
+from armident.identify.document import to_json
+from armident.identify.methods import MEASURED
+from armident.identify.model.arm import ArmModel
+from armident.identify.options import METHODS, Method, Options, parse_decimation, parse_nvr
+from armident.identify.report.identification import identification_report
+from armident.identify.service import Outcome, identify_recording
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.offline import simulate_recording
 
 
 @cache

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from identify.model.chain import Floats
-from identify.model.compiled import compiled
-from identify.model.elementary import arctangents, padded, sines_cosines
+from armident.identify.model.chain import Floats
+from armident.identify.model.compiled import compiled
+from armident.identify.model.elementary import arctangents, padded, sines_cosines
 
 
 @compiled

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import load_robot, load_trajectory
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
-from identify.model.physical import damp_to_physical, is_physical
-from identify.model.simulation import simulate
+from armident.configs import load_robot, load_trajectory
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.physical import damp_to_physical, is_physical
+from armident.identify.model.simulation import simulate
 
 Floats = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from configs import ArmidentError, load_robot
-from identify.model.arm import ArmModel
-from identify.model.base_parameters import independent_columns
+from armident.configs import ArmidentError, load_robot
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.base_parameters import independent_columns
 from tests.pinocchio_oracle import pinocchio_model, random_parameters
 
 TABLE_B2 = {

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from configs import DataError, config_path, load_robot, load_trajectory
-from identify.cli import trajectory as trajectory_command
-from identify.document import IdentificationDocument, to_json, write_atomically
-from identify.options import Options
-from identify.preparation import LS_CUTOFF
-from identify.prior import _deviation_below, prior_from
-from identify.service import identify_recording
-from virtual_robot.offline import simulate_recording
+from armident.configs import DataError, config_path, load_robot, load_trajectory
+from armident.identify.cli import trajectory as trajectory_command
+from armident.identify.document import IdentificationDocument, to_json, write_atomically
+from armident.identify.options import Options
+from armident.identify.preparation import LS_CUTOFF
+from armident.identify.prior import _deviation_below, prior_from
+from armident.identify.service import identify_recording
+from armident.virtual_robot.offline import simulate_recording
 
 
 @cache

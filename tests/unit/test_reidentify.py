@@ -13,19 +13,19 @@ import pytest
 import sqlalchemy as sa
 import yaml
 
-from configs import ConfigError, DataError, config_path, load_robot, load_session, load_trajectory
-from configs.scenario import Scenario
-from daq.recording import write_recording
-from identify.document import IdentificationDocument, load_document, to_json
-from identify.drift import compare
-from identify.history import History
-from identify.reidentify.baseline import baseline_of
-from identify.reidentify.fleet import cluster
-from identify.reidentify.run import prepare
-from identify.reidentify.verdict import meaning_of, place_of, told
-from identify.service import identify_recording
+from armident.configs import ConfigError, DataError, config_path, load_robot, load_session, load_trajectory
+from armident.configs.scenario import Scenario
+from armident.daq.recording import write_recording
+from armident.identify.document import IdentificationDocument, load_document, to_json
+from armident.identify.drift import compare
+from armident.identify.history import History
+from armident.identify.reidentify.baseline import baseline_of
+from armident.identify.reidentify.fleet import cluster
+from armident.identify.reidentify.run import prepare
+from armident.identify.reidentify.verdict import meaning_of, place_of, told
+from armident.identify.service import identify_recording
+from armident.virtual_robot.offline import simulate_recording
 from tests.statistics.weeks import WORN
-from virtual_robot.offline import simulate_recording
 
 NOW = datetime.datetime(2026, 3, 1, tzinfo=datetime.UTC)
 
@@ -44,7 +44,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def documents(recordings: Path) -> dict[str, IdentificationDocument]:
-    from daq.recording import read_recording
+    from armident.daq.recording import read_recording
 
     return {
         path.stem: identify_recording(read_recording(path)).document for path in sorted(recordings.glob("*_*.mcap"))
@@ -159,7 +159,7 @@ def test_parameters_have_places_and_meanings(name: str, place: str, meaning: str
 
 
 def fleet(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "daq.cli", "reidentify", "--recordings", str(folder / "[a-z]_*.mcap")]
+    command = [sys.executable, "-m", "armident.daq.cli", "reidentify", "--recordings", str(folder / "[a-z]_*.mcap")]
     command += ["--store", store(folder), "--out", str(folder / "results"), *options]
     return subprocess.run(command, capture_output=True, text=True, timeout=250, check=False)
 

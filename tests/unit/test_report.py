@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from configs import load_robot, load_trajectory
-from identify.document import IdentificationDocument, load_document
-from identify.options import Options
-from identify.service import Outcome, identify_recording, write_identification
-from virtual_robot.offline import simulate_recording
+from armident.configs import load_robot, load_trajectory
+from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.options import Options
+from armident.identify.service import Outcome, identify_recording, write_identification
+from armident.virtual_robot.offline import simulate_recording
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,12 @@ import re
 import numpy as np
 import pytest
 
-from configs import load_robot, load_trajectory
-from configs.scenario import HiddenEffect, Scenario
-from identify.discrepancy.diagnose import Diagnosis, diagnose
-from identify.from_recording import experiments_from_recording
-from identify.report.diagnosis import SHOWN, diagnosis_report, followed_variable, telling_stretch
-from virtual_robot.offline import simulate_recording
+from armident.configs import load_robot, load_trajectory
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.identify.discrepancy.diagnose import Diagnosis, diagnose
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.report.diagnosis import SHOWN, diagnosis_report, followed_variable, telling_stretch
+from armident.virtual_robot.offline import simulate_recording
 
 HIDDEN = (
     HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.15}),

@@ -11,28 +11,28 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import ArmidentError, ConfigError, DataError, load_robot, load_trajectory
-from daq.recording import read_recording
-from identify.controller.nominal import known_controller
-from identify.estimators.idim_ls import idim_ls
-from identify.from_recording import experiments_from_recording
-from identify.model.arm import ArmModel
-from identify.model.subset import restricted_to
-from identify.reproduction import claims, recordings
-from identify.reproduction.bench import Bench
-from identify.reproduction.chapter4 import GOOD, UNDECIMATED, WRONG, relative
-from identify.reproduction.chapter5 import IMPULSE_RESPONSES, OWN_RESPONSES
-from identify.reproduction.chapter6 import COARSE_HZ, degraded, nearest
-from identify.reproduction.command import SLOW, TABLES, chosen_tables, make_bench, reproduce, reproduce_command
-from identify.reproduction.emps_controller import controllers_on_emps
-from identify.reproduction.laboratory import RESPONSE_LENGTHS, Case, Laboratory, Run, between
-from identify.reproduction.printing import document, markdown
-from identify.reproduction.recordings import measured_emps, measured_recording, virtual_recording
-from identify.reproduction.reference import REFERENCE, essential_names, reference_tables
-from identify.reproduction.tables import Cell, Column, Table
-from virtual_robot.cli import robot as robot_command
-from virtual_robot.offline import simulate_recording, with_encoder_counts
-from virtual_robot.run import record_robot
+from armident.configs import ArmidentError, ConfigError, DataError, load_robot, load_trajectory
+from armident.daq.recording import read_recording
+from armident.identify.controller.nominal import known_controller
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.subset import restricted_to
+from armident.identify.reproduction import claims, recordings
+from armident.identify.reproduction.bench import Bench
+from armident.identify.reproduction.chapter4 import GOOD, UNDECIMATED, WRONG, relative
+from armident.identify.reproduction.chapter5 import IMPULSE_RESPONSES, OWN_RESPONSES
+from armident.identify.reproduction.chapter6 import COARSE_HZ, degraded, nearest
+from armident.identify.reproduction.command import SLOW, TABLES, chosen_tables, make_bench, reproduce, reproduce_command
+from armident.identify.reproduction.emps_controller import controllers_on_emps
+from armident.identify.reproduction.laboratory import RESPONSE_LENGTHS, Case, Laboratory, Run, between
+from armident.identify.reproduction.printing import document, markdown
+from armident.identify.reproduction.recordings import measured_emps, measured_recording, virtual_recording
+from armident.identify.reproduction.reference import REFERENCE, essential_names, reference_tables
+from armident.identify.reproduction.tables import Cell, Column, Table
+from armident.virtual_robot.cli import robot as robot_command
+from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
+from armident.virtual_robot.run import record_robot
 
 
 @pytest.fixture(scope="module")

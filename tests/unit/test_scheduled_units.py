@@ -11,8 +11,8 @@ import pytest
 import typer.main
 from typer.core import TyperGroup
 
-from configs.loading import HERE
-from daq.cli import application
+from armident.configs.loading import HERE
+from armident.daq.cli import application
 
 UNITS = sorted((HERE / "systemd").glob("*@.*"))
 CRON = HERE / "cron" / "armident-reidentify.cron"

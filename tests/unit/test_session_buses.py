@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from configs import config_path, load_session
-from configs.session import SessionConfig
+from armident.configs import config_path, load_session
+from armident.configs.session import SessionConfig
 
 FD = {"bitrate": 1_000_000, "fd": True, "data_bitrate": 5_000_000}
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.signals.bandwidth import MARGIN, PERIODS, motion_bandwidth
+from armident.configs import DataError
+from armident.identify.signals.bandwidth import MARGIN, PERIODS, motion_bandwidth
 
 SECONDS = 30.0
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from configs import DataError
-from identify.signals.classical import chebyshev_decimate, kept_samples
-from identify.signals.decimate import STOPBAND_DB, design
+from armident.configs import DataError
+from armident.identify.signals.classical import chebyshev_decimate, kept_samples
+from armident.identify.signals.decimate import STOPBAND_DB, design
 
 DT = 2e-4
 

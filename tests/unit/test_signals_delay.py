@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import load_robot
-from identify.experiment import Experiment
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
-from identify.model.simulation import Simulation, simulate
-from identify.reproduction.emps_derivatives import DURATIONS, polynomial_moves
-from identify.signals.decimate import Decimation, design
-from identify.signals.delay import HELD, TorqueDelay, torque_delay
-from identify.signals.differentiate import Derivatives, differentiate
+from armident.configs import load_robot
+from armident.identify.experiment import Experiment
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.simulation import Simulation, simulate
+from armident.identify.reproduction.emps_derivatives import DURATIONS, polynomial_moves
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.delay import HELD, TorqueDelay, torque_delay
+from armident.identify.signals.differentiate import Derivatives, differentiate
 
 DT = 1e-3
 THETA = np.array([96.0, 205.0, 20.0, -3.0])

@@ -7,8 +7,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal
 
-from configs import DataError, load_robot
-from identify.signals.differentiate import NVR_BY_HAND, Method, differentiate, encoder_resolution, tracking_error_nvr
+from armident.configs import DataError, load_robot
+from armident.identify.signals.differentiate import (
+    NVR_BY_HAND,
+    Method,
+    differentiate,
+    encoder_resolution,
+    tracking_error_nvr,
+)
 
 DT = 2e-4
 

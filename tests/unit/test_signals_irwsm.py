@@ -7,8 +7,8 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.signals.irwsm import (
+from armident.configs import DataError
+from armident.identify.signals.irwsm import (
     automatic_nvr,
     cross_validated_nvr,
     cross_validation,

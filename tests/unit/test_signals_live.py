@@ -8,9 +8,9 @@ from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from configs import DataError
-from identify.signals.irwsm import automatic_nvr
-from identify.signals.live import PRIOR, VelocityFilter
+from armident.configs import DataError
+from armident.identify.signals.irwsm import automatic_nvr
+from armident.identify.signals.live import PRIOR, VelocityFilter
 
 DT = 2e-4
 NOISE = 1e-6

@@ -5,10 +5,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal
 
-from configs import DataError
-from identify.estimators.noise import whiteness
-from identify.signals.decimate import design
-from identify.signals.noise_decimation import decimation_from_noise
+from armident.configs import DataError
+from armident.identify.estimators.noise import whiteness
+from armident.identify.signals.decimate import design
+from armident.identify.signals.noise_decimation import decimation_from_noise
 
 
 def coloured(coefficients: list[float], samples: int, seed: int = 0) -> NDArray[np.float64]:

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import DataError, load_robot
-from identify.estimators.idim_ls import idim_ls
-from identify.estimators.regression import Block, Estimate, filtered_regressor
-from identify.model.arm import ArmModel
-from identify.preparation import aligned_torque
-from identify.reproduction.emps_derivatives import simulate_emps
-from identify.signals.decimate import Decimation, design
-from identify.signals.differentiate import Derivatives, differentiate
-from identify.signals.standstill import SLOW_SHARE, moving, velocity_threshold
+from armident.configs import DataError, load_robot
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.estimators.regression import Block, Estimate, filtered_regressor
+from armident.identify.model.arm import ArmModel
+from armident.identify.preparation import aligned_torque
+from armident.identify.reproduction.emps_derivatives import simulate_emps
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.differentiate import Derivatives, differentiate
+from armident.identify.signals.standstill import SLOW_SHARE, moving, velocity_threshold
 
 DT = 1e-3
 FORCE_NOISE = 5.0

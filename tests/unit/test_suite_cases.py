@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from configs import ConfigError, config_path, load_robot, load_suite, load_trajectory
-from configs.scenario import Scenario
-from configs.suite import LEVELS
-from daq.suite.cases import all_cases, chosen, twin
-from virtual_robot.batch import resolved
-from virtual_robot.effects import CATALOGUE, OUTSIDE, hidden_effects
+from armident.configs import ConfigError, config_path, load_robot, load_suite, load_trajectory
+from armident.configs.scenario import Scenario
+from armident.configs.suite import LEVELS
+from armident.daq.suite.cases import all_cases, chosen, twin
+from armident.virtual_robot.batch import resolved
+from armident.virtual_robot.effects import CATALOGUE, OUTSIDE, hidden_effects
 
 SUITE = load_suite("suite")
 CASES = all_cases(SUITE)

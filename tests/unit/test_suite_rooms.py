@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from configs import ArmidentError, DataError
-from daq.suite.lanes import DIAGNOSIS, PLANT
-from daq.suite.room import Room
-from daq.suite.store import Store, code_version
+from armident.configs import ArmidentError, DataError
+from armident.daq.suite.lanes import DIAGNOSIS, PLANT
+from armident.daq.suite.room import Room
+from armident.daq.suite.store import Store, code_version
 
 EMPS = {
     "robot": "emps.yaml", "trajectory": "trajectories/emps_excitation.yaml", "repeats": 1, "period": 1e-3, "seed": 1,

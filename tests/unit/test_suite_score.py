@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from daq.suite.cases import Case, HiddenPart
-from daq.suite.markdown import report, shortfalls
-from daq.suite.score import Score, closed_share, matches, score, within
-from daq.suite.table import clopper_pearson, tables
+from armident.daq.suite.cases import Case, HiddenPart
+from armident.daq.suite.markdown import report, shortfalls
+from armident.daq.suite.score import Score, closed_share, matches, score, within
+from armident.daq.suite.table import clopper_pearson, tables
 
 SPRING = HiddenPart("joint_spring", "joint_2", None, ("joint_spring",), {}, {}, 1.0)
 SHAFT = HiddenPart("coupling_friction", "joint_4", "joint_5", ("coupling_friction",), {}, {}, 1.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from configs import DataError
-from identify.reproduction.emps_derivatives import (
+from armident.configs import DataError
+from armident.identify.reproduction.emps_derivatives import (
     COULOMB,
     GAIN,
     KP,
@@ -20,7 +20,7 @@ from identify.reproduction.emps_derivatives import (
     simulate_emps,
     table_5_2,
 )
-from identify.reproduction.emps_protocol import (
+from armident.identify.reproduction.emps_protocol import (
     INFERRED,
     SUFFIX,
     VARIANTS,

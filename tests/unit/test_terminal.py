@@ -3,7 +3,7 @@
 import numba
 import pytest
 
-from identify.terminal import progress
+from armident.identify.terminal import progress
 
 
 def test_who_waits_for_the_compiler_is_told_so_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,21 +5,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from configs import ConfigError, RobotConfig, load_robot, load_trajectory
-from configs.robot import Effect
-from configs.scenario import HiddenEffect, Scenario
-from identify.catalogue.registry import catalogue
-from identify.catalogue.wiring import rewired
-from identify.controller.nominal import nominal_controller
-from identify.experiment import Experiment
-from identify.model.arm import ArmModel
-from identify.model.relaxation import simulate_with_terms
-from identify.model.simulation import simulate
-from identify.options import Method, Options
-from identify.service import identify_recording
-from identify.signals.bandpass import butterworth
-from virtual_robot.inertias import plant_parameters
-from virtual_robot.offline import simulate_recording
+from armident.configs import ConfigError, RobotConfig, load_robot, load_trajectory
+from armident.configs.robot import Effect
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.identify.catalogue.registry import catalogue
+from armident.identify.catalogue.wiring import rewired
+from armident.identify.controller.nominal import nominal_controller
+from armident.identify.experiment import Experiment
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.relaxation import simulate_with_terms
+from armident.identify.model.simulation import simulate
+from armident.identify.options import Method, Options
+from armident.identify.service import identify_recording
+from armident.identify.signals.bandpass import butterworth
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.offline import simulate_recording
 
 DT = 1e-3
 

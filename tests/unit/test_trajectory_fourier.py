@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
-from configs.trajectory import Fourier
-from identify.excitation import assess, design_trajectory
-from identify.model.arm import ArmModel
-from identify.trajectory_command import trajectory_command
+from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.configs.trajectory import Fourier
+from armident.identify.excitation import assess, design_trajectory
+from armident.identify.model.arm import ArmModel
+from armident.identify.trajectory_command import trajectory_command
 
 NOISE = np.sqrt([1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523])
 """Standard deviation of the torque noise of the TX40 after the decimate filter, N m (thesis table 6.3)."""

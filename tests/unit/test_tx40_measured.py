@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from configs import load_robot
-from identify.experiment import Experiment
-from identify.options import Method, Options
-from identify.result import Identification
-from identify.run import identify_experiment
+from armident.configs import load_robot
+from armident.identify.experiment import Experiment
+from armident.identify.options import Method, Options
+from armident.identify.result import Identification
+from armident.identify.run import identify_experiment
 from tests.tx40_reference import TABLE_B4, published_estimate
 
 STANDSTILL_S = 7.5

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from configs import ConfigError, RobotConfig, load_robot
-from configs.denavit_hartenberg import modified_dh
-from configs.urdf import mdh_of, read_chain
-from daq.recording import Recording, Stream, read_recording, write_recording
-from daq.recording.model import Field
+from armident.configs import ConfigError, RobotConfig, load_robot
+from armident.configs.denavit_hartenberg import modified_dh
+from armident.configs.urdf import mdh_of, read_chain
+from armident.daq.recording import Recording, Stream, read_recording, write_recording
+from armident.daq.recording.model import Field
 
 LIMIT = '<limit lower="-2" upper="2" velocity="3" effort="50"/>'
 

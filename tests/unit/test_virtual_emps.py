@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 from scipy import signal
 from scipy.io import loadmat
 
-from configs import ConfigError, RobotConfig, Trajectory, load_robot, load_session, load_trajectory
-from configs.trajectory import Move
-from daq.recording import Recording, read_recording
-from drivers.bus_load import check_fits
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from identify.options import Method, Options
-from identify.run import identify_experiment
-from identify.signals.differentiate import differentiate
-from virtual_robot import noise, servo
-from virtual_robot.arm import Arm
-from virtual_robot.inertias import HERE, plant_parameters
-from virtual_robot.noise import Noise
-from virtual_robot.offline import simulate_recording
-from virtual_robot.plant import Plant
-from virtual_robot.run import record_robot
+from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, load_session, load_trajectory
+from armident.configs.trajectory import Move
+from armident.daq.recording import Recording, read_recording
+from armident.drivers.bus_load import check_fits
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.options import Method, Options
+from armident.identify.run import identify_experiment
+from armident.identify.signals.differentiate import differentiate
+from armident.virtual_robot import noise, servo
+from armident.virtual_robot.arm import Arm
+from armident.virtual_robot.inertias import HERE, plant_parameters
+from armident.virtual_robot.noise import Noise
+from armident.virtual_robot.offline import simulate_recording
+from armident.virtual_robot.plant import Plant
+from armident.virtual_robot.run import record_robot
 
 NAMES = ("m1", "fv1", "fc1", "off1")
 PUBLISHED = (95.1089, 203.5034, 20.3935, -3.1648)

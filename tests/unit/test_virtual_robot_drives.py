@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot
-from configs.trajectory import Move
-from daq.recording import Recording
-from drivers.objects import Control, DriveState, drive_state
-from virtual_robot.arm import Arm, counts_per_si
-from virtual_robot.inertias import rest_posture
-from virtual_robot.machine import next_state, statusword
-from virtual_robot.noise import DECIMATED_VARIANCE, RESIDUAL_VARIANCE, Noise
-from virtual_robot.offline import simulate_recording
-from virtual_robot.plant import Plant
-from virtual_robot.replay import Replay
-from virtual_robot.scenario import load_scenario
+from armident.configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot
+from armident.configs.trajectory import Move
+from armident.daq.recording import Recording
+from armident.drivers.objects import Control, DriveState, drive_state
+from armident.virtual_robot.arm import Arm, counts_per_si
+from armident.virtual_robot.inertias import rest_posture
+from armident.virtual_robot.machine import next_state, statusword
+from armident.virtual_robot.noise import DECIMATED_VARIANCE, RESIDUAL_VARIANCE, Noise
+from armident.virtual_robot.offline import simulate_recording
+from armident.virtual_robot.plant import Plant
+from armident.virtual_robot.replay import Replay
+from armident.virtual_robot.scenario import load_scenario
 
 PERIOD = 200e-6
 

@@ -8,15 +8,15 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from configs import ConfigError, RobotConfig, load_robot
-from configs.scenario import HiddenEffect, Scenario
-from virtual_robot.arm import Arm
-from virtual_robot.cli import robot as robot_command
-from virtual_robot.effects import CATALOGUE, EFFECTS, OUTSIDE, describe_effects, hidden_effects
-from virtual_robot.effects.forces import CODES, effect_torque, force_table
-from virtual_robot.inertias import rest_posture
-from virtual_robot.plant import Plant
-from virtual_robot.scenario import SCENARIOS, load_scenario
+from armident.configs import ConfigError, RobotConfig, load_robot
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.virtual_robot.arm import Arm
+from armident.virtual_robot.cli import robot as robot_command
+from armident.virtual_robot.effects import CATALOGUE, EFFECTS, OUTSIDE, describe_effects, hidden_effects
+from armident.virtual_robot.effects.forces import CODES, effect_torque, force_table
+from armident.virtual_robot.inertias import rest_posture
+from armident.virtual_robot.plant import Plant
+from armident.virtual_robot.scenario import SCENARIOS, load_scenario
 
 cli = typer.Typer()
 cli.command()(robot_command)

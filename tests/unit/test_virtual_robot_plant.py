@@ -5,11 +5,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from configs import ConfigError, RobotConfig, load_robot
-from virtual_robot import inertias
-from virtual_robot.arm import counts_per_si
-from virtual_robot.model import build_model, pin
-from virtual_robot.plant import Plant
+from armident.configs import ConfigError, RobotConfig, load_robot
+from armident.virtual_robot import inertias
+from armident.virtual_robot.arm import counts_per_si
+from armident.virtual_robot.model import build_model, pin
+from armident.virtual_robot.plant import Plant
 
 PERIOD = 200e-6
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from configs import RobotConfig, Trajectory, config_path, load_robot, load_trajectory
-from identify.experiment import Experiment
-from identify.from_recording import experiments_from_recording
-from identify.model.arm import ArmModel
-from identify.options import Method, Options
-from identify.result import Identification
-from identify.run import identify_experiment
-from virtual_robot.inertias import plant_parameters
-from virtual_robot.offline import simulate_recording
+from armident.configs import RobotConfig, Trajectory, config_path, load_robot, load_trajectory
+from armident.identify.experiment import Experiment
+from armident.identify.from_recording import experiments_from_recording
+from armident.identify.model.arm import ArmModel
+from armident.identify.options import Method, Options
+from armident.identify.result import Identification
+from armident.identify.run import identify_experiment
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.offline import simulate_recording
 
 ESSENTIAL = (
     *("zz1r", "fv1", "fc1", "xx2r", "xz2r", "zz2r", "mx2r", "fv2", "fc2", "xx3r", "zz3r", "my3r", "ia3", "fv3", "fc3"),

@@ -6,15 +6,15 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from configs import RobotConfig
-from identify.estimators.auxiliary import AuxiliaryModel
-from identify.estimators.regression import Block, filtered_regressor
-from identify.model.arm import ArmModel
-from identify.model.controller import DiscreteController
-from identify.model.simulation import simulate
-from identify.preparation import aligned_torque
-from identify.signals.decimate import design
-from identify.signals.differentiate import Derivatives
+from armident.configs import RobotConfig
+from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.regression import Block, filtered_regressor
+from armident.identify.model.arm import ArmModel
+from armident.identify.model.controller import DiscreteController
+from armident.identify.model.simulation import simulate
+from armident.identify.preparation import aligned_torque
+from armident.identify.signals.decimate import design
+from armident.identify.signals.differentiate import Derivatives
 
 Floats = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ import numpy as np
 import pinocchio
 from numpy.typing import NDArray
 
-from configs import ConfigError
-from virtual_robot.effects.hidden import Hidden
+from armident.configs import ConfigError
+from armident.virtual_robot.effects.hidden import Hidden
 
 pin: Any = pinocchio
 

@@ -7,8 +7,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from configs import ConfigError, RobotConfig
-from virtual_robot.effects.hidden import Hidden
+from armident.configs import ConfigError, RobotConfig
+from armident.virtual_robot.effects.hidden import Hidden
 
 COLUMNS = 7
 """Joint, Coulomb friction, extra at rest, Stribeck velocity, exponent, stiffness, damping."""

@@ -7,8 +7,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from configs import Joint, RobotConfig
-from virtual_robot.effects.hidden import Hidden
+from armident.configs import Joint, RobotConfig
+from armident.virtual_robot.effects.hidden import Hidden
 
 CODES = (
     "asymmetric_viscous_friction", "asymmetric_coulomb_friction", "nonlinear_viscous_friction",

@@ -7,8 +7,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from configs import ConfigError, RobotConfig
-from virtual_robot.effects.hidden import Hidden
+from armident.configs import ConfigError, RobotConfig
+from armident.virtual_robot.effects.hidden import Hidden
 
 COLUMNS = 6
 """Coordinate of the motor, coordinate of the link (-1: the ground), stiffness, damping, gap, its rounding."""

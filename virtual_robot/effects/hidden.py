@@ -3,9 +3,9 @@
 import math
 from dataclasses import dataclass
 
-from configs import ConfigError, RobotConfig
-from configs.scenario import HiddenEffect, Scenario
-from virtual_robot.effects.catalogue import EFFECTS, Parameter, Place
+from armident.configs import ConfigError, RobotConfig
+from armident.configs.scenario import HiddenEffect, Scenario
+from armident.virtual_robot.effects.catalogue import EFFECTS, Parameter, Place
 
 REPEATABLE = ("cogging_torque", "torque_bump", "position_dependent_friction", "encoder_eccentricity", "mains_ripple")
 """Effects that one joint may have several of: harmonics, spots."""

@@ -7,9 +7,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from configs import RobotConfig
-from virtual_robot.effects.forces import waves
-from virtual_robot.effects.hidden import Hidden
+from armident.configs import RobotConfig
+from armident.virtual_robot.effects.forces import waves
+from armident.virtual_robot.effects.hidden import Hidden
 
 Vector = NDArray[np.float64]
 

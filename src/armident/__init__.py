@@ -1,0 +1,1 @@
+"""Records robot arms over CANopen and identifies, diagnoses and monitors their dynamic models."""
