@@ -1,11 +1,12 @@
 """What a site edits, and the one schema that loads and checks it."""
 
 from armident.configs.errors import ArmidentError, ConfigError, DataError
-from armident.configs.loading import config_path, load_robot, load_session, load_suite, load_trajectory
-from armident.configs.robot import Coupling, Drive, Joint, Limits, Mdh, RobotConfig
-from armident.configs.session import SessionConfig
-from armident.configs.suite import SuiteConfig
-from armident.configs.trajectory import Trajectory
+from armident.configs.loading import config_path, load_robot, load_scenario, load_session, load_suite, load_trajectory
+from armident.configs.schema.robot import Coupling, Drive, Joint, Limits, Mdh, RobotConfig
+from armident.configs.schema.scenario import Scenario
+from armident.configs.schema.session import SessionConfig
+from armident.configs.schema.suite import SuiteConfig
+from armident.configs.schema.trajectory import Trajectory
 
 __all__ = [
     "ArmidentError",
@@ -17,11 +18,13 @@ __all__ = [
     "Limits",
     "Mdh",
     "RobotConfig",
+    "Scenario",
     "SessionConfig",
     "SuiteConfig",
     "Trajectory",
     "config_path",
     "load_robot",
+    "load_scenario",
     "load_session",
     "load_suite",
     "load_trajectory",

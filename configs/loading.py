@@ -7,13 +7,13 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from armident.configs.errors import ConfigError
-from armident.configs.reading import is_file, read_yaml
-from armident.configs.robot import RobotConfig
-from armident.configs.scenario import Scenario
-from armident.configs.session import SessionConfig
-from armident.configs.suite import SuiteConfig
-from armident.configs.trajectory import Trajectory
+from armident.configs.schema.robot import RobotConfig
+from armident.configs.schema.scenario import Scenario
+from armident.configs.schema.session import SessionConfig
+from armident.configs.schema.suite import SuiteConfig
+from armident.configs.schema.trajectory import Trajectory
 from armident.configs.urdf import UrdfGeometry, geometry_from_urdf
+from armident.configs.yaml_loader import is_file, read_yaml
 
 HERE = Path(__file__).parent
 KINDS: dict[str, type[BaseModel]] = {
@@ -24,31 +24,47 @@ KINDS: dict[str, type[BaseModel]] = {
     "scenario": Scenario,
 }
 """Kinds of files, by the word for them in their ``schema``."""
+SHIPPED = ("robots", "cells", "trajectories", "scenarios", "suites", "eds")
+"""Folders of shipped files, in the order in which a bare name is looked up."""
 _LONGEST = 80
 """Most characters of a file that a message repeats."""
 T = TypeVar("T", bound=BaseModel)
 
 
-def config_path(name: str | Path) -> Path:
-    """The file a user means: the path as given, or a file that comes with armident.
+def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells")) -> Path:
+    """Find the file that a user names: the path as given, else a file that is shipped with armident.
 
-    ``tx40.yaml``, ``configs/tx40.yaml`` and ``tx40`` all find the shipped ``configs/tx40.yaml``
-    where no file of that name exists in the working directory.
+    Parameters
+    ----------
+    name
+        A path, or the name of a shipped file. ``tx40.yaml``, ``configs/tx40.yaml``, ``robots/tx40.yaml`` and ``tx40``
+        all find the shipped ``configs/robots/tx40.yaml`` where the working directory has no file of that name.
+    listed
+        Folders of shipped files that the message lists where there is no such file.
 
     Raises
     ------
     ConfigError
-        If there is no such file; names the shipped ones.
+        If there is no such file.
     """
     path = Path(name)
     if is_file(path):
         return path
-    relative = Path(*path.parts[1:]) if path.parts[:1] == ("configs",) else path
-    for candidate in (HERE / relative, (HERE / relative).with_suffix(".yaml")):
-        if not path.is_absolute() and is_file(candidate):
-            return candidate
-    shipped = ", ".join(sorted(p.name for p in HERE.glob("*.yaml")))
+    found = _shipped(path)
+    if found is not None:
+        return found
+    shipped = ", ".join(sorted(p.name for folder in listed for p in (HERE / folder).glob("*.yaml")))
     raise ConfigError(f"{name}: no such file (shipped with armident: {shipped})")
+
+
+def _shipped(path: Path) -> Path | None:
+    """Return the shipped file of a relative path or bare name, ``None`` if there is none."""
+    if path.is_absolute():
+        return None
+    relative = Path(*path.parts[1:]) if path.parts[:1] == ("configs",) else path
+    folders = (HERE, *(HERE / folder for folder in SHIPPED))
+    candidates = (c for folder in folders for c in (folder / relative, (folder / relative).with_suffix(".yaml")))
+    return next((c for c in candidates if is_file(c)), None)
 
 
 def load_robot(name: str | Path) -> RobotConfig:
@@ -85,6 +101,8 @@ def load_trajectory(name: str | Path) -> Trajectory:
 def load_session(name: str | Path) -> SessionConfig:
     """A session configuration from a file, its relative paths made absolute.
 
+    A relative path is looked up beside the file first, then among the shipped files (see `config_path`).
+
     Raises
     ------
     ConfigError
@@ -96,9 +114,10 @@ def load_session(name: str | Path) -> SessionConfig:
 
     def resolved(relative: Path, key: str) -> Path:
         target = base / relative
-        if not is_file(target):
+        found = target if is_file(target) else _shipped(relative)
+        if found is None:
             raise ConfigError(f"{path}: {key}: no such file {relative} (looked for {target})")
-        return target
+        return found
 
     changes: dict[str, Any] = {
         "robot": resolved(session.robot, "robot"),
@@ -132,6 +151,22 @@ def load_suite(name: str | Path) -> SuiteConfig:
         Naming file, key and what was expected.
     """
     return _load(config_path(name), SuiteConfig)
+
+
+def load_scenario(name: str | Path) -> Scenario:
+    """Load the effects that are injected into a virtual arm from a file.
+
+    Parameters
+    ----------
+    name
+        A path, or the name of a file in ``configs/scenarios``.
+
+    Raises
+    ------
+    ConfigError
+        Naming file, key and what was expected.
+    """
+    return _load(config_path(name, listed=("scenarios",)), Scenario)
 
 
 def _load(path: Path, kind: type[T]) -> T:

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs.base import Frozen
-from armident.configs.denavit_hartenberg import MdhChain, modified_dh
 from armident.configs.errors import ConfigError
-from armident.configs.reading import is_file
-from armident.configs.robot import Drive, Positive
+from armident.configs.mdh import MdhChain, modified_dh
+from armident.configs.schema.base import Frozen
+from armident.configs.schema.robot import Drive, Positive
+from armident.configs.yaml_loader import is_file
 
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 """URDF joint types that a chain may have, besides ``fixed``, and what they are to the model."""

@@ -28,7 +28,7 @@ def capture(
 
     Example: armident capture --config tx40_cell.yaml --out recordings
     """
-    from armident.daq.capture import run_capture
+    from armident.daq.capture.capture import run_capture
 
     run_capture(config, out, duration, listen_only, as_json, sniff)
 
@@ -47,7 +47,7 @@ def command(
     Example: armident command mark "gripper changed" --config cell.yaml
     """
     from armident.configs import ConfigError, load_robot, load_session
-    from armident.daq.remote import COMMANDS, Command, send_command
+    from armident.daq.capture.remote_commands import COMMANDS, Command, send_command
 
     known = next((each for each in COMMANDS if each == name), None)
     if known is None:
@@ -82,8 +82,8 @@ def import_(
     Example: armident import DATA_EMPS.mat --config emps.yaml --out emps.mcap
     """
     from armident.configs import ConfigError, load_robot, load_session
-    from armident.daq.bus_log import SUFFIXES, recording_from_log
-    from armident.daq.importing import import_recording
+    from armident.daq.interchange.bus_log import SUFFIXES, recording_from_log
+    from armident.daq.interchange.importing import import_recording
     from armident.daq.recording import write_recording
 
     if file.suffix.lower() in SUFFIXES:
@@ -133,7 +133,7 @@ def export(
 
     Example: armident export tx40.mcap --out tx40.csv
     """
-    from armident.daq.exporting import export_recording
+    from armident.daq.interchange.exporting import export_recording
     from armident.daq.recording import read_recording
 
     read = read_recording(recording)
@@ -186,59 +186,3 @@ def heal(
     for found in healed:
         kept = "" if found.original is None else f"; as it was: {found.original}"
         print(f"{found.path}: " + ("complete" if found.missing is None else f"healed: {found.missing}{kept}"))
-
-
-def demo(
-    out: Annotated[Path, typer.Option("--out", help="Directory of recordings, results and the report.")] = Path("demo"),
-    keep_going: Annotated[
-        bool, typer.Option("--keep-going", help="Leave the virtual cell running at the end.")
-    ] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="Only the first chapter.")] = False,
-) -> None:
-    """Show the whole story on this machine without hardware, and write a report.
-
-    A virtual arm on a virtual bus is captured and identified; then one with a hidden effect is diagnosed.
-
-    Example: armident demo --out demo
-    """
-    from armident.daq.demo import demo as run_demo
-
-    run_demo(out=out, keep_going=keep_going, quick=quick)
-
-
-def diagnose_suite(
-    suite: Annotated[Path, typer.Option("--suite", help="What to hide, where and how strongly.")] = Path("suite.yaml"),
-    out: Annotated[Path, typer.Option("--out", help="Directory of results and tables; a run goes on there.")] = Path(
-        "suite"
-    ),
-    quick: Annotated[bool, typer.Option("--quick", help="One arm, place, strength and run of each effect.")] = False,
-    only: Annotated[
-        str, typer.Option("--only", help="Effects by name, or clean, clean_baseline, pair, outside: A,B,...")
-    ] = "",
-    strength: Annotated[str, typer.Option("--strength", help="detectable, typical, obvious: A,B,...")] = "",
-    jobs: Annotated[int | None, typer.Option("--jobs", help="Cases at a time. [default: processors]", min=1)] = None,
-    minutes: Annotated[
-        float | None, typer.Option("--minutes", help="Begin no case after so long; call again to go on.", min=0)
-    ] = None,
-    any_version: Annotated[
-        bool, typer.Option("--any-version", help="Use results that another version of the code made.")
-    ] = False,
-    list_cases: Annotated[bool, typer.Option("--list", help="Print the cases and end.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print tables and scores as JSON.")] = False,
-) -> None:
-    """Hide effects in virtual arms, diagnose them, and say how often they are found by name.
-
-    Results are kept case by case: a run that was stopped goes on where it was.
-
-    Example: armident diagnose-suite --quick --out suite
-    """
-    from armident.daq.suite.run import Chosen, list_suite, run_suite
-
-    def words(text: str) -> tuple[str, ...]:
-        return tuple(word.strip() for word in text.split(",") if word.strip())
-
-    options = Chosen(suite, out, quick, words(only), words(strength), jobs, minutes, any_version)
-    if list_cases:
-        list_suite(options)
-    else:
-        run_suite(options, as_json=as_json)

@@ -21,14 +21,14 @@ from armident.configs import (
     load_session,
     load_trajectory,
 )
-from armident.configs.session import Bus
-from armident.daq.clock import clock_state
-from armident.daq.storage import gathered
-from armident.daq.streams import captured_streams
-from armident.daq.zenoh_keys.session import configuration, endpoints
-from armident.drivers.bus_load import check_fits
-from armident.drivers.socketcan import RECEIVE_BUFFER, RawSocket
-from armident.drivers.stamps import has_hardware_stamps
+from armident.configs.schema.session import Bus
+from armident.daq.capture.clock import clock_state
+from armident.daq.capture.files import gathered
+from armident.daq.matching.streams import captured_streams
+from armident.daq.streaming.session import configuration, endpoints
+from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
+from armident.drivers.can.timestamps import has_hardware_stamps
+from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 
 Verdict = Literal["ok", "warning", "failed"]

@@ -26,7 +26,7 @@ def bus_load(
     from rich.table import Table
 
     from armident.configs import ConfigError, load_session
-    from armident.drivers.bus_load import bus_loads, check_fits
+    from armident.drivers.canopen.bus_load import bus_loads, check_fits
 
     session = load_session(config)
     if data_bitrate is not None and bitrate is None:

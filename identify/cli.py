@@ -50,7 +50,7 @@ def identify(
 
     Example: armident identify tx40.mcap --out results
     """
-    from armident.identify.service import identify_command
+    from armident.identify.commands import identify_command
 
     chosen = {
         "method": method,
@@ -78,7 +78,7 @@ def worker(
 
     Example: armident worker --config configs/tx40_cell.yaml
     """
-    from armident.identify.worker import run_worker
+    from armident.identify.monitoring.worker import run_worker
 
     code = run_worker(config, once=once, out=out)
     if code:
@@ -109,7 +109,7 @@ def diagnose(
 
     Example: armident diagnose monday.mcap --validate tuesday.mcap
     """
-    from armident.identify.service import diagnose_command
+    from armident.identify.commands import diagnose_command
 
     chosen = {"false_alarms": false_alarms, "material": material}
     code = diagnose_command(recordings, config, validate, baseline, chosen, out, as_json=json)
@@ -125,7 +125,7 @@ def effects(
 
     Example: armident effects stribeck_friction
     """
-    from armident.identify.catalogue.listing import effects_command
+    from armident.identify.effects.listing import effects_command
 
     effects_command(name, as_json=json)
 
@@ -156,7 +156,7 @@ def history(
 
     Example: armident history recordings/*.identification/identification.json --plot history.png
     """
-    from armident.identify.history_command import history_command
+    from armident.identify.monitoring.history_cli import history_command
 
     code = history_command(documents or [], database, robot, cell, parameter or [], plot, false_alarms, as_json=json)
     if code:
@@ -200,7 +200,7 @@ def trajectory(
 
     Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
-    from armident.identify.trajectory_command import trajectory_command
+    from armident.identify.excitation.cli import trajectory_command
 
     trajectory_command(
         config, out, duration, seed, known, evaluations, wanted, joint, against, shape, harmonics, picture, look_at
@@ -218,6 +218,44 @@ def reproduce(
 
     Example: armident reproduce --tables 5.2,6.7
     """
-    from armident.identify.reproduction.command import reproduce_command
+    from armident.identify.thesis.command import reproduce_command
 
     reproduce_command(tables, measured, out, quick, as_json=json)
+
+
+def diagnose_suite(
+    suite: Annotated[Path, typer.Option("--suite", help="What to hide, where and how strongly.")] = Path("suite.yaml"),
+    out: Annotated[Path, typer.Option("--out", help="Directory of results and tables; a run goes on there.")] = Path(
+        "suite"
+    ),
+    quick: Annotated[bool, typer.Option("--quick", help="One arm, place, strength and run of each effect.")] = False,
+    only: Annotated[
+        str, typer.Option("--only", help="Effects by name, or clean, clean_baseline, pair, outside: A,B,...")
+    ] = "",
+    strength: Annotated[str, typer.Option("--strength", help="detectable, typical, obvious: A,B,...")] = "",
+    jobs: Annotated[int | None, typer.Option("--jobs", help="Cases at a time. [default: processors]", min=1)] = None,
+    minutes: Annotated[
+        float | None, typer.Option("--minutes", help="Begin no case after so long; call again to go on.", min=0)
+    ] = None,
+    any_version: Annotated[
+        bool, typer.Option("--any-version", help="Use results that another version of the code made.")
+    ] = False,
+    list_cases: Annotated[bool, typer.Option("--list", help="Print the cases and end.")] = False,
+    json: Json = False,
+) -> None:
+    """Hide effects in virtual arms, diagnose them, and say how often they are found by name.
+
+    Results are kept case by case: a run that was stopped goes on where it was.
+
+    Example: armident diagnose-suite --quick --out suite
+    """
+    from armident.identify.evaluation.run import Chosen, list_suite, run_suite
+
+    def words(text: str) -> tuple[str, ...]:
+        return tuple(word.strip() for word in text.split(",") if word.strip())
+
+    options = Chosen(suite, out, quick, words(only), words(strength), jobs, minutes, any_version)
+    if list_cases:
+        list_suite(options)
+    else:
+        run_suite(options, as_json=json)

@@ -18,7 +18,7 @@ from armident.configs import ConfigError, DataError, RobotConfig
 from armident.daq.recording import Recording
 
 if TYPE_CHECKING:
-    from armident.identify.result import Identification
+    from armident.identify.identification.result import Identification
 
 LIBRARIES = ("armident", "numpy", "scipy", "numba")
 T = TypeVar("T", bound=BaseModel)
@@ -397,7 +397,7 @@ def schema_text(kind: type[Document]) -> str:
 def main() -> None:
     """Write the schema files: ``python -m armident.identify.document``."""
     for name, kind in SCHEMA_FILES.items():
-        write_atomically(Path(configs.__file__).parent / name, schema_text(kind))
+        write_atomically(Path(configs.__file__).parent / "json_schemas" / name, schema_text(kind))
 
 
 if __name__ == "__main__":

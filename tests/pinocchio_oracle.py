@@ -7,7 +7,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from armident.configs import Joint, Limits, Mdh, RobotConfig
-from armident.identify.model.arm import ArmModel
+from armident.identify.robot.arm import ArmModel
 
 Floats = NDArray[np.float64]
 

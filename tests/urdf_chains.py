@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs.denavit_hartenberg import MdhChain
+from armident.configs.mdh import MdhChain
 from armident.configs.urdf import UrdfJoint, rotation
 
 Floats = NDArray[np.float64]

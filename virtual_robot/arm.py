@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from armident.configs import ConfigError, RobotConfig
-from armident.configs.scenario import Scenario
+from armident.configs.schema.scenario import Scenario
 from armident.virtual_robot import servo
 from armident.virtual_robot.effects import hidden_effects
 from armident.virtual_robot.effects.signals import Signals

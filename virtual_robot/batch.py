@@ -13,7 +13,7 @@ import numpy as np
 from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
 from armident.configs.exchange import Document, serve
 from armident.configs.expression import evaluate
-from armident.configs.scenario import HiddenEffect, Scenario
+from armident.configs.schema.scenario import HiddenEffect, Scenario
 from armident.daq.recording import write_recording
 from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording

@@ -1,4 +1,4 @@
-"""The command ``armident robot``."""
+"""Commands of this package: robot, demo."""
 
 from pathlib import Path
 from typing import Annotated
@@ -63,3 +63,21 @@ def robot(
     if truth is not None and replay is not None:
         raise ConfigError("--truth: a replayed recording does not know the parameters of its arm")
     run_robot(config, scenario, replay, seed, noise, duration, truth, velocity_feedback)
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Directory of recordings, results and the report.")] = Path("demo"),
+    keep_going: Annotated[
+        bool, typer.Option("--keep-going", help="Leave the virtual cell running at the end.")
+    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Only the first chapter.")] = False,
+) -> None:
+    """Show the whole story on this machine without hardware, and write a report.
+
+    A virtual arm on a virtual bus is captured and identified; then one with a hidden effect is diagnosed.
+
+    Example: armident demo --out demo
+    """
+    from armident.virtual_robot.demo import demo as run_demo
+
+    run_demo(out=out, keep_going=keep_going, quick=quick)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from armident.configs import ArmidentError, ConfigError, RobotConfig
-from armident.configs.reading import is_file
+from armident.configs.yaml_loader import is_file
 
 HERE = Path(__file__).parent
 clarabel: Any = untyped_clarabel

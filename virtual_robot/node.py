@@ -15,8 +15,8 @@ from canopen.sdo.exceptions import SdoAbortedError
 from canopen.sdo.server import SdoServer
 
 from armident.configs import ConfigError
-from armident.configs.robot import Joint
-from armident.drivers.objects import (
+from armident.configs.schema.robot import Joint
+from armident.drivers.canopen.objects import (
     COB_HEARTBEAT,
     COB_SDO_REQUEST,
     COB_SDO_RESPONSE,
@@ -50,7 +50,7 @@ from armident.drivers.objects import (
     rated_milliamperes,
 )
 from armident.virtual_robot.arm import Motion
-from armident.virtual_robot.machine import MOVING, next_state, statusword
+from armident.virtual_robot.cia402 import MOVING, next_state, statusword
 
 ABORT_UNSUPPORTED = 0x06010000
 ABORT_NOT_MAPPABLE = 0x06040041

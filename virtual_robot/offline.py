@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig, Trajectory
-from armident.configs.scenario import Scenario
+from armident.configs.schema.scenario import Scenario
 from armident.daq.recording import Field, Mark, Recording, Stream
 from armident.virtual_robot import servo
 from armident.virtual_robot.arm import Arm, counts_per_si

@@ -8,7 +8,7 @@ import pinocchio
 from numpy.typing import ArrayLike, NDArray
 
 from armident.configs import ConfigError, RobotConfig
-from armident.configs.scenario import Scenario
+from armident.configs.schema.scenario import Scenario
 from armident.virtual_robot import dynamics
 from armident.virtual_robot.effects import Hidden, hidden_effects
 from armident.virtual_robot.effects.bodies import add_rotors, change_bodies, hanging, hinge_damping, shaking

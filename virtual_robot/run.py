@@ -10,6 +10,7 @@ from types import FrameType
 from numpy.typing import ArrayLike
 
 from armident.configs import ConfigError, RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
+from armident.configs.loading import load_scenario
 from armident.daq.recording import read_recording, write_recording
 from armident.virtual_robot import servo
 from armident.virtual_robot.arm import Arm, Motion
@@ -17,7 +18,6 @@ from armident.virtual_robot.inertias import base_parameters, plant_parameters, r
 from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.replay import Replay
-from armident.virtual_robot.scenario import load_scenario
 from armident.virtual_robot.server import Server
 
 

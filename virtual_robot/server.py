@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, SessionConfig
-from armident.drivers.frames import frames
-from armident.drivers.objects import DriveState
-from armident.drivers.socketcan import RECEIVE_TIMEOUT, RawSocket
+from armident.drivers.can.frames import frames
+from armident.drivers.can.socketcan import RECEIVE_TIMEOUT, RawSocket
+from armident.drivers.canopen.objects import DriveState
 from armident.virtual_robot.arm import Motion, counts_per_si
-from armident.virtual_robot.line import BATCH, Line
+from armident.virtual_robot.bus_server import BATCH, Line
 from armident.virtual_robot.node import Drive
 
 TOGETHER_S = 0.05

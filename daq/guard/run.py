@@ -10,14 +10,14 @@ from types import FrameType
 import numpy as np
 
 from armident.configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session
-from armident.configs.session import Bus
+from armident.configs.schema.session import Bus
 from armident.daq.guard.limits import FOLLOWING_S, limits_of
-from armident.daq.guard.watch import Alarm, Watch
-from armident.daq.streams import bus_numbers, node_ids
-from armident.drivers.frames import BusDown, FrameBus, Frames, frames
-from armident.drivers.objects import COB_MASK, COB_SDO_REQUEST, CONTROLWORD, Control, rpdo_cob, stop_rpdo
-from armident.drivers.priority import be_punctual
-from armident.drivers.udp import open_bus
+from armident.daq.guard.monitor import Alarm, Watch
+from armident.daq.matching.streams import bus_numbers, node_ids
+from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown, FrameBus, Frames, frames
+from armident.drivers.can.scheduling import be_punctual
+from armident.drivers.can.udp import open_bus
+from armident.drivers.canopen.objects import COB_SDO_REQUEST, CONTROLWORD, Control, rpdo_cob, stop_rpdo
 
 BATCH = 512
 LOOK_S = 0.02
@@ -173,4 +173,4 @@ def guard(config: str, following_s: float = FOLLOWING_S) -> None:
 
 
 def _opened(bus: Bus, watch: Watch, number: int) -> FrameBus:
-    return open_bus(bus, filters=[(identifier, COB_MASK) for identifier in watch.identifiers(number)])
+    return open_bus(bus, filters=[(identifier, STANDARD_ID_MASK) for identifier in watch.identifiers(number)])

@@ -16,7 +16,7 @@ from google.protobuf import descriptor_pb2
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.daq.recording.mcap_format import MESSAGE, RECORD_HEAD
+from armident.daq.recording.mcap_records import MESSAGE, RECORD_HEAD
 from armident.daq.recording.model import Field, Quantity, Side, Stream
 
 _PROTO = descriptor_pb2.FieldDescriptorProto

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
-from armident.daq.recording import mcap_format as mcap
+from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.model import Gap, Mark, Recording, Stream, gap_from, mark_from
 from armident.daq.recording.rows import Rows

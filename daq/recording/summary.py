@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from armident.daq.recording import mcap_format as mcap
+from armident.daq.recording import mcap_records as mcap
 
 
 @dataclass

@@ -19,12 +19,12 @@ import zstandard
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig, SessionConfig
-from armident.daq.recording import mcap_format as mcap
+from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
-from armident.daq.recording.looking import PREFIX, Look
+from armident.daq.recording.lost_rows import STANDS_STILL, Spans, Unwritten
 from armident.daq.recording.model import Gap, Mark, Recording
+from armident.daq.recording.preview import PREFIX, Look
 from armident.daq.recording.summary import Summary
-from armident.daq.recording.unwritten import STANDS_STILL, Spans, Unwritten
 
 SCHEMA = "armident/recording/1"
 GAPS_TOPIC, MARKS_TOPIC = "/events/gaps", "/events/marks"

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from armident.configs import DataError
-from armident.identify.estimators.noise import ArModel, fit_ar
-from armident.identify.model.controller import DiscreteController
+from armident.identify.regression.ar_noise import ArModel, fit_ar
+from armident.identify.robot.controller import DiscreteController
 
 LENGTHS = (1, 2, 3, 5, 8, 12, 20)
 """Impulse-response lengths tried; the thesis settles between 3 and 20 (table 5.12)."""

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig
-from armident.identify.model.arm import ArmModel
-from armident.identify.model.controller import DiscreteController
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.controller import DiscreteController
 
 STIFFNESS = 8.0
 """Natural frequency of the stand-in, in closed-loop bandwidths of the robot."""

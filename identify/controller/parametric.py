@@ -11,7 +11,7 @@ from armident.configs import DataError
 from armident.identify.controller.crc import HELD_OUT, IdentifiedController, JointResponse
 from armident.identify.controller.law import UNITS, Array, Stretch, Structure, gains, loop_ratios, simulate_law, taps
 from armident.identify.controller.riv import LawFit, fit_law, refined_iv
-from armident.identify.model.controller import DiscreteController
+from armident.identify.robot.controller import DiscreteController
 
 WORTH = 1e-5
 """Share of the torque's variance that an addition to the law has to explain on held-out data (0.3 % in amplitude),"""

@@ -13,7 +13,7 @@ from scipy import signal
 
 from armident.configs import DataError
 from armident.identify.controller.law import Array, Stretch, Structure, columns, integral_slopes, low_pass, simulate_law
-from armident.identify.estimators.noise import WHITE, ArModel, fit_ar
+from armident.identify.regression.ar_noise import WHITE, ArModel, fit_ar
 
 ITERATIONS = 40
 """Iterations at most."""

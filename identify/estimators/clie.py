@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.output_error import output_error
-from armident.identify.estimators.regression import ITERATIONS, Block, Estimate
+from armident.identify.regression.equations import ITERATIONS, Block, Estimate
 
 
 def clie(

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.output_error import output_error
-from armident.identify.estimators.regression import ITERATIONS, Block, Estimate
+from armident.identify.regression.equations import ITERATIONS, Block, Estimate
 
 
 def cloe(

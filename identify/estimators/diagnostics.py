@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, signal, stats
 
-from armident.identify.estimators.noise import ArModel, lagged_sums
-from armident.identify.estimators.regression import (
+from armident.identify.regression.ar_noise import ArModel, lagged_sums
+from armident.identify.regression.equations import (
     MAX_AR_ORDER,
     Block,
     Estimate,

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.estimators.auxiliary import AuxiliaryModel
-from armident.identify.estimators.regression import (
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.estimators.sensitivity import torque_sensitivities
+from armident.identify.regression.equations import (
     ITERATIONS,
     Block,
     Estimate,
@@ -20,7 +21,6 @@ from armident.identify.estimators.regression import (
     stacked,
     whitened_residuals,
 )
-from armident.identify.estimators.sensitivity import torque_sensitivities
 
 
 def didim(

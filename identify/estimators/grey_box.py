@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from armident.identify.estimators.auxiliary import AuxiliaryModel
-from armident.identify.estimators.noise import ArModel, fit_spectrum
-from armident.identify.estimators.regression import Block
-from armident.identify.model.controller import DiscreteController
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.regression.ar_noise import ArModel, fit_spectrum
+from armident.identify.regression.equations import Block
+from armident.identify.robot.controller import DiscreteController
 
 FREQUENCIES = 2048
 """Points of the controller's frequency response, zero to the Nyquist frequency of the decimated equations."""

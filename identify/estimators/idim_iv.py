@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.estimators.auxiliary import AuxiliaryModel
-from armident.identify.estimators.regression import (
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
     ITERATIONS,
     Block,

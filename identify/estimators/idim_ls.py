@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from armident.identify.estimators.regression import (
+from armident.identify.regression.equations import (
     Block,
     Estimate,
     inverse_gram,

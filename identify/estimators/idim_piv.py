@@ -5,11 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.grey_box import InverseController
-from armident.identify.estimators.iv_products import IvProducts, iv_products
-from armident.identify.estimators.noise import ArModel
-from armident.identify.estimators.regression import (
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.equations import (
     ITERATIONS,
     MAX_AR_ORDER,
     Block,
@@ -20,6 +19,7 @@ from armident.identify.estimators.regression import (
     residual_norm,
     whitened_residuals,
 )
+from armident.identify.regression.iv_products import IvProducts, iv_products
 
 NOISE_UPDATES = 6
 """Iterations after which the noise models are held: an order that flips between two equal AICs never settles."""

@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from armident.identify.estimators.auxiliary import AuxiliaryModel, Response
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
 from armident.identify.estimators.didim import solve_didim
-from armident.identify.estimators.noise import ArModel
-from armident.identify.estimators.regression import (
+from armident.identify.estimators.sensitivity import Array, Arrays, difference_steps, sensitivities, weighted_columns
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.equations import (
     TOLERANCE,
     Block,
     Estimate,
@@ -21,8 +22,7 @@ from armident.identify.estimators.regression import (
     weighted_rows,
     whitened,
 )
-from armident.identify.estimators.sensitivity import Array, Arrays, difference_steps, sensitivities, weighted_columns
-from armident.identify.estimators.triangular import triangularize
+from armident.identify.regression.tall_qr import triangularize
 
 Signal = Callable[[Response], Arrays]
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.identify.estimators.auxiliary import AuxiliaryModel, Response
-from armident.identify.estimators.noise import ArModel
-from armident.identify.estimators.regression import Block, column_norms, error_variances, unweighted, weighted_rows
-from armident.identify.estimators.triangular import triangularize
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.equations import Block, column_norms, error_variances, unweighted, weighted_rows
+from armident.identify.regression.tall_qr import triangularize
 
 Array = NDArray[np.float64]
 Arrays = Sequence[Array]

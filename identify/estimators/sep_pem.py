@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.estimators.auxiliary import AuxiliaryModel
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.didim import solve_didim
-from armident.identify.estimators.regression import (
+from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
     ITERATIONS,
     MAX_AR_ORDER,

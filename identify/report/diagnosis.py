@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.discrepancy.diagnose import Diagnosis
-from armident.identify.discrepancy.where import Disagreement
+from armident.identify.diagnosis.diagnose import Diagnosis
+from armident.identify.diagnosis.where import Disagreement
 from armident.identify.document import DiagnosisDocument, Finding
 from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument
+from armident.identify.identification.result import Identification
 from armident.identify.report.page import BAND, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
-from armident.identify.result import Identification
 
 Array = NDArray[np.float64]
 

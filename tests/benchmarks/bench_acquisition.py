@@ -22,10 +22,10 @@ import can
 import numpy as np
 
 from armident.configs import load_robot, load_session
+from armident.daq.matching.streams import captured_streams
 from armident.daq.recording import read_recording
-from armident.daq.streams import captured_streams
-from armident.drivers.receiver import Receiver
-from armident.drivers.socketcan import RawSocket
+from armident.drivers.can.receiver import Receiver
+from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.benchmarks.harness import Row
 from tests.faults.bus import session_file

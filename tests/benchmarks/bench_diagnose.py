@@ -9,21 +9,20 @@ from tests.benchmarks.harness import Row
 MEASURE = """
 import json, resource, time
 from armident.configs import config_path, load_robot, load_trajectory
-from armident.identify.discrepancy.candidates import candidates
-from armident.identify.discrepancy.diagnose import diagnose
-from armident.identify.discrepancy.search import Search
-from armident.identify.discrepancy.state import Settings
-from armident.identify.discrepancy.study import build_study
-from armident.identify.from_recording import experiments_from_recording
-from armident.identify.options import Options
-from armident.identify.run import identify_experiment
+from armident.identify.diagnosis.candidates import candidates
+from armident.identify.diagnosis.diagnose import diagnose
+from armident.identify.diagnosis.search import Search
+from armident.identify.diagnosis.state import Settings
+from armident.identify.diagnosis.study import build_study
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.options import Options
+from armident.identify.identification.pipeline import identify_experiment
 from armident.virtual_robot.offline import simulate_recording
-from armident.virtual_robot.scenario import load_scenario
+from armident.configs.loading import load_scenario
 
 robot = load_robot("tx40")
-folder = config_path("tx40.yaml").parent
-trajectory = load_trajectory(str(folder / "trajectories" / "tx40_excitation.yaml"))
-scenario = load_scenario(str(folder / "scenarios" / "tx40_worn_joint2.yaml"))
+trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
+scenario = load_scenario("scenarios/tx40_worn_joint2.yaml")
 experiments, _ = experiments_from_recording(simulate_recording(robot, trajectory, seed=1, scenario=scenario), robot)
 best = None
 for _ in range(2):

@@ -4,19 +4,19 @@ import json
 import subprocess
 import sys
 
-from armident.identify.options import METHODS
+from armident.identify.identification.options import METHODS
 from tests.benchmarks.harness import Row
 
 MEASURE = """
 import json, resource, sys, time
 from armident.configs import config_path, load_robot, load_trajectory
-from armident.identify.from_recording import experiments_from_recording
-from armident.identify.options import Options
-from armident.identify.run import identify_experiment
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.options import Options
+from armident.identify.identification.pipeline import identify_experiment
 from armident.virtual_robot.offline import simulate_recording
 
 robot = load_robot("tx40")
-trajectory = load_trajectory(str(config_path("tx40.yaml").parent / "trajectories" / "tx40_excitation.yaml"))
+trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
 experiments, _ = experiments_from_recording(simulate_recording(robot, trajectory, seed=1), robot)
 figures = {"samples": sum(e.q.shape[0] for e in experiments)}
 for method in sys.argv[1:]:

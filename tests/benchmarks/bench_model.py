@@ -8,9 +8,10 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from armident.configs import load_robot, load_trajectory
-from armident.identify.model.arm import ArmModel
-from armident.identify.model.controller import DiscreteController
-from armident.identify.model.simulation import simulate
+from armident.identify.effects.terms import arm_model
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.controller import DiscreteController
+from armident.identify.robot.simulation import simulate
 from tests.benchmarks.harness import Row, best_of
 from tests.pinocchio_oracle import TO_OURS, pinocchio_model, random_parameters
 
@@ -26,7 +27,7 @@ INNER_STEPS = 3
 def run() -> list[Row]:
     """Closed loop of ten seconds, and the regressor of 50 000 samples."""
     robot = load_robot("tx40")
-    model = ArmModel.from_config(robot)
+    model = arm_model(robot)
     theta = _parameters(model)
     return [_closed_loop(model, theta), _regressor(model, theta)]
 

@@ -15,9 +15,9 @@ import can
 import numpy as np
 from numba import njit
 
-from armident.drivers.frames import frames
-from armident.drivers.socketcan import Messages, RawSocket
-from armident.drivers.sync_loop import monotonic_ns, send_messages, sleep_until
+from armident.drivers.can.frames import frames
+from armident.drivers.can.socketcan import Messages, RawSocket
+from armident.drivers.canopen.sync_loop import monotonic_ns, send_messages, sleep_until
 from armident.drivers.vcan import ensure_vcan
 from tests.benchmarks.harness import Row
 

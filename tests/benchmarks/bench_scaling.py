@@ -13,13 +13,13 @@ import json, resource, sys, time
 import numpy as np
 from armident.configs import config_path, load_robot, load_trajectory
 from armident.identify.experiment import Experiment
-from armident.identify.from_recording import experiments_from_recording
-from armident.identify.options import Options
-from armident.identify.run import identify_experiment
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.options import Options
+from armident.identify.identification.pipeline import identify_experiment
 from armident.virtual_robot.offline import simulate_recording
 
 robot = load_robot("tx40")
-trajectory = load_trajectory(str(config_path("tx40.yaml").parent / "trajectories" / "tx40_excitation.yaml"))
+trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
 (one,), _ = experiments_from_recording(simulate_recording(robot, trajectory, seed=1), robot)
 wanted = round(float(sys.argv[1]) / one.dt)
 # The motion ends where it began and stands still there: repeated, it is one long motion.

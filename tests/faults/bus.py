@@ -91,7 +91,7 @@ def session_file(
     """A session of six drives on some buses."""
     source = config_path("tx40_replay.yaml")
     data = yaml.safe_load(source.read_text())
-    data |= {"cell": name, "robot": str(source.parent / data["robot"]), "heartbeat_ms": 50, "sdo_timeout_s": 1.0}
+    data |= {"cell": name, "robot": str(config_path(data["robot"])), "heartbeat_ms": 50, "sdo_timeout_s": 1.0}
     data["sync"] = {"role": "producer" if producing else "consumer", "period_us": period_us, "counter": 240}
     if demand:
         data["streams"]["demand"] = {"tpdo": 2, "every": 5, "objects": ["demand"]}
@@ -99,7 +99,7 @@ def session_file(
     del data["bus"]
     data["buses"] = [{"channel": channel, "bitrate": None} for channel in channels]
     for i, drive in enumerate(data["drives"]):
-        drive |= {"eds": str(source.parent / drive["eds"]), "bus": channels[i * len(channels) // 6]}
+        drive |= {"eds": str(config_path(drive["eds"])), "bus": channels[i * len(channels) // 6]}
     path = folder / f"{name}.yaml"
     path.write_text(yaml.safe_dump(data))
     return path

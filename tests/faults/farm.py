@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, SessionConfig
-from armident.drivers.frames import BusDown, Frames, frames
-from armident.drivers.objects import (
+from armident.drivers.can.frames import BusDown, Frames, frames
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen.objects import (
     COB_SYNC,
     CURRENT_ACTUAL,
     POSITION_ACTUAL,
@@ -31,8 +32,7 @@ from armident.drivers.objects import (
     TPDO_COMMUNICATION,
     DriveState,
 )
-from armident.drivers.socketcan import RawSocket
-from armident.virtual_robot.line import Line
+from armident.virtual_robot.bus_server import Line
 from armident.virtual_robot.node import Drive
 
 SIOCGIFFLAGS, SIOCSIFFLAGS, IFF_UP = 0x8913, 0x8914, 1

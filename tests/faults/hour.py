@@ -20,13 +20,13 @@ from typing import Self
 
 import numpy as np
 
-import armident.daq.capture
-import armident.drivers.side_socket
+import armident.daq.capture.capture
+import armident.drivers.can.filtered_socket
 from armident.configs import ArmidentError
-from armident.configs.session import Bus
-from armident.daq.order import prepare
-from armident.drivers.frames import Frames, frames
-from armident.drivers.objects import COB_SYNC
+from armident.configs.schema.session import Bus
+from armident.daq.capture.plan import prepare
+from armident.drivers.can.frames import Frames, frames
+from armident.drivers.canopen.objects import COB_SYNC
 from tests.faults.bus import session_file
 from tests.faults.sender import COUNTER, current_of, position_of
 from tests.faults.soak import memory_mb
@@ -110,7 +110,7 @@ def main() -> int:
         shutil.rmtree(folder)
 
 
-def watched(order: armident.daq.capture.Order, bus: MadeUp, count: int, folder: Path) -> int:
+def watched(order: armident.daq.capture.capture.Order, bus: MadeUp, count: int, folder: Path) -> int:
     """Capture in this process while another thread looks at memory and makes room."""
 
     def open_bus(config: Bus, **_: object) -> MadeUp:
@@ -135,13 +135,13 @@ def watched(order: armident.daq.capture.Order, bus: MadeUp, count: int, folder: 
                 stop.set()
 
     # The one thing that is not real: where the frames come from, among them no EMCY.
-    setattr(armident.daq.capture, "open_bus", open_bus)  # noqa: B010
-    setattr(armident.drivers.side_socket, "open_bus", lambda config, **_: MadeUp(0, 1.0))  # noqa: B010
+    setattr(armident.daq.capture.capture, "open_bus", open_bus)  # noqa: B010
+    setattr(armident.drivers.can.filtered_socket, "open_bus", lambda config, **_: MadeUp(0, 1.0))  # noqa: B010
     watcher = threading.Thread(target=look)
     watcher.start()
     begin, cpu = time.monotonic(), time.process_time()
     try:
-        done = armident.daq.capture.capture(order, stop, lambda line: None)
+        done = armident.daq.capture.capture.capture(order, stop, lambda line: None)
     finally:
         ended.set()
         watcher.join()

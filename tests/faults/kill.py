@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 
 from armident.daq.recording import heal_recording, read_recording
 from armident.daq.recording.model import join_parts
-from armident.drivers.objects import COB_MASK, COB_SYNC
-from armident.drivers.socketcan import RawSocket
+from armident.drivers.can.frames import STANDARD_ID_MASK
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen.objects import COB_SYNC
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.faults.bus import session_file
 from tests.faults.farm import drained
@@ -80,7 +81,7 @@ class Lane:
         )
         out, log = self._folder / f"k{number}", self._folder / f"k{number}.log"
         with (
-            RawSocket(self._name, filters=[(COB_SYNC, COB_MASK)]) as witness,
+            RawSocket(self._name, filters=[(COB_SYNC, STANDARD_ID_MASK)]) as witness,
             Sender([self._name], 10**6 // rate, lossy=lossy) as sender,
         ):
             capture = self._recorders.start(path, out, log, listen_only=True)

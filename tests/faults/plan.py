@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from armident.daq.recording import Recording
-from armident.daq.recording.unwritten import NOT_WRITTEN
-from armident.drivers.frames import ERROR_FLAG, Frames, frame, frames
-from armident.drivers.objects import (
+from armident.daq.recording.lost_rows import NOT_WRITTEN
+from armident.drivers.can.frames import ERROR_FLAG, Frames, frame, frames
+from armident.drivers.canopen.objects import (
     COB_NMT,
     COB_SDO_REQUEST,
     PDO_NOT_VALID,

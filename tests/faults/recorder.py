@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from armident.configs import ArmidentError
-from armident.daq.assembler import Assembler, TpdoStream
-from armident.daq.capture import run_capture
-from armident.drivers import sync_loop
-from armident.drivers.frames import frames
-from armident.drivers.socketcan import RawSocket
+from armident.daq.capture.capture import run_capture
+from armident.daq.matching.assembler import Assembler, TpdoStream
+from armident.drivers.can.frames import frames
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen import sync_loop
 
 
 def warm() -> None:

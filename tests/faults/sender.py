@@ -10,9 +10,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from armident.drivers.objects import COB_SYNC
-from armident.drivers.socketcan import Messages, RawSocket
-from armident.drivers.sync_loop import monotonic_ns, send_messages, sleep_until
+from armident.drivers.can.socketcan import Messages, RawSocket
+from armident.drivers.canopen.objects import COB_SYNC
+from armident.drivers.canopen.sync_loop import monotonic_ns, send_messages, sleep_until
 
 READY, GO, STOP, SENT, WORST_NS, SHIFTED, FAILED = range(7)
 COUNTER = 240

@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 import zstandard
 
-from armident.daq.recording import mcap_format as mcap
+from armident.daq.recording import mcap_records as mcap
 
 Mutator = Callable[[random.Random, Sequence[bytes]], bytes]
 """Makes an input of some that are known."""

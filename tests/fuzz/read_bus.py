@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ArmidentError, ConfigError, load_session
-from armident.configs.session import Temperature
-from armident.daq.assembler import Assembler, TpdoStream
-from armident.daq.sniffing import survey
-from armident.drivers import objects as od
-from armident.drivers.bus_errors import summarise
-from armident.drivers.frames import FRAME
-from armident.drivers.sdo import DriveSdo
+from armident.configs.schema.session import Temperature
+from armident.daq.capture.pdo_discovery import survey
+from armident.daq.matching.assembler import Assembler, TpdoStream
+from armident.drivers.can.error_frames import summarise
+from armident.drivers.can.frames import FRAME
+from armident.drivers.canopen import objects as od
+from armident.drivers.canopen.sdo import DriveSdo
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import spoil_bytes
 from tests.property.test_daq_assembler import JOINTS, PERIOD_NS, STREAMS, Faults, bus

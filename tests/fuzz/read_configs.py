@@ -11,9 +11,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from armident.configs import load_robot, load_session, load_suite, load_trajectory
-from armident.configs.loading import HERE
-from armident.configs.reading import read_yaml
-from armident.virtual_robot.scenario import load_scenario
+from armident.configs.loading import HERE, load_scenario
+from armident.configs.yaml_loader import read_yaml
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import either, spoil_text, spoil_tree
 from tests.urdf_chains import random_urdf
@@ -36,7 +35,7 @@ def _beside(folder: Path) -> Path:
     """A place where the relative paths of shipped sessions lead to files."""
     place = folder / "configs"
     if not place.exists():
-        for name in ("eds", "trajectories", "zenoh", "."):
+        for name in ("eds", "trajectories", "zenoh", "robots"):
             (place / name).mkdir(parents=True, exist_ok=True)
             for path in (p for p in (HERE / name).iterdir() if p.is_file()):
                 shutil.copy(path, place / name)
@@ -112,10 +111,10 @@ def _target(name: str, seeds: Callable[[], list[bytes]], load: Load) -> Target:
 
 
 TARGETS = (
-    _target("robot", _shipped("tx40.yaml", "emps.yaml", "kuka*.yaml"), load_robot),
-    _target("session", _shipped("*_cell.yaml", "tx40_*.yaml"), load_session),
+    _target("robot", _shipped("robots/tx40.yaml", "robots/emps.yaml", "robots/kuka*.yaml"), load_robot),
+    _target("session", _shipped("cells/*.yaml"), load_session),
     _target("trajectory", _shipped("trajectories/*.yaml"), _load_trajectory),
-    _target("suite", _shipped("suite.yaml"), load_suite),
+    _target("suite", _shipped("suites/*.yaml"), load_suite),
     _target("scenario", _shipped("scenarios/*.yaml"), load_scenario),
     Target("urdf", _urdf_seeds, spoil_text, _check_urdf),
 )

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from armident.configs import RobotConfig, SessionConfig, load_robot, load_session
-from armident.daq.bus_log import recording_from_log
-from armident.daq.exporting import export_recording
-from armident.daq.importing import import_recording
+from armident.daq.interchange.bus_log import recording_from_log
+from armident.daq.interchange.exporting import export_recording
+from armident.daq.interchange.importing import import_recording
 from armident.daq.recording import Recording, read_recording, write_recording
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import Mutator, either, spoil_bytes, spoil_text
-from tests.unit.test_daq_recording import make_recording
+from tests.unit.daq.test_recording import make_recording
 
 ROWS = 60
 

@@ -12,7 +12,7 @@ from armident.configs import ConfigError, DataError
 from armident.daq.recording import Recording, Stream, heal_recording, read_recording
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import forge_recording, spoil_bytes
-from tests.unit.test_daq_recording import make_recording, write_chunked
+from tests.unit.daq.test_recording import make_recording, write_chunked
 
 ROWS = 300
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from armident.configs import DataError
-from armident.daq.zenoh_keys import Block, assemble, decode_block, decode_event, encode_block, encode_event
+from armident.daq.streaming import Block, assemble, decode_block, decode_event, encode_block, encode_event
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import either, forge_block, spoil_bytes, spoil_json, spoil_text
-from tests.unit.test_daq_zenoh import blocks, cell, events
+from tests.unit.daq.test_streaming import blocks, cell, events
 
 
 @cache

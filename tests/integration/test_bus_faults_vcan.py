@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from armident.daq.recording import read_recording
-from armident.drivers.frames import ERROR_FLAG, frame, frames
-from armident.drivers.objects import NmtCommand
-from armident.drivers.receiver import BusEvent, Receiver
-from armident.drivers.socketcan import RawSocket
+from armident.drivers.can.frames import ERROR_FLAG, frame, frames
+from armident.drivers.can.receiver import BusEvent, Receiver
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen.objects import NmtCommand
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.integration.test_several_buses_vcan import (
     SLOW,

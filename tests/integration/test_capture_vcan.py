@@ -17,10 +17,10 @@ import pytest
 import yaml
 
 from armident.configs import config_path, load_robot
-from armident.daq.assembler import LATE_S
-from armident.daq.capture import capture, prepare
+from armident.daq.capture.capture import capture, prepare
+from armident.daq.matching.assembler import LATE_S
+from armident.daq.matching.streams import counts_per_si
 from armident.daq.recording import read_recording
-from armident.daq.streams import counts_per_si
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
 
@@ -32,11 +32,11 @@ def session_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
     """The shipped cell on another bus, under a name of its own."""
     shipped = config_path("tx40_cell.yaml")
     data = yaml.safe_load(shipped.read_text()) | changes
-    data |= {"cell": cell, "robot": str(shipped.parent / data["robot"]), "bus": {"channel": bus}}
+    data |= {"cell": cell, "robot": str(config_path(data["robot"])), "bus": {"channel": bus}}
     for drive in data["drives"]:
-        drive["eds"] = str(shipped.parent / drive["eds"])
+        drive["eds"] = str(config_path(drive["eds"]))
     if data.get("setpoints"):
-        data["setpoints"]["trajectory"] = str(shipped.parent / data["setpoints"]["trajectory"])
+        data["setpoints"]["trajectory"] = str(config_path(data["setpoints"]["trajectory"]))
     path = folder / f"{cell}.yaml"
     path.write_text(yaml.safe_dump({key: value for key, value in data.items() if value is not None}))
     return path

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from armident.configs import ArmidentError
-from armident.daq.demo import _running
+from armident.virtual_robot.demo import _running
 
 LONGEST_S = 280
 

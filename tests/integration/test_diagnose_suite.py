@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from armident.daq.suite.run import REPORT, RESULTS, SUMMARY, TABLE
+from armident.identify.evaluation.run import REPORT, RESULTS, SUMMARY, TABLE
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 

@@ -12,11 +12,11 @@ import pytest
 from canopen.sdo import SdoAbortedError
 
 from armident.configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session
-from armident.drivers import objects as od
-from armident.drivers.frames import BusDown, frames
-from armident.drivers.master import DriveEvent, DriveMaster
-from armident.drivers.objects import Control, DriveState
-from armident.drivers.socketcan import RawSocket
+from armident.drivers.can.frames import BusDown, frames
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen import objects as od
+from armident.drivers.canopen.master import DriveEvent, DriveMaster
+from armident.drivers.canopen.objects import Control, DriveState
 
 pytestmark = pytest.mark.vcan
 

@@ -5,10 +5,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from armident.drivers.bus_errors import NO_ACKNOWLEDGE
-from armident.drivers.frames import ERROR_FLAG, Frames, frames
-from armident.drivers.receiver import BATCH, Receiver
-from armident.drivers.socketcan import RawSocket
+from armident.drivers.can.error_frames import NO_ACKNOWLEDGE
+from armident.drivers.can.frames import ERROR_FLAG, Frames, frames
+from armident.drivers.can.receiver import BATCH, Receiver
+from armident.drivers.can.socketcan import RawSocket
 
 pytestmark = pytest.mark.vcan
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from armident.configs import ConfigError
-from armident.drivers.frames import BIT_RATE_SWITCH, FD_FLAG, BusDown, Frames, frame, frames
-from armident.drivers.socketcan import BATCH, RawSocket
+from armident.drivers.can.frames import BIT_RATE_SWITCH, FD_FLAG, BusDown, Frames, frame, frames
+from armident.drivers.can.socketcan import BATCH, RawSocket
 
 pytestmark = pytest.mark.vcan
 

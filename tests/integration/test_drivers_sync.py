@@ -8,12 +8,12 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from armident.configs.session import Bus
-from armident.drivers.bcm import KernelSync
-from armident.drivers.frames import BusDown, Frames, frames
-from armident.drivers.objects import COB_SYNC
-from armident.drivers.socketcan import RawSocket
-from armident.drivers.sync import SetpointPlan, SyncProducer
+from armident.configs.schema.session import Bus
+from armident.drivers.can.frames import BusDown, Frames, frames
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen.kernel_sync import KernelSync
+from armident.drivers.canopen.objects import COB_SYNC
+from armident.drivers.canopen.sync_producer import SetpointPlan, SyncProducer
 
 pytestmark = pytest.mark.vcan
 

@@ -16,10 +16,18 @@ from numpy.typing import NDArray
 
 from armident.configs import ArmidentError, config_path, load_robot
 from armident.daq.guard.run import guard
-from armident.daq.streams import counts_per_si
-from armident.drivers.frames import frame, frames
-from armident.drivers.objects import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC, rpdo_cob, tpdo_cob
-from armident.drivers.socketcan import RawSocket
+from armident.daq.matching.streams import counts_per_si
+from armident.drivers.can.frames import frame, frames
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen.objects import (
+    COB_EMCY,
+    COB_HEARTBEAT,
+    COB_NMT,
+    COB_SDO_REQUEST,
+    COB_SYNC,
+    rpdo_cob,
+    tpdo_cob,
+)
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
 
@@ -61,11 +69,11 @@ class Cell:
 def session_file(folder: Path, bus: str) -> Path:
     shipped = config_path("tx40_cell.yaml")
     data = yaml.safe_load(shipped.read_text())
-    data |= {"cell": "guarded", "robot": str(shipped.parent / data["robot"]), "bus": {"channel": bus}}
+    data |= {"cell": "guarded", "robot": str(config_path(data["robot"])), "bus": {"channel": bus}}
     data |= {"sync": {"period_us": round(PERIOD_S * 1e6)}, "heartbeat_ms": HEARTBEAT_MS}
     for drive in data["drives"]:
-        drive["eds"] = str(shipped.parent / drive["eds"])
-    data["setpoints"] |= {"trajectory": str(shipped.parent / data["setpoints"]["trajectory"]), "every": 1}
+        drive["eds"] = str(config_path(drive["eds"]))
+    data["setpoints"] |= {"trajectory": str(config_path(data["setpoints"]["trajectory"])), "every": 1}
     path = folder / "guarded.yaml"
     path.write_text(yaml.safe_dump(data))
     return path

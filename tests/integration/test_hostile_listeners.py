@@ -15,13 +15,13 @@ import pytest
 import zenoh
 
 from armident.configs import RobotConfig, SessionConfig, load_robot, load_session
-from armident.daq.assembler import Batch, Rows
-from armident.daq.publisher import Publisher
+from armident.daq.capture.files import open_series
+from armident.daq.capture.publisher import Publisher
+from armident.daq.capture.sink import Sink
+from armident.daq.matching.assembler import Batch, Rows
+from armident.daq.matching.streams import captured_streams
 from armident.daq.recording import Gap, read_recording
-from armident.daq.sink import Sink
-from armident.daq.storage import open_series
-from armident.daq.streams import captured_streams
-from armident.daq.zenoh_keys import Keys, decode_block, open_session
+from armident.daq.streaming import Keys, decode_block, open_session
 
 ROWS, EVERY_S, SECONDS = 100, 0.02, 3.0
 """Six axes at 5 kHz, taken every 20 ms."""
@@ -31,7 +31,7 @@ LISTENER = """
 import sys, threading, time
 import zenoh, zenoh.ext
 from armident.configs import load_session
-from armident.daq.zenoh_keys import Keys, open_session
+from armident.daq.streaming import Keys, open_session
 role, cell = sys.argv[1:]
 session = load_session("tx40_cell.yaml").model_copy(update={"cell": cell})
 keys = Keys(cell, "tx40")

@@ -13,9 +13,9 @@ import pytest
 
 from armident.configs import config_path
 from armident.daq.recording import read_recording
-from armident.drivers.frames import Frames, frame, frames
-from armident.drivers.objects import COB_EMCY
-from armident.drivers.socketcan import RawSocket
+from armident.drivers.can.frames import Frames, frame, frames
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen.objects import COB_EMCY
 from tests.integration.test_several_buses_vcan import session_file, start
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]

@@ -14,7 +14,7 @@ FOLDERS = ("configs", "drivers", "daq", "identify", "virtual_robot", "tests")
 CALLS = (
     ["-m", "armident.daq.cli", "effects", "stribeck_friction"],
     ["-m", "armident.daq.cli", "bus-load", "--config", "tx40_cell.yaml"],
-    ["-c", "import armident.daq.capture, armident.identify.worker, armident.virtual_robot.run"],
+    ["-c", "import armident.daq.capture.capture, armident.identify.monitoring.worker, armident.virtual_robot.run"],
 )
 
 

@@ -16,9 +16,9 @@ import sqlalchemy as sa
 import yaml
 
 from armident.daq.recording import read_recording
-from armident.drivers.frames import Frames, frame, frames
-from armident.drivers.objects import COB_EMCY, DriveState, drive_state
-from armident.drivers.socketcan import RawSocket
+from armident.drivers.can.frames import Frames, frame, frames
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen.objects import COB_EMCY, DriveState, drive_state
 from tests.statistics.weeks import WORN, cell_file
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(280)]

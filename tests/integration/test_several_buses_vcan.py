@@ -42,11 +42,11 @@ def session_file(folder: Path, shipped: str, channels: list[str], **changes: Any
     for k in range(6):
         text = text.replace(f"vcan{k}", channels[k])
     data = yaml.safe_load(text) | changes
-    data |= {"cell": folder.name[:40].lower().rstrip("_"), "robot": str(source.parent / data["robot"])}
+    data |= {"cell": folder.name[:40].lower().rstrip("_"), "robot": str(config_path(data["robot"]))}
     for drive in data["drives"]:
-        drive["eds"] = str(source.parent / drive["eds"])
+        drive["eds"] = str(config_path(drive["eds"]))
     if data.get("setpoints"):
-        data["setpoints"]["trajectory"] = str(source.parent / data["setpoints"]["trajectory"])
+        data["setpoints"]["trajectory"] = str(config_path(data["setpoints"]["trajectory"]))
     path = folder / f"{len(list(folder.glob('*.yaml')))}.yaml"
     path.write_text(yaml.safe_dump(data))
     return path

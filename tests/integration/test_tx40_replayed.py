@@ -39,9 +39,9 @@ def test_the_replayed_recording_arrives_whole_and_gives_the_published_parameters
     )
     shipped = config_path("tx40_replay.yaml")
     data = yaml.safe_load(shipped.read_text()) | {"bus": {"channel": vcan_bus}}
-    data["robot"] = str(shipped.parent / data["robot"])
+    data["robot"] = str(config_path(data["robot"]))
     for drive in data["drives"]:
-        drive["eds"] = str(shipped.parent / drive["eds"])
+        drive["eds"] = str(config_path(drive["eds"]))
     cell = tmp_path / "cell.yaml"
     cell.write_text(yaml.safe_dump(data))
 

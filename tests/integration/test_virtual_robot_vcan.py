@@ -1,7 +1,6 @@
 """The virtual arm on a real (virtual) SocketCAN bus, driven by the project's own master and SYNC producer."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -17,13 +16,13 @@ import pytest
 from numpy.typing import NDArray
 
 from armident.configs import SessionConfig, Trajectory, load_robot, load_session
-from armident.configs.trajectory import Move
+from armident.configs.schema.trajectory import Move
 from armident.daq.recording import write_recording
-from armident.drivers.frames import frames
-from armident.drivers.master import DriveMaster
-from armident.drivers.objects import COB_MASK, COB_SYNC, Control, DriveState, NmtCommand, drive_state
-from armident.drivers.socketcan import RawSocket
-from armident.drivers.sync import SetpointPlan, SyncProducer
+from armident.drivers.can.frames import STANDARD_ID_MASK, frames
+from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen.master import DriveMaster
+from armident.drivers.canopen.objects import COB_SYNC, Control, DriveState, NmtCommand, drive_state
+from armident.drivers.canopen.sync_producer import SetpointPlan, SyncProducer
 from armident.virtual_robot.offline import simulate_recording
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
@@ -63,9 +62,7 @@ def robot_process(config: Path, options: str = "noise=0.0") -> Iterator[Output]:
 @pytest.fixture
 def config(vcan_bus: str, tmp_path: Path) -> Path:
     """The session file of the demonstration cell, on the bus of this test."""
-    text = (REPOSITORY / "configs" / "tx40_cell.yaml").read_text()
-    for relative in ("tx40.yaml", "eds/cia402_servo.eds", "trajectories/tx40_excitation.yaml"):
-        text = re.sub(rf"(?<![\w/]){relative}", str(REPOSITORY / "configs" / relative), text)
+    text = (REPOSITORY / "configs" / "cells" / "tx40_cell.yaml").read_text()
     path = tmp_path / "cell.yaml"
     path.write_text(text.replace("vcan0", vcan_bus))
     return path
@@ -121,7 +118,9 @@ def test_every_sync_is_answered_by_every_drive_and_set_points_are_followed(confi
         rows = setpoint_rows(session, start, 1.0)
         cobs = tuple(0x200 + drive.node_id for drive in session.drives)
         sync = SyncProducer(session.bus, session.sync.period_us, session.sync.counter, SetpointPlan(rows, cobs, 5))
-        with RawSocket(session.bus.channel, filters=((COB_SYNC, COB_MASK), (0x180, 0x780), (0x280, 0x780))) as bus:
+        with RawSocket(
+            session.bus.channel, filters=((COB_SYNC, STANDARD_ID_MASK), (0x180, 0x780), (0x280, 0x780))
+        ) as bus:
             sync.start()
             log = collect_answers(bus, sync, 6500)
             assert bus.dropped == 0
@@ -157,7 +156,7 @@ def test_drives_that_are_behind_obey_at_the_same_sync(config: Path) -> None:
     with robot_process(config) as output, DriveMaster(session, load_robot(session.robot)) as master:
         master.configure()
         master.start()
-        with RawSocket(session.bus.channel, filters=((0x183, COB_MASK),)) as bus:
+        with RawSocket(session.bus.channel, filters=((0x183, STANDARD_ID_MASK),)) as bus:
             os.kill(output.process_id, signal.SIGSTOP)
             with RawSocket(session.bus.channel, filters=()) as other:
                 other.send(burst)

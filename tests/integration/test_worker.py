@@ -16,14 +16,14 @@ import pytest
 import zenoh
 
 from armident.configs import SessionConfig, load_robot, load_session, load_trajectory
-from armident.configs.session import IdentificationOptions
-from armident.daq.publisher import Publisher
+from armident.configs.schema.session import IdentificationOptions
+from armident.daq.capture.publisher import Publisher
 from armident.daq.recording import Recording, StreamLayout, read_recording, write_recording
-from armident.daq.zenoh_keys import Block, Keys, encode_event, open_session
-from armident.daq.zenoh_keys.codec import end_content, start_content
+from armident.daq.streaming import Block, Keys, encode_event, open_session
+from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.document import IdentificationDocument, from_json, load_document
-from armident.identify.service import identify_recording
-from armident.identify.worker import Worker
+from armident.identify.identification.api import identify_recording
+from armident.identify.monitoring.worker import Worker
 from armident.virtual_robot.offline import simulate_recording
 
 BLOCK_ROWS = 500
@@ -120,7 +120,7 @@ def test_a_capture_too_long_for_the_memory_is_read_from_its_file(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("armident.identify.worker.MOST_BYTES", 10 * next(blocks_of(captured)).nbytes)
+    monkeypatch.setattr("armident.identify.monitoring.worker.MOST_BYTES", 10 * next(blocks_of(captured)).nbytes)
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session)
         assert worker.result(LONGEST_S) == 0
@@ -150,7 +150,7 @@ def test_garbage_is_told_once_and_then_by_tens(
 def test_a_block_that_never_comes_is_fetched_from_the_file(
     captured: Recording, session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("armident.identify.worker.MAX_WAITING_S", 1.0)
+    monkeypatch.setattr("armident.identify.monitoring.worker.MAX_WAITING_S", 1.0)
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session, leave_out=3)
         assert worker.result(LONGEST_S) == 0
@@ -165,7 +165,7 @@ def test_missing_blocks_without_a_file_end_with_exit_code_3_and_say_how_many(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("armident.identify.worker.MAX_WAITING_S", 1.0)
+    monkeypatch.setattr("armident.identify.monitoring.worker.MAX_WAITING_S", 1.0)
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session, leave_out=3, path=tmp_path / "gone.mcap")
         assert worker.result(LONGEST_S) == 3

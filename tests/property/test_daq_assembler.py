@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from armident.daq.assembler import SYNC_LOST, Assembler, Batch, TpdoStream
+from armident.daq.matching.assembler import SYNC_LOST, Assembler, Batch, TpdoStream
 from armident.daq.recording import Gap
 
 FRAME = np.dtype([("t_ns", "<i8"), ("can_id", "<u4"), ("length", "u1"), ("data", "u1", (8,))])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from armident.daq.assembler import Assembler, Batch, TpdoStream
-from armident.drivers.frames import Frames, frames
+from armident.daq.matching.assembler import Assembler, Batch, TpdoStream
+from armident.drivers.can.frames import Frames, frames
 
 PERIOD_NS = 200_000
 OVERFLOW = 240

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.daq.assembler import SYNC_LOST, UNSENT, Assembler, Batch, TpdoStream
+from armident.daq.matching.assembler import SYNC_LOST, UNSENT, Assembler, Batch, TpdoStream
 from armident.daq.recording import Gap
-from armident.drivers.frames import FD_FRAME
+from armident.drivers.can.frames import FD_FRAME
 
 JOINTS = ("joint_1", "joint_2", "joint_3", "joint_4")
 BUS_OF = (0, 0, 1, 2)

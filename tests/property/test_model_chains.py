@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from armident.configs import ConfigError, RobotConfig, load_robot
 from armident.configs.urdf import mdh_of, read_chain
-from armident.identify.model.arm import ArmModel
-from armident.identify.model.base_parameters import independent_columns
-from armident.identify.model.chain import chain_of, columns_of, standard_names
-from armident.identify.model.khalil import evaluate, khalil_rules, lengths_of
+from armident.identify.effects.terms import arm_model
+from armident.identify.robot.base_parameters import independent_columns
+from armident.identify.robot.chain import chain_of, columns_of, standard_names
+from armident.identify.robot.khalil import evaluate, khalil_rules, lengths_of
 from tests.pinocchio_oracle import TO_OURS, Floats, pinocchio_model, random_parameters, random_robot
 from tests.urdf_chains import configuration, link_frames, random_urdf
 
@@ -27,7 +27,7 @@ def test_dynamics_agree_with_pinocchio_on_random_chains(chain: tuple[int, int, b
     seed, n, right_angles = chain
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, n, right_angles)
-    model = ArmModel.from_config(robot)
+    model = arm_model(robot)
     theta = random_parameters(model, rng)
     values = model.values(theta)
     oracle = pinocchio_model(robot, values.inertial, values.ia)
@@ -58,7 +58,7 @@ def test_dynamics_agree_with_pinocchio_on_random_chains(chain: tuple[int, int, b
 def test_regressor_times_parameters_is_inverse_dynamics(chain: tuple[int, int, bool]) -> None:
     seed, n, right_angles = chain
     rng = np.random.default_rng(seed)
-    model = ArmModel.from_config(random_robot(rng, n, right_angles))
+    model = arm_model(random_robot(rng, n, right_angles))
     theta = random_parameters(model, rng, friction=True)
     q, qd, qdd = rng.uniform(-2.0, 2.0, (3, 20, n))
     for sharp in (False, True):
@@ -101,7 +101,7 @@ def test_a_urdf_has_the_dynamics_that_pinocchio_reads_from_it(
     seed, n, right_angles = chain
     rng = np.random.default_rng(seed)
     robot, oracle, frames = from_urdf(tmp_path_factory.mktemp("urdf"), rng, n, right_angles)
-    model, data = ArmModel.from_config(robot), oracle.createData()
+    model, data = arm_model(robot), oracle.createData()
     theta = np.zeros(len(model.names))
     theta[model.columns.inertial] = in_our_frames(list(oracle.inertias)[1:], frames)
     for j in np.flatnonzero(model.columns.ia >= 0):

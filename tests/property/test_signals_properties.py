@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from armident.identify.estimators.noise import ArModel, fit_ar
+from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.signals.decimate import design
 from armident.identify.signals.irwsm import irwsm, negative_log_likelihood, optimal_nvr
 

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from armident.configs import RobotConfig, Trajectory, config_path, load_robot, load_trajectory
-from armident.identify.from_recording import experiments_from_recording
-from armident.identify.model.arm import ArmModel
-from armident.identify.options import METHODS, Method, Options
-from armident.identify.run import identify_experiment
+from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.identify.effects.terms import arm_model
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.options import METHODS, Method, Options
+from armident.identify.identification.pipeline import identify_experiment
 from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording
 from tests.tx40_reference import TABLE_B4
@@ -134,13 +134,13 @@ def robot() -> RobotConfig:
 @cache
 def trajectory() -> Trajectory:
     """Its exciting trajectory."""
-    return load_trajectory(str(config_path("tx40.yaml").parent / "trajectories" / "tx40_excitation.yaml"))
+    return load_trajectory("trajectories/tx40_excitation.yaml")
 
 
 @cache
 def truth() -> tuple[tuple[str, ...], Floats]:
     """Names and values (b,) of the base parameters that the plant has."""
-    model = ArmModel.from_config(robot())
+    model = arm_model(robot())
     plant = plant_parameters(robot())
     return model.base.names, np.asarray(model.base.regroup @ np.array([plant[name] for name in model.names]))
 

@@ -27,7 +27,7 @@ import numpy as np
 import yaml
 
 from armident.configs import ArmidentError, config_path
-from armident.identify.reidentify.play import play
+from armident.identify.monitoring.reidentify.record_run import play
 
 PERIOD_US = 2000
 """SYNC period: six axes on a bus of a guest with one CPU, beside guard, capture and arm."""
@@ -39,19 +39,19 @@ WORN = {
     "description": "a tenth more friction in joint 2",
     "effects": [{"effect": "friction_drift", "joint": "joint_2", "parameters": {"change": 0.1, "time_constant": 1e-6}}],
 }
-PRELOADED = ("armident.daq.capture", "armident.daq.guard.run", "armident.virtual_robot.run")
+PRELOADED = ("armident.daq.capture.capture", "armident.daq.guard.run", "armident.virtual_robot.run")
 
 
 def cell_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
     """The shipped cell on one bus, at the rate of the campaign."""
     shipped = config_path("tx40_cell.yaml")
     data = yaml.safe_load(shipped.read_text(encoding="utf-8"))
-    data |= {"cell": cell, "robot": str(shipped.parent / data["robot"]), "bus": {"channel": bus}}
+    data |= {"cell": cell, "robot": str(config_path(data["robot"])), "bus": {"channel": bus}}
     data |= {"sync": {"period_us": PERIOD_US}, "heartbeat_ms": HEARTBEAT_MS}
     for drive in data["drives"]:
-        drive["eds"] = str(shipped.parent / drive["eds"])
+        drive["eds"] = str(config_path(drive["eds"]))
     data["streams"]["demand"]["every"] = 1
-    data["setpoints"] |= {"trajectory": str(shipped.parent / data["setpoints"]["trajectory"]), "every": 1}
+    data["setpoints"] |= {"trajectory": str(config_path(data["setpoints"]["trajectory"])), "every": 1}
     path = folder / f"{cell}.yaml"
     path.write_text(yaml.safe_dump(data | changes), encoding="utf-8")
     return path
@@ -96,7 +96,7 @@ class _Passed:
 
 
 def start_forked(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Forked:
-    """As `armident.identify.reidentify.play.start_process`."""
+    """As `armident.identify.monitoring.reidentify.record_run.start_process`."""
     return Forked(words, out.fileno(), err.fileno())
 
 

@@ -1,6 +1,6 @@
 """Scenarios for the tests of what can be hidden in the virtual arms."""
 
-from armident.configs.scenario import HiddenEffect, Scenario
+from armident.configs.schema.scenario import HiddenEffect, Scenario
 
 
 def hide(effect: str, joint: str, other: str | None = None, **parameters: float) -> Scenario:

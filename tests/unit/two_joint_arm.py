@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
-from armident.identify.estimators.auxiliary import AuxiliaryModel
-from armident.identify.estimators.regression import Block, filtered_regressor
-from armident.identify.model.arm import ArmModel
-from armident.identify.model.controller import DiscreteController
-from armident.identify.model.simulation import simulate
-from armident.identify.preparation import aligned_torque
+from armident.identify.effects.terms import arm_model
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.identification.equations import aligned_torque
+from armident.identify.regression.equations import Block, filtered_regressor
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.controller import DiscreteController
+from armident.identify.robot.simulation import simulate
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import Derivatives
 
@@ -53,7 +54,7 @@ def model() -> ArmModel:
             "transmission": [[20.0, 0.0], [15.0, 15.0]],
         }
     )
-    return ArmModel.from_config(robot)
+    return arm_model(robot)
 
 
 def start() -> Floats:

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from armident.configs import ConfigError, RobotConfig
-from armident.configs.scenario import HiddenEffect, Scenario
+from armident.configs.schema.scenario import HiddenEffect, Scenario
 from armident.virtual_robot.effects.catalogue import EFFECTS, Parameter, Place
 
 REPEATABLE = ("cogging_torque", "torque_bump", "position_dependent_friction", "encoder_eccentricity", "mains_ripple")

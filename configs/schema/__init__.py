@@ -1,0 +1,1 @@
+"""The pydantic models of every kind of configuration file."""

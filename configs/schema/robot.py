@@ -1,0 +1,203 @@
+"""The robot: geometry, transmission, drives and the terms of its dynamic model."""
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from armident.configs.schema.base import Frozen
+
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=64)]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class Mdh(Frozen):
+    """Modified Denavit-Hartenberg parameters, frame j-1 to j (thesis section 2.1.1, table B.1).
+
+    ``Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r)``; the joint variable is added to
+    ``theta`` of a revolute joint and to ``r`` of a prismatic one.
+    """
+
+    alpha: float = Field(description="rad")
+    d: float = Field(description="m")
+    theta: float = Field(description="rad")
+    r: float = Field(description="m")
+
+
+class Limits(Frozen):
+    """What a joint may do, in joint coordinates (rad or m, s, N m or N)."""
+
+    position: tuple[float, float]
+    velocity: Positive
+    acceleration: Positive
+    torque: Positive
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.position[0] >= self.position[1]:
+            raise ValueError("position: the lower limit must be below the upper one")
+        return self
+
+
+class Drive(Frozen):
+    """The drive of one motor: how its raw numbers become rad and N m at the motor shaft.
+
+    Parameters
+    ----------
+    signal
+        What the drive reports as effort: ``current`` (A), ``voltage`` (V) or ``torque`` (N m, N).
+    gain
+        Shaft torque (N m) or force (N) per unit of ``signal``; thesis equation 2.14 without the gear ratio.
+    rated
+        Value of ``signal`` that the drive reports as 1000 per mille (CiA 402, 6075h for 6078h).
+    counts_per_unit
+        Encoder counts per motor turn (revolute) or per metre (prismatic); ``None`` if positions come in SI.
+    saturation
+        Largest absolute value of ``signal`` the drive can apply; ``None`` if unknown.
+    """
+
+    signal: Literal["current", "voltage", "torque"] = "current"
+    gain: float = 1.0
+    rated: Positive = 1.0
+    counts_per_unit: Positive | None = None
+    saturation: Positive | None = None
+
+
+class Joint(Frozen):
+    """One joint with its drive. ``rotor_inertia`` says whether ``ia`` is a parameter of its own."""
+
+    name: Name
+    type: Literal["revolute", "prismatic"] = "revolute"
+    mdh: Mdh
+    limits: Limits
+    drive: Drive = Drive()
+    rotor_inertia: bool = True
+
+
+class Coupling(Frozen):
+    """Friction and inertia between two joints (thesis equation B.1): ``ia<name>, fv<name>, fc<name>``."""
+
+    name: Name
+    joints: tuple[Name, Name]
+
+
+class Effect(Frozen):
+    """An effect of the discrepancy catalogue that is part of this robot's model, and its parameters.
+
+    Shape parameters (a Stribeck velocity, a harmonic) stay as given; linear ones are estimated with the rest.
+    ``other`` is the second joint of an effect between two. Linear parameters named in ``without`` are left out: what
+    they stand for, the rigid model of this arm has already.
+    """
+
+    effect: Name
+    joint: Name
+    other: Name | None = None
+    parameters: dict[str, float] = Field(default_factory=dict)
+    without: tuple[Name, ...] = ()
+
+
+class Friction(Frozen):
+    """Coulomb friction near standstill.
+
+    Parameters
+    ----------
+    sign_smoothing
+        ``g`` (s/rad or s/m) in ``sign(qd) -> (2/pi) atan(g qd)``, used in simulation (thesis appendix B.2).
+    velocity_threshold
+        Per joint (rad/s or m/s): samples of a joint slower than this say nothing about its friction and
+        are left out of that joint's equations. ``None``: chosen from the data.
+    """
+
+    sign_smoothing: Positive = 150.0
+    velocity_threshold: tuple[Annotated[float, Field(ge=0)], ...] | None = None
+
+
+class Controller(Frozen):
+    """A known cascade ``nu = kv (kp (q_r - q) - qd)`` per motor, in units of the drive's signal.
+
+    ``kp`` in 1/s; ``kv`` in units of ``signal`` per (rad/s or m/s). The velocity is the mean over the last
+    ``velocity_samples`` sampling periods.
+    """
+
+    kp: tuple[Positive, ...]
+    kv: tuple[float, ...]
+    velocity_samples: Annotated[int, Field(ge=1)] = 1
+
+
+class Preprocessing(Frozen):
+    """Filters of a published least-squares fit, applied as published (`armident.identify.signals.published_filters`).
+
+    Parameters
+    ----------
+    cutoff_hz, order, padlen
+        Zero-phase Butterworth on the positions, before central differences.
+    drop
+        Samples dropped at the start.
+    decimation, decimation_order, decimation_ripple_db, decimation_padlen
+        Zero-phase Chebyshev low-pass on torque and regressor, and the factor of decimation.
+    """
+
+    cutoff_hz: Positive
+    order: Annotated[int, Field(ge=1)] = 4
+    padlen: Annotated[int, Field(ge=0)] = 12
+    drop: Annotated[int, Field(ge=0)] = 0
+    decimation: Annotated[int, Field(ge=2)]
+    decimation_order: Annotated[int, Field(ge=1)] = 8
+    decimation_ripple_db: Positive = 0.05
+    decimation_padlen: Annotated[int, Field(ge=0)] = 24
+
+
+class RobotConfig(Frozen):
+    """A serial arm as the whole service sees it; all values SI, joint side unless said."""
+
+    schema_: Literal["armident/robot/1"] = Field(alias="schema")
+    name: Name
+    description: str = ""
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    joints: Annotated[tuple[Joint, ...], Field(min_length=1)]
+    transmission: tuple[tuple[float, ...], ...]
+    couplings: tuple[Coupling, ...] = ()
+    effects: tuple[Effect, ...] = ()
+    friction: Friction = Friction()
+    controller: Controller | None = None
+    bandwidth_hz: Positive | None = Field(None, description="closed-loop bandwidth; None: from the data")
+    initial_parameters: dict[str, float] = Field(default_factory=dict)
+    preprocessing: Preprocessing | None = Field(
+        None, description="filters of a published IDIM-LS fit, with a sharp sign(qd); None: from the bandwidth"
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        n = len(self.joints)
+        names = [j.name for j in self.joints]
+        if len(set(names)) != n:
+            raise ValueError("joints: names must be unique")
+        if len(self.transmission) != n or any(len(row) != n for row in self.transmission):
+            raise ValueError(f"transmission: expected {n} rows of {n} numbers (motor rows, joint columns)")
+        if abs(np.linalg.det(np.array(self.transmission))) < 1e-12:
+            raise ValueError("transmission: the matrix is singular")
+        for coupling in self.couplings:
+            for joint in coupling.joints:
+                if joint not in names:
+                    raise ValueError(f"couplings: no joint named {joint!r}; joints are {', '.join(names)}")
+        for effect in self.effects:
+            for name in (effect.joint, effect.other):
+                if name is not None and name not in names:
+                    raise ValueError(f"effects: no joint named {name!r}; joints are {', '.join(names)}")
+        threshold = self.friction.velocity_threshold
+        if threshold is not None and len(threshold) != n:
+            raise ValueError(f"friction.velocity_threshold: expected {n} numbers")
+        if self.controller is not None and not len(self.controller.kp) == len(self.controller.kv) == n:
+            raise ValueError(f"controller: expected {n} numbers in kp and in kv")
+        return self
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.joints)
+
+    @property
+    def transmission_matrix(self) -> NDArray[np.float64]:
+        """``R`` of shape (n, n): ``q_motor = R q`` and ``tau = R' tau_motor``."""
+        return np.array(self.transmission, dtype=np.float64)

@@ -1,0 +1,154 @@
+"""Reference trajectories: point-to-point moves with smoothed trapezoidal velocities (B.4), or Fourier sums."""
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from armident.configs.errors import ConfigError
+from armident.configs.schema.base import Frozen
+from armident.configs.schema.robot import RobotConfig
+
+RAMP_SHARE = 0.4
+"""Share of a move spent accelerating; as much again decelerating, the rest at constant speed."""
+
+LONGEST_S = 3600.0
+"""Longest trajectory, s: its set points are in memory while it is played."""
+
+REST_TOLERANCE = 1e-4
+"""How far from zero a Fourier sum's first velocity and acceleration may be, relative to those of its harmonics."""
+
+
+class Move(Frozen):
+    """All joints go to ``to`` (rad or m) in ``duration`` seconds, then stand still for ``dwell``."""
+
+    to: tuple[float, ...]
+    duration: Annotated[float, Field(gt=0)]
+    dwell: Annotated[float, Field(ge=0)] = 0.0
+
+
+class Fourier(Frozen):
+    """Finite Fourier sums, periodic and smooth (Swevers 1997).
+
+    ``q(t) = start + sum over l of sine[l-1] sin(l w t) + cosine[l-1] (cos(l w t) - 1)``, ``w = 2 pi frequency``.
+
+    Parameters
+    ----------
+    frequency
+        Of the first harmonic, Hz.
+    sine, cosine
+        Coefficients (rad or m), one row a harmonic, one column a joint. ``sum l sine_l`` and ``sum l^2 cosine_l`` are
+        zero: the motion begins and ends at rest.
+    periods
+        How often the period is played.
+    """
+
+    frequency: Annotated[float, Field(gt=0)]
+    sine: Annotated[tuple[tuple[float, ...], ...], Field(min_length=1)]
+    cosine: Annotated[tuple[tuple[float, ...], ...], Field(min_length=1)]
+    periods: Annotated[int, Field(ge=1)] = 1
+
+    @model_validator(mode="after")
+    def _at_rest(self) -> Self:
+        if len(self.sine) != len(self.cosine):
+            raise ValueError(f"fourier: {len(self.sine)} rows of sine, {len(self.cosine)} of cosine")
+        if len({len(row) for row in self.sine + self.cosine}) != 1:
+            raise ValueError("fourier: rows of sine and cosine have one number per joint")
+        order = np.arange(1.0, len(self.sine) + 1)
+        for name, rows, weight in (("sine", self.sine, order), ("cosine", self.cosine, order**2)):
+            terms = weight[:, None] * np.array(rows)
+            if (np.abs(terms.sum(axis=0)) > REST_TOLERANCE * np.abs(terms).sum(axis=0) + 1e-12).any():
+                power = "l" if name == "sine" else "l^2"
+                raise ValueError(f"fourier: the sum of {power} {name}_l is not zero: it would not begin at rest")
+        return self
+
+    def sample(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance from the start at times ``t`` (N,); shape (N, n)."""
+        angle = 2 * np.pi * self.frequency * t[:, None] * np.arange(1.0, len(self.sine) + 1)
+        away: NDArray[np.float64] = np.sin(angle) @ np.array(self.sine) + (np.cos(angle) - 1.0) @ np.array(self.cosine)
+        return away
+
+
+class Trajectory(Frozen):
+    """From ``start``, either a sequence of synchronous point-to-point moves, or Fourier sums."""
+
+    schema_: Literal["armident/trajectory/1"] = Field(alias="schema")
+    start: tuple[float, ...]
+    moves: tuple[Move, ...] = ()
+    fourier: Fourier | None = None
+
+    @model_validator(mode="after")
+    def _same_length(self) -> Self:
+        if bool(self.moves) == (self.fourier is not None):
+            raise ValueError("expected either moves or fourier")
+        if not self.duration <= LONGEST_S:
+            raise ValueError(f"takes {self.duration:.6g} s; expected at most {LONGEST_S:g}, a session can repeat it")
+        if self.fourier is not None and len(self.fourier.sine[0]) != len(self.start):
+            raise ValueError(f"fourier: expected rows of {len(self.start)} numbers")
+        for k, move in enumerate(self.moves):
+            if len(move.to) != len(self.start):
+                raise ValueError(f"moves[{k}].to: expected {len(self.start)} numbers")
+        return self
+
+    @property
+    def duration(self) -> float:
+        """Length of the whole trajectory, s."""
+        if self.fourier is not None:
+            return self.fourier.periods / self.fourier.frequency
+        return sum(move.duration + move.dwell for move in self.moves)
+
+    def sample(self, period: float) -> NDArray[np.float64]:
+        """Positions at ``0, period, 2 period, ...`` up to the end; shape (N, n), rad or m."""
+        t: NDArray[np.float64] = np.arange(round(self.duration / period) + 1, dtype=np.float64) * period
+        if self.fourier is not None:
+            return np.array(self.start) + self.fourier.sample(t)
+        q = np.empty((t.size, len(self.start)))
+        origin, begin = np.array(self.start), 0.0
+        for move in self.moves:
+            target = np.array(move.to)
+            inside = t >= begin - 1e-12
+            q[inside] = origin + _smooth_step((t[inside] - begin) / move.duration)[:, None] * (target - origin)
+            origin, begin = target, begin + move.duration + move.dwell
+        return q
+
+    def check(self, robot: RobotConfig, where: str = "trajectory") -> None:
+        """Refuse a trajectory that leaves the limits of the robot.
+
+        Raises
+        ------
+        ConfigError
+            Naming the joint, the limit, and by how much it is exceeded.
+        """
+        if len(self.start) != robot.n:
+            raise ConfigError(f"{where}: {len(self.start)} joints, but {robot.name} has {robot.n}")
+        period = 1e-3
+        q = self.sample(period)
+        qd = np.diff(q, axis=0) / period
+        qdd = np.diff(qd, axis=0) / period
+        for j, joint in enumerate(robot.joints):
+            low, high = joint.limits.position
+            if q[:, j].min() < low or q[:, j].max() > high:
+                raise ConfigError(
+                    f"{where}: {joint.name} moves over [{q[:, j].min():.3f}, {q[:, j].max():.3f}], "
+                    f"allowed is [{low:.3f}, {high:.3f}]"
+                )
+            for label, values, limit in (
+                ("velocity", qd[:, j], joint.limits.velocity),
+                ("acceleration", qdd[:, j], joint.limits.acceleration),
+            ):
+                peak = float(np.abs(values).max(initial=0.0))
+                if peak > limit * (1 + 1e-6):
+                    raise ConfigError(f"{where}: {joint.name} reaches {label} {peak:.3f}, allowed is {limit:.3f}")
+
+
+def _smooth_step(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0 to 1 for ``s`` in [0, 1] with a trapezoidal velocity whose ramps are half cosines."""
+    a = RAMP_SHARE
+    v = 1.0 / (1.0 - a)
+    s = np.clip(s, 0.0, 1.0)
+    rising = v * (s / 2 - a / (2 * np.pi) * np.sin(np.pi * s / a))
+    falling = 1.0 - v * ((1 - s) / 2 - a / (2 * np.pi) * np.sin(np.pi * (1 - s) / a))
+    level = v * (s - a / 2)
+    step: NDArray[np.float64] = np.where(s < a, rising, np.where(s > 1 - a, falling, level))
+    return step

@@ -1,0 +1,1 @@
+"""The capture daemon: from the bus to recordings and Zenoh."""

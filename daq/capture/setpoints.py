@@ -1,0 +1,137 @@
+"""What a capture makes the arm do: from where it is to the start of the trajectory, the trajectory, and rest."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import RobotConfig, SessionConfig, Trajectory
+from armident.configs.schema.trajectory import RAMP_SHARE, Move
+from armident.daq.matching.streams import bus_numbers, counts_per_si, node_ids
+from armident.drivers.canopen.objects import rpdo_cob
+from armident.drivers.canopen.sync_producer import SetpointPlan
+
+APPROACH_SHARE = 0.5
+"""Largest share of the joints' velocity and acceleration limits used on the way to the start."""
+SHORTEST_APPROACH_S = 0.5
+REST_SPAN_S = 0.05
+"""How long an arm must not have moved before it counts as standing."""
+REST_STEP_S = 0.01
+"""Motion is looked for between positions that are at least so far apart."""
+SLOW_SHARE = 0.002
+"""Share of a joint's velocity limit up to which it counts as standing."""
+SHAKE_COUNTS = 2.0
+"""Encoder counts by which the position of a standing motor may differ between two looks."""
+_ALREADY_THERE = 1e-4
+"""A joint closer to the start than this (rad or m) needs no approach."""
+
+
+class Standstill:
+    """Sees in the newest positions whether an arm has come to rest.
+
+    At rest is an arm none of whose joints was faster, on average over any 10 ms of the last 50 ms, than 0.2 % of its
+    velocity limit: one that swings back does not rest where it turns round. Two encoder counts are no motion.
+
+    Parameters
+    ----------
+    session, robot
+        Period, scales and limits.
+
+    Raises
+    ------
+    ConfigError
+        If a drive has no ``counts_per_unit``.
+    """
+
+    def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
+        self._step, self._span = round(REST_STEP_S / session.sync_period), round(REST_SPAN_S / session.sync_period)
+        self._per_count = np.linalg.inv(robot.transmission_matrix) / counts_per_si(robot)
+        limits = np.array([joint.limits.velocity for joint in robot.joints])
+        self._slow = limits * SLOW_SHARE * session.sync_period
+        self._shake = np.abs(self._per_count).sum(axis=1) * SHAKE_COUNTS
+        self._last: tuple[int, NDArray[np.float64]] | None = None
+        self._since = 0
+
+    def look(self, sync: int, counts: NDArray[np.integer]) -> bool:
+        """Whether the arm rests, where SYNC ``sync`` found its motors at ``counts``, (n,).
+
+        Knows it only from positions that are 50 ms apart; the same SYNC again says nothing new.
+        """
+        now = self._per_count @ counts
+        if self._last is None:
+            self._last, self._since = (sync, now), sync
+        last, before = self._last
+        if sync - last >= max(self._step, 1):
+            if (np.abs(now - before) > np.maximum(self._slow * (sync - last), self._shake)).any():
+                self._since = sync
+            self._last = sync, now
+        return self._last[0] - self._since >= self._span
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Set points of a capture; row ``first`` is the start of the experiment, row ``last`` its end."""
+
+    plan: SetpointPlan
+    first: int
+    last: int
+
+    def span(self, played_from: int) -> tuple[int, int]:
+        """SYNC numbers of start and end of the experiment, with row 0 the target at SYNC ``played_from``.
+
+        The demand reaches a row one interpolation after it becomes the target (60C2h).
+        """
+        every = self.plan.every
+        return played_from + (self.first + 1) * every, played_from + (self.last + 1) * every
+
+
+def plan_motion(
+    session: SessionConfig, robot: RobotConfig, trajectory: Trajectory, actual_counts: NDArray[np.int64]
+) -> Motion:
+    """Set points from the actual motor positions on.
+
+    Parameters
+    ----------
+    session
+        With ``setpoints``.
+    robot
+        The robot.
+    trajectory
+        Checked against the robot's limits.
+    actual_counts
+        Motor positions (6064h), (n,) counts.
+    """
+    assert session.setpoints is not None
+    options = session.setpoints
+    period = session.sync_period * options.every
+    scale = counts_per_si(robot)
+    actual: NDArray[np.float64] = np.linalg.solve(robot.transmission_matrix, actual_counts / scale).astype(np.float64)
+    start = np.array(trajectory.start)
+    rest = np.repeat(start[None, :], int(np.ceil(options.settle_s / period)) + 1, axis=0)
+    parts = [rest]
+    if np.abs(actual - start).max() > _ALREADY_THERE:
+        parts.insert(0, approach(actual, start, robot, period))
+    first = sum(len(part) for part in parts)
+    parts += [trajectory.sample(period)] * options.repeat
+    last = sum(len(part) for part in parts) - 1
+    parts.append(np.repeat(parts[-1][-1:], len(rest), axis=0))
+    counts = np.rint(np.concatenate(parts) @ robot.transmission_matrix.T * scale).astype(np.int32)
+    cob_ids = tuple(rpdo_cob(options.rpdo, node) for node in node_ids(session, robot))
+    return Motion(SetpointPlan(counts, cob_ids, options.every, bus_numbers(session, robot)), first, last)
+
+
+def approach(
+    actual: NDArray[np.float64], start: NDArray[np.float64], robot: RobotConfig, period: float
+) -> NDArray[np.float64]:
+    """Joint positions (N, n) of a smooth move from ``actual`` to ``start`` under half the limits."""
+    way = np.abs(start - actual)
+    velocity = np.array([joint.limits.velocity for joint in robot.joints]) * APPROACH_SHARE
+    acceleration = np.array([joint.limits.acceleration for joint in robot.joints]) * APPROACH_SHARE
+    # Peaks of a unit move in unit time: speed 1 / (1 - a), acceleration pi / 2 of speed per ramp.
+    speed = 1.0 / (1.0 - RAMP_SHARE)
+    peak = np.pi / 2 * speed / RAMP_SHARE
+    duration = max(
+        SHORTEST_APPROACH_S, float((speed * way / velocity).max()), float(np.sqrt(peak * way / acceleration).max())
+    )
+    move = Move(to=tuple(start.tolist()), duration=duration)
+    return Trajectory(schema="armident/trajectory/1", start=tuple(actual.tolist()), moves=(move,)).sample(period)

@@ -1,0 +1,185 @@
+"""Where captured rows go: the recording, and Zenoh."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import RobotConfig, SessionConfig
+from armident.daq.capture.publisher import Publisher
+from armident.daq.matching.assembler import Batch, Rows
+from armident.daq.matching.streams import CapturedStream
+from armident.daq.recording import Gap, Mark, QueuedSeries
+from armident.daq.recording.model import MarkKind
+from armident.daq.streaming import Block, encode_event
+from armident.daq.streaming.codec import end_content, start_content
+
+PIECE_NS = 200_000_000
+"""So much recorded time is written and published at once, however much became certain together."""
+
+
+class Sink:
+    """Writes batches to the recording, offers them to Zenoh, and places marks at their SYNC.
+
+    Parameters
+    ----------
+    writer
+        The files of the recording.
+    publisher
+        Where blocks are offered.
+    streams
+        The session's streams.
+    capture
+        Name of this capture, the same in all its events.
+    """
+
+    def __init__(
+        self,
+        writer: QueuedSeries,
+        publisher: Publisher,
+        streams: Sequence[CapturedStream],
+        capture: str,
+    ) -> None:
+        self.gaps: list[Gap] = []
+        self.marks: list[Mark] = []
+        self.first_sync: int | None = None
+        self.last_sync = -1
+        self.last_raw: dict[str, NDArray[Any]] = {}
+        """What the newest samples said, by object, each (n,)."""
+        self.last_ns = 0
+        self._writer, self._publisher = writer, publisher
+        self._streams, self._capture = tuple(streams), capture
+        self._blocks = 0
+        self._planned: list[tuple[MarkKind, int, str]] = []
+
+    @property
+    def path(self) -> Path | None:
+        """The file being written, if one is."""
+        return self._writer.path
+
+    @property
+    def lost_rows(self) -> int:
+        """Rows that the disk did not take."""
+        return self._writer.lost_rows
+
+    @property
+    def waiting_rows(self) -> int:
+        """Rows that wait for the disk."""
+        return self._writer.waiting_rows
+
+    @property
+    def problem(self) -> str | None:
+        """What went wrong with writing last, in words."""
+        return self._writer.problem
+
+    def announce(
+        self, robot: RobotConfig, session: SessionConfig, sample_rate_hz: float, metadata: dict[str, str]
+    ) -> None:
+        """Say on Zenoh what is about to come."""
+        layouts = [stream.layout for stream in self._streams]
+        content = start_content(self._capture, robot, session, sample_rate_hz, layouts, metadata)
+        self._publisher.event(encode_event("experiment_start", content))
+
+    def mark(self, kind: MarkKind, sync: int, text: str = "") -> None:
+        """Place a mark at a SYNC, now or when that SYNC has come."""
+        self._planned.append((kind, sync, text))
+        self._place_marks(False)
+
+    def trigger(self) -> None:
+        """Have what was just recorded, and what follows, written where only events are."""
+        self._writer.trigger(self.last_ns)
+
+    def move_mark(self, kind: MarkKind, sync: int, text: str) -> None:
+        """Bring a mark forward that was planned for later."""
+        self._planned = [planned for planned in self._planned if planned[0] != kind]
+        self.mark(kind, sync, text)
+
+    def take(self, batch: Batch) -> None:
+        """Write and publish what became certain."""
+        for piece in pieces(batch):
+            self._take(piece)
+
+    def _take(self, batch: Batch) -> None:
+        samples = batch.rows["samples"]
+        if samples.sync.size:
+            self._writer.turn(int(samples.t_ns[0]))
+            self.last_ns = self.last_ns or int(samples.t_ns[0])
+        if batch.gaps:
+            # Before the rows behind them: a file that ends in the middle says what is missing in what it has.
+            self.gaps += batch.gaps
+            self._writer.add_gaps(batch.gaps, self.last_ns)
+        for stream in self._streams:
+            rows = batch.rows[stream.bus.name]
+            if rows.sync.size == 0:
+                continue
+            raw = stream.decode(rows)
+            self._writer.append(stream.bus.name, rows.sync, rows.t_ns, raw)
+            self._publisher.offer(Block(stream.layout, self._blocks, rows.sync, rows.t_ns, raw))
+            self._blocks += 1
+            if stream.bus.name == "samples":
+                if self.first_sync is None:
+                    self.first_sync = int(rows.sync[0])
+                self.last_sync, self.last_ns = int(rows.sync[-1]), int(rows.t_ns[-1])
+                self.last_raw = {name: column[-1] for name, column in raw.items()}
+                self._place_marks(False, rows)
+        if batch.gaps:
+            found = [asdict(gap) for gap in batch.gaps]
+            self._publisher.event(encode_event("gaps", {"capture": self._capture, "gaps": found}))
+
+    def finish(self, counters: dict[str, int]) -> None:
+        """Place the last marks, close the recording, and say on Zenoh what it holds."""
+        self._place_marks(True)
+        self._writer.flush()
+        counters["writer.rows_lost"] = self._writer.lost_rows
+        counters["writer.files"] = len(self._writer.paths)
+        counters["zenoh.blocks"] = self._blocks
+        counters["zenoh.blocks_dropped"] = self._publisher.dropped
+        counters["gaps"] = len(self.gaps)
+        self._writer.close(counters)
+        paths = [path.resolve() for path in self._writer.paths]
+        content = end_content(self._capture, self._blocks, counters, self.gaps, self.marks, paths)
+        self._publisher.event(encode_event("experiment_end", content))
+
+    def _place_marks(self, final: bool, rows: Rows | None = None) -> None:
+        due = [planned for planned in self._planned if final or planned[1] <= self.last_sync]
+        self._planned = [planned for planned in self._planned if planned not in due]
+        for kind, sync, text in due:
+            t_ns = self.last_ns
+            if rows is not None and sync >= rows.sync[0]:
+                t_ns = int(rows.t_ns[np.searchsorted(rows.sync, sync)])
+            mark = Mark(kind, sync, t_ns, text)
+            self.marks.append(mark)
+            self._writer.add_marks([mark])
+            self._publisher.event(encode_event("mark", {"capture": self._capture, **asdict(mark, dict_factory=_mark)}))
+
+
+def pieces(batch: Batch) -> Iterator[Batch]:
+    """Cut what drives that were behind sent at once into pieces of ``PIECE_NS``, by the time of the samples.
+
+    Rows of every stream are in the piece of their SYNC, a gap is in that of its first one: files end, and blocks have
+    the size, as if the answers had come in time.
+    """
+    samples = batch.rows["samples"]
+    if samples.sync.size == 0 or samples.t_ns[-1] - samples.t_ns[0] < PIECE_NS:
+        yield batch
+        return
+    number = (samples.t_ns - samples.t_ns[0]) // PIECE_NS
+    borders = samples.sync[np.flatnonzero(np.diff(number) > 0) + 1]
+    of_gap = np.searchsorted(borders, [gap.first for gap in batch.gaps], side="right")
+    cuts = {
+        name: [0, *np.searchsorted(rows.sync, borders).tolist(), rows.sync.size] for name, rows in batch.rows.items()
+    }
+    for k in range(borders.size + 1):
+        part = {}
+        for name, rows in batch.rows.items():
+            here = slice(cuts[name][k], cuts[name][k + 1])
+            part[name] = Rows(rows.sync[here], rows.t_ns[here], rows.data[here])
+        yield Batch(part, tuple(gap for gap, at in zip(batch.gaps, of_gap, strict=True) if at == k))
+
+
+def _mark(entries: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The entries of a mark, its kind under a name that the event's own kind leaves free."""
+    return {("mark" if key == "kind" else key): value for key, value in entries}

@@ -1,0 +1,132 @@
+"""Recordings for other tools: CSV, NPZ, MAT, Parquet and rosbag2 in SI units at the joints; logs of the bus."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import ConfigError, DataError
+from armident.daq.interchange.bus_log import SUFFIXES as LOG_SUFFIXES
+from armident.daq.interchange.bus_log import write_log
+from armident.daq.recording import Recording, Stream
+
+
+def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
+    """Time (s), joint positions, torques and, where recorded, reference positions; every value of shape (N,).
+
+    The reference between set points is linear, as the drives interpolate it (CiA 402, 60C0h = 0); rows it does not
+    cover are NaN.
+
+    Raises
+    ------
+    DataError
+        If the recording has no samples.
+    """
+    robot, samples = recording.robot, recording.samples
+    if samples.sync.size == 0:
+        raise DataError(f"{recording.path}: no samples")
+    table = {"t": samples.sync / recording.sample_rate_hz}
+    position = samples.named("position")
+    if position is not None:
+        table |= _numbered("q", _positions(recording, samples, position))
+    effort = next((e for e in (samples.named("torque"), samples.named("current"), samples.named("voltage")) if e), None)
+    if effort is not None:
+        field = samples.fields[effort]
+        torque = samples.si(effort)
+        if field.quantity != "torque":
+            torque = torque * np.array([joint.drive.gain for joint in robot.joints])
+        if field.side == "motor":
+            torque = torque @ robot.transmission_matrix
+        table |= _numbered("tau", torque)
+    for stream in recording.streams.values():
+        demand = stream.named("demand")
+        if demand is not None and stream.sync.size > 1:
+            values = _positions(recording, stream, demand)
+            reference = np.stack(
+                [np.interp(samples.sync, stream.sync, v, left=np.nan, right=np.nan) for v in values.T], axis=1
+            )
+            table |= _numbered("qr", reference)
+    return table
+
+
+def export_recording(recording: Recording, path: Path) -> None:
+    """Write the columns to ``path`` (.csv, .npz, .mat, .parquet, .mcap of ROS 2), or the frames of the bus (`bus_log`).
+
+    The file appears when it is complete.
+
+    Raises
+    ------
+    ConfigError
+        If the kind of file is unknown, needs a package that is not installed, or cannot be written.
+    DataError
+        If the recording has no samples, or frames are wanted of one that does not come from a bus.
+    """
+    if path.suffix.lower() in LOG_SUFFIXES:
+        write_log(recording, path)
+        return
+    writers: dict[str, Callable[[Recording, dict[str, NDArray[np.float64]], Path], None]] = {
+        ".csv": _write_csv,
+        ".npz": _write_npz,
+        ".mat": _write_mat,
+        ".parquet": _write_parquet,
+        ".mcap": _write_rosbag,
+    }
+    write = writers.get(path.suffix.lower())
+    if write is None:
+        known = ", ".join([*writers, *LOG_SUFFIXES])
+        raise ConfigError(f"{path}: cannot export {path.suffix or 'without suffix'}; expected {known}")
+    table = columns(recording)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(recording, table, temporary)
+        temporary.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _positions(recording: Recording, stream: Stream, name: str) -> NDArray[np.float64]:
+    """A position field at the joints, (N, n)."""
+    values = stream.si(name)
+    if stream.fields[name].side == "motor":
+        values = values @ np.linalg.inv(recording.robot.transmission_matrix).T
+    return values
+
+
+def _numbered(base: str, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    return {f"{base}{j + 1}": np.ascontiguousarray(values[:, j]) for j in range(values.shape[1])}
+
+
+def _write_csv(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+    values = np.stack(list(table.values()), axis=1)
+    np.savetxt(path, values, fmt="%.17g", delimiter=",", header=",".join(table), comments="")
+
+
+def _write_npz(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+    with path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **table)
+
+
+def _write_parquet(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise ConfigError(f"{path}: Parquet needs the package pyarrow (pip install pyarrow)") from error
+    pyarrow.parquet.write_table(pyarrow.table(table), path)  # type: ignore[no-untyped-call]
+
+
+def _write_mat(_: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+    from scipy.io import savemat
+
+    savemat(path, dict(table), do_compression=True, oned_as="column")
+
+
+def _write_rosbag(recording: Recording, table: dict[str, NDArray[np.float64]], path: Path) -> None:
+    from armident.daq.interchange.rosbag import write_joint_states
+
+    write_joint_states(path, [joint.name for joint in recording.robot.joints], recording.samples.t_ns, table)

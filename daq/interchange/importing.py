@@ -1,0 +1,402 @@
+"""Recordings from what other tools wrote: CSV, MAT, NPZ, Parquet, rosbag2."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import ConfigError, DataError, RobotConfig
+from armident.configs.yaml_loader import is_file
+from armident.daq.interchange.resample import on_clock
+from armident.daq.interchange.sandbox import apart, said
+from armident.daq.recording import Field, Recording, Stream
+from armident.daq.recording.model import Quantity, Side
+
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "time": ("t", "time", "times"),
+    "position": ("q", "qm", "position", "positions"),
+    "torque": ("tau", "torque", "torques"),
+    "current": ("current", "currents"),
+    "voltage": ("voltage", "vir"),
+    "demand": ("qr", "qg", "target_positions"),
+}
+"""By what names each quantity is known; ``q`` also stands for columns ``q1..qn``."""
+
+ABSENT = "-"
+"""The name that leaves out what a file holds of a quantity."""
+
+EFFORTS: tuple[Quantity, ...] = ("torque", "current", "voltage")
+_UNEVEN = 0.01
+"""Largest deviation of a sampling step from the median step, relative."""
+_FAR_OUT, _TOO_STRONG = 3.0, 10.0
+"""Positions and torques beyond these multiples of the joint's limits are taken as a wrong unit."""
+
+_STILL = 1e-3
+"""A joint that uses less than this share of its position range says nothing about its demand."""
+_UNFOLLOWED = 0.5
+"""Share of the power of a joint's motion that its demand may leave unexplained before it counts as another quantity."""
+
+Table = dict[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file's named arrays, and how its places are called in messages."""
+
+    path: Path
+    table: Table
+    first_line: int | None = None
+
+    def place(self, row: int, name: str) -> str:
+        """Where row ``row`` of column ``name`` stands, for a message."""
+        where = f"row {row}" if self.first_line is None else f"line {self.first_line + row}"
+        return f"{self.path}: {where}, column {name}"
+
+
+def import_recording(
+    path: Path,
+    robot: RobotConfig,
+    *,
+    effort: Path | None = None,
+    motor_side: bool = False,
+    rate_hz: float | None = None,
+    names: Mapping[str, str] | None = None,
+    polled: bool = False,
+) -> Recording:
+    """Read measured motion and effort as a recording, checked before anything is written.
+
+    Parameters
+    ----------
+    path
+        CSV with a header line, MAT (up to version 7), NPZ, Parquet, or joint states in an MCAP of ROS 2; SI units.
+    robot
+        The robot that was measured.
+    effort
+        A second CSV with one effort column per joint; ``path`` then has one position column per joint, and
+        headers of both are free or absent. A file of a single column has the joints one after the other, sample by
+        sample.
+    motor_side
+        Positions and torques are those of the motors; currents and voltages always are.
+    rate_hz
+        Sampling rate where the file has no time column, or where its times are known to be worse than the clock.
+    names
+        Names of this file by quantity (``time, position, torque, current, voltage, demand``); ``-`` leaves one out.
+    polled
+        The rows were read from a controller of ``rate_hz`` without waiting for its samples, so that some are repeated
+        and some missed: they are put back on its clock (`armident.daq.interchange.resample`).
+
+    Raises
+    ------
+    ConfigError
+        If a file or option is wrong.
+    DataError
+        If the content is: missing columns, wrong number of axes, NaN, uneven time, values far outside the limits, or
+        a demand that no joint followed.
+    """
+    names = dict(names or {})
+    unknown = sorted(names.keys() - NAMES.keys())
+    if unknown:
+        raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
+    if polled and rate_hz is None:
+        raise ConfigError("--polled: say the rate of the controller's clock with --rate")
+    source = _pair(path, effort, robot) if effort is not None else _load(path, robot)
+    rate = rate_hz if rate_hz is not None else _rate(source, names)
+    side: Side = "motor" if motor_side else "joint"
+    fields: dict[str, Field] = {}
+    raw: dict[str, NDArray[Any]] = {}
+    quantities: tuple[Quantity, ...] = ("position", *EFFORTS, "demand")
+    for quantity in quantities:
+        values = _pick(source, quantity, robot.n, names)
+        if values is None or (quantity in EFFORTS and any(e in raw for e in EFFORTS)):
+            continue
+        own_side: Side = "motor" if quantity in ("current", "voltage") else side
+        fields[quantity] = Field(quantity, quantity, _unit(quantity, robot), own_side, (1.0,) * robot.n)
+        raw[quantity] = values
+    if "position" not in raw or not any(e in raw for e in EFFORTS):
+        have = ", ".join(source.table)
+        raise DataError(
+            f"{path}: expected columns q1..q{robot.n} and tau1..tau{robot.n} (or current, voltage); found {have}"
+        )
+    known = _known(raw["demand"]) if "demand" in raw else slice(0, len(raw["position"]))
+    _check_units(path, robot, fields, raw, known)
+    if polled and known != slice(0, len(raw["position"])):
+        raise DataError(f"{source.place(0, 'demand')}: --polled needs a demand in every row, or --map demand={ABSENT}")
+    facts = {"source": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    if effort is not None:
+        facts |= {"effort": effort.name, "effort_sha256": hashlib.sha256(effort.read_bytes()).hexdigest()}
+    if polled:
+        try:
+            even = on_clock(raw)
+        except DataError as error:
+            raise DataError(f"{path}: {error}") from error
+        raw = dict(even.values)
+        facts |= {"polled.repeated": str(even.repeated), "polled.interpolated": str(even.interpolated)}
+    count = len(raw["position"])
+    sync = np.arange(count, dtype=np.int64)
+    t_ns = np.round(sync * (1e9 / rate)).astype(np.int64)
+    streams: dict[str, Stream] = {}
+    if known != slice(0, count) and not polled:
+        demand, field = raw.pop("demand")[known], fields.pop("demand")
+        streams["demand"] = Stream("demand", 1, sync[known], t_ns[known], {"demand": field}, {"demand": demand})
+    streams["samples"] = Stream("samples", 1, sync, t_ns, fields, raw)
+    counters = {
+        f"{name}.{what}": number
+        for name, stream in streams.items()
+        for what, number in (("expected", stream.sync.size), ("rows", stream.sync.size), ("in_gaps", 0))
+    }
+    return Recording(None, robot, None, rate, streams, counters=counters, metadata=facts)
+
+
+def _known(demand: NDArray[np.float64]) -> slice:
+    """Rows from the first to the last with a demand: ours is not known before the first set point."""
+    rows = np.flatnonzero(~np.isnan(demand).all(axis=1))
+    return slice(int(rows[0]), int(rows[-1]) + 1) if rows.size else slice(0, len(demand))
+
+
+def _load(path: Path, robot: RobotConfig) -> Source:
+    if not is_file(path):
+        raise ConfigError(f"{path}: no such file")
+    kind = path.suffix.lower()
+    if kind in (".csv", ".txt"):
+        header, values, first_line = _csv(path)
+        if header is None:
+            raise DataError(f"{path}: no header line; expected t,q1..,tau1.. (or a pair of files with --effort)")
+        return Source(path, dict(zip(header, values.T, strict=True)), first_line)
+    if kind == ".npz":
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+        except Exception as error:  # whatever zipfile, zlib and numpy say of a damaged file
+            raise DataError(f"{path}: not a readable NPZ file: {said(error)}") from error
+        return Source(path, _numeric(arrays))
+    if kind == ".mat":
+        return Source(path, _numeric(_mat(path)))
+    if kind == ".parquet":
+        return Source(path, _numeric(_parquet(path)))
+    if kind == ".mcap":
+        from armident.daq.interchange.rosbag import read_joint_states
+
+        return Source(path, read_joint_states(path, robot))
+    raise ConfigError(
+        f"{path}: cannot import {kind or 'a file without suffix'}; expected .csv, .mat, .npz, .parquet, "
+        "an .mcap of ROS 2, or the log of a bus (.log, .asc, .blf, .trc)"
+    )
+
+
+def _parquet(path: Path) -> dict[str, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise ConfigError(f"{path}: Parquet needs the package pyarrow (pip install pyarrow)") from error
+    try:
+        table = pyarrow.parquet.read_table(path)  # type: ignore[no-untyped-call]
+        return {name: table.column(name).to_numpy() for name in table.column_names}
+    except Exception as error:  # whatever pyarrow says of a damaged file
+        raise DataError(f"{path}: not a readable Parquet file: {said(error)}") from error
+
+
+def _mat(path: Path) -> dict[str, NDArray[Any]]:
+    from scipy.io import loadmat
+
+    def read() -> dict[str, Any]:
+        try:
+            arrays: dict[str, Any] = loadmat(path)
+        except NotImplementedError as error:
+            raise ValueError("MAT version 7.3 is not read; save it with -v7") from error
+        return arrays
+
+    try:
+        # Some damaged files take scipy's reader down.
+        return apart(read)
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: not a readable MAT file: {said(error)}") from error
+
+
+def _numeric(arrays: Mapping[str, Any]) -> Table:
+    """The real arrays, vectors as (N,)."""
+    table: Table = {}
+    for name, value in arrays.items():
+        if isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and value.size:
+            array = value.astype(np.float64)
+            table[name] = array.ravel() if array.ndim == 2 and 1 in array.shape else array
+    return table
+
+
+def _pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
+    """Two headerless or freely headed tables as one source; torque or the drive's own signal is what effort means."""
+    columns: Table = {}
+    first_line = 1
+    for file, base in ((path, "q"), (effort, "tau")):
+        if not is_file(file):
+            raise ConfigError(f"{file}: no such file")
+        _, values, first_line = _csv(file)
+        _check_finite(
+            Source(file, {}, first_line), values, [f"{j + 1}" for j in range(values.shape[1])], slice(0, len(values))
+        )
+        if values.shape[1] == 1 and values.shape[0] % robot.n == 0:
+            values = values.reshape(-1, robot.n)
+        if values.shape[1] != robot.n:
+            raise DataError(f"{file}: {values.shape[1]} columns, but {robot.name} has {robot.n} joints")
+        columns |= {f"{base}{j + 1}": values[:, j] for j in range(robot.n)}
+    rows = {len(v) for v in columns.values()}
+    if len(rows) != 1:
+        raise DataError(f"{path} and {effort}: {' and '.join(str(r) for r in sorted(rows))} rows")
+    return Source(path, columns, first_line)
+
+
+def _csv(path: Path) -> tuple[list[str] | None, NDArray[np.float64], int]:
+    """Header (if there is one), values (N, columns) and the line number of the first values."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            first = file.readline()
+            delimiter = next((d for d in (",", ";", "\t") if d in first), None)
+            words = [word.strip() for word in first.split(delimiter)]
+            header = None if all(_is_number(w) for w in words) else words
+            file.seek(0)
+            skip = 0 if header is None else 1
+            values = np.loadtxt(file, delimiter=delimiter, skiprows=skip, ndmin=2, comments=None)
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a text file") from error
+    except ValueError as error:
+        raise DataError(_bad_line(path, delimiter, len(words), skip) or f"{path}: {error}") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    if values.size == 0:
+        raise DataError(f"{path}: no values")
+    if header is not None and len(header) != values.shape[1]:
+        raise DataError(f"{path}: {len(header)} names in the header, {values.shape[1]} columns of values")
+    return header, values, skip + 1
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _bad_line(path: Path, delimiter: str | None, columns: int, skip: int) -> str | None:
+    """What is wrong with the first line that cannot be read."""
+    with path.open(encoding="utf-8-sig") as file:
+        for number, line in enumerate(file, start=1):
+            words = line.split(delimiter)
+            if number <= skip or not line.strip():
+                continue
+            if len(words) != columns:
+                return f"{path}: line {number} has {len(words)} columns, expected {columns}"
+            for k, word in enumerate(words, start=1):
+                if not _is_number(word):
+                    return f"{path}: line {number}, column {k}: expected a number, found {word.strip()!r:.80}"
+    return None
+
+
+def _pick(source: Source, quantity: str, n: int, names: Mapping[str, str]) -> NDArray[np.float64] | None:
+    """The (N, n) values of a quantity, or ``None`` if the file has none or it is to be left out."""
+    if names.get(quantity) == ABSENT:
+        return None
+    for base in (names[quantity],) if quantity in names else NAMES[quantity]:
+        whole = source.table.get(base)
+        labels = [f"{base}{j + 1}" for j in range(n)]
+        if whole is not None:
+            values = whole[:, None] if whole.ndim == 1 else whole
+            if values.ndim != 2 or values.shape[1] != n:
+                raise DataError(f"{source.path}: {base} has {values.shape[-1]} axes, the robot has {n}")
+            labels = [base] * n if whole.ndim == 1 else labels
+        elif labels[0] in source.table:
+            absent = [name for name in labels if name not in source.table]
+            if absent:
+                raise DataError(f"{source.path}: no column {absent[0]}, the robot has {n} joints")
+            if f"{base}{n + 1}" in source.table:
+                raise DataError(f"{source.path}: has a column {base}{n + 1}, but the robot has {n} joints")
+            values = np.stack([source.table[name] for name in labels], axis=1)
+        else:
+            continue
+        _check_finite(source, values, labels, _known(values) if quantity == "demand" else slice(0, len(values)))
+        return np.ascontiguousarray(values)
+    if quantity in names:
+        raise DataError(f"{source.path}: nothing named {names[quantity]!r}; found {', '.join(source.table)}")
+    return None
+
+
+def _check_finite(source: Source, values: NDArray[np.float64], labels: Sequence[str], rows: slice) -> None:
+    bad = np.argwhere(~np.isfinite(values[rows]))
+    if bad.size:
+        row, column = rows.start + int(bad[0, 0]), int(bad[0, 1])
+        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        raise DataError(f"{source.place(row, labels[column])}: {values[row, column]} is not a number{more}")
+
+
+def _rate(source: Source, names: Mapping[str, str]) -> float:
+    """Sampling rate from the time column, 1/s."""
+    times = _pick(source, "time", 1, names)
+    if times is None:
+        raise DataError(f"{source.path}: no time column t; say the sampling rate with --rate")
+    steps = np.diff(times[:, 0])
+    if steps.size == 0:
+        raise DataError(f"{source.path}: a single row is not a recording")
+    median = float(np.median(steps))
+    back = np.flatnonzero(steps <= 0)
+    if back.size:
+        raise DataError(f"{source.place(int(back[0]) + 1, 't')}: time does not increase")
+    uneven = np.flatnonzero(np.abs(steps - median) > _UNEVEN * median)
+    if uneven.size:
+        k = int(uneven[0])
+        raise DataError(
+            f"{source.place(k + 1, 't')}: a step of {steps[k]:.6g} s where {median:.6g} s is usual; "
+            "say the sampling rate with --rate if the samples are even"
+        )
+    return float(steps.size / (times[-1, 0] - times[0, 0]))
+
+
+def _unit(quantity: str, robot: RobotConfig) -> str:
+    kinds = {joint.type for joint in robot.joints}
+    if quantity in ("position", "demand"):
+        return "rad" if kinds == {"revolute"} else "m" if kinds == {"prismatic"} else "rad|m"
+    if quantity == "torque":
+        return "N m" if kinds == {"revolute"} else "N" if kinds == {"prismatic"} else "N m|N"
+    return "A" if quantity == "current" else "V"
+
+
+def _check_units(path: Path, robot: RobotConfig, fields: Mapping[str, Field], raw: Table, known: slice) -> None:
+    """Refuse what cannot be in SI units on the side said; ``known`` are the rows that have a demand."""
+    transmission = robot.transmission_matrix
+    for name, values in raw.items():
+        values = values[known] if name == "demand" else values
+        motor = fields[name].side == "motor"
+        if name in ("position", "demand"):
+            joint = values @ np.linalg.inv(transmission).T if motor else values
+            limits = [max(abs(end) for end in j.limits.position) for j in robot.joints]
+            factor, hint = _FAR_OUT, "rad (or m), joint side unless --motor-side"
+        elif name == "torque":
+            joint = values @ transmission if motor else values
+            limits = [j.limits.torque for j in robot.joints]
+            factor, hint = _TOO_STRONG, "N m (or N), joint side unless --motor-side"
+        else:
+            continue
+        peaks = np.abs(joint).max(axis=0)
+        for axis, peak, limit in zip(robot.joints, peaks, limits, strict=True):
+            if peak > factor * limit:
+                raise DataError(
+                    f"{path}: {name} of {axis.name} reaches {peak:.4g}, its limit is {limit:.4g}: expected {hint}"
+                )
+    if "demand" in raw:
+        _check_demand(path, robot, raw["demand"][known], raw["position"][known])
+
+
+def _check_demand(path: Path, robot: RobotConfig, demand: NDArray[np.float64], position: NDArray[np.float64]) -> None:
+    """Refuse a demand that moves otherwise than the joints: another unit, or not what the controller was given."""
+    motion = np.sum((position - position.mean(axis=0)) ** 2, axis=0)
+    missed = np.sum((demand - demand.mean(axis=0) - position + position.mean(axis=0)) ** 2, axis=0)
+    for k in np.flatnonzero(missed > _UNFOLLOWED * motion):
+        joint, moved, wanted = robot.joints[k], np.ptp(position[:, k]), np.ptp(demand[:, k])
+        if moved > _STILL * np.ptp(joint.limits.position):
+            raise DataError(
+                f"{path}: {joint.name} did not follow its demand, which spans {wanted:.4g} where the position spans "
+                f"{moved:.4g}: expected the same unit; --map demand={ABSENT} leaves it out"
+            )

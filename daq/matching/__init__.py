@@ -1,0 +1,1 @@
+"""Assignment of received PDOs to their SYNC, and gaps."""

@@ -1,0 +1,66 @@
+"""Gaps that grow from batch to batch, and become known when they are over."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.daq.matching.state import AMBIGUOUS, LOST, NO_SYNC, WRONG_LENGTH, WRONG_MAPPING
+from armident.daq.recording import Gap
+
+SYNC_LOST = "SYNC not received"
+REASONS = {
+    NO_SYNC: SYNC_LOST,
+    LOST: "lost",
+    WRONG_LENGTH: "wrong length",
+    WRONG_MAPPING: "mapping changed",
+    AMBIGUOUS: "ambiguous order",
+}
+
+
+class OpenGaps:
+    """The gaps that may still go on, by stream, joint (``None``: all of them) and reason.
+
+    Parameters
+    ----------
+    joints
+        Names of the joints, in the order of the columns.
+    """
+
+    def __init__(self, joints: Sequence[str]) -> None:
+        self._joints = tuple(joints)
+        self._open: dict[tuple[str, str | None, str], tuple[int, int]] = {}
+
+    def add(self, stream: str, every: int, sync: NDArray[np.int64], code: NDArray[np.uint8]) -> list[Gap]:
+        """Take incomplete rows: ``sync`` (N,) and what is known of each joint, ``code`` (N, n); gaps that are over."""
+        found: list[tuple[str | None, str, NDArray[np.int64]]] = []
+        for value, reason in REASONS.items():
+            hit = code == value
+            everyone = hit.all(axis=1)
+            found.append((None, reason, sync[everyone]))
+            found += [(name, reason, sync[hit[:, j] & ~everyone]) for j, name in enumerate(self._joints)]
+        gaps = []
+        for joint, reason, numbers in found:
+            if numbers.size == 0:
+                continue
+            key = stream, joint, reason
+            breaks = np.flatnonzero(np.diff(numbers) != every) + 1
+            for run in np.split(numbers, breaks):
+                first, last = int(run[0]), int(run[-1])
+                if key in self._open:
+                    before = self._open.pop(key)
+                    if first - before[1] == every:
+                        first = before[0]
+                    else:
+                        gaps.append(Gap(stream, *before, joint, reason))
+                self._open[key] = first, last
+        return gaps
+
+    def over(self, stream: str, last: int | None, final: bool) -> list[Gap]:
+        """Gaps of the stream that the rows up to ``last`` do not continue; all of them at the end."""
+        gaps = []
+        for key, (begin, end) in list(self._open.items()):
+            if key[0] == stream and (final or (last is not None and last > end)):
+                del self._open[key]
+                gaps.append(Gap(stream, begin, end, key[1], key[2]))
+        return gaps

@@ -1,0 +1,355 @@
+"""The compiled part that closes the books: which answers are certain, which given up, and the samples given out."""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from armident.daq.matching.state import (
+    AMBIGUOUS,
+    BASE,
+    BEHIND,
+    BEST,
+    BEST_AT,
+    CALM,
+    EMITTED,
+    HELD,
+    IN_STEP,
+    LENGTH,
+    NO_SYNC,
+    PACED,
+    PACK,
+    PATIENCE,
+    RECEIVED,
+    SHORT,
+    SIZE,
+    STILL,
+    STOOD,
+    TOP,
+    TPDO_DUPLICATE,
+    TPDO_LATE,
+    UNSEEN,
+    UNSURE,
+    WINDOW,
+    Books,
+    Decided,
+)
+
+
+@njit(cache=True, nogil=True)
+def slot_of(b: Books, s: int, u: int) -> int:
+    """Where row ``u`` stands in the ring of its stream."""
+    return int((u - b.mark[s, BASE]) % b.row_sync.shape[1])
+
+
+@njit(cache=True, nogil=True)
+def _seen(b: Books, s: int, j: int, u: int) -> bool:
+    """Whether the SYNC of row ``u`` was received on the bus of a joint."""
+    return bool(b.row_t[s, slot_of(b, s, u), b.kind[s, PACK] - 1, b.bus_of[j]] != UNSEEN)
+
+
+@njit(cache=True, nogil=True)
+def _place(b: Books, s: int, j: int, u: int, i: int) -> None:
+    slot = slot_of(b, s, u)
+    for w in range(b.answer.shape[3]):
+        b.row_data[s, slot, j, w] = b.answer[s, j, i, w]
+    b.row_code[s, slot, j] = b.answer_code[s, j, i] if u >= b.doubt[s, j] else AMBIGUOUS
+    if b.label[s, j, i] > u and _seen(b, s, j, u):
+        b.counts[TPDO_LATE] += 1
+
+
+@njit(cache=True, nogil=True)
+def _same(b: Books, s: int, j: int, i: int, k: int) -> bool:
+    """Whether two answers of a drive have the same bytes."""
+    same = b.answer_code[s, j, i] == b.answer_code[s, j, k]
+    for w in range(-(-b.kind[s, LENGTH] // 8)):
+        # What stands behind the data of a short frame is no part of it.
+        unused = np.uint64(8 * max(0, 8 * w + 8 - b.kind[s, LENGTH]))
+        same = same and ((b.answer[s, j, i, w] ^ b.answer[s, j, k, w]) << unused) == 0
+    return bool(same)
+
+
+@njit(cache=True, nogil=True)
+def _without_repeats(b: Books, s: int, j: int, owed: int) -> None:
+    """More answers than SYNCs: frames that were sent twice are dropped; where they cannot be told, all are in doubt."""
+    count = b.pending[s, j]
+    b.counts[TPDO_DUPLICATE] += count - owed
+    unlike = 0
+    for i in range(count):
+        if i == 0 or not _same(b, s, j, i, i - 1):
+            unlike += 1
+    if unlike != owed and unlike > 1:
+        b.doubt[s, j] = max(b.doubt[s, j], b.settled[s, j] + owed)
+    elif unlike == owed:
+        kept = 0
+        for i in range(count):
+            if i == 0 or not _same(b, s, j, i, i - 1):
+                b.label[s, j, kept] = b.label[s, j, i]
+                b.answer_code[s, j, kept] = b.answer_code[s, j, i]
+                for w in range(b.answer.shape[3]):
+                    b.answer[s, j, kept, w] = b.answer[s, j, i, w]
+                kept += 1
+    b.pending[s, j] = owed
+
+
+@njit(cache=True, nogil=True)
+def _was_behind(b: Books, s: int, j: int, rows: int) -> None:
+    """A drive owed the answers to so many SYNCs at once."""
+    if rows >= b.behind[s, j] or b.head[b.bus_of[j], s] - b.behind_at[s, j] > 2 * b.kind[s, WINDOW]:
+        b.behind[s, j] = rows
+        b.behind_at[s, j] = b.head[b.bus_of[j], s]
+
+
+@njit(cache=True, nogil=True)
+def _keep_pace(b: Books, s: int, j: int) -> None:
+    """See how a drive keeps up: how far it is behind the rows at its best, and for how long it stays there."""
+    head = b.head[b.bus_of[j], s]
+    balance = b.pending[s, j] - (head - b.settled[s, j])
+    best = b.pace[s, j, BEST]
+    if balance > best or (balance < best and head - b.pace[s, j, BEST_AT] > b.kind[s, SHORT]):
+        b.pace[s, j, BEST], b.pace[s, j, BEST_AT], b.pace[s, j, STOOD] = balance, head, 0
+    if b.pace[s, j, PACED] == head:
+        return
+    b.pace[s, j, PACED] = head
+    b.pace[s, j, STOOD] = b.pace[s, j, STOOD] + 1 if balance == b.pace[s, j, BEST] else 0
+    b.pace[s, j, CALM] = b.pace[s, j, CALM] + 1 if balance == 0 and not b.pace[s, j, UNSURE] else 0
+
+
+@njit(cache=True, nogil=True)
+def _close(b: Books, s: int, j: int, until: int, unsure: bool) -> None:
+    """The rows before ``until`` are settled, all answers taken; whether some may still come to rows given up."""
+    b.settled[s, j], b.pending[s, j] = until, 0
+    b.pace[s, j, BEST], b.pace[s, j, STOOD], b.pace[s, j, UNSURE] = UNSEEN, 0, int(unsure)
+
+
+@njit(cache=True, nogil=True)
+def _drop_first(b: Books, s: int, j: int, count: int) -> None:
+    """The first answers are to rows that were given up; where frames were sent twice nobody can say how many are."""
+    for i in range(1, b.pending[s, j]):
+        if _same(b, s, j, i, i - 1):
+            b.doubt[s, j] = max(b.doubt[s, j], b.settled[s, j] + b.pending[s, j] - count)
+    b.pending[s, j] -= count
+    b.counts[TPDO_LATE] += count
+    for i in range(b.pending[s, j]):
+        b.label[s, j, i] = b.label[s, j, i + count]
+        b.answer_code[s, j, i] = b.answer_code[s, j, i + count]
+        for w in range(b.answer.shape[3]):
+            b.answer[s, j, i, w] = b.answer[s, j, i + count, w]
+
+
+@njit(cache=True, nogil=True)
+def _may_repeat(b: Books, s: int, j: int) -> bool:
+    """Whether late answers came together that may be one sent twice: the next SYNC shows if there are too many."""
+    found = False
+    for i in range(1, b.pending[s, j]):
+        found = found or (b.label[s, j, i] == b.label[s, j, i - 1] and _same(b, s, j, i, i - 1))
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _not_behind(b: Books, s: int, j: int) -> int:
+    """How many of its answers a drive has certainly sent in time, or all where it is not known to have been behind."""
+    count, prompt = b.pending[s, j], 0
+    while prompt < count and not b.pace[s, j, UNSURE] and b.label[s, j, prompt] == b.settled[s, j] + prompt:
+        prompt += 1
+    behind = b.behind[s, j] > 0 and b.head[b.bus_of[j], s] - b.behind_at[s, j] <= 2 * b.kind[s, WINDOW]
+    previous = b.settled[s, j] + prompt - 1
+    for i in range(prompt, count):
+        # Two at once; or so many missing in a row that it rather stood still.
+        behind = behind or b.label[s, j, i] == previous or b.label[s, j, i] - previous > STILL
+        previous = b.label[s, j, i]
+    return prompt if behind else count
+
+
+@njit(cache=True, nogil=True)
+def _settle(b: Books, s: int, j: int, final: bool, witness: bool) -> None:
+    """Close the books of one TPDO of one drive: match what is certain, give up what nobody answers any more."""
+    bus = b.bus_of[j]
+    head, unsure = b.head[bus, s], b.pace[s, j, UNSURE] != 0
+    owed = head - b.settled[s, j]
+    if b.pending[s, j] > owed and not unsure:
+        _without_repeats(b, s, j, owed)
+    b.fresh[s, j] = 0
+    balance, stood = b.pending[s, j] - owed, b.pace[s, j, STOOD]
+    # Where answers to rows given up may come in between, as many as SYNCs prove nothing before they keep step.
+    if (balance == 0 and not unsure) or (balance >= 0 and unsure and stood >= IN_STEP):
+        if balance > 0:
+            _drop_first(b, s, j, balance)
+        elif not unsure and not final and b.pace[s, j, HELD] != head - 1 and _may_repeat(b, s, j):
+            b.pace[s, j, HELD] = head
+            return
+        for i in range(owed):
+            if b.label[s, j, i] > b.settled[s, j] + i and _seen(b, s, j, b.label[s, j, i]):
+                _was_behind(b, s, j, owed)
+            _place(b, s, j, b.settled[s, j] + i, i)
+        if b.settled[s, j] < b.hole[bus, s]:
+            _give_up_refilled(b, s, j, owed)
+        _close(b, s, j, head, False)
+        return
+    count = b.pending[s, j]
+    last = b.label[s, j, count - 1] + 1 if count else b.settled[s, j]
+    # It answers every SYNC, and no better than that while others owe nothing: what it still owes is lost.
+    in_step = balance < 0 and stood >= IN_STEP and head - b.pace[s, j, BEST_AT] >= b.kind[s, SHORT]
+    in_step = in_step and (witness or b.settled[s, j] < b.hole[bus, s])
+    silent = witness and head - last > 2 * b.kind[s, SHORT]
+    late = owed > b.kind[s, WINDOW] and head - b.mark[s, BEHIND] > b.kind[s, WINDOW]
+    if not (late or owed > b.kind[s, PATIENCE] or final or in_step or silent):
+        return
+    if balance > 0:
+        _drop_first(b, s, j, balance)
+        count -= balance
+    keep = head if final else head - b.kind[s, WINDOW]
+    if silent:
+        keep = max(keep, head - 2 * b.kind[s, SHORT])
+    keep = max(keep, b.settled[s, j])
+    u, twice, answered = head, False, b.settled[s, j]
+    ends = (final or silent) and not in_step
+    caught_up = _not_behind(b, s, j)
+    for i in range(count - 1, -1, -1):
+        after, u = u, min(b.label[s, j, i], u - 1)
+        answered = max(answered, u + 1)
+        _place(b, s, j, u, i)
+        # Who has been behind may be so before silence: what it sent last is late, or what it did not send is lost.
+        for v in range(u + 1, after):
+            ends = ends or not _seen(b, s, j, v)
+        if ends and i >= caught_up:
+            b.row_code[s, slot_of(b, s, u), j] = AMBIGUOUS
+        # A frame sent twice looks like two late answers, which move those before them.
+        twice = u < b.label[s, j, i] and (
+            twice or (b.label[s, j, i] == b.label[s, j, i + 1] and _same(b, s, j, i, i + 1))
+        )
+        if twice:
+            b.row_code[s, slot_of(b, s, u), j] = AMBIGUOUS
+    _give_up_doubtful(b, s, j, count)
+    # A drive answers in order: behind an answer none can come to what is before it.
+    _close(b, s, j, max(keep, answered), keep > answered or (unsure and not in_step))
+
+
+@njit(cache=True, nogil=True)
+def _give_up_refilled(b: Books, s: int, j: int, count: int) -> None:
+    """As many answers as SYNCs, where frames were missing lately, may be one lost and a later one sent twice."""
+    repeated, unlike = -1, False
+    for i in range(1, count):
+        if b.label[s, j, i] == b.label[s, j, i - 1] and _same(b, s, j, i, i - 1):
+            repeated = i
+    for i in range(1, repeated + 1):
+        unlike = unlike or not _same(b, s, j, i, i - 1)
+    for i in range(repeated + 1 if unlike else 0):
+        b.row_code[s, slot_of(b, s, b.settled[s, j] + i), j] = AMBIGUOUS
+
+
+@njit(cache=True, nogil=True)
+def _give_up_doubtful(b: Books, s: int, j: int, count: int) -> None:
+    """Of answers taken as prompt where one was lost, those that need not have been."""
+    # Answers that came in a burst after a silence: with one of them lost, none can be told from the next.
+    previous = b.settled[s, j] - 1
+    for i in range(count):
+        label = b.label[s, j, i]
+        if i + 1 < count and b.label[s, j, i + 1] == label:
+            if _seen(b, s, j, label):
+                _was_behind(b, s, j, label - previous)
+            for v in range(previous + 1, label + 1):
+                b.row_code[s, slot_of(b, s, v), j] = AMBIGUOUS
+        else:
+            previous = label
+    # A drive that was behind lately may have been so again when an answer was lost: then those after it are late ones.
+    if b.head[b.bus_of[j], s] - b.behind_at[s, j] > 2 * b.kind[s, WINDOW]:
+        b.behind[s, j] = 0
+    previous = b.settled[s, j] - 1
+    for i in range(count):
+        label = b.label[s, j, i]
+        if i + 1 < count and b.label[s, j, i + 1] == label:
+            # With a burst it has caught up.
+            b.doubt[s, j] = min(b.doubt[s, j], label + 1)
+        elif b.behind[s, j] > 1 and label > previous + 1:
+            b.doubt[s, j] = max(b.doubt[s, j], label + b.behind[s, j] - 1)
+        for v in range(max(previous + 1, b.settled[s, j]), min(label + 1, b.doubt[s, j])):
+            if b.row_code[s, slot_of(b, s, v), j] == RECEIVED:
+                b.row_code[s, slot_of(b, s, v), j] = AMBIGUOUS
+        previous = label
+
+
+@njit(cache=True, nogil=True)
+def _sample(b: Books, s: int, slot: int, j: int, i: int, word: int) -> Any:
+    """Eight bytes of sample ``i`` of a packed answer."""
+    value = np.uint64(0)
+    for octet in range(8 * word, min(b.kind[s, SIZE], 8 * word + 8)):
+        at = i * b.kind[s, SIZE] + octet
+        taken = (b.row_data[s, slot, j, at >> 3] >> np.uint64(8 * (at & 7))) & np.uint64(0xFF)
+        value |= taken << np.uint64(8 * (octet & 7))
+    return value
+
+
+@njit(cache=True, nogil=True)
+def _emit(b: Books, s: int, end: int, out: Decided) -> None:
+    """Give out the rows before ``end``; a packed one is as many samples."""
+    pack, buses = b.kind[s, PACK], b.state.shape[0]
+    words = -(-b.kind[s, SIZE] // 8)
+    while b.mark[s, EMITTED] < end:
+        slot = slot_of(b, s, b.mark[s, EMITTED])
+        for i in range(pack):
+            k = b.row_sync[s, slot] - pack + 1 + i
+            if k < 0:
+                continue
+            o = out.rows[s]
+            out.sync[s, o] = k
+            out.t_ns[s, o] = UNSEEN
+            for bus in range(buses - 1, -1, -1):
+                if b.row_t[s, slot, i, bus] != UNSEEN:
+                    out.t_ns[s, o] = b.row_t[s, slot, i, bus]
+            for j in range(b.settled.shape[1]):
+                seen = b.row_t[s, slot, i, b.bus_of[j]] != UNSEEN
+                out.code[s, o, j] = b.row_code[s, slot, j] if seen else NO_SYNC
+                for w in range(words):
+                    out.data[s, o, j, w] = b.row_data[s, slot, j, w] if pack == 1 else _sample(b, s, slot, j, i, w)
+            out.rows[s] += 1
+        b.mark[s, EMITTED] += 1
+    if b.mark[s, EMITTED] == b.mark[s, TOP]:
+        b.mark[s, BASE] = b.mark[s, TOP]
+
+
+@njit(cache=True, nogil=True)
+def settle_all(b: Books, bus: int, s: int, final: bool, out: Decided) -> None:
+    """Close the books of the drives on one bus, and give out what all drives have settled."""
+    n = b.settled.shape[1]
+    head = b.head[bus, s]
+    slot = (head - 1 - b.mark[s, BASE]) % b.row_sync.shape[1]
+    all_owe, whole = n > 1, True
+    here = calm_here = calm = 0
+    for j in range(n):
+        if b.bus_of[j] == bus:
+            here += 1
+            # The one answer to the one SYNC: done here, as a call that hands over the books costs more than all of it.
+            if (
+                b.pending[s, j] == 1
+                and b.settled[s, j] == head - 1
+                and not b.pace[s, j, UNSURE]
+                and head > b.hole[bus, s]
+            ):
+                for w in range(b.answer.shape[3]):
+                    b.row_data[s, slot, j, w] = b.answer[s, j, 0, w]
+                b.row_code[s, slot, j] = b.answer_code[s, j, 0] if head > b.doubt[s, j] else AMBIGUOUS
+                b.settled[s, j], b.pending[s, j], b.fresh[s, j] = head, 0, 0
+                b.pace[s, j, BEST], b.pace[s, j, STOOD] = UNSEEN, 0
+                if b.pace[s, j, PACED] != head:
+                    b.pace[s, j, PACED] = head
+                    b.pace[s, j, CALM] += 1
+            else:
+                _keep_pace(b, s, j)
+        all_owe = all_owe and b.settled[s, j] + b.pending[s, j] < b.head[b.bus_of[j], s]
+        whole = whole and b.settled[s, j] >= b.hole[b.bus_of[j], s]
+        # Buses are read one after the other: what another one was like before, or has become since, says nothing.
+        begun, ended = b.pace[s, j, PACED] - b.pace[s, j, CALM], b.pace[s, j, PACED]
+        if begun <= head - IN_STEP and ended >= head - 1:
+            calm += 1
+            calm_here += b.bus_of[j] == bus
+    if all_owe and whole:
+        b.mark[s, BEHIND] = head
+    end = b.mark[s, TOP]
+    for j in range(n):
+        if b.bus_of[j] == bus and (b.settled[s, j] < head or b.pending[s, j]):
+            # Who owes nothing shows that neither the host nor the bus is behind.
+            _settle(b, s, j, final, calm_here > 0 if here > 1 else calm > 0)
+        end = min(end, b.settled[s, j])
+    if end > b.mark[s, EMITTED]:
+        _emit(b, s, end, out)

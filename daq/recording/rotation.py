@@ -1,0 +1,170 @@
+"""A capture in several files: a new one when the last is large or old enough, every row in exactly one of them."""
+
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import ConfigError
+from armident.daq.recording.lost_rows import Spans
+from armident.daq.recording.model import Gap, Mark
+from armident.daq.recording.writer import RecordingWriter
+
+RETRY_NS = 10_000_000_000
+"""Time until the next attempt, where a new file could not be begun, ns."""
+
+
+class RecordingSeries:
+    """The files of one capture, written one after the other.
+
+    A file is closed, with its index, when the next one has been begun: rows go on into the old one if that fails (disk
+    full, directory gone), which :attr:`problem` tells, and it is tried again ``RETRY_NS`` later.
+
+    Parameters
+    ----------
+    begin
+        Opens part k, counted from 1, at a path.
+    directory, name
+        Where the files are and what they are called: ``NAME.mcap``, or ``NAME.0001.mcap`` and so on where a limit is
+        set.
+    max_bytes, max_ns
+        Size and time span at which a file is full; ``None``: no limit.
+
+    Raises
+    ------
+    ConfigError
+        If the first file cannot be begun.
+    """
+
+    def __init__(
+        self,
+        begin: Callable[[Path, int], RecordingWriter],
+        directory: Path,
+        name: str,
+        max_bytes: int | None = None,
+        max_ns: int | None = None,
+    ) -> None:
+        self._begin, self._directory, self._name = begin, directory, name
+        self._max_bytes, self._max_ns = max_bytes, max_ns
+        self.paths: list[Path] = []
+        self._lost_before = 0
+        self._problem: str | None = None
+        self._since: int | None = None
+        self._not_before: int | None = None
+        self._writer = self._next()
+
+    @property
+    def path(self) -> Path:
+        """The file being written."""
+        return self._writer.path
+
+    @property
+    def lost_rows(self) -> int:
+        """Rows that the disk did not take, of all files."""
+        return self._lost_before + self._writer.lost_rows
+
+    @property
+    def problem(self) -> str | None:
+        """What went wrong last, in words."""
+        return self._writer.problem or self._problem
+
+    def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
+        """Change when a file is full."""
+        self._max_bytes, self._max_ns = max_bytes, max_ns
+
+    def turn(self, t_ns: int) -> Path | None:
+        """Begin a new file if the last is full at ``t_ns``, the time of the rows to come; the one that was finished."""
+        if self._since is None:
+            self._since = t_ns
+        if not self._full(t_ns) or (self._not_before is not None and t_ns < self._not_before):
+            return None
+        full = self._writer
+        try:
+            self._writer = self._next()
+        except ConfigError as error:
+            self._problem, self._not_before = f"writing on into {full.path}: {error}", t_ns + RETRY_NS
+            return None
+        self._since, self._not_before = t_ns, None
+        self._finish(full)
+        return full.path
+
+    def append(
+        self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """See :meth:`RecordingWriter.append`."""
+        self._writer.append(stream, sync, t_ns, raw)
+
+    def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
+        """See :meth:`RecordingWriter.add_gaps`."""
+        self._writer.add_gaps(gaps, t_ns)
+
+    def add_marks(self, marks: Sequence[Mark]) -> None:
+        """See :meth:`RecordingWriter.add_marks`."""
+        self._writer.add_marks(marks)
+
+    def leave_out(self, rows: Spans) -> None:
+        """See :meth:`RecordingWriter.leave_out`."""
+        self._writer.leave_out(rows)
+
+    def flush(self) -> None:
+        """See :meth:`RecordingWriter.flush`."""
+        self._writer.flush()
+
+    def close(self, counters: Mapping[str, int]) -> None:
+        """Finish the last file, with the counters of the whole capture.
+
+        Raises
+        ------
+        ConfigError
+            If the disk does not take its end; what is there remains readable as a torn file.
+        """
+        self._writer.close(counters)
+
+    def finish(self) -> None:
+        """Finish the last file with what can be counted of it; one that cannot be is left as a torn one."""
+        self._finish(self._writer)
+
+    def trigger(self, t_ns: int) -> None:
+        """Everything is written anyway."""
+
+    def keep(self, before_ns: int, after_ns: int) -> None:
+        """Everything is kept anyway."""
+
+    def abort(self) -> None:
+        """Leave nothing behind of a capture that did not begin."""
+        self._writer.abort()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._writer.__exit__(kind, error, at)
+
+    def _full(self, t_ns: int) -> bool:
+        old = self._max_ns is not None and self._since is not None and t_ns - self._since >= self._max_ns
+        return old or (self._max_bytes is not None and self._writer.size >= self._max_bytes)
+
+    def _next(self) -> RecordingWriter:
+        number = len(self.paths) + 1
+        part = "" if self._max_bytes is None and self._max_ns is None else f".{number:04d}"
+        writer = self._begin(self._directory / f"{self._name}{part}.mcap", number)
+        self.paths.append(writer.path)
+        return writer
+
+    def _finish(self, writer: RecordingWriter) -> None:
+        """Close a full file with what can be counted of it; one that cannot be finished is left as a torn one."""
+        writer.flush()
+        if writer is not self._writer:
+            self._lost_before += writer.lost_rows
+        self._problem = writer.problem or self._problem
+        counters = {f"{name}.rows": count for name, count in writer.rows.items()}
+        with contextlib.suppress(ConfigError):
+            writer.close({**counters, "writer.rows_lost": writer.lost_rows})
+            return
+        self._problem = f"{writer.path}: could not be finished"
+        if writer is not self._writer:
+            self._writer.take_over(writer)

@@ -1,0 +1,16 @@
+"""What is said on Zenoh: keys, blocks of samples, events, and how a session is opened."""
+
+from armident.daq.streaming.codec import Block, assemble, decode_block, decode_event, encode_block, encode_event
+from armident.daq.streaming.keys import Keys
+from armident.daq.streaming.session import open_session
+
+__all__ = [
+    "Block",
+    "Keys",
+    "assemble",
+    "decode_block",
+    "decode_event",
+    "encode_block",
+    "encode_event",
+    "open_session",
+]

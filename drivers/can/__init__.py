@@ -1,0 +1,1 @@
+"""CAN frames and buses: SocketCAN, time stamps, batched reception, UDP multicast, bus load."""

@@ -1,0 +1,173 @@
+"""The bus where there is no SocketCAN: python-can's ``udp_multicast``, for low rates.
+
+UDP may lose frames, above some thousand a second it does: fit for trying things out, never for measuring.
+"""
+
+import time
+from collections.abc import Sequence
+from typing import Self
+
+import can
+import numpy as np
+
+from armident.configs.errors import ConfigError
+from armident.configs.schema.session import Bus
+from armident.drivers.can.frames import ERROR_FLAG, BusDown, Filter, FrameBus, Frames
+from armident.drivers.can.socketcan import RawSocket
+
+NOTE = "udp_multicast carries the bus over UDP and may lose frames: fit for low rates, not for measuring"
+"""What a program says in one line when it runs on this bus."""
+
+EXTENDED_FLAG = 0x8000_0000
+
+
+class UdpBus:
+    """A bus over UDP multicast with the interface of :class:`RawSocket`.
+
+    Frames sent through it come back to it as well, as multicast on one machine does.
+
+    Parameters
+    ----------
+    channel
+        Multicast address, ``239.74.163.2``.
+    filters
+        What is let through; ``None``: everything, empty: nothing.
+
+    Raises
+    ------
+    ConfigError
+        If the address is no multicast address or the network has no route for it.
+    """
+
+    fd = False
+    stamps = "software"
+    up = bound = True
+
+    def __init__(self, channel: str, *, filters: Sequence[Filter] | None = None) -> None:
+        self.channel = channel
+        self.dropped = 0
+        """Always 0: UDP does not tell what it lost."""
+        self._filters = filters
+        try:
+            self._bus = can.Bus(channel, interface="udp_multicast")
+        except (can.CanError, OSError, ValueError) as error:
+            cause = error.__cause__ or error
+            raise ConfigError(f"bus {channel}: cannot join the multicast group: {cause}") from error
+        self._ahead: can.Message | None = None
+
+    def receive(self, batch: Frames) -> int:
+        """Fill the beginning of ``batch`` with the frames that have arrived; never waits.
+
+        Raises
+        ------
+        BusDown
+            If the network went down.
+        """
+        n = 0
+        while n < batch.size and (message := self._next(0.0)) is not None:
+            if not self._passes(message.arbitration_id):
+                continue
+            into = batch[n]
+            into["t_ns"] = round(message.timestamp * 1e9)
+            into["can_id"] = (
+                message.arbitration_id
+                | (EXTENDED_FLAG if message.is_extended_id else 0)
+                | (ERROR_FLAG if message.is_error_frame else 0)
+            )
+            into["length"] = message.dlc
+            into["data"] = 0
+            into["data"][: message.dlc] = np.frombuffer(message.data, dtype=np.uint8)
+            n += 1
+        return n
+
+    def poll(self, timeout: float) -> bool:
+        """Whether a frame arrived within ``timeout`` seconds.
+
+        Raises
+        ------
+        BusDown
+            If the network went down.
+        """
+        deadline = time.monotonic() + timeout
+        while self._ahead is None:
+            message = self._next(max(0.0, deadline - time.monotonic()))
+            if message is None:
+                return False
+            if self._passes(message.arbitration_id):
+                self._ahead = message
+        return True
+
+    def send(self, frames: Frames) -> int:
+        """Send all frames in order.
+
+        Raises
+        ------
+        BusDown
+            If the network does not take them.
+        """
+        for one in frames:
+            can_id = int(one["can_id"])
+            message = can.Message(
+                arbitration_id=can_id & ~EXTENDED_FLAG,
+                is_extended_id=bool(can_id & EXTENDED_FLAG),
+                data=one["data"][: one["length"]].tobytes(),
+            )
+            try:
+                self._bus.send(message)
+            except can.CanError as error:
+                raise BusDown(f"bus {self.channel}: {error}") from error
+        return int(frames.size)
+
+    def drops(self) -> int:
+        """Always 0."""
+        return self.dropped
+
+    def _next(self, timeout: float) -> can.Message | None:
+        if self._ahead is not None:
+            message, self._ahead = self._ahead, None
+            return message
+        try:
+            return self._bus.recv(timeout)
+        except can.CanError as error:
+            raise BusDown(f"bus {self.channel}: {error}") from error
+
+    def _passes(self, can_id: int) -> bool:
+        return self._filters is None or any(can_id & mask == wanted & mask for wanted, mask in self._filters)
+
+    def close(self) -> None:
+        """Release the sockets; nothing happens the second time."""
+        self._bus.shutdown()
+
+    def __enter__(self) -> Self:
+        """Use the bus in a ``with`` block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the bus."""
+        self.close()
+
+
+def open_bus(
+    bus: Bus, *, filters: Sequence[Filter] | None = None, errors: bool = False, hardware: bool = False
+) -> FrameBus:
+    """Open the bus of a session for frames in batches.
+
+    Parameters
+    ----------
+    bus
+        The ``bus`` of the session.
+    filters
+        What is let through; ``None``: everything, empty: nothing.
+    errors, hardware
+        Whether to receive error frames, and to use hardware time stamps, where there are any.
+
+    Raises
+    ------
+    ConfigError
+        If the bus is not there.
+    BusDown
+        If it is there but down.
+    """
+    if bus.interface == "udp_multicast":
+        return UdpBus(bus.channel, filters=filters)
+    return RawSocket(bus.channel, filters=filters, errors=errors, fd=bus.fd, hardware=hardware)

@@ -1,0 +1,76 @@
+"""The way of one drive through the state machine of CiA 402 (part 2), over SDO."""
+
+import time
+
+from armident.configs.errors import ArmidentError, ConfigError
+from armident.drivers.canopen import objects as od
+from armident.drivers.canopen.emcy import emcy_text
+from armident.drivers.canopen.objects import Control, DriveState
+from armident.drivers.canopen.sdo import DriveSdo
+
+ENABLE_TIMEOUT = 3.0
+"""Longest wait for a drive to reach the next state of CiA 402, s."""
+
+POLL_INTERVAL = 0.005
+
+TO_ENABLED: dict[DriveState, tuple[Control, DriveState]] = {
+    DriveState.SWITCH_ON_DISABLED: (Control.SHUTDOWN, DriveState.READY),
+    DriveState.READY: (Control.SWITCH_ON, DriveState.SWITCHED_ON),
+    DriveState.SWITCHED_ON: (Control.ENABLE_OPERATION, DriveState.ENABLED),
+    DriveState.QUICK_STOP_ACTIVE: (Control.DISABLE_VOLTAGE, DriveState.SWITCH_ON_DISABLED),
+    DriveState.FAULT: (Control.FAULT_RESET, DriveState.SWITCH_ON_DISABLED),
+}
+"""Command and next state on the way to operation enabled (CiA 402 part 2, state machine)."""
+
+
+def state_of(sdo: DriveSdo) -> DriveState | None:
+    """The state that the drive's statusword says."""
+    return od.drive_state(sdo.read(od.STATUSWORD, 0, "H"))
+
+
+def stand_still(sdo: DriveSdo) -> None:
+    """Command the mode, and the position where the drive stands, whatever was commanded before it is enabled."""
+    sdo.write(od.MODE_OF_OPERATION, 0, od.CYCLIC_SYNCHRONOUS_POSITION, "b")
+    sdo.write(od.TARGET_POSITION, 0, sdo.read(od.POSITION_ACTUAL, 0, "i"), "i")
+
+
+def enable_drive(sdo: DriveSdo) -> None:
+    """Take one drive through the CiA 402 state machine, from wherever it is to operation enabled.
+
+    Raises
+    ------
+    ArmidentError
+        If it stays in a state; names it.
+    """
+    state = state_of(sdo)
+    while state != DriveState.ENABLED:
+        if state not in TO_ENABLED:
+            state = _await_state(sdo, DriveState.ENABLED, *TO_ENABLED)
+            continue
+        control, wanted = TO_ENABLED[state]
+        if control == Control.FAULT_RESET:
+            # The reset acts on the rising edge of its bit.
+            sdo.order(od.CONTROLWORD, 0, Control.DISABLE_VOLTAGE, "H")
+        sdo.order(od.CONTROLWORD, 0, control, "H")
+        state = _await_state(sdo, wanted)
+
+
+def _await_state(sdo: DriveSdo, *wanted: DriveState) -> DriveState:
+    deadline = time.monotonic() + ENABLE_TIMEOUT
+    while (state := state_of(sdo)) not in wanted:
+        if time.monotonic() > deadline:
+            raise ArmidentError(
+                f"{sdo.who}: cannot be enabled: stays in state '{state or 'unknown'}'{_fault_cause(sdo)}, "
+                f"expected '{wanted[0]}' within {ENABLE_TIMEOUT:g} s"
+            )
+        time.sleep(POLL_INTERVAL)
+    assert state is not None
+    return state
+
+
+def _fault_cause(sdo: DriveSdo) -> str:
+    try:
+        code = sdo.read(od.ERROR_CODE, 0, "H")
+    except ConfigError:  # optional object
+        return ""
+    return f" (error {code:04X}h, {emcy_text(code, sdo.emcy_texts)})" if code else ""

@@ -1,0 +1,61 @@
+"""What drives report by themselves, for somebody who listens only: emergency messages."""
+
+from typing import Self
+
+from armident.configs.schema.session import SessionConfig
+from armident.drivers.can.filtered_socket import SideSocket
+from armident.drivers.canopen.emcy import read_emergencies
+from armident.drivers.canopen.master import DriveEvent
+from armident.drivers.canopen.objects import COB_EMCY
+
+
+class Eavesdropper:
+    """Hears the drives of a session and sends nothing; use it in a ``with`` block.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such bus.
+    BusDown
+        If a bus is down.
+    """
+
+    def __init__(self, session: SessionConfig) -> None:
+        self._texts = session.emcy_texts
+        self._sockets: list[tuple[SideSocket, dict[int, str]]] = []
+        try:
+            for bus in session.all_buses:
+                joints = {drive.node_id: drive.joint for drive in session.drives_on(bus)}
+                self._sockets.append((SideSocket(bus, [COB_EMCY + node for node in joints]), joints))
+        except BaseException:
+            self.close()
+            raise
+
+    def supervise(self) -> list[DriveEvent]:
+        """What has been reported since the last call; never waits."""
+        return [
+            DriveEvent(
+                kind="emcy",
+                joint=joints[emcy.node],
+                node_id=emcy.node,
+                t_ns=emcy.t_ns,
+                text=f"node {emcy.node} ({joints[emcy.node]}): {emcy.text(self._texts)}",
+                code=emcy.code,
+            )
+            for socket, joints in self._sockets
+            for batch in socket.read()
+            for emcy in read_emergencies(batch)
+        ]
+
+    def close(self) -> None:
+        """Leave the buses."""
+        for socket, _ in self._sockets:
+            socket.close()
+
+    def __enter__(self) -> Self:
+        """Listen in a ``with`` block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the buses."""
+        self.close()

@@ -1,0 +1,210 @@
+"""The compiled loop of the SYNC producer: sleep until the deadline, send, account for the lateness."""
+
+import errno
+import socket
+from typing import Any
+
+import numpy as np
+from numba import carray, njit, types
+from numpy.typing import NDArray
+
+from armident.drivers.can.socketcan import Messages
+from armident.drivers.canopen.objects import COB_SYNC
+
+MAX_LATE_PERIODS = 10
+"""Lateness, in periods, beyond which the time grid moves instead of being caught up with."""
+
+BIN_NS = 5_000
+"""Width of a bin of the lateness histogram, ns."""
+
+BINS = 10_000
+"""Bins of the lateness histogram; the last one also holds everything later."""
+
+STOP, RETURN, SENT, ERROR, SKIPPED, OVERRUNS, ROW, FIRST, LATE_MAX, BASE_NS, LAST_NS, WANTED = range(12)
+"""Places in the shared state. ``STOP``: end. ``RETURN``: leave the loop to take a new plan. ``ERROR``: errno while all
+buses refuse SYNC. ``WANTED``: how many SYNCs there shall be in all."""
+
+STATE_SIZE = 12
+
+TIMES = 1 << 16
+"""So many SYNCs have the times kept at which they were sent."""
+
+_SEND_ATTEMPTS = 5000
+_RETRY_NS = 100_000
+_FEW_ATTEMPTS = 3
+"""The same where other buses wait for their SYNC meanwhile."""
+_REALTIME, _MONOTONIC = 0, 1
+_ABSOLUTE = 1
+_EINTR, _EAGAIN, _ENOBUFS = errno.EINTR, errno.EAGAIN, errno.ENOBUFS
+_DONTWAIT = int(socket.MSG_DONTWAIT)
+
+_clock_nanosleep: Any = types.ExternalFunction(
+    "clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp)
+)
+_clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
+_sendmmsg: Any = types.ExternalFunction("sendmmsg", types.int32(types.int32, types.intp, types.uint32, types.int32))
+_errno_location: Any = types.ExternalFunction("__errno_location", types.voidptr())
+
+
+def is_knot(k: int, every: int) -> bool:
+    """Whether SYNC ``k`` is one at which set points become targets: its counter is a multiple of ``every``."""
+    return (k + 1) % every == 0
+
+
+class Loop:
+    """The loop with the arrays it works on; called again, it goes on where it was.
+
+    Parameters
+    ----------
+    descriptors
+        One socket per bus.
+    period_ns, counter
+        Of SYNC.
+    state, late
+        Shared state and histogram of the lateness.
+    errors, unsent
+        Per bus the errno with which it refused the last SYNC (0: none), and how many SYNCs it refused.
+    times
+        Ring of the time (ns, UTC) at which SYNC k had just been sent, at ``k % TIMES``.
+    """
+
+    def __init__(
+        self,
+        descriptors: NDArray[np.int64],
+        period_ns: int,
+        counter: int,
+        state: NDArray[np.int64],
+        late: NDArray[np.int64],
+        errors: NDArray[np.int64],
+        unsent: NDArray[np.int64],
+        times: NDArray[np.int64],
+    ) -> None:
+        self._fixed = (descriptors, period_ns, counter)
+        self._shared = (late, errors, unsent, times)
+        self._state = state
+        self._spec = np.zeros(2, dtype=np.int64)
+        ended = np.ones(STATE_SIZE, dtype=np.int64)
+        none = np.zeros((0, 0), dtype=np.int32)
+        # Compiled here, where nothing waits for the first SYNC yet.
+        self._call(ended, none, np.zeros(0, np.uint32), np.zeros(0, np.int64), 1)
+
+    def __call__(
+        self, rows: NDArray[np.int32], cob_ids: NDArray[np.uint32], bus_of: NDArray[np.int64], every: int
+    ) -> None:
+        """Send SYNCs, and ``rows`` from ``state[ROW]`` on, until ``state[STOP]``, ``state[RETURN]`` or the last wanted.
+
+        Parameters
+        ----------
+        rows
+            Set points, shape (M, n), counts.
+        cob_ids, bus_of
+            Identifiers of the set point frames and the bus that each goes to, shape (n,).
+        every
+            SYNCs between two rows.
+        """
+        self._call(self._state, rows, cob_ids, bus_of, every)
+
+    def _call(
+        self,
+        state: NDArray[np.int64],
+        rows: NDArray[np.int32],
+        cob_ids: NDArray[np.uint32],
+        bus_of: NDArray[np.int64],
+        every: int,
+    ) -> None:
+        buses = self._fixed[0].size
+        # Per bus the SYNC and behind it the set points of its drives.
+        first = np.searchsorted(np.sort(bus_of), np.arange(buses + 1)) + np.arange(buses + 1)
+        place = np.zeros(cob_ids.size, np.int64)
+        for bus in range(buses):
+            here = np.flatnonzero(bus_of == bus)
+            place[here] = first[bus] + 1 + np.arange(here.size)
+        messages = Messages(buses + cob_ids.size, control=False)
+        body = messages.body.view(np.uint32)
+        body[first[:-1], 0], body[place, 0] = COB_SYNC, cob_ids
+        messages.body[first[:-1], 4], messages.body[place, 4] = 1, 4
+        shared = messages.address, messages.body.view(np.int32), first.astype(np.int64), place
+        _run(*self._fixed, state, *self._shared, *shared, rows, every, self._spec)
+
+
+@njit(nogil=True, cache=True)
+def monotonic_ns(spec):  # type: ignore[no-untyped-def]
+    """Read CLOCK_MONOTONIC (ns); ``spec`` (2,) int64 is room for a ``struct timespec``."""
+    _clock_gettime(_MONOTONIC, spec.ctypes.data)
+    return spec[0] * 1_000_000_000 + spec[1]
+
+
+@njit(nogil=True, cache=True)
+def utc_ns(spec):  # type: ignore[no-untyped-def]
+    """Read CLOCK_REALTIME (ns), which the kernel stamps frames with; ``spec`` as in `monotonic_ns`."""
+    _clock_gettime(_REALTIME, spec.ctypes.data)
+    return spec[0] * 1_000_000_000 + spec[1]
+
+
+@njit(nogil=True, cache=True)
+def sleep_until(deadline, spec):  # type: ignore[no-untyped-def]
+    """Sleep until CLOCK_MONOTONIC reads ``deadline`` (ns)."""
+    spec[0], spec[1] = deadline // 1_000_000_000, deadline % 1_000_000_000
+    while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, spec.ctypes.data, 0) == _EINTR:
+        pass
+
+
+@njit(nogil=True, cache=True)
+def send_messages(descriptor, address, count, attempts, spec):  # type: ignore[no-untyped-def]
+    """Hand ``count`` messages to the kernel; 0, or errno if it will not take them."""
+    sent, code = 0, 0
+    for _ in range(attempts):
+        done = _sendmmsg(descriptor, address + 64 * sent, count - sent, _DONTWAIT)
+        if done > 0:
+            sent += done
+            if sent == count:
+                return 0
+            continue
+        code = carray(_errno_location(), 1, np.int32)[0]
+        if code not in (_EAGAIN, _ENOBUFS, _EINTR):
+            return code
+        sleep_until(monotonic_ns(spec) + _RETRY_NS, spec)
+    return code
+
+
+@njit(nogil=True, cache=True)
+def _run(  # type: ignore[no-untyped-def]
+    descriptors, period, counter, state, late, errors, unsent, times, address, body, first, place, rows, every, spec
+):
+    buses = descriptors.size
+    if state[BASE_NS] == 0:
+        state[BASE_NS] = monotonic_ns(spec) + period
+    while state[STOP] == 0 and state[RETURN] == 0 and state[SENT] < state[WANTED]:
+        k = state[SENT]
+        deadline = state[BASE_NS] + k * period
+        sleep_until(max(deadline, state[LAST_NS] + period // 2), spec)
+        due = state[ROW] < rows.shape[0] and (k + 2) % every == 0
+        if due:
+            for j in range(rows.shape[1]):
+                body[place[j], 2] = rows[state[ROW], j]
+            state[ROW] += 1
+        refused, code = 0, 0
+        for b in range(buses):
+            body[first[b], 2] = k % counter + 1
+            count = first[b + 1] - first[b] if due else 1
+            attempts = _SEND_ATTEMPTS if buses == 1 else _FEW_ATTEMPTS
+            errors[b] = send_messages(descriptors[b], address + 64 * first[b], count, attempts, spec)
+            if errors[b] != 0:
+                unsent[b] += 1
+                refused += 1
+                code = errors[b]
+        state[ERROR] = code if refused == buses else 0
+        # Behind it: whoever hears it never hears it later than this, however long we were held up before.
+        times[k % TIMES] = utc_ns(spec)
+        # Half a period's rest counts from here, too: what takes its time to be sent leaves the processor to others.
+        now = monotonic_ns(spec)
+        state[LAST_NS] = now
+        lateness = now - deadline
+        late[min(BINS - 1, lateness // BIN_NS)] += 1
+        state[LATE_MAX] = max(state[LATE_MAX], lateness)
+        if lateness > period:
+            state[OVERRUNS] += 1
+        if lateness > MAX_LATE_PERIODS * period:
+            state[SKIPPED] += lateness // period
+            state[BASE_NS] += lateness // period * period
+        state[SENT] = k + 1

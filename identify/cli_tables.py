@@ -1,0 +1,189 @@
+"""What the commands show on a terminal: progress on stderr, tables on stdout."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+
+import numpy as np
+from numba.core import event
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from armident.configs import RobotConfig
+from armident.identify.document import DiagnosisDocument, IdentificationDocument
+from armident.identify.effects.terms import arm_model
+
+SHOW_AFTER_S = 2.0
+"""Work that takes no longer needs no progress."""
+
+Report = Callable[[str, float], None]
+
+
+class _Compilation(event.Listener):
+    """Says once that kernels are being compiled: the first run on a machine waits for that, and for nothing else."""
+
+    def __init__(self, what: str) -> None:
+        self._what, self._said = what, False
+
+    def on_start(self, event: event.Event) -> None:
+        """A kernel that no cache holds is about to be compiled."""
+        if not self._said:
+            self._said = True
+            print(f"{self._what}: compiling for this machine, once: later runs find it cached", file=sys.stderr)
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing is said of the end."""
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Report]:
+    """Report stages after two seconds: a bar where stderr is a terminal, otherwise one plain line per stage.
+
+    The first run on a machine also says that it waits for the compiler.
+    """
+    begin = time.monotonic()
+    with event.install_listener("numba:compile", _Compilation(what)), _stages(what, begin) as report:
+        yield report
+
+
+@contextmanager
+def _stages(what: str, begin: float) -> Iterator[Report]:
+    if not sys.stderr.isatty():
+        yield _plain_lines(what, begin)
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0, visible=False)
+
+        def show(stage: str, share: float) -> None:
+            visible = time.monotonic() - begin > SHOW_AFTER_S
+            bar.update(task, completed=share, description=f"{what}: {stage}", visible=visible)
+
+        yield show
+
+
+def warn(lines: list[str]) -> None:
+    """One line each on stderr."""
+    for line in lines:
+        print(f"armident: warning: {line}", file=sys.stderr)
+
+
+def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:
+    """What a trajectory will tell: base parameters (b,), as far as known, and their predicted standard deviations."""
+    table = Table(title=f"{robot.name}: predicted precision, base parameters", title_justify="left")
+    names = arm_model(robot).base.names
+    for column in ("parameter", "value", "std", "std %") if theta is not None else ("parameter", "std"):
+        table.add_column(column, justify="left" if column == "parameter" else "right")
+    if theta is None:
+        for name, deviation in zip(names, std, strict=True):
+            table.add_row(name, f"{deviation:.4g}")
+    for name, value, deviation in () if theta is None else zip(names, theta, std, strict=True):
+        relative = "" if value == 0 else f"{100 * deviation / abs(value):.1f}"
+        table.add_row(name, f"{value:.4f}", f"{deviation:.4f}", relative)
+    Console().print(table)
+
+
+def wanted_table(std: Mapping[str, float]) -> None:
+    """What a designed trajectory will tell of the effects that it was designed for."""
+    table = Table(title="predicted precision, wanted effect", title_justify="left")
+    table.add_column("parameter")
+    table.add_column("std", justify="right")
+    for name, deviation in std.items():
+        table.add_row(name, f"{deviation:.4g}" if np.isfinite(deviation) else "not visible")
+    Console().print(table)
+
+
+def identification_table(document: IdentificationDocument) -> None:
+    """Essential parameters with their standard deviations, IDIM-LS beside another method's estimate."""
+    beside = {} if document.comparison is None else {p.name: p for p in document.comparison.parameters}
+    table = Table(title=f"{document.robot}: {document.method}, essential parameters", title_justify="left")
+    table.add_column("parameter")
+    table.add_column("value", justify="right")
+    table.add_column("std", justify="right")
+    table.add_column("std %", justify="right")
+    table.add_column("unit")
+    if beside:
+        table.add_column("idim-ls", justify="right")
+    for p in document.parameters:
+        if not p.essential:
+            continue
+        relative = "" if p.relative_std_pct is None else f"{p.relative_std_pct:.2f}"
+        row = [p.name, f"{p.value:.4f}", f"{p.std:.4f}", relative, p.unit]
+        table.add_row(*row, *([f"{beside[p.name].value:.4f}"] if beside else []))
+    console = Console()
+    console.print(table)
+    essential = sum(p.essential for p in document.parameters)
+    errors = ", ".join(f"{name} {value:.1f}" for name, value in document.relative_error_pct_by_joint.items())
+    outside = max((w.fraction_outside_2sigma for w in document.whiteness), default=0.0)
+    console.print(
+        f"{essential} of {len(document.parameters)} base parameters are essential; "
+        f"relative torque error {document.relative_error_pct:.4f} % ({errors})",
+        highlight=False,
+        soft_wrap=True,
+    )
+    console.print(
+        f"{document.iterations} iterations, {'converged' if document.converged else 'not converged'}; "
+        f"residual autocorrelation outside 2 sigma at most at {100 * outside:.0f} % of the lags (white: 5 %)",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def diagnosis_table(document: DiagnosisDocument) -> None:
+    """The verdict, the findings in the order found, and the gap on held-out data."""
+    console = Console()
+    console.print(f"verdict: {document.verdict}", highlight=False)
+    if document.findings:
+        table = Table(title="findings", title_justify="left")
+        for heading in ("joint", "effect", "parameters", "confidence", "held-out gap"):
+            table.add_column(heading, overflow="fold")
+        for f in document.findings:
+            std = f.evidence.get("std", {})
+            values = ", ".join(
+                f"{k} {v:.4g}" + (f" ± {std[k]:.2g}" if k in std else "") for k, v in f.parameters.items()
+            )
+            where = f.joint if f.other is None else f"{f.joint}, {f.other}"
+            table.add_row(
+                where, f.effect, values, f"{100 * f.confidence:.0f} %", f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
+            )
+        console.print(table)
+        for f in document.findings:
+            rivals = f.evidence.get("ambiguous_with", [])
+            unsure = f"; could also be {', '.join(rivals)}" if rivals else ""
+            console.print(f"{f.joint}: {f.evidence['says']}{unsure}", highlight=False)
+    if document.considered:
+        named = ", ".join(f.doubt for f in document.considered)
+        console.print(f"considered, and not convincing: {named}", highlight=False, soft_wrap=True)
+    for u in document.unexplained:
+        console.print(
+            f"unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % of its residual varies with {u.varies_with}",
+            highlight=False,
+        )
+    if document.recommended_experiment is not None:
+        console.print(f"to decide: {document.recommended_experiment}", highlight=False)
+    gap = document.gap.validation
+    console.print(
+        f"torque error on held-out data: {gap.before.all:.2f} % before, {gap.after.all:.2f} % after", highlight=False
+    )
+
+
+def _plain_lines(what: str, begin: float) -> Report:
+    """Lines on stderr: one per stage, and one for every further fifth of the work."""
+    last: tuple[str, int] | None = None
+
+    def show(stage: str, share: float) -> None:
+        nonlocal last
+        now = stage, int(5 * share)
+        if now != last and time.monotonic() - begin > SHOW_AFTER_S:
+            print(f"{what}: {stage} ({100 * share:.0f} %)", file=sys.stderr, flush=True)
+            last = now
+
+    return show

@@ -1,0 +1,159 @@
+"""A fit beside a baseline, and the directions in which a change of the plant would part them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from armident.configs import DataError
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
+from armident.identify.document import IdentificationDocument
+from armident.identify.effects.effect import Effect, Place
+from armident.identify.regression.equations import COVARIANCE_PASSES, Block, noise_models
+
+Array = NDArray[np.float64]
+
+RANK_TOLERANCE = 1e-7
+"""Directions of normalised changes shorter than this are none."""
+
+ESTIMABLE = 0.999
+"""Share of a parameter that must lie in the directions seen for it to have a value of its own."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A candidate: an effect at a place, and what the known parameters (k,) do per unit of its own, (k, m)."""
+
+    effect: Effect
+    place: Place
+    directions: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A fit beside a baseline.
+
+    Parameters
+    ----------
+    known
+        Which parameters of the fit the baseline has, (k,).
+    theta0, covariance0
+        The baseline's, (k,) and (k, k).
+    covariance
+        Of the difference, (k, k).
+    absorbed
+        What terms that the baseline has not would have done to its parameters had they been in its data, (k, m):
+        nobody knows which of the two models it was, so differences along these directions are no evidence.
+    """
+
+    fit: Fit
+    known: NDArray[np.int64]
+    theta0: Array
+    covariance0: Array
+    covariance: Array
+    absorbed: Array
+
+    @property
+    def difference(self) -> Array:
+        """Fit less baseline, (k,)."""
+        difference: Array = self.fit.theta[self.known] - self.theta0
+        return difference
+
+    def whitened(self, values: Array) -> Array:
+        """``L^-1 values`` with ``L L'`` the covariance of the difference."""
+        scale = np.sqrt(np.diag(self.covariance))
+        lower = linalg.cholesky(self.covariance / np.outer(scale, scale), lower=True)
+        out: Array = linalg.solve_triangular(lower, (values.T / scale).T, lower=True)
+        return out
+
+    def solved(self, changes: Sequence[Change]) -> tuple[Array, Array, Array, float, int]:
+        """Parameters of changes by generalised least squares.
+
+        Returns
+        -------
+        tuple
+            Parameters (of `absorbed` first), covariance, which of them have a value of their own, the chi-square that
+            is left and its degrees of freedom.
+        """
+        stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
+        target = self.whitened(self.difference)
+        columns = self.whitened(stack)
+        scale = np.linalg.norm(columns, axis=0)
+        scale[scale == 0] = 1.0
+        u, s, vt = np.linalg.svd(columns / scale, full_matrices=False)
+        kept = s > RANK_TOLERANCE * max(float(s.max(initial=0.0)), 1e-300)
+        u, s, vt = u[:, kept], s[kept], vt[kept]
+        inverse = (vt.T / s) / scale[:, None]
+        rest = target - u @ (u.T @ target)
+        own = np.einsum("kj,kj->j", vt, vt) > ESTIMABLE
+        return inverse @ (u.T @ target), inverse @ inverse.T, own, float(rest @ rest), target.size - int(kept.sum())
+
+    def predicted(self, changes: Sequence[Change]) -> Array:
+        """Parameters (b,) with the baseline's numbers after these changes; the terms it has not go along."""
+        values = self.solved(changes)[0]
+        stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
+        return self.completed(self.theta0 + stack @ values)
+
+    def completed(self, known: Array) -> Array:
+        """All parameters of the fit (b,), those that the baseline has as given."""
+        theta = self.fit.theta.copy()
+        free = np.setdiff1d(np.arange(theta.size), self.known)
+        if free.size:
+            c = self.fit.covariance
+            scale = np.sqrt(np.diag(c))[self.known]
+            inner = c[np.ix_(self.known, self.known)] / np.outer(scale, scale)
+            theta[free] += (
+                c[np.ix_(free, self.known)] / scale @ np.linalg.solve(inner, (known - theta[self.known]) / scale)
+            )
+        theta[self.known] = known
+        return theta
+
+
+def compared(fit: Fit, baseline: IdentificationDocument) -> Comparison:
+    """Put a fit beside a baseline.
+
+    Raises
+    ------
+    DataError
+        If the baseline is of another model, or its covariance has another size.
+    """
+    names = fit.study.model.base.names
+    rigid = names[: len(names) - fit.study.model.e]
+    listed = [p.name for p in baseline.parameters]
+    missing = [name for name in rigid if name not in listed]
+    if missing:
+        raise DataError(
+            f"the baseline of robot {baseline.robot!r} lacks {', '.join(missing[:5])}"
+            f"{' and more' if len(missing) > 5 else ''}: it was identified with another model"
+        )
+    theirs = np.array(baseline.covariance, dtype=np.float64)
+    if theirs.shape != (len(listed), len(listed)):
+        raise DataError(f"the baseline's covariance has shape {theirs.shape} for {len(listed)} parameters")
+    known = np.array([k for k, name in enumerate(names) if name in listed], dtype=np.int64)
+    chosen = [listed.index(names[k]) for k in known]
+    theta0 = np.array([baseline.parameters[k].value for k in chosen])
+    covariance0 = theirs[np.ix_(chosen, chosen)]
+    free = np.setdiff1d(np.arange(len(names)), known)
+    z, x = fit.train.z[:, known], fit.train.x
+    absorbed = np.zeros((known.size, 0))
+    if free.size:
+        scale = np.linalg.norm(z, axis=0)
+        scale[scale == 0] = 1.0
+        absorbed = np.linalg.solve((z / scale).T @ (x[:, known] / scale), (z / scale).T @ x[:, free]) / scale[:, None]
+    covariance = fit.covariance[np.ix_(known, known)] + covariance0
+    return Comparison(fit, known, theta0, covariance0, covariance, absorbed)
+
+
+def cautious(fit: Fit) -> Fit:
+    """The fit with noise models that count what its parameters have absorbed, and that they are estimates.
+
+    A search compares candidates in one recording, and needs neither; two recordings are compared by covariances.
+    """
+    blocks = [
+        Block(y, x, np.ones(y.shape, dtype=np.bool_), np.arange(float(y.shape[0]))) for x, _, y in fit.equations.train
+    ]
+    for _ in range(COVARIANCE_PASSES - 1):
+        fit = fit.renoised(noise_models(blocks, fit.theta, fit.covariance, MAX_AR_ORDER))
+    return fit

@@ -1,0 +1,240 @@
+"""Which effects could sit where, and the columns they would add."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.study import Study
+from armident.identify.diagnosis.whitening import joints_of, whitened
+from armident.identify.effects.effect import Effect, Place
+from armident.identify.effects.registry import catalogue
+from armident.identify.effects.terms import effect_terms
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.robot.motion import Motion
+
+Array = NDArray[np.float64]
+Shapes = tuple[tuple[str, float], ...]
+Key = tuple[str, int, int | None, Shapes, str, str]
+Kept = tuple[Array, bool]
+"""Columns of one stretch: (M, k) of the joint of their place and ``True``, or (M, n, k) of all joints and ``False``."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect at a place; the nonlinear parameters are those of the grid that are to be tried."""
+
+    effect: Effect
+    place: Place
+    grid: tuple[Shapes, ...]
+
+    @property
+    def key(self) -> tuple[str, int, int | None]:
+        """Name and place."""
+        return self.effect.name, self.place.joint, self.place.other
+
+    def closer(self) -> "Candidate":
+        """The candidate for a loop that has it inside, with what is worth trying there."""
+        shapes = self.effect.shapes
+        axes = [sorted({tried[k][1] for tried in self.grid} | {*s.closer}) for k, s in enumerate(shapes)]
+        if not any(shape.closer for shape in shapes):
+            return self
+        named = ([(s.name, value) for value in axis] for s, axis in zip(shapes, axes, strict=True))
+        return replace(self, grid=tuple(product(*named)))
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Whitened columns of a candidate, (R, k) each: training rows and held-out rows, measured and simulated."""
+
+    x: Array
+    z: Array
+    held_x: Array
+    held_z: Array
+
+
+@dataclass
+class Workshop:
+    """Makes columns of candidates, and keeps what can be used again.
+
+    Parameters
+    ----------
+    study
+        The stretches.
+    theta
+        Parameters by which effects that depend on the model's torques predict them.
+    """
+
+    study: Study
+    theta: Array
+    kept: dict[Key, tuple[Kept, ...]] = field(default_factory=dict)
+    _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
+
+    def with_theta(self, study: Study, theta: Array) -> "Workshop":
+        """The same after a refit; columns that depend neither on theta nor on another simulation stay."""
+        moved = any(a.simulated is not b.simulated for a, b in zip(study.train, self.study.train, strict=True))
+        still = {
+            key: value
+            for key, value in self.kept.items()
+            if not _predicts(key[0]) and not (moved and key[5] == "simulated")
+        }
+        return Workshop(study, theta, still)
+
+    def instruments(
+        self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel], *, keep: bool = True
+    ) -> Array:
+        """Whitened columns (R, k) at the simulated signals of the training data: what a search looks at."""
+        return whitened(self.band(effect, place, shapes, "train", "simulated", keep=keep), noise)
+
+    def columns(self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel]) -> Columns:
+        """Whitened columns of an effect."""
+        parts = (
+            whitened(self.band(effect, place, shapes, part, kind), noise)
+            for part in ("train", "held")
+            for kind in ("measured", "simulated")
+        )
+        return Columns(*parts)
+
+    def motion(self, stretch: Stretch, kind: str) -> Motion:
+        """A stretch as effects see it."""
+        key = (id(stretch), kind)
+        if key not in self._motions:
+            self._motions[key] = self.study.motion(stretch, kind, self.theta)
+        return self._motions[key]
+
+    def band(
+        self, effect: Effect, place: Place, shapes: Shapes, part: str, kind: str, *, keep: bool = True
+    ) -> tuple[Array, ...]:
+        """Columns in the band of the comparison, (M, n, k) of every stretch.
+
+        Parameters
+        ----------
+        part, kind
+            ``train`` or ``held``; ``measured`` or ``simulated``.
+        keep
+            Whether they may be asked for again.
+        """
+        (made,) = self._bands(effect, place, (shapes,), part, kind, keep=keep)
+        return tuple(self._of_all_joints(columns, place) for columns in made)
+
+    def grid(
+        self, effect: Effect, place: Place, grid: Sequence[Shapes], noise: Sequence[ArModel], *, keep: bool = True
+    ) -> list[tuple[int, Array]]:
+        """Instruments of a whole grid, (R, G k) of every joint that they act on, by its number.
+
+        Whitened columns at the simulated signals of the training data, shape after shape.
+        """
+        made = self._bands(effect, place, grid, "train", "simulated", keep=keep)
+        stretches = range(len(self.study.train))
+        if made[0][0][1]:
+            own = [np.concatenate([columns[s][0] for columns in made], axis=1) for s in stretches]
+            return [(place.joint, np.concatenate([noise[place.joint].whiten(x) for x in own]))]
+        every = [np.concatenate([columns[s][0] for columns in made], axis=2) for s in stretches]
+        acts = sorted({j for x in every for j in joints_of(x)})
+        return [(j, np.concatenate([noise[j].whiten(x[:, j]) for x in every])) for j in acts]
+
+    def _bands(
+        self, effect: Effect, place: Place, grid: Sequence[Shapes], part: str, kind: str, *, keep: bool
+    ) -> list[tuple[Kept, ...]]:
+        """Columns of a grid in the band of the comparison, of every shape and every stretch."""
+        kind = "measured" if effect.sudden else kind
+
+        def key(shapes: Shapes) -> Key:
+            return (effect.name, place.joint, place.other, shapes, part, kind)
+
+        missing = [shapes for shapes in grid if key(shapes) not in self.kept]
+        stretches = [self._filtered(effect, place, missing, self.motion(s, kind)) for s in getattr(self.study, part)]
+        made = {key(shapes): tuple(own[g] for own in stretches) for g, shapes in enumerate(missing)}
+        if keep:
+            self.kept.update(made)
+        return [made[key(shapes)] if key(shapes) in made else self.kept[key(shapes)] for shapes in grid]
+
+    def _filtered(self, effect: Effect, place: Place, grid: Sequence[Shapes], motion: Motion) -> list[Kept]:
+        """Columns of one stretch in the band of the comparison, of every shape."""
+        narrow: list[Array] = []
+        out: list[Kept] = []
+        for shapes in grid:
+            columns = effect.columns(motion, place, **dict(shapes))[motion.lead :]
+            if columns.ndim == 3:
+                out.append((self._decimated(columns), False))
+            else:
+                narrow.append(columns)
+        if narrow:
+            # A filter is hardly slower for many columns than for one.
+            sizes = np.cumsum([columns.shape[1] for columns in narrow])[:-1]
+            band = self.study.decimation(np.concatenate(narrow, axis=1))
+            out += [(columns, True) for columns in np.split(band, sizes, axis=1)]
+        return out
+
+    def _decimated(self, columns: Array) -> Array:
+        """Columns (N, n, k) in the band; joints that they leave alone are not filtered."""
+        acts = joints_of(columns)
+        if len(acts) == columns.shape[1]:
+            return self.study.decimation(columns)
+        filtered = self.study.decimation(columns[:, acts])
+        whole = np.zeros((filtered.shape[0], *columns.shape[1:]))
+        whole[:, acts] = filtered
+        return whole
+
+    def _of_all_joints(self, kept: Kept, place: Place) -> Array:
+        """Columns (M, n, k), joint by joint in memory, as they are whitened."""
+        columns, own = kept
+        if not own:
+            return columns
+        whole = np.zeros((self.study.robot.n, *columns.shape))
+        whole[place.joint] = columns
+        return whole.transpose(1, 0, 2)
+
+
+def _predicts(name: str) -> bool:
+    effect = catalogue().get(name)
+    return effect is None or effect.predicts
+
+
+def candidates(workshop: Workshop) -> Iterator[Candidate]:
+    """All effects of the catalogue at all places of the robot that it does not have there already.
+
+    Left out are effects that are nothing but other numbers, exchanges of signals, and those that say of themselves
+    that this motion cannot show them.
+    """
+    study = workshop.study
+    motion = workshop.motion(study.train[0], "measured")
+    names = study.joints
+    present: dict[tuple[str, int, int | None], list[Shapes]] = {}
+    for term in effect_terms(study.model):
+        here = (term.effect.name, term.place.joint, term.place.other)
+        present.setdefault(here, []).append(tuple(term.shapes.items()))
+    coupled = {frozenset(names.index(j) for j in c.joints) for c in study.robot.couplings}
+    for effect in catalogue().values():
+        if effect.rewires or effect.numbers is not None:
+            continue
+        right = {names.index(stanza.joint) for stanza in study.recorded if stanza.effect == effect.name}
+        for place in places(effect, study.robot.n):
+            if place.joint in right:
+                continue
+            if effect.scope == "pair" and frozenset((place.joint, place.other)) in coupled:
+                continue
+            there = present.get((effect.name, place.joint, place.other), [])
+            if there and not effect.together:
+                continue
+            if effect.visible is not None and effect.visible(motion, place) is not None:
+                continue
+            yield Candidate(effect.essence, place, tuple(s for s in grid(effect, motion, place) if s not in there))
+
+
+def places(effect: Effect, n: int) -> list[Place]:
+    """Where an effect can sit in an arm of n joints."""
+    if effect.scope == "pair":
+        return [Place(i, j) for i, j in combinations(range(n), 2)]
+    if effect.scope == "arm":
+        return [Place(0)]
+    return [Place(j) for j in range(n)]
+
+
+def grid(effect: Effect, motion: Motion, place: Place) -> tuple[Shapes, ...]:
+    """All combinations of nonlinear parameters to try."""
+    axes = [[(shape.name, float(v)) for v in shape.grid(motion, place.joint)] for shape in effect.shapes]
+    return tuple(product(*axes))

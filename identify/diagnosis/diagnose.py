@@ -1,0 +1,315 @@
+"""The diagnosis: is there a gap, where, what fills it, does it close on unseen data, and what is left."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from armident.configs import RobotConfig
+from armident.identify.diagnosis.doubt import Outcome, convincing
+from armident.identify.diagnosis.findings import (
+    experiment_to_separate,
+    gap_of,
+    miswired,
+    noise_floor,
+    outdated,
+    undetectable,
+)
+from armident.identify.diagnosis.hiding import hideable
+from armident.identify.diagnosis.numbers import stale_numbers
+from armident.identify.diagnosis.regression import relative_errors
+from armident.identify.diagnosis.search import Search
+from armident.identify.diagnosis.simulated import SimulatedErrors, simulated_errors
+from armident.identify.diagnosis.state import Settings, State, with_values
+from armident.identify.diagnosis.study import Study, build_study
+from armident.identify.diagnosis.where import Disagreement, beyond_noise, survey, where
+from armident.identify.diagnosis.wiring_check import WiringFinding, find_wiring
+from armident.identify.document import (
+    BeforeAfter,
+    DiagnosisDocument,
+    Finding,
+    Gaps,
+    IdentificationDocument,
+    RecordingReference,
+    Unexplained,
+    Verdict,
+    versions,
+)
+from armident.identify.experiment import Experiment
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+SHARE_OF_ALARMS = 0.1
+"""Of the rate of false alarms, for a mistake of wiring that no other gap speaks for."""
+NOTABLY = 0.2
+"""Drop of the logarithm of the held-out errors' power, summed over the joints, that makes a mistake of wiring likelier
+than effects that are no more to believe in: a wrong sign of a wrist looks much like a missing rotor."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found, and the curves that show it.
+
+    Parameters
+    ----------
+    document
+        ``diagnosis.json`` without the path of the model.
+    robot
+        The configuration with the findings added.
+    t, measured, before, after
+        Held-out instants (M,), s, and torques (M, n): measured, and of the model without and with the findings.
+    lacking
+        The same of the model with all findings but one, for each finding of the document; ``None`` for one that is not
+        a part of the model (wiring, numbers).
+    q, qd
+        Held-out joint positions and velocities (M, n).
+    where
+        What the residual of the model as configured depends on, and what is left of that.
+    left
+        The same of the model with the findings.
+    simulated
+        Errors of the simulated closed loop before and after.
+    """
+
+    document: DiagnosisDocument
+    robot: RobotConfig
+    t: Array
+    measured: Array
+    before: Array
+    after: Array
+    lacking: tuple[Array | None, ...]
+    q: Array
+    qd: Array
+    where: tuple[Disagreement, ...]
+    left: tuple[Disagreement, ...]
+    simulated: SimulatedErrors
+
+
+def diagnose(
+    training: Sequence[Experiment],
+    validation: Sequence[Experiment],
+    robot: RobotConfig,
+    recordings: Sequence[RecordingReference] = (),
+    baseline: IdentificationDocument | None = None,
+    notes: Sequence[str] = (),
+    progress: Progress | None = None,
+    settings: Settings | None = None,
+) -> Diagnosis:
+    """Find the effects a model lacks, one after the other, until none passes.
+
+    Parameters
+    ----------
+    training
+        Experiments to fit.
+    validation
+        Experiments to judge by; without them the last part of the training experiments is held out.
+    robot
+        The model in question.
+    recordings
+        References to where the experiments come from, for the document.
+    baseline
+        Numbers to judge too: which of them no longer hold.
+    notes
+        Of the conversion, for the document's warnings.
+    progress
+        Called with a stage and the share done.
+    settings
+        Error rates.
+
+    Raises
+    ------
+    DataError
+        If the recordings cannot support a diagnosis.
+    """
+    # Threads gain little on tall and narrow matrices, and round otherwise.
+    with threadpool_limits(1):  # type: ignore[no-untyped-call]
+        return _diagnose(
+            training, validation, robot, recordings, baseline, notes, _Steps(progress), settings or Settings()
+        )
+
+
+class _Steps:
+    """Turns the steps of a search, whose number nobody knows, into shares of the whole."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self._progress = progress or (lambda stage, share: None)
+        self._done = 0.0
+        self._begin = self._since = time.perf_counter()
+        self._stage = ""
+        self.spent: dict[str, float] = {}
+
+    def __call__(self, stage: str) -> None:
+        self._note()
+        self._stage = stage
+        self._done += 0.15 * (1.0 - self._done)
+        self._progress(stage, self._done)
+
+    def finish(self) -> dict[str, float]:
+        self._note()
+        self._progress("done", 1.0)
+        return {**self.spent, "total": time.perf_counter() - self._begin}
+
+    def _note(self) -> None:
+        now = time.perf_counter()
+        if self._stage:
+            kind = "search" if self._stage.startswith(("adding", "taking", "exchang")) else self._stage
+            self.spent[kind] = self.spent.get(kind, 0.0) + now - self._since
+        self._since = now
+
+
+def _diagnose(
+    training: Sequence[Experiment],
+    validation: Sequence[Experiment],
+    robot: RobotConfig,
+    recordings: Sequence[RecordingReference],
+    baseline: IdentificationDocument | None,
+    notes: Sequence[str],
+    steps: _Steps,
+    settings: Settings,
+) -> Diagnosis:
+    steps("wiring")
+    wiring = find_wiring([*training, *validation], robot)
+    found = _searched(training, validation, robot, wiring if wiring and wiring.certain else None, steps, settings)
+    if wiring is not None and not wiring.certain:
+        # Where nothing else can be to blame, the recordings alone must say it; elsewhere they say it of many things.
+        alone = found.open == 0 and wiring.p_values[0] <= SHARE_OF_ALARMS * settings.false_alarms
+        other = _searched(training, validation, robot, wiring, steps, settings) if alone or found.open else None
+        # The mistake itself is one thing more to believe in.
+        room = 0 if alone else found.open - 1
+        if other is not None and other.open <= room and other.misfit < found.misfit - NOTABLY * (other.open == room):
+            found = other
+        else:
+            wiring = None
+    study, first, outcome, left = found.study, found.first, found.outcome, found.left
+    final = outcome.state
+    findings = [*([] if wiring is None else miswired(wiring, robot)), *outcome.findings]
+    lacking = [*(None for _ in findings[len(outcome.findings) :]), *(_beside(final, s) for s in outcome.lacking)]
+    if baseline is not None:
+        steps("numbers")
+        findings += outdated(stale_numbers(final.fit, final.workshop, baseline, settings.false_alarms))
+    steps("simulation")
+    simulated = simulated_errors(first, final)
+    steps("what could hide")
+    could_hide = hideable(final, settings)
+    document = DiagnosisDocument(
+        robot=robot.name,
+        recordings=list(recordings),
+        verdict=_verdict(findings, left),
+        findings=findings,
+        considered=list(outcome.considered),
+        unexplained=[
+            Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint) for d in left
+        ],
+        gap=Gaps(
+            train=BeforeAfter(before=gap_of(first, held=False), after=gap_of(final, held=False)),
+            validation=BeforeAfter(before=gap_of(first, held=True), after=gap_of(final, held=True)),
+        ),
+        noise_floor=noise_floor(final, left),
+        recommended_experiment=experiment_to_separate(findings),
+        model=None,
+        timing_s=steps.finish(),
+        versions=versions(),
+        warnings=[*notes, *study.warnings],
+        not_visible=undetectable(first),
+        could_hide=could_hide,
+        simulated=simulated.document(),
+    )
+    held = final.study.held
+    return Diagnosis(
+        document=document,
+        robot=with_values(final),
+        t=_continued([s.t for s in held]),
+        measured=np.concatenate([s.y for s in held]),
+        before=_beside(final, first),
+        after=_predicted(final),
+        lacking=(*lacking, *(None for _ in findings[len(lacking) :])),
+        q=_sampled(final, "q"),
+        qd=_sampled(final, "qd"),
+        where=found.where,
+        left=tuple(left),
+        simulated=simulated,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What a search found, with the drives wired in one way: data, models at its ends, and what is left."""
+
+    study: Study
+    first: State
+    outcome: Outcome
+    where: tuple[Disagreement, ...]
+    left: tuple[Disagreement, ...]
+
+    @property
+    def open(self) -> int:
+        """Effects that the wiring needs, and what stays unexplained with them."""
+        return len(self.outcome.findings) + len(self.left)
+
+    @property
+    def misfit(self) -> float:
+        """Sum over the joints of the logarithm of the share of the held-out torque's power that the model leaves."""
+        _, each = relative_errors(self.outcome.state.fit, held=True)
+        return float(np.sum(np.log(each**2)))
+
+
+def _searched(
+    training: Sequence[Experiment],
+    validation: Sequence[Experiment],
+    robot: RobotConfig,
+    wiring: WiringFinding | None,
+    steps: _Steps,
+    settings: Settings,
+) -> _Found:
+    """Search for effects, with the mistakes of wiring undone."""
+    wired = robot if wiring is None else robot.model_copy(update={"effects": (*wiring.stanzas, *robot.effects)})
+    steps("derivatives and closed loop")
+    study = build_study(training, validation, wired)
+    steps("base fit")
+    search = Search(study, settings, steps)
+    first = search.start()
+    steps("where")
+    seen = survey(first.fit, first.workshop, settings.false_alarms)
+    places = where(first.fit, first.workshop, seen=seen)
+    outcome = convincing(search, first, search.run(), seen)
+    steps("what is left")
+    left = beyond_noise(outcome.state.fit, outcome.left, settings.false_alarms)
+    return _Found(study, first, outcome, tuple(places), tuple(left))
+
+
+def _verdict(findings: Sequence[Finding], left: Sequence[Disagreement]) -> Verdict:
+    """``no_gap`` and ``explained`` say that what remains is noise (see `excess`) and varies with nothing."""
+    if findings:
+        return "partly_explained" if left else "explained"
+    return "unexplained" if left else "no_gap"
+
+
+def _predicted(state: State) -> Array:
+    """Torques of the model on the held-out data, (M, n)."""
+    return np.concatenate([x @ state.fit.theta for x, _, _ in state.fit.equations.held])
+
+
+def _beside(final: State, state: State) -> Array:
+    """Torques of another model (M, n); what it misses of recordings as it has them, on them as they are put right."""
+    pairs = zip(final.study.held, state.study.held, strict=True)
+    return np.asarray(_predicted(state) + np.concatenate([right.y - own.y for right, own in pairs]))
+
+
+def _sampled(state: State, name: str) -> Array:
+    """A measured signal at the held-out instants, (M, n)."""
+    signals = [getattr(s.measured, name) for s in state.study.held]
+    return np.concatenate([s[state.study.decimation.instants(s.shape[0])] for s in signals])
+
+
+def _continued(times: Sequence[Array]) -> Array:
+    """Instants of one stretch after the other on one axis, each from where the last one ended."""
+    parts: list[Array] = []
+    end = 0.0
+    for t in times:
+        parts.append(t - t[0] + end)
+        end = float(parts[-1][-1])
+    return np.concatenate(parts)

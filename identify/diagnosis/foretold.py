@@ -1,0 +1,67 @@
+"""What a model changes of another's errors at simulated motion, where measured motion brings noise.
+
+A link on a spring or a late torque takes one derivative more than the rigid model: at measured signals it brings noise
+that the effect does not have, and the errors of the right model may be larger than those of the wrong one. What it
+changes of the predicted torque is known without that noise where the motion is simulated.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs.schema.robot import Effect as Stanza
+from armident.identify.diagnosis.study import Study
+from armident.identify.effects.recorded import put_right
+from armident.identify.effects.registry import known
+from armident.identify.experiment import Experiment
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Foretold:
+    """Held-out errors (M, n) of every stretch: of a model at measured motion, and less what another one changes."""
+
+    before: tuple[Array, ...]
+    after: tuple[Array, ...]
+
+
+def foretold(study: Study, theta: Array, other: Study, other_theta: Array) -> Foretold | None:
+    """Errors of a model, and what another model would leave of them if it were right at simulated motion.
+
+    Parameters
+    ----------
+    study, theta
+        The model, (b,).
+    other, other_theta
+        The same recordings with the other one, and the motion that it makes.
+
+    Returns
+    -------
+    Foretold or None
+        In the torques as the other model has them put right; ``None`` where it undoes something that the first one has
+        put right, or exchanges signals.
+    """
+    more = tuple(stanza for stanza in other.recorded if stanza not in study.recorded)
+    undone = any(stanza not in other.recorded for stanza in study.recorded)
+    if undone or any(known(stanza.effect).rewires for stanza in more):
+        return None
+    before, after = [], []
+    for own, right in zip(study.held, other.held, strict=True):
+        there = replace(own, simulated=right.simulated, before=right.before)
+        seen, simulated = (
+            torque_put_right(study.torques(there, kind, theta), study, more) for kind in ("measured", "simulated")
+        )
+        change = other.torques(right, "simulated", other_theta) - simulated
+        error = right.torque - seen
+        before.append(study.decimation(error))
+        after.append(study.decimation(error - change))
+    return Foretold(tuple(before), tuple(after))
+
+
+def torque_put_right(torque: Array, study: Study, stanzas: tuple[Stanza, ...]) -> Array:
+    """Torques (N, n) at the working rate as they are without what stanzas say of recordings."""
+    robot = study.robot.model_copy(update={"effects": stanzas})
+    (done,) = put_right([Experiment(q=torque, tau=torque, q_ref=None, dt=study.dt)], robot)
+    return done.tau

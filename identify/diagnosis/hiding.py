@@ -1,0 +1,88 @@
+"""How much of an effect these recordings could hide: the smallest size that a diagnosis would nearly always find."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from armident.identify.diagnosis.candidates import Candidate, Columns, Shapes, candidates
+from armident.identify.diagnosis.state import HELD_OUT_LEVEL, Settings, State
+from armident.identify.diagnosis.trial import deviations, inflation_along, joints_reached
+from armident.identify.diagnosis.whitening import rows_of_joints, whitened
+from armident.identify.document import Hideable
+
+Array = NDArray[np.float64]
+
+POWER = 0.9
+"""Chance with which an effect of the size that is told would have been found."""
+
+
+def hideable(state: State, settings: Settings) -> list[Hideable]:
+    """Sizes up to which effects that are not in the model could be in the arm without showing.
+
+    Each linear parameter by itself, at the nonlinear ones that fit best. It must be so large that training and held-out
+    data each speak for it, at the levels of a search, with a chance of nine in ten, and that it takes the share of the
+    held-out error away that a finding must.
+
+    Parameters
+    ----------
+    state
+        The model with all that was found.
+    settings
+        Error rates of the search.
+    """
+    shapes = {trial.candidate.key: trial.shapes for trial in (*state.others, *state.trials[::-1])}
+    found: list[Hideable] = []
+    for candidate in candidates(state.workshop):
+        if candidate.key in state.hidden or candidate.effect.sudden:
+            continue
+        tried = shapes.get(candidate.key, candidate.grid[len(candidate.grid) // 2] if candidate.grid else ())
+        sizes = _smallest(state, candidate, tried, settings)
+        if sizes is not None and np.isfinite(sizes).any():
+            found.append(_told(state, candidate, sizes))
+    return found
+
+
+def _smallest(state: State, candidate: Candidate, shapes: Shapes, settings: Settings) -> Array | None:
+    """Smallest size (k,) of each linear parameter that would be found; infinite where none would."""
+    fit = state.fit
+    # Of the simulated motion: a search has made them already, and the size is that of a chance.
+    z, held_z = (
+        whitened(state.workshop.band(candidate.effect, candidate.place, shapes, part, "simulated"), fit.noise)
+        for part in ("train", "held")
+    )
+    std = deviations(fit, Columns(z, z, held_z, held_z))
+    if std is None:
+        return None
+    often = float(stats.norm.ppf(POWER))
+    tests = max(state.tests, 1) * max(len(candidate.grid), 1)
+    train = float(stats.norm.isf(0.5 * settings.false_alarms / tests)) + often
+    held = float(stats.norm.isf(HELD_OUT_LEVEL)) + often
+    residual = fit.held_residual
+    change = held_z - np.stack([fit.held_at_simulated(a) for a in fit.absorbed(z).T], axis=1)
+    rows = rows_of_joints([s.y.shape[0] for s in fit.study.held], fit.noise)
+    sizes = np.full(std.size, np.inf)
+    for k in np.flatnonzero(std > 0.0):
+        own = change[:, k]
+        size = float(own @ own)
+        if size == 0.0:
+            continue
+        inflation = inflation_along(own, residual)
+        spread = np.sqrt(size * inflation + fit.spread(own)) / size
+        reached = joints_reached(candidate, own, rows)
+        powers = np.array([[float(of[r] @ of[r]) for of in (residual, own)] for r in reached])
+        share = np.sqrt(settings.material * float(np.min(powers[:, 0] / np.maximum(powers[:, 1], 1e-300))))
+        sizes[k] = max(train * std[k] * np.sqrt(inflation), held * spread, share)
+    return sizes
+
+
+def _told(state: State, candidate: Candidate, sizes: Array) -> Hideable:
+    joints, place = state.study.joints, candidate.place
+    kind = int(state.study.robot.joints[place.joint].type == "prismatic")
+    named = [(p, float(v)) for p, v in zip(candidate.effect.linear, sizes, strict=True) if np.isfinite(v)]
+    return Hideable(
+        effect=candidate.effect.name,
+        joint=joints[place.joint],
+        other=None if place.other is None else joints[place.other],
+        below={p.name: float(f"{v:.2g}") for p, v in named},
+        units={p.name: p.unit[kind] for p, _ in named},
+    )

@@ -1,0 +1,163 @@
+"""Lines in the spectrum of the residual: torques of a fixed frequency, whatever the motion."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.study import BAND, Study
+
+Array = NDArray[np.float64]
+
+BLOCK = 128
+"""Independent frequencies from whose median the spectrum around a line is estimated."""
+
+PADDING = 2
+"""Frequencies of the search over independent ones."""
+
+HIGHEST = 0.35
+"""Highest frequency of the search over the working rate: the first filter begins there."""
+
+PROMINENT = 100.0
+"""Power of a line of the references over that around it."""
+
+MODULATED = 0.1
+"""Width to either side of a line that the motion modulates, over the motion's bandwidth."""
+
+EQUIVALENT = BLOCK / 1.5 * np.log(2) ** 2
+"""Shape of the gamma distribution with the spread of such a median; a Hann window makes 1.5 frequencies one."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of one joint.
+
+    Parameters
+    ----------
+    frequency
+        Hz.
+    p_train, p_held
+        That the training residual has such a line anywhere, and the held-out one at this frequency, by chance.
+    share
+        Share of the held-out residual's power at the working rate.
+    f, amplitude, noise
+        Amplitudes of the training residual around it, N m or N, and those that a residual without a line exceeds at
+        one frequency in twenty, (G,) each.
+    """
+
+    frequency: float
+    p_train: float
+    p_held: float
+    share: float
+    f: Array
+    amplitude: Array
+    noise: Array
+
+    @property
+    def p_value(self) -> float:
+        """Both combined (Fisher's method)."""
+        return float(stats.combine_pvalues([max(p, 1e-300) for p in (self.p_train, self.p_held)]).pvalue)
+
+
+def residuals(study: Study, stretches: Sequence[Stretch], theta: Array) -> list[Array]:
+    """Torques less those of the model at the working rate, (N, n) each."""
+    return [s.torque - study.torques(s, "measured", theta) for s in stretches]
+
+
+def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, lowest: float) -> Line | None:
+    """The strongest line of one joint's residuals above the frequencies of the motion.
+
+    The power at a frequency over that of its surroundings has an F-distribution if there is no line (its phase may
+    differ from one stretch to the next).
+
+    Parameters
+    ----------
+    train, held
+        Residuals, (N,) each.
+    lowest
+        Frequency at which the search begins, Hz.
+    """
+    spectra = [_Spectrum.of(e, dt) for e in train]
+    size = max(s.power.size for s in spectra)
+    f = np.linspace(0.0, 0.5 / dt, size)
+    chosen = np.flatnonzero((f >= lowest) & (f <= HIGHEST / dt))
+    if chosen.size < PADDING * BLOCK:
+        return None
+    ratio = np.mean([np.interp(f[chosen], s.f, s.power / s.background) for s in spectra], axis=0)
+    peak = int(np.argmax(ratio))
+    frequency = float(f[chosen[peak]])
+    p_train = min(1.0, chosen.size * _chance(float(ratio[peak]), len(spectra)))
+    unseen = [_Spectrum.of(e, dt) for e in held]
+    there = [s.at(frequency) for s in unseen]
+    power = sum(max(p - b, 0.0) * s.to_power for (p, b), s in zip(there, unseen, strict=True)) / len(unseen)
+    total = sum(float(e @ e) for e in held) / sum(e.size for e in held)
+    longest = max(spectra, key=lambda s: s.power.size)
+    around = np.flatnonzero(np.abs(longest.f - frequency) <= 40 * longest.f[1])
+    return Line(
+        frequency,
+        p_train,
+        _chance(float(np.mean([p / b for p, b in there])), len(there)),
+        power / max(total, 1e-300),
+        longest.f[around],
+        np.sqrt(2.0 * longest.to_power * longest.power[around]),
+        np.sqrt(2.0 * longest.to_power * longest.background[around] * np.log(20.0)),
+    )
+
+
+def of_references(study: Study, frequency: float) -> bool:
+    """Whether the references have that line, too: set points come at a rate of their own, and the arm follows them.
+
+    The motion modulates it, so that it is some of the motion's own frequencies wide.
+    """
+    wide = MODULATED * lowest_frequency(study)
+    for reference in study.auxiliary.references:
+        for joint in np.diff(reference, 2, axis=0).T:
+            spectrum = _Spectrum.of(joint, study.sample)
+            near = np.abs(spectrum.f - frequency) <= max(wide, 2 * PADDING * spectrum.f[1])
+            if np.any(spectrum.power[near] > PROMINENT * spectrum.background[near]):
+                return True
+    return False
+
+
+def lowest_frequency(study: Study) -> float:
+    """Bandwidth of the motion, Hz: below it what repeats with the motion has lines, too."""
+    return 0.5 / (study.dt * study.decimation.factor * BAND)
+
+
+def _chance(ratio: float, stretches: int) -> float:
+    """That a mean over stretches of power over background is so large without a line."""
+    return float(stats.f.sf(ratio, 2 * stretches, 2 * EQUIVALENT * stretches))
+
+
+@dataclass(frozen=True, eq=False)
+class _Spectrum:
+    """Power at frequencies f, and that of the surroundings; ``to_power`` times power is the mean square of a line."""
+
+    f: Array
+    power: Array
+    background: Array
+    to_power: float
+    windowed: Array
+    dt: float
+
+    @classmethod
+    def of(cls, e: Array, dt: float) -> "_Spectrum":
+        window = np.hanning(e.size)
+        windowed = window * (e - e.mean()) / np.sqrt(window @ window)
+        power = np.abs(np.fft.rfft(windowed, PADDING * e.size)) ** 2
+        block = PADDING * BLOCK
+        count = max(1, power.size // block)
+        parts = np.array_split(np.arange(power.size), count)
+        level = np.array([np.log(np.median(power[part]) / np.log(2)) for part in parts])
+        background = np.exp(np.interp(np.arange(power.size), [part.mean() for part in parts], level))
+        to_power = 2.0 * float(window @ window) / float(window.sum()) ** 2
+        f = np.arange(power.size) / (PADDING * e.size * dt)
+        return cls(f, power, np.maximum(background, 1e-300), to_power, windowed, dt)
+
+    def at(self, frequency: float) -> tuple[float, float]:
+        """Power and background at any frequency."""
+        turning = np.exp(-2j * np.pi * frequency * self.dt * np.arange(self.windowed.size))
+        return float(np.abs(self.windowed @ turning) ** 2), float(np.interp(frequency, self.f, self.background))

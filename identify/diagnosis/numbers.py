@@ -1,0 +1,261 @@
+"""Whether the numbers of a baseline still hold, and what has changed where they do not.
+
+A fit and a baseline of the same plant differ by their errors alone: ``d = theta - theta_0`` has the covariance
+``S = C + C_0``. A change of the plant moves d along a few directions, ``d = B p``: those that the catalogue gives for
+a payload, other friction, another drive gain. Candidates compete by how well they explain d, and have to predict
+held-out torques better than the baseline's numbers do.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special, stats
+
+from armident.identify.diagnosis.baseline import Change, Comparison, cautious, compared
+from armident.identify.diagnosis.candidates import Workshop
+from armident.identify.diagnosis.changes import STRUCTURAL, changes, p_value, ranked
+from armident.identify.diagnosis.regression import Fit, relative_errors
+from armident.identify.diagnosis.trial import CLOSE, newey_west
+from armident.identify.document import IdentificationDocument
+from armident.identify.effects.effect import Effect
+
+Array = NDArray[np.float64]
+
+ALTERNATIVES = 3
+
+
+@dataclass(frozen=True)
+class NumbersFinding:
+    """One reason why numbers of a baseline no longer hold.
+
+    Parameters
+    ----------
+    effect, joint, other
+        Entry of the catalogue and where, or ``changed_parameters`` for what no entry explains.
+    parameters, std
+        Changes against the baseline, as far as the data tell them one by one, and their standard deviations, which
+        hold the uncertainty of the baseline too.
+    p_value
+        Chance of so great a change of numbers if there were none, all candidates counted.
+    gap_before, gap_after
+        Relative torque error on held-out data, percent, with the baseline's numbers and all findings before this one,
+        and with this one: of the joint, or of all joints where the arm as a whole is concerned.
+    confidence
+        Share of the posterior odds that is its own, times the chance that anything has changed at all.
+    ambiguous_with
+        Effects at odds of less than 20 to 1.
+    alternatives
+        Effect, joint and score (see `Standing`) of the candidates next to this one.
+    words
+        What it means, in plain language.
+    """
+
+    effect: str
+    joint: str
+    other: str | None
+    parameters: dict[str, float]
+    std: dict[str, float]
+    p_value: float
+    gap_before: float
+    gap_after: float
+    confidence: float
+    ambiguous_with: tuple[str, ...]
+    alternatives: tuple[tuple[str, str, float], ...]
+    words: str
+
+
+def stale_numbers(
+    fit: Fit, workshop: Workshop, baseline: IdentificationDocument, alpha: float = 0.01
+) -> list[NumbersFinding]:
+    """Name what has changed since a baseline was identified.
+
+    Parameters
+    ----------
+    fit
+        Of the model with everything it lacked in structure.
+    workshop
+        Of the same study.
+    baseline
+        Result of an earlier identification of the same robot.
+    alpha
+        Chance of a false alarm.
+
+    Raises
+    ------
+    DataError
+        If the baseline is of another model, or has no covariance.
+    """
+    comparison = compared(cautious(fit), baseline)
+    if not _stale(comparison, alpha):
+        return []
+    pool = list(changes(comparison, workshop))
+    found: list[Change] = []
+    barred: list[Change] = []
+    while True:
+        standings = ranked(comparison, found, [c for c in pool if c not in found and c not in barred])
+        passing = [standing.change for standing in standings if standing.p_value * len(pool) <= alpha]
+        if not passing:
+            break
+        best = passing[0]
+        if _closes(comparison, found, [*found, best], alpha):
+            found.append(best)
+            found = [c for c in found if p_value(comparison, [o for o in found if o is not c], c) * len(pool) <= alpha]
+            if best not in found:
+                barred.append(best)
+        else:
+            barred.append(best)
+    findings = []
+    for k, change in enumerate(found):
+        findings.append(_described(comparison, found[:k], change, found, pool))
+    return [*findings, *_rest(comparison, found, alpha)]
+
+
+def _stale(comparison: Comparison, alpha: float) -> bool:
+    """Whether all parameters together, or any of them by itself, differ; half the false alarms for either test."""
+    _, _, _, rest, free = comparison.solved([])
+    together = float(stats.chi2.sf(rest, free))
+    return together < alpha / 2 or bool(_changed_names(comparison, [], alpha / 2))
+
+
+def _changed_names(comparison: Comparison, changes: Sequence[Change], alpha: float) -> list[tuple[int, float, float]]:
+    """Known parameters that differ beyond the changes: number, difference and standard deviation, by Holm's method."""
+    stack = np.column_stack([comparison.absorbed, *(c.directions for c in changes)])
+    rest = comparison.difference - stack @ comparison.solved(changes)[0]
+    std = np.sqrt(np.diag(comparison.covariance))
+    p = 2 * stats.norm.sf(np.abs(rest) / std)
+    found = []
+    for rank, k in enumerate(np.argsort(p)):
+        if p[k] * (p.size - rank) > alpha:
+            break
+        found.append((int(k), float(rest[k]), float(std[k])))
+    return found
+
+
+def _closes(comparison: Comparison, before: Sequence[Change], after: Sequence[Change], alpha: float) -> bool:
+    """Whether held-out torques follow the change."""
+    return _held_out(comparison, comparison.predicted(before), comparison.predicted(after)) > stats.norm.isf(alpha)
+
+
+def _held_out(comparison: Comparison, before: Array, after: Array) -> float:
+    """Projection of the held-out residual on the change of prediction in its standard deviations.
+
+    Its spread comes from the noise, from what serial correlation is left (Newey-West), and from the baseline.
+    """
+    held = comparison.fit.held
+    change = held.z @ (after - before)
+    size = float(change @ change)
+    if size == 0.0:
+        return 0.0
+    residual = held.y - held.x @ before
+    inflation = max(1.0, newey_west(change * (residual - change)) / size)
+    through = change @ held.x[:, comparison.known]
+    spread = float(through @ comparison.covariance0 @ through)
+    return float(change @ residual) / float(np.sqrt(size * inflation + spread))
+
+
+def _described(
+    comparison: Comparison,
+    before: Sequence[Change],
+    change: Change,
+    found: Sequence[Change],
+    pool: Sequence[Change],
+) -> NumbersFinding:
+    """A change with its values in the model of all changes, the gaps of the order in which they were found."""
+    fit = comparison.fit
+    others = [c for c in found if c is not change]
+    values, covariance, own, _, _ = comparison.solved([*others, change])
+    m = change.directions.shape[1]
+    names = [p.name for p in change.effect.linear]
+    told = {n: float(v) for n, v, o in zip(names, values[-m:], own[-m:], strict=True) if o}
+    std = {n: float(np.sqrt(v)) for n, v, o in zip(names, np.diag(covariance)[-m:], own[-m:], strict=True) if o}
+    gap_before = _gap(fit, comparison.predicted(before), change)
+    gap_after = _gap(fit, comparison.predicted([*before, change]), change)
+    p = min(1.0, p_value(comparison, others, change) * len(pool))
+    every = ranked(comparison, others, [change, *(c for c in pool if c not in found)])
+    own_score = next((s.score for s in every if s.change is change), -np.inf)
+    rivals = [s for s in every if s.change is not change]
+    share = float(np.exp(own_score - special.logsumexp([s.score for s in every]))) if every else 0.0
+    joint = _joint(fit, change)
+    return NumbersFinding(
+        effect=change.effect.name,
+        joint=joint,
+        other=None,
+        parameters=told,
+        std=std,
+        p_value=p,
+        gap_before=gap_before,
+        gap_after=gap_after,
+        confidence=share * (1.0 - p),
+        ambiguous_with=tuple(s.change.effect.name for s in rivals if s.score > own_score - CLOSE),
+        alternatives=tuple((s.change.effect.name, _joint(fit, s.change), s.score) for s in rivals[:ALTERNATIVES]),
+        words=_words(change.effect, joint, told, std),
+    )
+
+
+def _joint(fit: Fit, change: Change) -> str:
+    """Name of the joint; a payload hangs on the last one, as its stanza does."""
+    joints = fit.study.joints
+    return joints[-1] if change.effect.name == "payload" else joints[change.place.joint]
+
+
+def _gap(fit: Fit, theta: Array, change: Change) -> float:
+    """Relative torque error on held-out data, percent, of the joint or of all."""
+    overall, each = relative_errors(fit, theta, held=True)
+    return overall if change.effect.scope == "arm" else float(each[change.place.joint])
+
+
+def _words(effect: Effect, joint: str, values: dict[str, float], std: dict[str, float]) -> str:
+    if effect.name == "payload" and "mp" in values:
+        mass = values["mp"]
+        words = f"{abs(mass):.3g} kg (standard deviation {std['mp']:.2g} kg) {'more' if mass > 0 else 'less'}"
+        words += " on the flange than in the baseline"
+        moments = [values.get(f"m{axis}p") for axis in "xyz"]
+        if mass > 3 * std["mp"] and None not in moments:
+            at = ", ".join(f"{moment / mass:.3f}" for moment in moments if moment is not None)
+            words += f", centre of mass at ({at}) m in the frame of the last link"
+        return words
+    told = ", ".join(f"{name} {value:+.3g} (standard deviation {std[name]:.2g})" for name, value in values.items())
+    title = STRUCTURAL.get(effect.name, effect.title)
+    return f"{title} at {joint}: {told}" if told else f"{title} at {joint}"
+
+
+def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list[NumbersFinding]:
+    """What has changed and no candidate explains, in one finding."""
+    fit = comparison.fit
+    _, _, _, left, free = comparison.solved(found)
+    p = float(stats.chi2.sf(left, free))
+    changed = _changed_names(comparison, found, alpha)
+    # All together can be off without one that could be named; nobody can act on that.
+    if not changed:
+        return []
+    before = comparison.predicted(found)
+    if _held_out(comparison, before, fit.theta) <= stats.norm.isf(alpha):
+        return []
+    model = fit.study.model
+    names = [model.base.names[comparison.known[k]] for k, _, _ in changed]
+    numbers = Counter(m.group(1) for name in names if (m := re.search(r"(\d)r?(?:_\d+)?$", name)))
+    joint = model.robot.joints[min(int(numbers.most_common(1)[0][0]), model.n) - 1 if numbers else 0].name
+    told = "; ".join(
+        f"{name} was {comparison.theta0[k]:.4g}, differs by {rest:+.3g} (standard deviation {std:.2g})"
+        for name, (k, rest, std) in zip(names, changed, strict=True)
+    )
+    return [
+        NumbersFinding(
+            effect="changed_parameters",
+            joint=joint,
+            other=None,
+            parameters={name: rest for name, (_, rest, _) in zip(names, changed, strict=True)},
+            std={name: std for name, (_, _, std) in zip(names, changed, strict=True)},
+            p_value=p,
+            gap_before=relative_errors(fit, before, held=True)[0],
+            gap_after=relative_errors(fit, held=True)[0],
+            confidence=1.0 - p,
+            ambiguous_with=(),
+            alternatives=(),
+            words=f"numbers differ from the baseline and no effect of the catalogue explains it: {told}",
+        )
+    ]

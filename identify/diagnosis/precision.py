@@ -1,0 +1,86 @@
+"""How sure the parameters of the effects in a model are, the nonlinear ones included."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.diagnosis.candidates import Workshop
+from armident.identify.diagnosis.regression import Fit
+from armident.identify.diagnosis.state import State
+from armident.identify.diagnosis.trial import newey_west
+from armident.identify.effects.terms import Term, effect_terms
+from armident.identify.regression.ar_noise import ArModel
+
+Array = NDArray[np.float64]
+
+STEP = 0.01
+"""Relative change of a nonlinear parameter for its derivative."""
+
+
+def standard_deviations(state: State) -> list[dict[str, float]]:
+    """Standard deviations of all parameters of every term of the model, by their names in the configuration.
+
+    The derivative of the torque with respect to a nonlinear parameter is one more column, so that its uncertainty
+    enters that of the linear ones (Gauss-Newton); parameters taken from a set of whole numbers count as known. What the
+    model leaves is no white noise where an effect is only nearly right: spreads are those of the residual along each
+    parameter's influence (Newey, West 1987, Econometrica 55(3)), if that is more.
+    """
+    study, fit = state.study, state.fit
+    slopes: list[Array] = []
+    owners: list[tuple[int, str]] = []
+    for k, term in enumerate(effect_terms(study.model)):
+        own = [study.model.base.names.index(name) for name in term.names]
+        for name in term.effect.movable(study.robot, term.place, term.shapes):
+            slopes.append(_slope(state.workshop, fit.noise, term, name, term.of_effect(fit.theta[own])))
+            owners.append((k, name))
+    deviations = _deviations(fit, slopes)
+    b = fit.theta.size
+    found: list[dict[str, float]] = []
+    for k, term in enumerate(effect_terms(study.model)):
+        own = [study.model.base.names.index(name) for name in term.names]
+        std = {p.name: float(deviations[i]) for p, i in zip(term.linear, own, strict=True)}
+        for place, (owner, name) in enumerate(owners):
+            if owner == k:
+                std[name] = float(deviations[b + place])
+        found.append(std)
+    return found
+
+
+def _slope(workshop: Workshop, noise: Sequence[ArModel], term: Term, name: str, values: Array) -> Array:
+    """Derivative of a term's whitened torque at the simulated signals with respect to a nonlinear parameter, (R,)."""
+
+    def torque(shapes: Mapping[str, float]) -> Array:
+        key = tuple((shape.name, shapes[shape.name]) for shape in term.effect.shapes)
+        rows: Array = workshop.instruments(term.effect, term.place, key, noise, keep=False) @ values
+        return rows
+
+    step = STEP * term.shapes[name]
+    up, down = (
+        torque({**term.shapes, name: term.shapes[name] + step}),
+        torque({**term.shapes, name: term.shapes[name] - step}),
+    )
+    slope: Array = (up - down) / (2 * step)
+    return slope
+
+
+def _deviations(fit: Fit, slopes: list[Array]) -> Array:
+    """Of the model's own parameters and of further ones whose columns at simulated signals are ``slopes``, (b + s,).
+
+    Those of the rigid model stay as they are (4.34).
+    """
+    b, e = fit.theta.size, fit.study.model.e
+    variances: Array = np.concatenate([np.diag(fit.covariance), np.zeros(len(slopes))])
+    if not e:
+        return variances**0.5
+    z = np.column_stack([fit.train.z, *slopes])
+    scale = np.linalg.norm(z, axis=0)
+    scale[scale == 0] = 1.0
+    inverse = np.linalg.pinv((z / scale).T @ (z / scale), rcond=1e-12, hermitian=True)
+    # Where the simulator is not exact, 4.34 is wider than (Z'Z)^-1; the further columns only widen it.
+    alone = np.linalg.pinv((z[:, :b] / scale[:b]).T @ (z[:, :b] / scale[:b]), rcond=1e-12, hermitian=True)
+    for k in range(b - e, b + len(slopes)):
+        influence = (z / scale) @ inverse[:, k] / scale[k]
+        variances[k] += (inverse[k, k] - (alone[k, k] if k < b else 0.0)) / scale[k] ** 2
+        variances[k] = max(variances[k], newey_west(influence * fit.residual))
+    return variances**0.5

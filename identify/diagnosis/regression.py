@@ -1,0 +1,392 @@
+"""The instrumental-variable regression behind a diagnosis, whitened joint by joint."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.study import Study
+from armident.identify.diagnosis.whitening import ar_models, rows_of_joints, summed_backwards, whitened
+from armident.identify.effects.terms import effect_terms
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.equations import require_excitation
+from armident.identify.regression.fir import filter_columns
+
+Array = NDArray[np.float64]
+
+MAX_AR_ORDER = 30
+PASSES = 3
+"""Between parameters and noise models; a fourth changes neither visibly."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Whitened rows of all joints, one below the other: regressor (R, b), instruments (R, b), torques (R,)."""
+
+    x: Array
+    z: Array
+    y: Array
+
+
+Equation = tuple[Array, Array, Array]
+"""Of one stretch: regressor at measured and at simulated signals (M, n, b) each, torques (M, n)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Equations in the band of the comparison, one entry per stretch."""
+
+    train: tuple[Equation, ...]
+    held: tuple[Equation, ...]
+
+    @cached_property
+    def blocks(self) -> tuple["Block", ...]:
+        """The training rows joint by joint, without the columns that are zero there."""
+        return tuple(Block.of(self.train, j) for j in range(self.train[0][2].shape[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rows of one joint, of which many columns are zero: a link hangs on the joints before it.
+
+    Parameters
+    ----------
+    x, z
+        Columns of regressor and instruments that are not zero.
+    parts
+        ``[X, Z, y]`` of these columns, one array (M, x + z + 1) per stretch.
+    """
+
+    x: NDArray[np.int64]
+    z: NDArray[np.int64]
+    parts: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, rows: Sequence[Equation], joint: int) -> "Block":
+        """Rows of a joint out of the equations of all."""
+        x, z = (
+            np.flatnonzero(np.any([np.any(row[k][:, joint] != 0, axis=0) for row in rows], axis=0)) for k in range(2)
+        )
+        parts = tuple(np.column_stack([r[0][:, joint, x], r[1][:, joint, z], r[2][:, joint]]) for r in rows)
+        return cls(x, z, parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Whitened rows of all joints, and their products.
+
+    Parameters
+    ----------
+    noise
+        That they are whitened by.
+    rows
+        ``[X, Z, y]`` of every joint's block, whitened.
+    parts
+        ``Z' [X, Z, y]`` of every joint's block.
+    zx, zz, zy
+        ``Z'X`` and ``Z'Z`` (b, b), ``Z'y`` (b,).
+    """
+
+    noise: tuple[ArModel, ...]
+    rows: tuple[Array, ...]
+    parts: tuple[Array, ...]
+    zx: Array
+    zz: Array
+    zy: Array
+
+    @classmethod
+    def of(cls, equations: Equations, noise: Sequence[ArModel], known: "Products | None" = None) -> "Products":
+        """Of the training rows under given noise models.
+
+        Parameters
+        ----------
+        known
+            Products of the same equations: those of joints with the same noise model are taken from there.
+        """
+        b = equations.train[0][0].shape[2]
+        zx, zz, zy = np.zeros((b, b)), np.zeros((b, b)), np.zeros(b)
+        rows, parts = [], []
+        for j, (block, ar) in enumerate(zip(equations.blocks, noise, strict=True)):
+            if known is not None and known.noise[j] is ar:
+                white, through = known.rows[j], known.parts[j]
+            else:
+                taps = np.append(1.0, ar.coefficients) / np.sqrt(ar.variance)
+                white = np.concatenate([filter_columns(taps, part) for part in block.parts])
+                through = white[:, block.x.size : -1].T @ white
+            zx[np.ix_(block.z, block.x)] += through[:, : block.x.size]
+            zz[np.ix_(block.z, block.z)] += through[:, block.x.size : -1]
+            zy[block.z] += through[:, -1]
+            rows.append(white)
+            parts.append(through)
+        return cls(tuple(noise), tuple(rows), tuple(parts), zx, zz, zy)
+
+    @cached_property
+    def scale(self) -> Array:
+        """Norms of the instruments, 1 for those that are zero, (b,)."""
+        scale = np.sqrt(np.diag(self.zz))
+        return np.where(scale == 0, 1.0, scale)
+
+    @cached_property
+    def solver(self) -> Any:
+        """Factors of ``Z'X``, scaled."""
+        return linalg.lu_factor(self.zx / np.outer(self.scale, self.scale))
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Parameters, noise models, and the whitened rows of both parts of the data.
+
+    Parameters
+    ----------
+    theta
+        (b,), those of the terms at the end.
+    noise
+        AR model of each joint.
+    equations
+        Rows before they were whitened.
+    products
+        Those of the whitened training rows.
+    fixed
+        Whether theta is given (a baseline), so that nothing of a candidate is absorbed by it.
+    """
+
+    study: Study
+    theta: Array
+    noise: tuple[ArModel, ...]
+    equations: Equations
+    products: Products
+    fixed: bool = False
+
+    def renoised(self, noise: Sequence[ArModel]) -> "Fit":
+        """The fit with other noise models; a given theta stays."""
+        return solved(self.study, self.equations, noise, self.theta if self.fixed else None, self.products)
+
+    def errors(self, theta: Array, *, held: bool) -> list[Array]:
+        """``y - X theta`` at measured signals in the band of the comparison, (M, n) of every stretch."""
+        rows = self.equations.held if held else self.equations.train
+        return [y - applied(x, theta) for x, _, y in rows]
+
+    @cached_property
+    def left(self) -> list[Array]:
+        """What the model leaves of the training rows, (M, n) of every stretch."""
+        return self.errors(self.theta, held=False)
+
+    @cached_property
+    def train(self) -> Rows:
+        """Whitened training rows."""
+        return self._rows(self.equations.train)
+
+    @cached_property
+    def held(self) -> Rows:
+        """Whitened held-out rows."""
+        return self._rows(self.equations.held)
+
+    def _rows(self, rows: tuple[Equation, ...]) -> Rows:
+        return Rows(*(whitened([row[k] for row in rows], self.noise) for k in range(3)))
+
+    @cached_property
+    def residual(self) -> Array:
+        """Of the training rows, (R,)."""
+        return whitened(self.left, self.noise)
+
+    @cached_property
+    def held_residual(self) -> Array:
+        """Of the held-out rows, (R,)."""
+        return whitened(self.errors(self.theta, held=True), self.noise)
+
+    def held_at_simulated(self, theta: Array) -> Array:
+        """``Z theta`` of the held-out rows, (R,)."""
+        return whitened([applied(z, theta) for _, z, _ in self.equations.held], self.noise)
+
+    def _through(self, columns: Array) -> tuple[Array, Array]:
+        """``X' columns`` and ``Z' columns`` of the training rows, (b, k) each."""
+        x, z = np.zeros((2, self.theta.size, columns.shape[1]))
+        begin = 0
+        for block, rows in zip(self.equations.blocks, self.products.rows, strict=True):
+            own = columns[begin : begin + rows.shape[0]]
+            begin += rows.shape[0]
+            # Most candidates act on one joint.
+            if own.any():
+                through = rows[:, :-1].T @ own
+                x[block.x] += through[: block.x.size]
+                z[block.z] += through[block.x.size :]
+        return x, z
+
+    def absorbed(self, columns: Array) -> Array:
+        """Parameters (b, k) that the model would give to torques ``columns`` (R, k): ``(Z'X)^-1 Z' columns``."""
+        if self.fixed:
+            return np.zeros((self.theta.size, columns.shape[1]))
+        scale = self.products.scale[:, None]
+        found: Array = linalg.lu_solve(self.products.solver, self._through(columns)[1] / scale) / scale
+        return found
+
+    def _inside(self, x: Array) -> Array:
+        """``(X'Z)^-1 x`` (b, k)."""
+        scale = self.products.scale[:, None]
+        inside: Array = linalg.lu_solve(self.products.solver, x / scale, trans=1) / scale
+        return inside
+
+    def beside(self, instruments: Array) -> Array:
+        """Instruments (R, k) less what the model's own explain: ``D - Z (X'Z)^-1 X'D``."""
+        if self.fixed:
+            return instruments
+        inside = self._inside(self._through(instruments)[0])
+        rest = instruments.copy()
+        begin = 0
+        for block, rows in zip(self.equations.blocks, self.products.rows, strict=True):
+            rest[begin : begin + rows.shape[0]] -= rows[:, block.x.size : -1] @ inside[block.z]
+            begin += rows.shape[0]
+        return rest
+
+    def products_beside(self, columns: Sequence[tuple[int, Array]], count: int) -> tuple[Array, Array]:
+        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = beside(instruments)``, without making it.
+
+        Parameters
+        ----------
+        columns
+            Instruments (R, G k) of each joint that they act on, by its number, group after group.
+        count
+            G.
+        """
+        width = columns[0][1].shape[1]
+        x, z = np.zeros((2, self.theta.size, width))
+        gram, score = np.zeros((count, width // count, width // count)), np.zeros(width)
+        for joint, own in columns:
+            block, rows = self.equations.blocks[joint], self.products.rows[joint]
+            score += own.T @ self.residual[self.rows_of[joint]]
+            groups = own.reshape(own.shape[0], count, -1).transpose(1, 0, 2)
+            gram += groups.transpose(0, 2, 1) @ groups
+            if not self.fixed:
+                through = rows[:, :-1].T @ own
+                x[block.x] += through[: block.x.size]
+                z[block.z] += through[block.x.size :]
+        if self.fixed:
+            return gram, score.reshape(count, -1)
+        inside = self._inside(x)
+
+        def products(right: Array) -> Array:
+            grouped = (part.reshape(self.theta.size, count, -1).transpose(1, 0, 2) for part in (inside, right))
+            left, other = grouped
+            return left.transpose(0, 2, 1) @ other
+
+        # The residual has nothing along the model's own instruments.
+        both = products(z)
+        return gram - both - both.transpose(0, 2, 1) + products(self.products.zz @ inside), score.reshape(count, -1)
+
+    @cached_property
+    def rows_of(self) -> list[slice]:
+        """Where the whitened training rows of each joint are."""
+        return rows_of_joints([y.shape[0] for _, _, y in self.equations.train], self.noise)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """``(Z'X)^-1 Z'Z (X'Z)^-1`` (4.34), (b, b)."""
+        scale = np.outer(self.products.scale, self.products.scale)
+        half = linalg.lu_solve(self.products.solver, self.products.zz / scale)
+        covariance: Array = linalg.lu_solve(self.products.solver, half.T) / scale
+        return covariance
+
+    def spread(self, direction: Array) -> float:
+        """Variance of ``direction' X_held theta`` from the uncertainty of theta, ``direction`` (R,)."""
+        if self.fixed:
+            return 0.0
+        parts = summed_backwards(direction, self.noise, [y.shape[0] for _, _, y in self.equations.held])
+        through = np.zeros(self.theta.size)
+        for (x, _, _), weight in zip(self.equations.held, parts, strict=True):
+            through += weight.reshape(-1) @ x.reshape(-1, x.shape[2])
+        return float(through @ self.covariance @ through)
+
+
+def fit(study: Study, theta0: Array | None = None) -> Fit:
+    """Alternate instrumental variables and AR noise models (thesis sections 2.3.3 and 6.1.3).
+
+    Parameters
+    ----------
+    theta0
+        Parameters by which terms that depend on the model's torques predict them; ``None``: none do.
+
+    Raises
+    ------
+    DataError
+        If the training motion leaves parameters undetermined.
+    """
+    equations = Equations(
+        tuple((*regressors(study, s, theta0), s.y) for s in study.train),
+        tuple((*regressors(study, s, theta0), s.y) for s in study.held),
+    )
+    flat = np.concatenate([x.reshape(-1, x.shape[-1]) for x, _, _ in equations.train])
+    require_excitation(flat, study.model.base.names)
+    theta = np.linalg.lstsq(flat, np.concatenate([y.reshape(-1) for _, _, y in equations.train]), rcond=None)[0]
+    noise = noise_models([y - x @ theta for x, _, y in equations.train], theta.size, 0)
+    found = solved(study, equations, noise)
+    for _ in range(PASSES - 1):
+        found = found.renoised(noise_models(found.errors(found.theta, held=False), theta.size, MAX_AR_ORDER))
+    return found
+
+
+def solved(
+    study: Study,
+    equations: Equations,
+    noise: Sequence[ArModel],
+    theta: Array | None = None,
+    known: Products | None = None,
+) -> Fit:
+    """Parameters by instrumental variables under given noise models; a given ``theta`` is kept as it is.
+
+    Parameters
+    ----------
+    known
+        Products of the same equations under other noise models.
+    """
+    products = Products.of(equations, noise, known)
+    if theta is not None:
+        return Fit(study, theta, tuple(noise), equations, products, fixed=True)
+    estimate = linalg.lu_solve(products.solver, products.zy / products.scale) / products.scale
+    return Fit(study, estimate, tuple(noise), equations, products)
+
+
+def relative_errors(fit: Fit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
+    """``|y - X theta| / |y|`` in percent in the band of the comparison, overall and of each joint (n,)."""
+    y = np.concatenate([s.y for s in (fit.study.held if held else fit.study.train)])
+    error = np.concatenate(fit.errors(fit.theta if theta is None else theta, held=held))
+    each = np.linalg.norm(error, axis=0) / np.maximum(np.linalg.norm(y, axis=0), 1e-300)
+    return 100 * float(np.linalg.norm(error) / np.linalg.norm(y)), 100 * each
+
+
+def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Array, Array]:
+    """Regressor (M, n, b) at measured and at simulated signals, in the band of the comparison."""
+    out: list[Array] = []
+    for kind in ("measured", "simulated"):
+        signals = getattr(stretch, kind)
+        key = (id(signals), study.model.base.names[: -study.model.e or None])
+        if key not in study.rigid:
+            made = study.decimation(study.model.rigid_regressor(signals.q, signals.qd, signals.qdd))
+            # With the signals, whose identity is the key only as long as they live.
+            study.rigid[key] = signals, made
+        rigid = study.rigid[key][1]
+        if study.model.e:
+            terms = study.decimation(study.terms(stretch, kind, theta))
+            if out:
+                first = out[0].shape[2] - study.model.e
+                sudden = np.flatnonzero([t.effect.sudden for t in effect_terms(study.model) for _ in t.names])
+                terms[:, :, sudden] = out[0][:, :, first + sudden]
+            rigid = np.concatenate([rigid, terms], axis=2)
+        out.append(rigid)
+    return out[0], out[1]
+
+
+def applied(columns: Array, values: Array) -> Array:
+    """``columns @ values``: (M, n, k) and (k,) to (M, n), as one product."""
+    product: Array = (columns.reshape(-1, columns.shape[2]) @ values).reshape(columns.shape[:2])
+    return product
+
+
+def noise_models(errors: Sequence[Array], parameters: float, order: int) -> list[ArModel]:
+    """AR model of each joint's residual (6.21 to 6.25), its variance corrected for the parameters estimated."""
+    free = 1 - parameters / sum(e.size for e in errors)
+    return [ArModel(ar.coefficients, ar.variance / free, ar.aic) for ar in ar_models(errors, order)]

@@ -1,0 +1,80 @@
+"""The simulated closed loop against the measured one, with the model as configured and with what was found."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.diagnosis.foretold import foretold
+from armident.identify.diagnosis.state import State
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.identification.equations import aligned_torque
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SimulatedErrors:
+    """Errors of simulated velocities and torques on the held-out data, percent of the measured ones, (n,) each.
+
+    ``torque_foretold`` is the error at measured motion less what the findings change of the torque at simulated motion,
+    see `armident.identify.diagnosis.foretold`. Not a number where a loop diverges, or that cannot be said.
+    """
+
+    joints: tuple[str, ...]
+    velocity_before: Array
+    velocity_after: Array
+    torque_before: Array
+    torque_after: Array
+    torque_foretold: Array
+
+    def document(self) -> dict[str, Any] | None:
+        """As it stands in ``diagnosis.json``."""
+        names = ("velocity_before", "velocity_after", "torque_before", "torque_after", "torque_foretold")
+        told = {name: getattr(self, name) for name in names if np.isfinite(getattr(self, name)).all()}
+        return {name: dict(zip(self.joints, map(float, values), strict=True)) for name, values in told.items()} or None
+
+
+def simulated_errors(first: State, final: State) -> SimulatedErrors:
+    """Simulate the references with both models."""
+    before, after = _errors(first), _errors(final)
+    if before is None or after is None:
+        unknown = np.full(first.study.robot.n, np.nan)
+        before = after = unknown, unknown
+    return SimulatedErrors(
+        tuple(first.study.joints), before[0], after[0], before[1], after[1], foretold_errors(first, final)
+    )
+
+
+def foretold_errors(first: State, final: State) -> Array:
+    """Held-out torque errors of a model less what another one changes at simulated motion, percent, (n,); or nan."""
+    found = foretold(first.study, first.fit.theta, final.study, final.fit.theta)
+    if found is None:
+        return np.full(first.study.robot.n, np.nan)
+    left, torque = (np.concatenate(part) for part in (found.after, [s.y for s in final.study.held]))
+    shares = np.linalg.norm(left, axis=0) / np.maximum(np.linalg.norm(torque, axis=0), 1e-300)
+    return np.asarray(100 * shares)
+
+
+def _errors(state: State) -> tuple[Array, Array] | None:
+    study = state.study
+    auxiliary: AuxiliaryModel = replace(
+        study.auxiliary.fresh(), model=study.model.anchored(state.fit.theta), anchor=None
+    )
+    runs = auxiliary.simulate(state.fit.theta)
+    if runs is None:
+        return None
+    totals = np.zeros((4, study.robot.n))
+    for stretch in study.held:
+        run = runs[stretch.experiment]
+        qd = run.qd[stretch.rows]
+        y = study.decimation(study.thinning(aligned_torque(run.tau))[stretch.span])
+        totals[0] += np.sum((qd - stretch.measured.qd) ** 2, axis=0)
+        totals[1] += np.sum(stretch.measured.qd**2, axis=0)
+        totals[2] += np.sum((y - stretch.y) ** 2, axis=0)
+        totals[3] += np.sum(stretch.y**2, axis=0)
+    if not np.isfinite(totals).all():
+        return None
+    velocity, torque = (100 * np.sqrt(totals[k] / np.maximum(totals[k + 1], 1e-300)) for k in (0, 2))
+    return velocity, torque

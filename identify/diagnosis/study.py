@@ -1,0 +1,297 @@
+"""What a diagnosis works on: training and held-out stretches of motion, with their torques in one band."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import DataError, RobotConfig
+from armident.configs.schema.robot import Effect as Stanza
+from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distances, rows_before
+from armident.identify.effects.recorded import of_recording, put_right
+from armident.identify.effects.registry import known
+from armident.identify.effects.terms import arm_model
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.estimators.idim_ls import idim_ls
+from armident.identify.experiment import Experiment
+from armident.identify.identification.auxiliary_loop import closed_loop
+from armident.identify.identification.equations import aligned_torque, equations, least_rows
+from armident.identify.identification.options import CONTROLLERS, Options
+from armident.identify.identification.solvers import decimation_of
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.motion import Motion
+from armident.identify.signals.bandwidth import motion_bandwidth
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.differentiate import Derivatives, differentiate
+
+Array = NDArray[np.float64]
+
+HELD_OUT_SHARE = 0.35
+"""Last part of every experiment kept for judging, where no other recording is given for it."""
+
+BAND = 5.0
+"""Frequency up to which model and data are compared, as a multiple of the closed-loop bandwidth."""
+
+WORKING_RATE = 20.0
+"""Rate at which effects are evaluated, over the frequency up to which model and data are compared."""
+
+
+ALIKE = 0.9
+"""Squared error of one loop's motion over that of another down to which they tell nothing."""
+STIFF_LOOP = 1.5
+"""Squared error of the motion of a stand-in's loop over that without the model's terms up to which it is no worse."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """Training and held-out stretches of one robot.
+
+    Parameters
+    ----------
+    robot
+        The robot as configured.
+    model
+        Its model.
+    decimation
+        From the working rate to the rate of the comparison.
+    dt
+        Of the working rate, s.
+    duration
+        Of all recordings, s.
+    loop
+        Which closed loop the instruments come from.
+    auxiliary
+        That loop, of the rigid arm as least squares have it.
+    thinning
+        From the recorded to the working rate.
+    sources
+        Recordings for training and for validation, as they are.
+    signals
+        Derivatives of their positions at the recorded rate.
+    rigid
+        Regressors that all models of the study share, made once; see
+        `armident.identify.diagnosis.regression.regressors`.
+    """
+
+    robot: RobotConfig
+    model: ArmModel
+    decimation: Decimation
+    dt: float
+    duration: float
+    train: tuple[Stretch, ...]
+    held: tuple[Stretch, ...]
+    loop: str
+    auxiliary: AuxiliaryModel
+    thinning: Decimation
+    sources: tuple[Sequence[Experiment], Sequence[Experiment]]
+    signals: tuple[Derivatives, ...]
+    warnings: tuple[str, ...] = ()
+    rigid: dict[tuple[int, tuple[str, ...]], tuple[Derivatives, Array]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    @property
+    def recorded(self) -> tuple[Stanza, ...]:
+        """Stanzas by which the recordings have been put right."""
+        return tuple(stanza for stanza in self.robot.effects if of_recording(stanza))
+
+    def of_robot(self, robot: RobotConfig) -> "Study":
+        """The same recordings for another model, put right anew where its stanzas say other things of them.
+
+        Raises
+        ------
+        DataError
+            If no closed loop can be simulated with them.
+        """
+        changed = replace(self, robot=robot, model=arm_model(robot))
+        if changed.recorded == self.recorded:
+            return changed
+        wiring = [[s for s in study.recorded if known(s.effect).rewires] for study in (self, changed)]
+        return build_study(*self.sources, robot, self.signals if wiring[0] == wiring[1] else None)
+
+    def moves_more_like_the_arm_than(self, other: "Study", *, held: bool) -> bool:
+        """Whether the simulated loop is a better likeness of the arm than that of another study of the same recordings.
+
+        One whose controller was identified is, beside a stand-in: that follows the measured motion whatever the arm.
+        """
+        ours, theirs = self.loop in CONTROLLERS, other.loop in CONTROLLERS
+        if ours != theirs:
+            return ours
+        one, two = (study.held if held else study.train for study in (self, other))
+        return bool(distances(one).sum() < distances(two).sum())
+
+    def likeness_lost(self, other: "Study", joints: Sequence[int], *, held: bool) -> float:
+        """Squared error of this simulated loop's motion at some joints over that of another's.
+
+        Infinite where one of the two is a stand-in, which follows what it sees, and the other one is not.
+        """
+        if (self.loop in CONTROLLERS) != (other.loop in CONTROLLERS):
+            return float("inf")
+        one, two = (distances(study.held if held else study.train)[list(joints)].sum() for study in (self, other))
+        return float(one / max(two, 1e-300))
+
+    @property
+    def sample(self) -> float:
+        """Sampling period of the recording, s."""
+        return self.dt / self.thinning.factor
+
+    @property
+    def joints(self) -> list[str]:
+        """Names of the joints."""
+        return [joint.name for joint in self.robot.joints]
+
+    def motion(self, stretch: Stretch, kind: str, theta: Array | None) -> Motion:
+        """A stretch as effects see it, ``measured`` or ``simulated``; with what came before."""
+        parts: list[Derivatives] = [getattr(stretch, kind)]
+        if stretch.before is not None:
+            parts.insert(0, stretch.before[KINDS.index(kind)])
+        q, qd, qdd = (np.concatenate([getattr(p, name) for p in parts]) for name in ("q", "qd", "qdd"))
+        lead = q.shape[0] - parts[-1].q.shape[0]
+        return Motion(self.model, q, qd, qdd, self.dt, parts[0].start, theta, self.duration, lead=lead)
+
+    def terms(self, stretch: Stretch, kind: str, theta: Array | None) -> Array:
+        """Columns (N, n, e) of the model's terms along a stretch."""
+        motion = self.motion(stretch, kind, theta)
+        return self.model.term_regressor(motion)[motion.lead :]
+
+    def torques(self, stretch: Stretch, kind: str, theta: Array) -> Array:
+        """Torques (N, n) of the model along a stretch, terms included."""
+        signals: Derivatives = getattr(stretch, kind)
+        rigid = self.model.inverse_dynamics(theta, signals.q, signals.qd, signals.qdd)
+        return rigid + self.terms(stretch, kind, theta) @ theta[-self.model.e :] if self.model.e else rigid
+
+    def resimulated(self, theta: Array, *, worse: float = 1.0) -> "Study":
+        """The study with the motion that the closed loop makes with its model, terms included, at these parameters.
+
+        Parameters
+        ----------
+        theta
+            (b,).
+        worse
+            Squared error of its motion over that of the loop there is up to which it is taken.
+
+        Returns
+        -------
+        Study
+            The same where that loop diverges, or follows the arm less closely than the one there is: large additions to
+            the compiled loop may be too stiff for it (see `armident.identify.robot.relaxation`).
+        """
+        auxiliary = replace(self.auxiliary.fresh(), model=self.model.anchored(theta), anchor=None)
+        runs = auxiliary.simulate(theta)
+        if runs is None:
+            return self
+        dt, factor = auxiliary.dt, self.thinning.factor
+        cut = {s.experiment: s.measured for s in (*self.train, *self.held)}
+        motions = {k: _seen(runs[k].q, measured, dt) for k, measured in cut.items()}
+
+        def moved(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
+            return tuple(s.resimulated(motions[s.experiment], dt, factor) for s in stretches)
+
+        train = moved(self.train)
+        # A stand-in follows the measured motion whatever the arm: there it must only not be led astray.
+        bound = distances(self.train).sum() * (worse if self.loop in CONTROLLERS else STIFF_LOOP)
+        if not distances(train).sum() < bound:
+            return self
+        return replace(self, train=train, held=moved(self.held))
+
+
+def build_study(
+    training: Sequence[Experiment],
+    validation: Sequence[Experiment],
+    robot: RobotConfig,
+    known_signals: Sequence[Derivatives] | None = None,
+) -> Study:
+    """Differentiate, simulate, split and filter the experiments.
+
+    Parameters
+    ----------
+    training
+        Experiments to fit; without ``validation`` their last part is held out.
+    validation
+        Experiments to judge by, or none.
+    known_signals
+        Derivatives of the positions of both, if they have been made.
+
+    Raises
+    ------
+    DataError
+        If rates differ, or the motion is too short or does not determine the parameters of the model.
+    """
+    experiments = put_right([*training, *validation], robot)
+    dt = experiments[0].dt
+    if any(abs(e.dt - dt) > 1e-9 * dt for e in experiments):
+        raise DataError("the recordings have different sampling rates; diagnose them separately")
+    experiments = _continued(experiments)
+    model = arm_model(robot)
+    bandwidth = robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
+    cutoff = min(BAND * bandwidth, 0.25 / dt)
+    factor = max(1, int(1.0 / (dt * WORKING_RATE * cutoff)))
+    first = design(dt, 0.4 / (dt * factor), factor) if factor > 1 else design(dt, 0.5 / dt, 1)
+    second = design(dt * factor, cutoff)
+    signals = known_signals or [
+        replace(differentiate(e.q, dt, bandwidth_hz=bandwidth), start=e.start) for e in experiments
+    ]
+    simulated, loop, auxiliary, warnings = _simulated(model, experiments, signals, bandwidth)
+    train: list[Stretch] = []
+    held: list[Stretch] = []
+    for k, (e, s, z) in enumerate(zip(experiments, signals, simulated, strict=True)):
+        torque = first(aligned_torque(e.tau))
+        kept = first.instants(e.tau.shape[0])
+        pieces = [(train if k < len(training) else held, slice(0, None))]
+        if not validation:
+            cut = int((1 - HELD_OUT_SHARE) * torque.shape[0])
+            pieces = [(train, slice(0, cut)), (held, slice(cut, None))]
+        for into, span in pieces:
+            rows = kept[span]
+            y = second(torque[span])
+            t = e.start + dt * (rows[0] + factor * second.instants(rows.size))
+            earlier = rows_before(kept, rows)
+            before = None if earlier.size == 0 else (at_rows(s, earlier, dt, factor), at_rows(z, earlier, dt, factor))
+            measured, noiseless = at_rows(s, rows, dt, factor), at_rows(z, rows, dt, factor)
+            into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span, before))
+    duration = max(e.start + dt * e.q.shape[0] for e in experiments)
+    return Study(
+        robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first,
+        (training, validation), tuple(signals), tuple(warnings),
+    )  # fmt: skip
+
+
+def _simulated(
+    model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], bandwidth: float
+) -> tuple[list[Derivatives], str, AuxiliaryModel, list[str]]:
+    """Motion of the simulated closed loop with the parameters of IDIM-LS, one per experiment."""
+    dt, warnings = experiments[0].dt, list[str]()
+    rigid = model.without_terms()
+    lengths = [e.q.shape[0] for e in experiments]
+    decimation = decimation_of("idim-ls", dt, bandwidth, None, samples=lengths, rows=least_rows(rigid))
+    ls = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names)
+    auxiliary, start, description = closed_loop(
+        rigid, experiments, signals, Options(method="idim-iv"), ls.theta, decimation, bandwidth, warnings
+    )
+    runs = auxiliary.simulate(start)
+    if runs is None:
+        raise DataError("the closed loop cannot be simulated with the model as it stands")
+    motions = [Derivatives(run.q, run.qd, run.qdd, None, dt, e.start) for run, e in zip(runs, experiments, strict=True)]
+    return motions, str(description["kind"]), auxiliary, warnings
+
+
+def _seen(q: Array, measured: Derivatives, dt: float) -> Derivatives:
+    """A simulated motion as the smoother that the measured one went through sees it.
+
+    Set points arrive in steps, which a simulated acceleration shows and a smoothed one does not: what effects make of
+    either should differ by the noise alone.
+    """
+    assert measured.nvr is not None
+    return replace(differentiate(q, dt, nvr=measured.nvr[:, 0]), start=measured.start)
+
+
+def _continued(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Experiments one after the other on one axis of time, where they all begin at zero."""
+    out: list[Experiment] = []
+    end = 0.0
+    for e in experiments:
+        start = e.start if e.start >= end else end
+        out.append(replace(e, start=start))
+        end = start + e.dt * e.q.shape[0]
+    return out

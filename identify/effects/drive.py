@@ -1,0 +1,167 @@
+"""Effects of drives and encoders: what they report is not what they do."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from armident.identify.effects.effect import Effect, Linear, Place, Recorded, Shape, motor_limit
+from armident.identify.robot.motion import Motion
+
+Array = NDArray[np.float64]
+
+
+def _gain(motion: Motion, place: Place) -> Array:
+    return motion.of_motor(place.joint, motion.motor_torque[:, place.joint])
+
+
+def _alone(motion: Motion, place: Place) -> str | None:
+    if motion.n == 1:
+        return "the parameters of a single axis grow and shrink with the gain of its only drive"
+    return None
+
+
+def _gain_numbers(motion: Motion, place: Place) -> Array:
+    if motion.n > 1 or motion.theta is None:
+        return np.zeros((motion.model.base.b, 0))
+    return motion.theta[: motion.model.base.b, None].copy()
+
+
+def _saturation(motion: Motion, place: Place) -> Array:
+    """The first term of any odd curve beyond the straight line: the share lost grows with the square of the torque."""
+    torque = motion.motor_torque[:, place.joint]
+    # By the limit of the joint, so that the parameter is the same in every motion.
+    loss = torque * (torque / motor_limit(motion.model.robot, place.joint)) ** 2
+    return motion.of_motor(place.joint, loss)
+
+
+def _unsaturated(recorded: Array, at: Recorded, loss: float) -> Array:
+    """Torques (N,) that currents give whose torque would be the recorded: ``i / sqrt(1 + 2 loss (i / limit)^2)``.
+
+    Sample by sample, as what a controller makes of the noise of its encoder is bent with the rest.
+    """
+    given: Array = recorded / np.sqrt(1.0 + 2.0 * max(loss, 0.0) * (recorded / at.limit) ** 2)
+    return given
+
+
+def _delay(motion: Motion, place: Place) -> Array:
+    return motion.of_motor(place.joint, -motion.rate(motion.motor_torque[:, place.joint]))
+
+
+def _bandwidth(motion: Motion, place: Place) -> Array:
+    return motion.of_motor(place.joint, motion.rate(motion.motor_torque[:, place.joint]))
+
+
+def _earlier(recorded: Array, at: Recorded, delay: float) -> Array:
+    """Recorded torques (N,) at the time that they belong to."""
+    t = at.dt * np.arange(recorded.size)
+    early: Array = np.interp(t + delay, t, recorded)
+    return early
+
+
+def _lagging(recorded: Array, at: Recorded, lag: float) -> Array:
+    """What a motor makes of the commands (N,) that are recorded: ``1 / (1 + lag s)``, from rest (Tustin)."""
+    if lag <= 0.0:
+        return recorded
+    ratio = 2.0 * lag / at.dt
+    b, a = np.array([1.0, 1.0]) / (1.0 + ratio), np.array([1.0, (1.0 - ratio) / (1.0 + ratio)])
+    late: Array = signal.lfilter(b, a, recorded, zi=recorded[:1] * (1.0 - b[0]))[0]
+    return late
+
+
+def _within_a_sample(values: Array, dt: float) -> bool:
+    """Whether a torque of one instant may as well be that of the next: drives differ in what they latch when."""
+    return bool(np.all(np.abs(values) < dt))
+
+
+def _eccentricity(motion: Motion, place: Place, *, harmonic: float) -> Array:
+    """Measured positions are ``q + c cos(h q) + s sin(h q)``: the real ones move by as much less."""
+    j = place.joint
+    angle, w, a = harmonic * motion.q[:, j], harmonic * motion.qd[:, j], harmonic * motion.qdd[:, j]
+    c, s = np.cos(angle), np.sin(angle)
+    ways = ((c, -s * w, -s * a - c * w**2), (s, c * w, c * a - s * w**2))
+    return -np.stack([motion.response(j, *way) for way in ways], axis=2)
+
+
+def rounds(motion: Motion, joint: int) -> Sequence[float]:
+    """Once and twice per turn of the joint and of its motor; of a prismatic axis wave numbers of its travel."""
+    if motion.model.robot.joints[joint].type == "prismatic":
+        resolution = np.pi / float(motion.span[joint])
+        return [float(resolution * k) for k in (*np.arange(2.0, 16.0, 0.5), *range(16, 81))]
+    ratio = float(np.max(np.abs(motion.model.robot.transmission_matrix[joint])))
+    return sorted({1.0, 2.0, ratio, 2 * ratio})
+
+
+EFFECTS = (
+    Effect(
+        name="drive_gain_error",
+        title="a wrong torque constant",
+        says="a drive gives another torque per ampere than configured: wrong data, weak magnets, a changed drive",
+        reference="Gautier, Briot 2014, IEEE Trans. Automatic Control 59(10), Global identification of drive gains",
+        linear=(Linear("gain_error", ("", ""), bounds=(-0.6, 1.5)),),
+        columns=_gain,
+        visible=_alone,
+        predicts=True,
+        share=True,
+        needs="several joints that carry the same link; for a single axis a baseline",
+        scope="motor",
+        excitation=("load", "accelerations"),
+    ),
+    Effect(
+        name="drive_gain_saturation",
+        title="a torque constant that falls with current",
+        says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost "
+        "at the joint's torque limit as far as it grows with the square of the torque",
+        reference="Leonhard 2001, Control of Electrical Drives, chapter 5",
+        linear=(Linear("gain_loss", ("", ""), sign=1),),
+        columns=_saturation,
+        predicts=True,
+        undo=_unsaturated,
+        needs="small and large torques",
+        scope="motor",
+        excitation=("load", "accelerations"),
+    ),
+    Effect(
+        name="time_delay",
+        title="torques that are recorded late",
+        says="the reported torque belongs to a position that was reported earlier: a filter or a queue in the drive",
+        reference="Brunot 2017, section 2.3.1",
+        linear=(Linear("delay", ("s", "s"), sign=1),),
+        columns=_delay,
+        predicts=True,
+        undo=_earlier,
+        negligible=_within_a_sample,
+        needs="quick changes of the torque",
+        scope="motor",
+        excitation=("accelerations",),
+    ),
+    Effect(
+        name="actuator_bandwidth",
+        title="torque that lags behind the command",
+        says="the reported torque is a command that the motor follows late: a slow current loop; positions that are "
+        "reported late look the same",
+        reference="Leonhard 2001, Control of Electrical Drives, chapter 7",
+        linear=(Linear("lag", ("s", "s"), sign=1),),
+        columns=_bandwidth,
+        predicts=True,
+        undo=_lagging,
+        negligible=_within_a_sample,
+        needs="quick changes of the torque",
+        scope="motor",
+        excitation=("accelerations",),
+    ),
+    Effect(
+        name="encoder_eccentricity",
+        title="an encoder that runs out of true",
+        says="the measured position has an error that repeats with the turn: an encoder disc mounted off centre",
+        reference="Armstrong 1998, Mechanism and Machine Theory; de Silva 2007, Sensors and Actuators, chapter 5",
+        linear=(Linear("ecc", ("rad", "m")), Linear("ecs", ("rad", "m"))),
+        shapes=(Shape("harmonic", ("per rad of the joint", "rad/m"), rounds, continuous=(False, True)),),
+        columns=_eccentricity,
+        predicts=True,
+        needs="fast motion over a wide range",
+        together=True,
+        excitation=("speeds", "range"),
+    ),
+)

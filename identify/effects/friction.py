@@ -1,0 +1,257 @@
+"""Friction that is more than ``fv qd + fc sign(qd)``."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.effects.effect import Effect, Linear, Place, Shape
+from armident.identify.effects.rotor import ROTOR
+from armident.identify.robot.compiled import compiled
+from armident.identify.robot.motion import Motion
+
+Array = NDArray[np.float64]
+
+TORQUE = ("N m", "N")
+LATE = 0.1
+"""Share of a joint's speed limit from which on friction may grow faster than speed: lubricants do not churn at rest."""
+VISCOUS = ("N m s/rad", "N s/m")
+
+
+def speeds(motion: Motion, joint: int) -> Sequence[float]:
+    """Characteristic speeds from a hundredth of the joint's top speed to a third of it."""
+    top = float(motion.top_speed[joint])
+    return [float(v) for v in top * np.geomspace(0.01, 0.35, 8)]
+
+
+def _asymmetric_viscous(motion: Motion, place: Place) -> Array:
+    return (motion.qd * motion.sign)[:, place.joint, None]
+
+
+def _asymmetric_coulomb(motion: Motion, place: Place, *, velocity: float = 0.0) -> Array:
+    if velocity == 0.0:
+        return motion.sign[:, place.joint, None] ** 2
+    built: Array = (2 / np.pi * np.arctan(motion.qd[:, place.joint, None] / velocity)) ** 2
+    return built
+
+
+def films(motion: Motion, joint: int) -> Sequence[float]:
+    """Speeds from that of the model's smoothed sign to a twentieth of the joint's top speed."""
+    least, most = 1 / motion.model.smoothing, 0.05 * float(motion.top_speed[joint])
+    return [float(v) for v in np.geomspace(least, most, 5)] if most > least else [least]
+
+
+def _stribeck(motion: Motion, place: Place, *, velocity: float, displacement: float = 0.0) -> Array:
+    j = place.joint
+    # So slow that the model's smoothed sign is only on its way, while a bristle has long been bent.
+    side = dahl(motion.q[:, j], displacement) if displacement > 0.0 else motion.sign[:, j]
+    # The bristle carries the model's dry friction, too: what of it the smoothed sign has no part in any more.
+    return np.stack([np.exp(-((motion.qd[:, j] / velocity) ** 2)) * side, side - motion.sign[:, j]], axis=1)
+
+
+def bristles(motion: Motion, joint: int) -> Sequence[float]:
+    """Displacements from three millionths of the joint's range of motion to a hundred times that."""
+    return [float(d) for d in motion.span[joint] * np.geomspace(3e-6, 3e-4, 4)]
+
+
+def _nonlinear_viscous(motion: Motion, place: Place, *, knee: float) -> Array:
+    j = place.joint
+    # Measured in the joint's own speeds, so that the parameter is a torque whatever the knee.
+    share = motion.qd[:, j] / motion.model.robot.joints[j].limits.velocity
+    curved: Array = np.arcsinh(share / knee) / np.arcsinh(1.0 / knee)
+    return curved[:, None]
+
+
+def knees(motion: Motion, joint: int) -> Sequence[float]:
+    """From a hundredth of the joint's top speed to a third of it, as shares of its speed limit."""
+    limit = motion.model.robot.joints[joint].limits.velocity
+    return [speed / limit for speed in speeds(motion, joint)]
+
+
+def _rises_from_rest(values: Array, shapes: Mapping[str, float]) -> bool:
+    """A negative one falls steeply from standstill where its knee is early: extra friction at low speed."""
+    return bool(shapes["knee"] >= LATE or values[0] >= 0.0)
+
+
+def _load_dependent(motion: Motion, place: Place, *, rotor: float = 0.0) -> Array:
+    j = place.joint
+    return (np.abs(motion.handed_on(j, rotor)) * motion.sign[:, j])[:, None]
+
+
+def _presliding(motion: Motion, place: Place, *, displacement: float) -> Array:
+    j = place.joint
+    return (motion.sign[:, j] - dahl(motion.q[:, j], displacement))[:, None]
+
+
+@compiled
+def dahl(q: Array, displacement: float) -> Array:
+    """Dahl's friction over its level along positions ``q`` (N,), exactly between samples.
+
+    ``dz/dq = (1 - z sign(qd)) / displacement``: after a reversal it approaches its level as an exponential of the way.
+    """
+    z = np.empty(q.size)
+    state = 0.0
+    z[0] = state
+    for k in range(1, q.size):
+        way = q[k] - q[k - 1]
+        side = 1.0 if way > 0 else -1.0
+        state = side + (state - side) * np.exp(-abs(way) / displacement)
+        z[k] = state
+    return z
+
+
+def _position_dependent(motion: Motion, place: Place, *, period: float) -> Array:
+    j = place.joint
+    angle, side = 2 * np.pi * motion.q[:, j] / period, motion.sign[:, j]
+    return np.stack([side * np.cos(angle), side * np.sin(angle)], axis=1)
+
+
+def turns(motion: Motion, joint: int) -> Sequence[float]:
+    """Periods in the joint's position: whole fractions of a turn, or of the travel of a prismatic axis."""
+    if motion.model.robot.joints[joint].type == "revolute":
+        return [2 * np.pi / k for k in (4, 3, 2, 1)]
+    low, high = motion.model.robot.joints[joint].limits.position
+    return [(high - low) / k for k in (4, 3, 2, 1)]
+
+
+def _drift(motion: Motion, place: Place, *, time_constant: float) -> Array:
+    """Friction goes from half a change below to half a change above the model's, as a warming body does."""
+    j, whole = place.joint, max(motion.duration, motion.dt * motion.samples)
+    progress = np.expm1(-motion.t / time_constant) / np.expm1(-whole / time_constant) - 0.5
+    return np.stack([motion.sign[:, j] * progress, motion.qd[:, j] * progress], axis=1)
+
+
+def warming(motion: Motion, joint: int) -> Sequence[float]:
+    """Time constants from a tenth of the recordings to three times all of them: hardly another curve than a line."""
+    whole = max(motion.duration, motion.dt * motion.samples)
+    return [whole * share for share in (0.1, 0.3, 1.0, 3.0)]
+
+
+def _coupling(motion: Motion, place: Place) -> Array:
+    first, second = place.joint, place.other
+    assert second is not None
+    dry = np.sign if motion.sharp else motion.model.smooth_sign
+    columns = np.zeros((motion.samples, motion.n, 3))
+    for one, two in ((first, second), (second, first)):
+        columns[:, one, 0] = motion.qdd[:, two]
+        columns[:, one, 1] = motion.qd[:, two]
+        columns[:, one, 2] = dry(motion.qd[:, one] + motion.qd[:, two])
+    return columns
+
+
+EFFECTS = (
+    Effect(
+        name="asymmetric_viscous_friction",
+        title="viscous friction that differs between the directions",
+        says="friction grows with speed more in one direction than in the other: a worn or one-sidedly loaded gear",
+        reference="Janot, Gautier, Brunot 2019, Data set and reference models of EMPS",
+        linear=(Linear("fva", VISCOUS),),
+        columns=_asymmetric_viscous,
+        needs="both directions of motion at several speeds",
+    ),
+    Effect(
+        name="asymmetric_coulomb_friction",
+        title="dry friction that differs between the directions",
+        says="dry friction differs between the two directions of motion, beyond a constant offset, and builds up with "
+        "the speed",
+        reference="Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)",
+        linear=(Linear("fca", TORQUE),),
+        shapes=(Shape("velocity", ("rad/s", "m/s"), films, default=0.0),),
+        columns=_asymmetric_coulomb,
+        needs="both directions of motion, and standstill: while moving it looks like a constant offset",
+        excitation=("reversals", "standstill"),
+    ),
+    Effect(
+        name="stribeck_friction",
+        title="extra friction at low speed",
+        says="extra friction at low speed that fades as the joint speeds up: poor or squeezed-out lubricant",
+        reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
+        linear=(Linear("fst", TORQUE, sign=1), Linear("fsb", TORQUE, through="displacement", replaces="fc")),
+        shapes=(
+            Shape("velocity", ("rad/s", "m/s"), speeds),
+            Shape("displacement", ("rad", "m"), bristles, default=0.0),
+        ),
+        columns=_stribeck,
+        needs="slow motion in both directions",
+        excitation=("slow", "reversals"),
+    ),
+    Effect(
+        name="nonlinear_viscous_friction",
+        title="friction curved in speed",
+        says="friction does not grow in proportion to speed: the lubricant thins or churns",
+        reference="Ree, Ree, Eyring 1958, Ind. Eng. Chem. 50(7)",
+        linear=(Linear("fvn", TORQUE),),
+        shapes=(Shape("knee", ("", ""), knees),),
+        columns=_nonlinear_viscous,
+        physical=_rises_from_rest,
+        needs="slow and fast motion",
+        excitation=("speeds",),
+    ),
+    Effect(
+        name="load_dependent_friction",
+        title="friction in proportion to the load",
+        says="dry friction grows with the torque that the gear transmits",
+        reference="Hamon, Gautier, Garrec 2010, IROS, Dynamic identification with load-dependent dry friction",
+        linear=(Linear("fcl", ("", ""), sign=1),),
+        shapes=(ROTOR,),
+        columns=_load_dependent,
+        predicts=True,
+        needs="motion in both directions under small and under large load",
+        excitation=("reversals", "load"),
+    ),
+    Effect(
+        name="presliding_friction",
+        title="dry friction that yields before it slides",
+        says="at a reversal dry friction builds up over a small way instead of at once: elastic contacts or seals",
+        reference="Dahl 1968, A solid friction model; Canudas de Wit et al. 1995, IEEE TAC 40(3)",
+        linear=(Linear("fcd", TORQUE, sign=-1),),
+        shapes=(
+            Shape(
+                "displacement",
+                ("rad", "m"),
+                lambda motion, joint: tuple(float(motion.span[joint]) * np.geomspace(0.0002, 0.1, 12)),
+            ),
+        ),
+        columns=_presliding,
+        needs="many reversals",
+        excitation=("reversals", "slow"),
+    ),
+    Effect(
+        name="position_dependent_friction",
+        title="friction that varies with the joint's position",
+        says="dry friction differs from one position of the joint to another: a bent shaft, a tight spot, uneven wear",
+        reference="Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators",
+        linear=(Linear("fpc", TORQUE), Linear("fps", TORQUE)),
+        shapes=(Shape("period", ("rad", "m"), turns, continuous=(False, True)),),
+        columns=_position_dependent,
+        needs="a wide range of joint positions, passed in both directions",
+        together=True,
+        excitation=("range", "reversals"),
+    ),
+    Effect(
+        name="friction_drift",
+        title="friction that changes while it is recorded",
+        says="friction at the end of the recording is not what it was at its beginning: the gear warms up",
+        reference="Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators",
+        linear=(Linear("fcdr", TORQUE), Linear("fvdr", VISCOUS)),
+        shapes=(Shape("time_constant", ("s", "s"), warming),),
+        columns=_drift,
+        needs="the same motion early and late in the recordings",
+        excitation=("repeats",),
+    ),
+    Effect(
+        name="coupling_friction",
+        title="friction and inertia shared by two joints",
+        says="two joints share a shaft or gear: what one does costs the other friction and inertia",
+        reference="Brunot 2017, equation B.1",
+        linear=(
+            Linear("iac", ("kg m^2", "kg"), sign=1),
+            Linear("fvc", VISCOUS, sign=1),
+            Linear("fcc", TORQUE, sign=1),
+        ),
+        columns=_coupling,
+        needs="motion of both joints, together and against each other",
+        scope="pair",
+        excitation=("independent",),
+    ),
+)

@@ -1,0 +1,86 @@
+"""``armident effects``: what a model can have, in a table or as JSON."""
+
+import json
+import sys
+from typing import Any
+
+from armident.identify.effects.effect import Effect
+from armident.identify.effects.registry import catalogue, known
+
+ALWAYS: tuple[tuple[str, str, str], ...] = (
+    ("viscous friction", "fv<joint> (N m s/rad, N s/m)", "in every model"),
+    ("Coulomb friction", "fc<joint> (N m, N)", "in every model, with the smoothing of `friction.sign_smoothing`"),
+    ("constant offset", "off<joint> (N m, N)", "in every model"),
+    ("rotor inertia", "ia<joint> (kg m^2, kg)", "where `joints[].rotor_inertia` is true"),
+    ("coupling of two joints", "ia<name>, fv<name>, fc<name>", "for every entry of `couplings`"),
+)
+"""Terms that have their own place in a robot configuration: name, parameters, when."""
+
+
+def described(effect: Effect) -> dict[str, Any]:
+    """An effect as plain data."""
+    return {
+        "name": effect.name,
+        "title": effect.title,
+        "says": effect.says,
+        "scope": effect.scope,
+        "parameters": [
+            {"name": p.name, "unit": list(p.unit), "sign": p.sign, "through": p.through, "replaces": p.replaces or None}
+            for p in effect.linear
+        ],
+        "shapes": [{"name": s.name, "unit": list(s.unit), "continuous": list(s.continuous)} for s in effect.shapes],
+        "needs": effect.needs,
+        "reference": effect.reference,
+    }
+
+
+def effects_command(name: str | None, *, as_json: bool) -> None:
+    """Carry out ``armident effects``.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such effect.
+    """
+    chosen = list(catalogue().values()) if name is None else [known(name)]
+    if as_json:
+        sys.stdout.write(json.dumps([described(effect) for effect in chosen], indent=1) + "\n")
+        return
+    if name is not None:
+        _one(chosen[0])
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="effects", title_justify="left")
+    for heading in ("effect", "is", "parameters", "at"):
+        table.add_column(heading, overflow="fold")
+    for effect in chosen:
+        table.add_row(effect.name, effect.title, ", ".join(_parameters(effect)), effect.scope)
+    console = Console()
+    console.print(table)
+    print("terms with a place of their own in the robot configuration:")
+    for title, parameters, when in ALWAYS:
+        print(f"  {title}: {parameters}; {when}")
+
+
+def _one(effect: Effect) -> None:
+    print(f"{effect.name}: {effect.title}\n{effect.says}")
+    for parameter in _parameters(effect):
+        print(f"  {parameter}")
+    for linear in effect.linear:
+        if linear.through is not None:
+            print(f"{linear.name} is there only with {linear.through}, in the place of {linear.replaces} of the joint;")
+            print(f"  a stanza with `without: [{linear.name}]` leaves {linear.replaces} as it is")
+    print(f"needs: {effect.needs}\nsource: {effect.reference}")
+    names = [shape.name for shape in effect.shapes] + [parameter.name for parameter in effect.linear]
+    values = [f"{parameter}: ..." for parameter in names]
+    other = ", other: joint_2" if effect.scope == "pair" else ""
+    print(f"stanza: {{effect: {effect.name}, joint: joint_1{other}, parameters: {{{', '.join(values)}}}}}")
+
+
+def _parameters(effect: Effect) -> list[str]:
+    units = [(p.name, p.unit) for p in effect.linear] + [(s.name, s.unit) for s in effect.shapes]
+    return [
+        f"{name} ({' | '.join(dict.fromkeys(u for u in unit if u))})" if any(unit) else name for name, unit in units
+    ]

@@ -1,0 +1,182 @@
+"""The effects that a robot configuration names, as terms of its model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import ConfigError, RobotConfig
+from armident.configs.schema.robot import Effect as Stanza
+from armident.identify.effects.effect import Effect, Linear, Place
+from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.registry import known
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.motion import Motion
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Term:
+    """One stanza of a robot's ``effects``.
+
+    Parameters
+    ----------
+    effect, place, shapes
+        The entry of the catalogue, where it sits, and its nonlinear parameters.
+    kept
+        Numbers of the effect's linear parameters that the term has, (k,).
+    names, units
+        Of these, as they stand in results.
+    values
+        Of them in the configuration, zero where it gives none, (k,).
+    """
+
+    effect: Effect
+    place: Place
+    shapes: dict[str, float]
+    kept: tuple[int, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+
+    def columns(self, motion: Motion) -> Array:
+        """Torques of all joints per unit of the linear parameters, (N, n, k)."""
+        every = self.effect.torque(motion, self.place, self.shapes)
+        return every if len(self.kept) == every.shape[2] else every[:, :, list(self.kept)]
+
+    @property
+    def linear(self) -> tuple[Linear, ...]:
+        """Its linear parameters."""
+        return tuple(self.effect.linear[k] for k in self.kept)
+
+    @property
+    def depends_on_torque(self) -> bool:
+        """True if the columns need torques that the model predicts."""
+        return self.effect.predicts
+
+    @property
+    def scales_torque(self) -> bool:
+        """True if the term is a share of the torque that the model predicts."""
+        return self.effect.share
+
+    def of_effect(self, values: Array) -> Array:
+        """Values (k,) of its linear parameters among all of the effect's, the others zero."""
+        every = np.zeros(len(self.effect.linear))
+        every[list(self.kept)] = values
+        return every
+
+
+def arm_model(robot: RobotConfig) -> ArmModel:
+    """Build the model of a robot with the effects that its configuration names.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+
+    Raises
+    ------
+    ConfigError
+        As `terms_of`.
+    """
+    return ArmModel.from_config(robot, terms_of(robot))
+
+
+def effect_terms(model: ArmModel) -> tuple[Term, ...]:
+    """Return the terms of a model that come from effects of the catalogue, in their order."""
+    return tuple(term for term in model.terms if isinstance(term, Term))
+
+
+def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
+    """Terms of a robot's effects, in their order; what is put right in the recordings is none.
+
+    Raises
+    ------
+    ConfigError
+        If an effect is unknown, lacks a parameter or has one too many, or stands at a joint where it cannot be.
+    """
+    terms: list[Term] = []
+    taken: dict[str, int] = {}
+    for k, stanza in enumerate(robot.effects):
+        effect = known(stanza.effect)
+        if of_recording(stanza):
+            continue
+        where = f"effects[{k}]: {stanza.effect} of {stanza.joint}"
+        place = place_of(stanza, effect, robot, where)
+        shapes = _shapes(stanza, effect, where)
+        kind = int(robot.joints[place.joint].type == "prismatic")
+        number = f"{place.joint + 1}" if place.other is None else f"{place.joint + 1}{place.other + 1}"
+        kept = _kept(stanza, effect, shapes, where)
+        names = []
+        for linear in (effect.linear[k] for k in kept):
+            name = f"{linear.name}{number}"
+            taken[name] = taken.get(name, 0) + 1
+            names.append(name if taken[name] == 1 else f"{name}_{taken[name]}")
+        terms.append(
+            Term(
+                effect,
+                place,
+                shapes,
+                kept,
+                tuple(names),
+                tuple(effect.linear[k].unit[kind] for k in kept),
+                np.array([stanza.parameters.get(effect.linear[k].name, 0.0) for k in kept]),
+            )
+        )
+    return tuple(terms)
+
+
+def place_of(stanza: Stanza, effect: Effect, robot: RobotConfig, where: str) -> Place:
+    """Where a stanza puts its effect.
+
+    Raises
+    ------
+    ConfigError
+        If a pair lacks its second joint, or another effect has one.
+    """
+    names = [joint.name for joint in robot.joints]
+    joint = names.index(stanza.joint)
+    if effect.scope != "pair":
+        if stanza.other is not None:
+            raise ConfigError(f"{where}: other: only an effect between two joints has one")
+        return Place(joint)
+    if stanza.other is None or stanza.other == stanza.joint:
+        raise ConfigError(f"{where}: other: expected the second joint")
+    return Place(joint, names.index(stanza.other))
+
+
+def stanza_of(
+    effect: Effect, place: Place, robot: RobotConfig, parameters: dict[str, float], without: tuple[str, ...] = ()
+) -> Stanza:
+    """The stanza of an effect at a place."""
+    other = None if place.other is None else robot.joints[place.other].name
+    return Stanza(
+        effect=effect.name, joint=robot.joints[place.joint].name, other=other, parameters=parameters, without=without
+    )
+
+
+def _kept(stanza: Stanza, effect: Effect, shapes: dict[str, float], where: str) -> tuple[int, ...]:
+    """Numbers of the linear parameters that a stanza does not leave out, and that its nonlinear ones do not."""
+    names = [parameter.name for parameter in effect.linear]
+    for name in stanza.without:
+        if name not in names:
+            raise ConfigError(f"{where}: without: {name!r} is none of its linear parameters ({', '.join(names)})")
+    there = [p.through is None or shapes[p.through] != 0.0 for p in effect.linear]
+    kept = tuple(k for k, name in enumerate(names) if name not in stanza.without and there[k])
+    if not kept:
+        raise ConfigError(f"{where}: without: nothing is left of it")
+    return kept
+
+
+def _shapes(stanza: Stanza, effect: Effect, where: str) -> dict[str, float]:
+    shapes = [shape.name for shape in effect.shapes]
+    linear = [parameter.name for parameter in effect.linear]
+    given = {shape.name: shape.default for shape in effect.shapes if shape.default is not None} | stanza.parameters
+    missing = [name for name in shapes if name not in given]
+    if missing:
+        raise ConfigError(f"{where} needs {', '.join(missing)}")
+    unknown = [name for name in stanza.parameters if name not in (*shapes, *linear)]
+    if unknown:
+        raise ConfigError(f"{where}: parameters.{unknown[0]}: unknown (takes {', '.join((*shapes, *linear))})")
+    return {name: given[name] for name in shapes}

@@ -1,0 +1,176 @@
+"""Effects between motor and joint: elasticity, play, ripple."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.effects.effect import Effect, Linear, Place, Shape
+from armident.identify.effects.rotor import ROTOR
+from armident.identify.robot.compiled import compiled
+from armident.identify.robot.motion import Motion
+
+Array = NDArray[np.float64]
+
+DAMPINGS = (0.1, 0.7)
+"""Damping ratios of a link on its spring: of its own, and where the controlled motor, giving way, calms it."""
+
+LEAST_DAMPING = 0.02
+"""Of a link on a spring of steel: seen where the motion has its oscillation in it."""
+
+LEAST_INERTIA = 0.1
+"""Inertia at a joint below which it is not believed, of the largest along the motion: a fit may make it negative."""
+
+
+def _cogging(motion: Motion, place: Place, *, harmonic: float) -> Array:
+    angle = harmonic * motion.motor[:, place.joint]
+    ripple = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ratios = motion.model.robot.transmission_matrix[place.joint]
+    # At the motor's own joint, so that a coupled transmission hands the rest on in proportion.
+    share: Array = ratios / ratios[int(np.argmax(np.abs(ratios)))]
+    columns: Array = ripple[:, None, :] * share[:, None]
+    return columns
+
+
+def harmonics(motion: Motion, joint: int) -> Sequence[float]:
+    """Harmonics of a motor turn; of a prismatic axis without a known pitch, wave numbers its travel can resolve."""
+    if motion.model.robot.joints[joint].type == "revolute":
+        return (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 18.0, 24.0)
+    resolution = np.pi / float(motion.span[joint])
+    return [float(resolution * k) for k in range(4, 161)]
+
+
+def _elasticity(
+    motion: Motion, place: Place, *, frequency: float, damping: float = DAMPINGS[-1], rotor: float = 0.0
+) -> Array:
+    """The link stands behind the motor by compliance times load, and swings there: slower where it has more inertia.
+
+    ``frequency`` is that of its mean inertia over the postures of the arm: the same spring in every motion.
+    """
+    j = place.joint
+    inertia, share = inertias(motion, j, rotor), np.ones(motion.samples)
+    if inertia.max() > 0.0:
+        usual = float(motion.model.mass_matrix(motion.links, motion.postures)[:, j, j].mean()) - rotor
+        share = inertia / max(usual, LEAST_INERTIA * float(inertia.max()))
+    moves = swinging(-motion.handed_on(j, rotor), share, 2 * np.pi * frequency, damping, motion.dt)
+    return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
+
+
+@compiled
+def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> tuple[Array, Array, Array]:
+    """Way, speed and acceleration (N,) of ``share x'' + 2 damping w x' + w^2 x = w^2 pull``, at first at rest.
+
+    By the trapezoidal rule (Newmark 1959): stable at any frequency.
+    """
+    way, rate, acceleration = np.empty(pull.size), np.zeros(pull.size), np.zeros(pull.size)
+    way[0] = pull[0]
+    half, drag, spring = 0.5 * dt, 2.0 * damping * w, w * w
+    for k in range(pull.size - 1):
+        v = rate[k] + half * acceleration[k]
+        x = way[k] + dt * rate[k] + half * half * acceleration[k]
+        a = (spring * (pull[k + 1] - x) - drag * v) / (share[k + 1] + drag * half + spring * half * half)
+        way[k + 1], rate[k + 1], acceleration[k + 1] = x + half * half * a, v + half * a, a
+    return way, rate, acceleration
+
+
+def frequencies(motion: Motion, joint: int) -> Sequence[float]:
+    """Resonances up to a fifth of the sampling rate."""
+    return [float(f) for f in np.geomspace(4.0, min(80.0, 0.2 / motion.dt), 7)]
+
+
+def _backlash(motion: Motion, place: Place, *, gap: float, rotor: float = 0.0) -> Array:
+    """Between the sides of the gap nothing drives the link: it coasts and falls on, until the teeth catch it."""
+    j = place.joint
+    moves = crossing(falls(motion, j, rotor), gap, motion.dt)
+    return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
+
+
+def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
+    """Acceleration (N,) of a link from its motor where no tooth touches, over position and time as they are."""
+    inertia = inertias(motion, joint, rotor)
+    if inertia.max() <= 0.0:
+        return np.zeros(motion.samples)
+    away: Array = -motion.handed_on(joint, rotor) / inertia
+    return away
+
+
+def inertias(motion: Motion, joint: int, rotor: float) -> Array:
+    """Inertia (N,) of the link that a gear drives, kept from vanishing; nowhere above zero where the fit has none."""
+    inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
+    believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())
+    return believed
+
+
+@compiled
+def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
+    """Way, speed and acceleration (N,) of a link against its motor under ``pull`` (N,), caught at half a gap.
+
+    Leapfrog; impacts are plastic. Speeds and accelerations are differences of the way to either side, so that none of
+    it is lost and none is late.
+    """
+    way, rate, acceleration = np.zeros(pull.size), np.zeros(pull.size), np.zeros(pull.size)
+    way[0] = 0.5 * gap if pull[0] > 0.0 else -0.5 * gap
+    v = 0.0
+    for k in range(pull.size - 1):
+        before = v
+        v += dt * pull[k]
+        if way[k] + dt * v > 0.5 * gap:
+            v = (0.5 * gap - way[k]) / dt
+        elif way[k] + dt * v < -0.5 * gap:
+            v = (-0.5 * gap - way[k]) / dt
+        way[k + 1] = way[k] + dt * v
+        rate[k] = 0.5 * (before + v)
+        acceleration[k] = (v - before) / dt
+    return way, rate, acceleration
+
+
+def gaps(motion: Motion, joint: int) -> Sequence[float]:
+    """Gaps that the link crosses in 5 to 100 ms under the usual load; one that is a quarter off misses the impacts."""
+    usual = max(float(np.std(falls(motion, joint))), 1e-9)
+    return [0.5 * usual * float(time) ** 2 for time in np.geomspace(0.005, 0.1, 25)]
+
+
+EFFECTS = (
+    Effect(
+        name="cogging_torque",
+        title="a torque ripple over the motor's turn",
+        says="a torque ripple that repeats with the motor angle: magnets of the motor, or an eccentric gear",
+        reference="Petrovic et al. 2000, IEEE Trans. Power Electronics 15(6); Gandhi et al. 2002, ICRA",
+        linear=(Linear("cgc", ("N m", "N")), Linear("cgs", ("N m", "N"))),
+        shapes=(Shape("harmonic", ("per rad of the motor", "rad/m"), harmonics, continuous=(False, True)),),
+        columns=_cogging,
+        needs="slow motion over several motor turns",
+        scope="motor",
+        together=True,
+        excitation=("slow", "range"),
+    ),
+    Effect(
+        name="joint_elasticity",
+        title="an elastic joint",
+        says="the link swings behind its motor: an elastic gear, belt or coupling, or a bending link",
+        reference="Spong 1987, J. Dyn. Sys. Meas. Control 109(4)",
+        linear=(Linear("compliance", ("rad/(N m)", "m/N"), sign=1),),
+        shapes=(
+            Shape("frequency", ("Hz", "Hz"), frequencies),
+            Shape("damping", ("", ""), lambda motion, joint: DAMPINGS, default=DAMPINGS[-1], closer=(LEAST_DAMPING,)),
+            ROTOR,
+        ),
+        columns=_elasticity,
+        predicts=True,
+        needs="quick accelerations near the resonance, under load",
+        excitation=("accelerations",),
+    ),
+    Effect(
+        name="backlash",
+        title="play in the gear",
+        says="the motor turns a little before the link follows when the load changes sides: worn teeth, a loose key",
+        reference="Nordin, Gutman 2002, Automatica 38(10)",
+        linear=(Linear("behind", ("", ""), sign=1, bounds=(0.1, 1.5)),),
+        shapes=(Shape("gap", ("rad", "m"), gaps), ROTOR),
+        columns=_backlash,
+        predicts=True,
+        sudden=True,
+        needs="many changes of the load's direction",
+        excitation=("reversals", "accelerations"),
+    ),
+)

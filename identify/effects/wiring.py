@@ -1,0 +1,119 @@
+"""Mistakes of wiring and naming: signals with the wrong sign, or of the wrong drive."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import ConfigError, RobotConfig
+from armident.identify.effects.effect import Effect, Place
+from armident.identify.experiment import Experiment
+from armident.identify.robot.motion import Motion
+
+Array = NDArray[np.float64]
+
+SIGNALS = ("position", "torque")
+"""Parameters of the stanzas of this file: which signal is meant, by a value of 1."""
+
+
+def _none(motion: Motion, place: Place) -> Array:
+    return np.zeros((motion.samples, 0))
+
+
+EFFECTS = (
+    Effect(
+        name="sign_error",
+        title="a signal with the wrong sign",
+        says="position or torque of a drive is read with the wrong sign: a swapped polarity, a wrong gear sign",
+        reference="CiA 402-2, object 607Eh (polarity)",
+        linear=(),
+        columns=_none,
+        needs="motion against gravity or friction",
+        scope="motor",
+        rewires=True,
+    ),
+    Effect(
+        name="joint_order",
+        title="two drives exchanged",
+        says="the signals of two drives stand in each other's place: swapped node numbers or plugs",
+        reference="CiA 301, node-ID; CiA 305",
+        linear=(),
+        columns=_none,
+        needs="different motion of the joints",
+        scope="pair",
+        rewires=True,
+    ),
+)
+NAMES = tuple(effect.name for effect in EFFECTS)
+
+
+def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Experiment]:
+    """The experiments as they would be without the wiring mistakes that a robot's effects name.
+
+    Raises
+    ------
+    ConfigError
+        If a stanza does not say which signal, or which other joint.
+    """
+    position, torque = exchanges(robot)
+    if np.array_equal(position, np.eye(robot.n)) and np.array_equal(torque, np.eye(robot.n)):
+        return list(experiments)
+    ratios = robot.transmission_matrix
+    # Signals belong to the motors: exchanged there, and brought back to the joints.
+    of_position = np.linalg.solve(ratios, position @ ratios)
+    of_torque = np.linalg.inv(ratios) @ torque.T @ ratios
+    return [
+        replace(
+            e,
+            q=np.ascontiguousarray(e.q @ of_position.T),
+            tau=np.ascontiguousarray(e.tau @ of_torque),
+            q_ref=None if e.q_ref is None else np.ascontiguousarray(e.q_ref @ of_position.T),
+        )
+        for e in experiments
+    ]
+
+
+def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
+    """What undoes the mistakes that a robot's effects name in the motors' positions and torques, (n, n) each.
+
+    Raw numbers are exchanged, counts and shares of the rated signal; what they are worth goes with the name. So these
+    are signed permutations, scaled where two drives differ in resolution, gain or rating.
+    """
+    names = [joint.name for joint in robot.joints]
+    worth = {"position": _per_count(robot), "torque": _per_share(robot)}
+    found = {signal: np.eye(robot.n) for signal in SIGNALS}
+    for k, stanza in enumerate(robot.effects):
+        if stanza.effect not in NAMES:
+            continue
+        meant = [signal for signal in SIGNALS if stanza.parameters.get(signal)]
+        if not meant:
+            raise ConfigError(f"effects[{k}]: {stanza.effect} of {stanza.joint} needs position: 1, torque: 1 or both")
+        first = names.index(stanza.joint)
+        for signal in meant:
+            change = np.eye(robot.n)
+            if stanza.effect == "sign_error":
+                change[first, first] = -1.0
+            else:
+                if stanza.other is None:
+                    raise ConfigError(f"effects[{k}]: joint_order of {stanza.joint} needs the other joint")
+                second = names.index(stanza.other)
+                change[[first, second]] = change[[second, first]]
+                change = change * worth[signal][:, None] / worth[signal]
+            found[signal] = change @ found[signal]
+    return found["position"], found["torque"]
+
+
+def _per_count(robot: RobotConfig) -> Array:
+    """Position of each motor per count (n,), rad or m; ones where positions come in SI."""
+    if any(joint.drive.counts_per_unit is None for joint in robot.joints):
+        return np.ones(robot.n)
+    turn = np.array([2 * np.pi if joint.type == "revolute" else 1.0 for joint in robot.joints])
+    counts: Array = np.array([joint.drive.counts_per_unit for joint in robot.joints], dtype=np.float64)
+    return turn / counts
+
+
+def _per_share(robot: RobotConfig) -> Array:
+    """Torque of each motor at its rated signal (n,), N m or N."""
+    drives = [joint.drive for joint in robot.joints]
+    return np.array([d.rated * (d.gain if d.signal != "torque" and d.gain else 1.0) for d in drives])

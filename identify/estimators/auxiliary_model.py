@@ -1,0 +1,248 @@
+"""The auxiliary model: the closed loop simulated with the last estimate, source of the instruments."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import DataError
+from armident.identify.regression.equations import Block, filtered_regressor
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.controller import DiscreteController
+from armident.identify.robot.physical import damp_to_physical
+from armident.identify.robot.relaxation import simulate_with_terms
+from armident.identify.robot.simulation import Simulation
+from armident.identify.signals.bandpass import butterworth
+from armident.identify.signals.decimate import Decimation
+from armident.identify.signals.differentiate import Derivatives
+
+HALVINGS = 8
+"""Step halvings towards the last estimate that could be simulated."""
+
+WIDER = 2.0
+"""Decimated Nyquist frequency in bands of the instruments from which on they are filtered; less is left by rounding."""
+
+FELT = 0.6
+"""Share of the band of the instruments up to which a simulated arm feels what terms add: beyond three bandwidths of the
+closed loop hardly any torque moves it."""
+
+POSTURES = 100
+"""Postures of the references at which the mass matrix of an iterate that diverged is examined."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """What the simulated loop does, filtered and decimated like the equations.
+
+    Parameters
+    ----------
+    torque
+        Joint torques at the samples, one (M, n) array per experiment, N m or N.
+    position
+        Joint positions, one (M, n) array per experiment, rad or m.
+    """
+
+    torque: tuple[NDArray[np.float64], ...]
+    position: tuple[NDArray[np.float64], ...]
+
+
+@dataclass
+class AuxiliaryModel:
+    """Simulates every experiment's reference through controller and arm, and filters the regressor.
+
+    An estimate that cannot be simulated is made physical (no negative friction, a positive definite mass matrix), and,
+    if that is not enough, moved half-way, and half-way again, towards the last one that could
+    (``warnings`` says so); the estimate itself is left alone, only the simulation uses the damped one.
+
+    Parameters
+    ----------
+    references
+        One (N, n) array of joint references per experiment, rad or m.
+    initial
+        Position and velocity (n,) each at the start of every experiment.
+    max_velocity
+        Joint speeds (n,) beyond which a simulation counts as diverged.
+    anchor
+        A theta that is known to simulate, to move towards while there is no last one.
+    band_hz
+        Instruments vary no faster than this, whatever the decimation lets through. Beyond the motion's band the
+        measured regressor, smoothed, lacks what reference and simulated loop still hold, such as the steps in
+        which set points arrive, and a prefilter that amplifies high frequencies would count that as information.
+    starts
+        Time of the first sample of every experiment since the recordings began, s; ``None``: zero.
+    """
+
+    model: ArmModel
+    controller: DiscreteController
+    references: Sequence[NDArray[np.float64]]
+    initial: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
+    dt: float
+    decimation: Decimation
+    max_velocity: NDArray[np.float64]
+    warnings: list[str] = field(default_factory=list)
+    anchor: NDArray[np.float64] | None = None
+    band_hz: float = np.inf
+    starts: Sequence[float] | None = None
+    _last: NDArray[np.float64] | None = None
+
+    @property
+    def limits_band(self) -> bool:
+        """Whether the decimation lets through so much more than ``band_hz`` that instruments are filtered."""
+        return 0.5 / (self.dt * self.decimation.factor) >= WIDER * self.band_hz
+
+    def fresh(self) -> Self:
+        """The same loop without memory of estimates and warnings: what an estimator starts with."""
+        return replace(self, warnings=[], _last=None)
+
+    def said(self) -> tuple[str, ...]:
+        """Warnings so far, each once."""
+        return tuple(dict.fromkeys(self.warnings))
+
+    def with_gear_ratios(self, share: float) -> Self:
+        """The loop as someone simulates it who takes the gear ratios for ``share`` of what they are (section 4.2.3).
+
+        Controller, reference and encoders live on the motor side, so the simulated joints move ``1 / share`` as far as
+        the real ones and get ``share`` of the drives' torques.
+        """
+        robot = self.model.robot
+        ratios = tuple(tuple(share * ratio for ratio in row) for row in robot.transmission)
+        return replace(
+            self.fresh(),
+            model=replace(self.model, robot=robot.model_copy(update={"transmission": ratios})),
+            references=[q_ref / share for q_ref in self.references],
+            initial=[(q / share, qd / share) for q, qd in self.initial],
+            max_velocity=self.max_velocity / share,
+        )
+
+    def simulate(self, theta: NDArray[np.float64]) -> list[Simulation] | None:
+        """All experiments with these base parameters, or ``None`` if one diverges or theta is not finite."""
+        if not np.isfinite(theta).all():
+            return None
+        runs = []
+        for k, (q_ref, (q0, qd0)) in enumerate(zip(self.references, self.initial, strict=True)):
+            run = simulate_with_terms(
+                self.model,
+                theta,
+                self.controller,
+                q_ref,
+                self.dt,
+                start=self._start(k),
+                band_hz=FELT * self.band_hz,
+                q0=q0,
+                qd0=qd0,
+                max_velocity=self.max_velocity,
+            )
+            if run.diverged_at is not None:
+                return None
+            runs.append(run)
+        return runs
+
+    def respond(self, theta: NDArray[np.float64]) -> Response | None:
+        """Simulated torques and positions after the parallel filter, or ``None`` if the simulation diverges."""
+        runs = self.simulate(theta)
+        return None if runs is None else self._filtered(runs)
+
+    def respond_many(self, thetas: Sequence[NDArray[np.float64]]) -> list[Response | None]:
+        """`respond` for many parameter vectors at once, on all processors: simulations hold no interpreter lock."""
+        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+            return list(pool.map(self.respond, thetas))
+
+    def instruments(self, theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Filtered regressor at simulated signals, one (M, n, b) per experiment.
+
+        Raises
+        ------
+        DataError
+            If neither theta nor any point between it and the last good estimate can be simulated.
+        """
+        return self.regressors(self.motions(theta))
+
+    def motions(self, theta: NDArray[np.float64]) -> list[Derivatives]:
+        """Simulated signals of every experiment.
+
+        Raises
+        ------
+        DataError
+            As `instruments`.
+        """
+        _, runs = self._nearest(theta)
+        return [Derivatives(run.q, run.qd, run.qdd, None, self.dt, self._start(k)) for k, run in enumerate(runs)]
+
+    def regressors(self, motions: Sequence[Derivatives]) -> list[NDArray[np.float64]]:
+        """Filtered regressor at motions that know no noise, one (M, n, b) per experiment."""
+        return [filtered_regressor(self.model, self._in_band(motion), self.decimation) for motion in motions]
+
+    def equations(self, blocks: Sequence[Block], theta: NDArray[np.float64]) -> list[Block]:
+        """The equations with the simulated regressor in place of the measured one (2.32).
+
+        Raises
+        ------
+        DataError
+            As `instruments`.
+        """
+        return [replace(block, x=zeta) for block, zeta in zip(blocks, self.instruments(theta), strict=True)]
+
+    def reachable(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], Response]:
+        """Theta and its response, or the nearest point towards the last good estimate that has one.
+
+        Raises
+        ------
+        DataError
+            As `instruments`.
+        """
+        near, runs = self._nearest(theta)
+        return near, self._filtered(runs)
+
+    def _start(self, experiment: int) -> float:
+        return 0.0 if self.starts is None else self.starts[experiment]
+
+    def _in_band(self, motion: Derivatives) -> Derivatives:
+        """A motion without what is faster than ``band_hz`` where the decimation leaves that in."""
+        if not self.limits_band:
+            return motion
+        q, qd, qdd = (butterworth(s, self.dt, self.band_hz) for s in (motion.q, motion.qd, motion.qdd))
+        return replace(motion, q=q, qd=qd, qdd=qdd)
+
+    def _filtered(self, runs: Sequence[Simulation]) -> Response:
+        return Response(
+            tuple(self.decimation(_at_samples(run.tau)) for run in runs),
+            tuple(self.decimation(run.q) for run in runs),
+        )
+
+    def _nearest(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[Simulation]]:
+        """Theta, or the first point on the way back from it that can be simulated."""
+        runs = self.simulate(theta)
+        if runs is not None:
+            self._last = theta
+            return theta, runs
+        previous = self.anchor if self._last is None else self._last
+        if previous is None:
+            raise DataError("the auxiliary closed loop cannot be simulated: it diverges with the first estimate")
+        damped = damp_to_physical(self.model, theta, previous, self._postures())
+        reason = damped.reason or "its simulation diverged"
+        for share in (*(0.5**halving for halving in range(HALVINGS + 1)), 0.0):
+            target = previous + (damped.theta - previous) * share
+            runs = self.simulate(target)
+            if runs is not None:
+                self._last = target
+                self.warnings.append(
+                    f"an iterate was not physical: {reason}; "
+                    f"simulated a point {100 * damped.step * share:.1f} % of the way to it"
+                )
+                return target, runs
+        raise DataError("the auxiliary closed loop cannot be simulated: it diverges between all estimates tried")
+
+    def _postures(self) -> NDArray[np.float64]:
+        total = sum(q_ref.shape[0] for q_ref in self.references)
+        return np.concatenate([q_ref[:: max(1, total // POSTURES)] for q_ref in self.references])
+
+
+def _at_samples(held: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Torques (N, n) at the samples: the mean of those held before and after, as the simulated accelerations are."""
+    at = held.copy()
+    at[1:] = 0.5 * (held[1:] + held[:-1])
+    return at

@@ -1,0 +1,49 @@
+"""Instruments without a simulation: an arm that follows the smoothed motion exactly."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.controller import DiscreteController
+from armident.identify.robot.simulation import Simulation
+from armident.identify.signals.bandpass import central_difference
+from armident.identify.signals.decimate import Decimation
+
+
+@dataclass
+class FollowedMotion(AuxiliaryModel):
+    """The limit of an infinitely stiff controller: the references are the motion, whatever the parameters.
+
+    For arms that nothing recorded lets simulate: no reference, and an estimate of inertias so far from physical that no
+    controller can be chosen by it, as torque sensors behind the gears give where a wrist weighs less than its friction.
+    Instruments from measured positions are independent of the torques' noise and, where the references are smoothed by
+    another filter than the regressor, of most of the positions'.
+    """
+
+    @classmethod
+    def of(cls, model: ArmModel, motion: Sequence[NDArray[np.float64]], dt: float, decimation: Decimation) -> Self:
+        """Instruments from a smoothed motion, one (N, n) array of joint positions per experiment; ``dt`` in s."""
+        # Neither controller nor initial state has a part in it.
+        controller = DiscreteController.fir(np.zeros((model.n, 1)), dt)
+        at_rest = [(q[0], np.zeros(model.n)) for q in motion]
+        return cls(model, controller, motion, at_rest, dt, decimation, np.full(model.n, np.inf))
+
+    def simulate(self, theta: NDArray[np.float64]) -> list[Simulation] | None:
+        """The motion of every experiment, with the torques that these base parameters need for it."""
+        if not np.isfinite(theta).all():
+            return None
+        runs: list[Simulation] = []
+        for q in self.references:
+            qd = central_difference(q, self.dt)
+            qdd = central_difference(qd, self.dt)
+            tau = self.model.inverse_dynamics(theta, q, qd, qdd)
+            if self.model.terms:
+                motion = self.model.motion(q, qd, qdd, self.dt, self._start(len(runs)))
+                tau = tau + self.model.term_regressor(motion) @ theta[theta.size - self.model.e :]
+            runs.append(Simulation(q, qd, qdd, tau, None))
+        return runs

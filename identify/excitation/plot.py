@@ -1,0 +1,103 @@
+"""A picture of a trajectory before anything moves: positions, velocities, accelerations, torques, and their limits."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from armident.configs import ConfigError, RobotConfig
+from armident.identify.excitation.design import PERIOD, Design
+from armident.identify.excitation.point_to_point import motion_of
+
+SUFFIXES = (".png", ".svg", ".pdf")
+LINE, LIMIT, OUTSIDE = "#2a5d8f", "#b5403a", "#f6dfdd"
+
+
+def draw(robot: RobotConfig, design: Design, path: Path, title: str) -> None:
+    """Write a picture with one row a joint.
+
+    Parameters
+    ----------
+    robot
+        For names, units and limits.
+    design
+        The trajectory; torques are drawn where they are known.
+    path
+        File to write, by its suffix a bitmap (.png) or a drawing (.svg, .pdf).
+    title
+        Stands above it.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be written, or its suffix is none of these.
+    """
+    check_name(path)
+    q, qd, qdd = motion_of(design.trajectory, PERIOD)
+    time = np.arange(len(q)) * PERIOD
+    columns = [("position", "", q), ("velocity", "/s", qd), ("acceleration", "/s²", qdd)]
+    if design.torque is not None:
+        columns.append(("torque", "", design.torque))
+    figure = Figure(figsize=(3.4 * len(columns), 1.5 * robot.n + 1.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(robot.n, len(columns), sharex=True, squeeze=False)
+    for j, joint in enumerate(robot.joints):
+        turns = joint.type == "revolute"
+        for k, (name, per, values) in enumerate(columns):
+            low, high = _limits(robot, j, name)
+            unit = ("N m" if turns else "N") if name == "torque" else f"{'rad' if turns else 'm'}{per}"
+            axis = axes[j, k]
+            margin = 0.12 * (high - low)
+            axis.axhspan(low - margin, low, color=OUTSIDE, lw=0)
+            axis.axhspan(high, high + margin, color=OUTSIDE, lw=0)
+            axis.axhline(low, color=LIMIT, lw=0.8)
+            axis.axhline(high, color=LIMIT, lw=0.8)
+            axis.plot(time, values[:, j], color=LINE, lw=1.1)
+            axis.set_ylim(
+                min(low - margin, float(values[:, j].min()) - margin),
+                max(high + margin, float(values[:, j].max()) + margin),
+            )
+            axis.set_xlim(0.0, time[-1])
+            axis.tick_params(labelsize=7)
+            axis.set_ylabel(f"{joint.name}\n{unit}" if k == 0 else unit, fontsize=8)
+            used = float(np.abs(values[:, j] - (low + high) / 2).max()) / ((high - low) / 2)
+            axis.annotate(
+                f"{100 * used:.0f} %",
+                (0.99, 0.95),
+                xycoords="axes fraction",
+                ha="right",
+                va="center",
+                fontsize=7,
+                color=LIMIT if used > 1.0 else "0.35",
+            )
+            if j == 0:
+                axis.set_title(name, fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel("s", fontsize=8)
+    figure.suptitle(title, fontsize=10)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=110)
+    except OSError as error:
+        raise ConfigError(f"--picture {path}: cannot be written: {error.strerror}") from error
+
+
+def check_name(path: Path) -> None:
+    """Refuse a name that says nothing of the format.
+
+    Raises
+    ------
+    ConfigError
+        If its suffix is none of `SUFFIXES`.
+    """
+    if path.suffix not in SUFFIXES:
+        raise ConfigError(f"--picture {path}: expected a name that ends in {', '.join(SUFFIXES)}")
+
+
+def _limits(robot: RobotConfig, j: int, name: str) -> tuple[float, float]:
+    limits = robot.joints[j].limits
+    if name == "position":
+        return limits.position
+    most = {"velocity": limits.velocity, "acceleration": limits.acceleration, "torque": limits.torque}[name]
+    return -most, most

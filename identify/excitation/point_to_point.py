@@ -1,0 +1,220 @@
+"""Random search over point-to-point moves within the limits of a robot: candidates, their neighbours, their cost."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from armident.configs import RobotConfig, Trajectory
+from armident.configs.schema.trajectory import RAMP_SHARE, Move
+from armident.identify.excitation.objective import Aim, weighted
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.chain import Floats
+from armident.identify.robot.motion import Motion
+from armident.identify.signals.decimate import Decimation, design
+
+PEAK_VELOCITY = 1.0 / (1.0 - RAMP_SHARE)
+"""Peak velocity of a move of unit length and duration."""
+
+PEAK_ACCELERATION = PEAK_VELOCITY * np.pi / (2.0 * RAMP_SHARE)
+"""Peak acceleration of a move of unit length and duration."""
+
+SHORTEST_MOVE = 0.3
+"""Moves shorter than this (s) excite little but the closed loop's own dynamics."""
+
+REACH = (0.15, 0.6)
+"""How far a move may go, as a share of the range: short moves accelerate harder, long ones run faster."""
+
+SLOWEST_PACE = 1.8
+"""Slowest pace, as a multiple of the shortest duration: speeds must differ to tell ``fv`` from ``fc``."""
+
+CONDITION = 190.0
+"""Condition number of the weighted base regressor that is good enough: under the 200 of thesis section B.4."""
+
+SLOW = 0.025
+"""Share of a joint's velocity limit under which a sample is slow."""
+
+SLOW_SHARE = 0.12
+"""Share of slow samples that costs nothing."""
+
+SEARCH_RATE = 100.0
+"""Sampling rate of the regressor during the search, Hz."""
+
+CUTOFF = 20.0
+"""Frequency up to which the regression is made, Hz."""
+
+AIM_FACTOR = 4
+"""Effects may vary faster than the motion: they are evaluated so much faster, then filtered."""
+
+AIM_REACH = (0.02, 0.9)
+AIM_SLOWEST_PACE = 6.0
+"""As `REACH` and `SLOWEST_PACE`, where an effect is wanted: it may need small, slow or lonely moves."""
+
+STEPS, AIM_STEPS = (0.05, 0.2, 0.5), (0.01, 0.05, 0.2, 0.5)
+"""Standard deviations of the changes of waypoints, over the range; small ones where an effect is wanted."""
+
+BASE_WEIGHT = 0.05
+"""Weight of the base parameters' precision beside that of a wanted effect's."""
+
+
+def slow_share(robot: RobotConfig, qd: Floats) -> Floats:
+    """Share of the samples ``qd`` (N, n) of each joint that are slower than `SLOW` of its velocity limit."""
+    limit = SLOW * np.array([joint.limits.velocity for joint in robot.joints])
+    result: Floats = (np.abs(qd) < limit).mean(axis=0)
+    return result
+
+
+@dataclass(frozen=True)
+class Moves:
+    """Waypoints (K, n) and paces (K,): how much slower than the limits each move is."""
+
+    points: Floats
+    paces: Floats
+
+
+class Search:
+    """Candidates within the limits, and their cost."""
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        model: ArmModel,
+        duration: float,
+        sigma: Floats,
+        margin: float,
+        theta: ArrayLike | None,
+        aim: Aim | None,
+        rng: np.random.Generator,
+    ) -> None:
+        limits = [joint.limits for joint in robot.joints]
+        bounds = np.array([limit.position for limit in limits])
+        middle, half = bounds.mean(axis=1), bounds[:, 1] - bounds.mean(axis=1)
+        self.low, self.high = middle - margin * half, middle + margin * half
+        self.velocity = margin * np.array([limit.velocity for limit in limits])
+        self.acceleration = margin * np.array([limit.acceleration for limit in limits])
+        self.torque = margin * np.array([limit.torque for limit in limits])
+        self.home = np.clip(0.0, self.low, self.high)
+        self.model, self.duration, self.sigma, self.theta, self.rng = model, duration, sigma, theta, rng
+        self.aim, self.anchored = aim, model if theta is None else model.anchored(theta)
+        self.decimation = design(1.0 / (AIM_FACTOR * SEARCH_RATE), CUTOFF, AIM_FACTOR)
+
+    def random(self) -> Moves:
+        """Waypoints within reach of each other, the last one home, as many as fit the duration."""
+        reach = self.rng.uniform(*REACH) * (self.high - self.low) if self.aim is None else None
+        points: list[Floats] = []
+        paces: list[float] = []
+        here, left = self.home, self.duration
+        while True:
+            way = self._far() if reach is None else reach
+            point = np.clip(here + self.rng.uniform(-way, way), self.low, self.high)
+            pace = float(self._pace(1)[0])
+            left -= pace * max(float(self._shortest((point - here)[None, :])[0]), SHORTEST_MOVE)
+            if left < 0.0 and points:
+                break
+            points.append(point)
+            paces.append(pace)
+            here = point
+        points[-1] = self.home
+        return Moves(np.array(points), np.array(paces))
+
+    def _far(self) -> Floats:
+        """How far the joints may go in one move (n,), each its own: the wanted one slowly while others hardly move."""
+        share = np.exp(self.rng.uniform(np.log(AIM_REACH[0]), np.log(AIM_REACH[1]), self.low.size))
+        far: Floats = share * (self.high - self.low)
+        return far
+
+    def neighbour(self, candidate: Moves) -> Moves:
+        """The candidate with a few coordinates changed."""
+        points, paces = candidate.points.copy(), candidate.paces.copy()
+        change = self.rng.random(points.shape) < self.rng.choice([0.03, 0.1, 0.3])
+        sizes = STEPS if self.aim is None else AIM_STEPS
+        step = self.rng.normal(0.0, self.rng.choice(sizes), points.shape) * (self.high - self.low)
+        points = np.where(change, np.clip(points + step, self.low, self.high), points)
+        points[-1] = self.home
+        change_pace = self.rng.random(paces.shape) < 0.1
+        return Moves(points, np.where(change_pace, self._pace(paces.size), paces))
+
+    def trajectory(self, candidate: Moves) -> Trajectory:
+        """The moves of a candidate, their durations in whole milliseconds and adding up."""
+        durations = self._durations(candidate)
+        ends = np.round(np.cumsum(durations), 3)
+        ends[-1] = round(self.duration, 3)
+        times = np.diff(ends, prepend=0.0)
+        moves = tuple(
+            Move(to=tuple(float(f"{v:.4f}") for v in point), duration=float(f"{time:.3f}"))
+            for point, time in zip(candidate.points, times, strict=True)
+        )
+        return Trajectory(schema="armident/trajectory/1", start=tuple(float(v) for v in self.home), moves=moves)
+
+    def cost(self, candidate: Moves) -> float:
+        """Mean logarithm of the standard deviations, raised where conditioning is poor or joints are slow.
+
+        Infinite where a limit is exceeded.
+        """
+        durations = self._durations(candidate)
+        lengths = np.diff(np.vstack([self.home, candidate.points]), axis=0)
+        if (durations < np.maximum(self._shortest(lengths), SHORTEST_MOVE)).any():
+            return np.inf
+        return self.worth(self.trajectory(candidate))
+
+    def worth(self, trajectory: Trajectory) -> float:
+        """Cost of a trajectory that keeps the limits of motion; infinite where it exceeds those of torque."""
+        factor = 1 if self.aim is None else AIM_FACTOR
+        period = 1.0 / (factor * SEARCH_RATE)
+        q, qd, qdd = motion_of(trajectory, period)
+        if self.theta is not None:
+            torque = self.model.inverse_dynamics(self.theta, q, qd, qdd)
+            if (np.abs(torque) > self.torque).any():
+                return np.inf
+        if self.aim is None:
+            x = weighted(self.model.base_regressor(q, qd, qdd, dt=period), self.sigma)
+            return self._base_cost(x, qd, slow=True)
+        motion = self.anchored.motion(q, qd, qdd, period)
+        x, decimation, sigma = equations_of(self.anchored, motion, self.decimation, self.sigma)
+        base = self._base_cost(x, qd, slow=False)
+        return base if np.isinf(base) else self.aim.cost(motion, x, decimation, sigma) + BASE_WEIGHT * base
+
+    def _base_cost(self, x: Floats, qd: Floats, *, slow: bool) -> float:
+        """Of the base parameters alone, from their weighted regressor (R, b)."""
+        eigenvalues = np.linalg.eigvalsh(x.T @ x)
+        if not eigenvalues[0] > 0.0:
+            return np.inf
+        condition = np.sqrt(eigenvalues[-1] / eigenvalues[0])
+        slowness = np.maximum(0.0, slow_share(self.model.robot, qd) - SLOW_SHARE).sum() if slow else 0.0
+        return float(-0.5 * np.log(eigenvalues).mean() + max(0.0, np.log(condition / CONDITION)) + slowness)
+
+    def _pace(self, count: int) -> Floats:
+        """Paces (count,): evenly spread, or in equal shares of every power where slow moves are wanted."""
+        if self.aim is None:
+            return self.rng.uniform(1.0, SLOWEST_PACE, count)
+        return np.exp(self.rng.uniform(0.0, np.log(AIM_SLOWEST_PACE), count))
+
+    def _durations(self, candidate: Moves) -> Floats:
+        lengths = np.diff(np.vstack([self.home, candidate.points]), axis=0)
+        wanted = np.maximum(self._shortest(lengths), SHORTEST_MOVE) * candidate.paces
+        result: Floats = wanted * self.duration / wanted.sum()
+        return result
+
+    def _shortest(self, lengths: Floats) -> Floats:
+        by_velocity = np.abs(lengths) * PEAK_VELOCITY / self.velocity
+        by_acceleration = np.sqrt(np.abs(lengths) * PEAK_ACCELERATION / self.acceleration)
+        result: Floats = np.maximum(by_velocity, by_acceleration).max(axis=1)
+        return result
+
+
+def equations_of(
+    model: ArmModel, motion: Motion, decimation: Decimation, sigma: Floats
+) -> tuple[Floats, Decimation, Floats]:
+    """Weighted base regressor (R, b) at the instants a decimation keeps, with what else an `Aim` asks for."""
+    kept = decimation.instants(motion.samples)
+    x = model.rigid_regressor(motion.q[kept], motion.qd[kept], motion.qdd[kept])
+    if model.terms:
+        x = np.concatenate([x, decimation(model.term_regressor(motion))], axis=2)
+    return weighted(x, sigma), decimation, sigma
+
+
+def motion_of(trajectory: Trajectory, period: float) -> tuple[Floats, Floats, Floats]:
+    """Positions, velocities and accelerations (N, n) along a trajectory, by differences."""
+    q = trajectory.sample(period)
+    qd = np.gradient(q, period, axis=0)
+    return q, qd, np.gradient(qd, period, axis=0)

@@ -1,0 +1,58 @@
+"""What an earlier identification knows of a robot, for the design of the next experiment."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from armident.configs import DataError, RobotConfig
+from armident.identify.document import IdentificationDocument
+from armident.identify.effects.terms import arm_model
+from armident.identify.identification.equations import LS_CUTOFF
+
+FREQUENCIES = 4096
+"""Points of the noise spectra."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Base parameters (b,) and standard deviation (n,) of the torque noise below the usual cut-off, N m or N."""
+
+    theta: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+
+def prior_from(document: IdentificationDocument, robot: RobotConfig, where: str) -> Prior:
+    """Parameters and noise of an identification of the same robot.
+
+    The noise is that of its noise models (6.19) below twice the closed-loop bandwidth, where the regression is made
+    (2.3.1); without a configured bandwidth, all of it.
+
+    Raises
+    ------
+    DataError
+        If it is of another robot or model, or its noise models are not of joint torques.
+    """
+    model = arm_model(robot)
+    if document.robot != robot.name:
+        raise DataError(f"{where}: the identification of robot {document.robot!r}, the configuration is {robot.name!r}")
+    values = {p.name: p.value for p in document.parameters}
+    if set(values) != set(model.base.names):
+        odd = sorted(set(values) ^ set(model.base.names))
+        raise DataError(f"{where}: other base parameters than the configuration of {robot.name}: {', '.join(odd[:5])}")
+    found = document.noise_model
+    if found.get("of") != "joint torque" or len(found.get("joints", [])) != robot.n:
+        raise DataError(f"{where}: noise_model: expected one model of joint torques for each of {robot.n} joints")
+    rate = float(found["rate_hz"])
+    cutoff = min(LS_CUTOFF * robot.bandwidth_hz, rate / 2) if robot.bandwidth_hz is not None else rate / 2
+    noise = [_deviation_below(cutoff, rate, joint["variance"], joint["coefficients"]) for joint in found["joints"]]
+    return Prior(np.array([values[name] for name in model.base.names]), np.array(noise))
+
+
+def _deviation_below(cutoff_hz: float, rate_hz: float, variance: float, coefficients: list[float]) -> float:
+    """Standard deviation of AR noise below a frequency: its spectrum is ``variance / |C|^2``."""
+    f, response = signal.freqz([1.0], [1.0, *coefficients], worN=FREQUENCIES, fs=rate_hz)
+    inside = f <= cutoff_hz
+    share = float(np.mean(np.abs(response[inside]) ** 2)) * cutoff_hz / (rate_hz / 2)
+    return float(np.sqrt(variance * share))

@@ -1,0 +1,1 @@
+"""The identification of a recording, from the experiment to the result."""

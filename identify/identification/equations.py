@@ -1,0 +1,145 @@
+"""From experiments to filtered equations: derivatives, alignment of the torque, parallel filter, decimation."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs.schema.robot import Preprocessing
+from armident.identify.experiment import Experiment
+from armident.identify.regression.equations import Block, filtered_regressor
+from armident.identify.robot.arm import ArmModel
+from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.differentiate import Derivatives
+from armident.identify.signals.published_filters import chebyshev_decimate, kept_samples
+
+LS_CUTOFF = 2.0
+"""Cut-off of the least-squares decimation in closed-loop bandwidths (thesis 2.3.1: ``w_Fp >= 2 w_dyn``)."""
+
+PIV_CUTOFF = 5.0
+"""Cut-off of the rough decimation before IDIM-PIV, in closed-loop bandwidths (thesis section 7.2)."""
+
+EQUATIONS_PER_PARAMETER = 10.0
+"""Fewest equations, of all joints and experiments together, per base parameter: what they leave to tell the noise from
+the parameters with."""
+
+
+def least_rows(model: ArmModel) -> int:
+    """Fewest decimated instants of all experiments together: each gives one equation per joint.
+
+    ``EQUATIONS_PER_PARAMETER b / n``, rounded up, for b base parameters and n joints.
+    """
+    return math.ceil(EQUATIONS_PER_PARAMETER * model.base.b / model.n)
+
+
+def decimated_rows(decimation: Decimation, samples: Sequence[int]) -> int:
+    """Instants that a decimation leaves of experiments of so many samples."""
+    return sum(decimation.count(count) for count in samples)
+
+
+def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: int) -> Decimation:
+    """The decimation or, where it leaves too few instants, the strongest one that leaves enough.
+
+    Motion slower than the cut-off fits through any wider one: raising it costs nothing but noise that the estimator
+    averages, while too few equations determine neither parameters nor noise.
+
+    Parameters
+    ----------
+    decimation
+        As the bandwidth asks for.
+    dt
+        Sampling period, s.
+    samples
+        Length of every experiment.
+    rows
+        Fewest instants of all experiments together, see :func:`least_rows`. Where not even all samples are as many,
+        all samples stay.
+    """
+    if decimated_rows(decimation, samples) >= rows:
+        return decimation
+    low, high = 1, decimation.factor
+    found = design(dt, 0.5 / dt, 1)
+    while high - low > 1:
+        factor = (low + high) // 2
+        tried = design(dt, 0.5 / (dt * factor), factor)
+        if decimated_rows(tried, samples) >= rows:
+            low, found = factor, tried
+        else:
+            high = factor
+    return found
+
+
+def aligned_torque(tau: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean of the torques held before and after each position sample, shape (N, n).
+
+    Sample k is held over ``[k, k + 1)``, so the torque as recorded belongs half a period after the position.
+    """
+    aligned = tau.copy()
+    aligned[1:] = (tau[1:] + tau[:-1]) / 2
+    return aligned
+
+
+def equations(
+    model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], decimation: Decimation
+) -> list[Block]:
+    """Filtered and decimated equations of every experiment.
+
+    The sign of the velocity is the smoothed one of the robot's configuration, so all samples can stay, which a linear
+    filter needs; where the configuration gives ``velocity_threshold``, slower rows are left out.
+    """
+    threshold = model.robot.friction.velocity_threshold
+    blocks = []
+    for experiment, s in zip(experiments, signals, strict=True):
+        kept = decimation.instants(s.q.shape[0])
+        y = decimation(aligned_torque(experiment.tau))
+        keep = np.ones(y.shape, dtype=np.bool_)
+        if threshold is not None:
+            keep = np.abs(s.qd[kept]) >= np.asarray(threshold)
+        t = np.asarray(kept * experiment.dt, dtype=np.float64)
+        blocks.append(Block(y, filtered_regressor(model, s, decimation), keep, t))
+    return blocks
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Recordings with the derivatives of their positions, and their equations, made once for every decimation.
+
+    Parameters
+    ----------
+    model
+        The arm.
+    experiments, signals
+        Recordings of one sampling rate, and the derivatives of their positions.
+    """
+
+    model: ArmModel
+    experiments: Sequence[Experiment]
+    signals: Sequence[Derivatives]
+    _made: dict[Decimation, list[Block]] = field(default_factory=dict, repr=False)
+
+    def equations(self, decimation: Decimation) -> list[Block]:
+        """:func:`equations` after a decimation, the same arrays whenever it is asked for again."""
+        if decimation not in self._made:
+            self._made[decimation] = equations(self.model, self.experiments, self.signals, decimation)
+        return self._made[decimation]
+
+
+def published_equations(
+    model: ArmModel, experiments: Sequence[Experiment], preprocessing: Preprocessing
+) -> list[Block]:
+    """Equations by the filters of a published fit: sharp ``sign``, torque as recorded, all rows."""
+    p = preprocessing
+    blocks = []
+    for experiment in experiments:
+        q = butterworth(experiment.q, experiment.dt, p.cutoff_hz, p.order, p.padlen)
+        qd = central_difference(q, experiment.dt)
+        qdd = central_difference(qd, experiment.dt)
+        x = model.base_regressor(q, qd, qdd, sharp_sign=True, dt=experiment.dt, start=experiment.start)[p.drop :]
+        filters = (p.decimation, p.decimation_order, p.decimation_ripple_db, p.decimation_padlen)
+        y = chebyshev_decimate(experiment.tau[p.drop :], *filters)
+        t = np.asarray((p.drop + kept_samples(x.shape[0], p.decimation)) * experiment.dt, dtype=np.float64)
+        blocks.append(Block(y, chebyshev_decimate(x, *filters), np.ones(y.shape, dtype=np.bool_), t))
+    return blocks

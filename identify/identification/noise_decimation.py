@@ -1,0 +1,58 @@
+"""Decimation from the noise instead of the bandwidth: keep one sample of as many as the noise remembers (6.2.3)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import DataError
+from armident.identify.regression.ar_noise import fit_ar
+
+MAX_ORDER = 250
+"""Highest order tried: twice the decimation that the thesis chose by hand."""
+
+
+@dataclass(frozen=True)
+class NoiseDecimation:
+    """A decimation and the memory of each joint's noise behind it.
+
+    Parameters
+    ----------
+    factor
+        ``n_d``: keep one sample of so many; the greatest of the orders, at least 1.
+    orders
+        Orders of the AR models of each joint's noise, shape (n,).
+    bounded
+        Whether an order is the highest that was tried: the noise may remember longer.
+    """
+
+    factor: int
+    orders: NDArray[np.int64]
+    bounded: bool
+
+
+def decimation_from_noise(series: Sequence[NDArray[np.float64]], max_order: int = MAX_ORDER) -> NoiseDecimation:
+    """Decimation after which the noise is hardly correlated any more: the order of its AR model (section 6.2.3).
+
+    Parameters
+    ----------
+    series
+        Torque residuals at the sampling rate, one array (N, n) per experiment, N m or N.
+    max_order
+        Highest order tried; a tenth of the samples at most.
+
+    Raises
+    ------
+    DataError
+        If there is no series, their shapes differ, or a residual is not finite.
+    """
+    if not series or any(s.ndim != 2 or s.shape[1] != series[0].shape[1] for s in series):
+        raise DataError(f"decimation from noise: expected residuals (N, n), got {[s.shape for s in series]}")
+    if not all(np.isfinite(s).all() for s in series):
+        raise DataError("decimation from noise: a residual is not a finite number")
+    total = sum(s.shape[0] for s in series)
+    highest = max(0, min(max_order, total // 10, min(s.shape[0] for s in series) - 1))
+    orders = np.array([fit_ar([s[:, j] for s in series], highest).order for j in range(series[0].shape[1])])
+    longest = int(orders.max())
+    return NoiseDecimation(max(1, longest), orders.astype(np.int64), longest == highest > 0)

@@ -1,0 +1,261 @@
+"""The methods by name: which equations each of them solves, and the estimator that does it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.estimators.clie import clie
+from armident.identify.estimators.cloe import cloe
+from armident.identify.estimators.diagnostics import Diagnostics, diagnose_estimate
+from armident.identify.estimators.didim import didim
+from armident.identify.estimators.idim_iv import idim_iv
+from armident.identify.estimators.idim_piv import idim_piv
+from armident.identify.estimators.sep_pem import sep_pem
+from armident.identify.identification.equations import LS_CUTOFF, PIV_CUTOFF, Prepared, decimated_rows, sufficient
+from armident.identify.identification.options import Method, Options
+from armident.identify.identification.torque_delay import TorqueDelay, torque_delay
+from armident.identify.regression.equations import Block, Estimate, joint_variances
+from armident.identify.signals.decimate import Decimation, design
+from armident.identify.signals.differentiate import Derivatives
+
+CONTRADICTION = 5.0
+"""Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before it is disbelieved."""
+
+PREFILTERED: tuple[Method, ...] = ("idim-piv", "sep-pem")
+"""Methods with a noise model: their equations are decimated only roughly (thesis section 7.2)."""
+
+MEASURED: tuple[Method, ...] = ("idim-ls", "idim-iv", "idim-piv")
+"""Methods whose regressor is the measured one."""
+
+Array = NDArray[np.float64]
+
+
+def decimation_of(
+    method: Method,
+    dt: float,
+    bandwidth_hz: float,
+    factor: int | None,
+    *,
+    samples: Sequence[int] = (),
+    rows: int = 0,
+    warnings: list[str] | None = None,
+) -> Decimation:
+    """Low-pass and decimation for a method, never so strong that too few equations are left.
+
+    Parameters
+    ----------
+    method
+        Methods with a noise model decimate only roughly.
+    dt
+        Sampling period, s.
+    bandwidth_hz
+        Closed-loop bandwidth.
+    factor
+        As chosen by hand, which stands however few equations it leaves; ``None``: from the bandwidth.
+    samples
+        Length of every experiment.
+    rows
+        Fewest instants to leave of all experiments together, see `least_rows`.
+    warnings
+        Gets a line if the cut-off was raised to leave as many, or if there are fewer.
+    """
+    share = PIV_CUTOFF if method in PREFILTERED else LS_CUTOFF
+    cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)
+    wanted = design(dt, cutoff, factor)
+    chosen = wanted if factor is not None else sufficient(wanted, dt, samples, rows)
+    left, heard = decimated_rows(chosen, samples), [] if warnings is None else warnings
+    if left < rows:
+        heard.append(
+            f"the decimation by {chosen.factor} leaves {left} equations per joint, fewer than {rows}: the estimate "
+            "and its standard deviations are uncertain; record longer"
+            + (" or decimate less" if chosen.factor > 1 else "")
+        )
+    elif chosen is not wanted:
+        heard.append(
+            f"a cut-off of {cutoff:.3g} Hz leaves {decimated_rows(wanted, samples)} equations per joint, fewer than "
+            f"{rows}: raised to {0.5 / (dt * chosen.factor):.3g} Hz, which leaves {left}"
+        )
+    return chosen
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What every method is given: experiments with derivatives, the closed loop, and where to start.
+
+    Parameters
+    ----------
+    auxiliary
+        The simulated closed loop with the decimation of the method.
+    start
+        First theta, shape (b,).
+    plain
+        Decimation of the methods without a noise model.
+    """
+
+    prepared: Prepared
+    auxiliary: AuxiliaryModel
+    start: Array
+    plain: Decimation
+    options: Options
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """Equations at measured signals, decimated as the method wants them."""
+        return self.prepared.equations(self.auxiliary.decimation)
+
+    @cached_property
+    def plain_problem(self) -> "Problem":
+        """The same with the decimation of the methods without a noise model."""
+        return replace(self, auxiliary=replace(self.auxiliary.fresh(), decimation=self.plain))
+
+    @cached_property
+    def in_band(self) -> "Problem":
+        """The same, decimated to the band of the instruments where the equations have a wider one.
+
+        At the recorded rate nearly all rows lie beyond the band in which anything is told.
+        """
+        auxiliary = self.auxiliary
+        if not auxiliary.limits_band:
+            return self
+        return replace(self, auxiliary=replace(auxiliary.fresh(), decimation=design(auxiliary.dt, auxiliary.band_hz)))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """An estimate, the problem it belongs to, and what is to be said about it.
+
+    ``prefiltered``: the noise models of the estimate have weighed its rows, not only entered its covariance.
+    ``noise_of``: the quantity that noise models and residuals of the estimate belong to.
+    """
+
+    estimate: Estimate
+    problem: Problem
+    prefiltered: bool = False
+    noise_of: str = "joint torque"
+    warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def motions(self) -> list[Derivatives]:
+        """The recorded references as the estimate follows them, without what disturbed the recordings.
+
+        Raises
+        ------
+        DataError
+            If neither the estimate nor any point between it and the last good one can be simulated.
+        """
+        return self.problem.auxiliary.fresh().motions(self.estimate.theta)
+
+    @cached_property
+    def instruments(self) -> list[Array]:
+        """Regressors at these motions, thinned out to the band of the instruments, one (M, n, b) per experiment."""
+        return self.problem.in_band.auxiliary.regressors(self.motions)
+
+    def diagnostics(self, essential: NDArray[np.bool_]) -> Diagnostics:
+        """Tests of the estimate on the equations it solves, thinned out to the band of its instruments."""
+        problem, estimate = self.problem.in_band, self.estimate
+        instruments = self.instruments
+        blocks, method = problem.blocks, problem.options.method
+        if method not in MEASURED:
+            blocks = [replace(b, x=z) for b, z in zip(blocks, instruments, strict=True)]
+        as_weighed = self.prefiltered and problem is self.problem
+        weights = None if as_weighed else joint_variances(blocks, estimate.theta)
+        return diagnose_estimate(
+            problem.auxiliary.model.base.names,
+            [joint.name for joint in problem.auxiliary.model.robot.joints],
+            blocks,
+            estimate,
+            instruments=instruments if method in MEASURED else None,
+            weights=weights,
+            essential=essential,
+        )
+
+    def delay(self) -> TorqueDelay:
+        """Delay of the recorded torques, with the motion simulated along the recorded reference as instruments."""
+        problem, prepared = self.problem, self.problem.prepared
+        x = [block.x for block in prepared.equations(problem.plain)]
+        thinned = problem.in_band.auxiliary.decimation == problem.plain
+        z = self.instruments if thinned else problem.plain_problem.auxiliary.regressors(self.motions)
+        return torque_delay(prepared.model, prepared.experiments, prepared.signals, problem.plain, self.motions, (x, z))
+
+
+def solve(problem: Problem) -> Solution:
+    """Run the method that the options name.
+
+    Raises
+    ------
+    DataError
+        If no auxiliary closed loop runs.
+    """
+    return _SOLVERS[problem.options.method](problem)
+
+
+def _idim_piv(problem: Problem) -> Solution:
+    """IDIM-PIV, unless the prefilter contradicts IDIM-IV, or comes to no rest where IDIM-IV does.
+
+    A noise model may move the estimate within its uncertainty only. Where it moves it further, the residual
+    is not noise but what the model lacks, and its inverse filter amplifies that (thesis section 6.2.3); then, as in
+    SEP-PEM, the dynamic model is estimated without it and it only enters the covariance (6.2.1). So it is where the
+    iterations with the prefilter, which weighs what lies beyond the motion's own frequencies, do not converge.
+    """
+    options, plain = problem.options, problem.plain_problem
+    without = idim_iv(plain.blocks, plain.auxiliary, problem.start, serial_order=options.max_ar_order)
+    estimate = idim_piv(
+        problem.blocks,
+        problem.auxiliary,
+        without.theta,
+        max_order=options.max_ar_order,
+        grey_box=options.noise_model == "grey-box",
+    )
+    shift = np.abs(estimate.theta - without.theta) / without.std
+    worst = int(np.argmax(shift))
+    if shift[worst] > CONTRADICTION:
+        name = problem.auxiliary.model.base.names[worst]
+        why = (
+            f"the prefilter of idim-piv moves {name} by {shift[worst]:.0f} standard deviations from idim-iv: the "
+            "residuals are model error, not noise"
+        )
+    elif without.converged and not estimate.converged:
+        why = f"idim-piv {estimate.stop_reason} without converging"
+    else:
+        if options.noise_model == "grey-box":
+            return Solution(estimate, problem, noise_of="motor position")
+        return Solution(estimate, problem, prefiltered=True)
+    warning = f"{why}; the parameters are those of idim-iv, the noise model only enters their standard deviations"
+    return Solution(without, plain, warnings=(warning,))
+
+
+def _idim_iv(problem: Problem) -> Solution:
+    return Solution(idim_iv(problem.blocks, problem.auxiliary, problem.start), problem)
+
+
+def _didim(problem: Problem) -> Solution:
+    return Solution(didim(problem.blocks, problem.auxiliary, problem.start), problem)
+
+
+def _clie(problem: Problem) -> Solution:
+    return Solution(clie(problem.blocks, problem.auxiliary, problem.start), problem)
+
+
+def _cloe(problem: Problem) -> Solution:
+    positions = [problem.auxiliary.decimation(e.q) for e in problem.prepared.experiments]
+    estimate = cloe(problem.blocks, positions, problem.auxiliary, problem.start)
+    return Solution(estimate, problem, noise_of="joint position")
+
+
+def _sep_pem(problem: Problem) -> Solution:
+    order = problem.options.max_ar_order
+    return Solution(sep_pem(problem.blocks, problem.auxiliary, problem.start, max_order=order), problem)
+
+
+_SOLVERS: dict[Method, Callable[[Problem], Solution]] = {
+    "idim-piv": _idim_piv,
+    "idim-iv": _idim_iv,
+    "didim": _didim,
+    "clie": _clie,
+    "cloe": _cloe,
+    "sep-pem": _sep_pem,
+}

@@ -1,0 +1,171 @@
+"""The delay between torque and position, estimated with the inverse dynamics as the ruler.
+
+A drive that reports the torque it holds from one sample to the next reports it half a sample early; filters and buses
+move it further. ``tau(k)`` then belongs to the instant ``k + delta`` of the positions, and to first order in the delay
+``tau = phi theta + delta d(phi theta)/dk + e``: one more parameter per joint, beside those of the inverse dynamics.
+
+In a closed loop a disturbance moves the arm first and the torque afterwards, so least squares finds a delay in the
+noise itself (tens of samples on an arm with slow disturbances). The instruments of the thesis's IV estimator (2.33) do
+not know the disturbance: the regressor along the reference, or better along a simulated motion.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.experiment import Experiment
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.equations import (
+    Block,
+    filtered_regressor,
+    instrumental_variable,
+    joint_variances,
+    noise_models,
+    serial_covariance,
+    unweighted,
+    weighted_rows,
+)
+from armident.identify.robot.arm import ArmModel
+from armident.identify.signals.decimate import Decimation
+from armident.identify.signals.differentiate import Derivatives, differentiate
+
+HELD = 0.5
+"""Delay in samples of a drive that reports the torque it holds until the next sample."""
+
+MAX_AR_ORDER = 10
+"""Highest order of the models of what is left after decimation, for the standard deviations."""
+
+REWEIGHTINGS = 2
+"""Weighted fits after the first, unweighted one."""
+
+_CHUNK_SAMPLES = 32768
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TorqueDelay:
+    """By how many samples the recorded torques run ahead of the positions.
+
+    Parameters
+    ----------
+    samples
+        Estimates, shape (n,): recorded torque k belongs to the instant ``k + samples`` of the positions.
+    std
+        Standard deviations, shape (n,), samples.
+    dt
+        Sampling period, s.
+    instrumented
+        Whether instruments that know no disturbance were there. Without, the delay is that of least squares, which
+        in a closed loop with disturbances is biased by far more than its standard deviation.
+    """
+
+    samples: Array
+    std: Array
+    dt: float
+    instrumented: bool
+
+    @property
+    def seconds(self) -> Array:
+        """Delays in seconds, shape (n,)."""
+        return self.samples * self.dt
+
+    def contradicts(self, expected: float = HELD, deviations: float = 3.0) -> NDArray[np.bool_]:
+        """Joints whose delay is further than so many standard deviations from an expected one, shape (n,)."""
+        contradiction: NDArray[np.bool_] = np.abs(self.samples - expected) > deviations * self.std
+        return contradiction
+
+
+def torque_delay(
+    model: ArmModel,
+    experiments: Sequence[Experiment],
+    signals: Sequence[Derivatives],
+    decimation: Decimation,
+    instruments: Sequence[Derivatives] | None = None,
+    regressors: tuple[Sequence[Array], Sequence[Array]] = ((), ()),
+) -> TorqueDelay:
+    """Delay between torque and position of every joint, in fractions of samples.
+
+    The torque is taken as recorded. All base parameters are estimated along with the delays, so a delay takes only
+    what they cannot explain; each joint has its own, the wrist's coupled motors the mixture that acts on the joint.
+
+    Parameters
+    ----------
+    model
+        The arm.
+    experiments, signals
+        Recordings of one sampling rate, and the derivatives of their positions.
+    decimation
+        Parallel filter of the fit.
+    instruments
+        Motions without the disturbances of the recordings, for instance simulated; ``None``: the references, and
+        where one is missing the measured motion, which makes it least squares.
+    regressors
+        Filtered regressors, (M, n, b) each, at the measured motions and at the instruments, where they are known.
+
+    Returns
+    -------
+    TorqueDelay
+        With standard deviations that allow for serially correlated residuals.
+
+    Raises
+    ------
+    DataError
+        If a recording is shorter than the parallel filter.
+    """
+    references = [e.q_ref for e in experiments if e.q_ref is not None]
+    instrumented = instruments is not None or len(references) == len(experiments)
+    if instruments is None:
+        instruments = [differentiate(q, experiments[0].dt) for q in references] if instrumented else signals
+    n, b = model.n, len(model.base.names)
+    joints = np.arange(n)
+
+    def augmented(motions: Sequence[Derivatives], known: Sequence[Array]) -> list[Array]:
+        return [_with_delays(value) for value in known or [filtered_regressor(model, s, decimation) for s in motions]]
+
+    x = augmented(signals, regressors[0])
+    z = augmented(instruments, regressors[1]) if instrumented else x
+    y = [decimation(e.tau) for e in experiments]
+    keep = [np.ones(value.shape, dtype=np.bool_) for value in y]
+
+    def solve(zeta: Sequence[Array], phi: Sequence[Array], noise: Sequence[ArModel]) -> tuple[Array, list[Block]]:
+        rows = [weighted_rows(values, keep, noise) for values in (zeta, phi, y)]
+        theta = instrumental_variable(*rows)
+        return theta, [Block(*parts, np.zeros(parts[0].shape[0])) for parts in zip(y, phi, keep, strict=True)]
+
+    without = [value[:, :, :b] for value in z], [value[:, :, :b] for value in x]
+    theta, blocks = solve(*without, unweighted(n))
+    theta, blocks = solve(*without, joint_variances(blocks, theta))
+    noise: Sequence[ArModel] = joint_variances(blocks, theta)
+    for _ in range(REWEIGHTINGS):
+        for values, motions in ((x, signals), (z, instruments)) if instrumented else ((x, signals),):
+            for value, motion in zip(values, motions, strict=True):
+                value[:, joints, b + joints] = _rate(model, motion, theta[:b], decimation)
+        theta, blocks = solve(z, x, noise)
+        noise = joint_variances(blocks, theta)
+    covariance = serial_covariance(z, x, keep, noise, noise)
+    coloured = noise_models(blocks, theta, covariance, MAX_AR_ORDER)
+    covariance = serial_covariance(z, x, keep, noise, coloured)
+    return TorqueDelay(theta[b:], np.sqrt(np.diag(covariance)[b:]), experiments[0].dt, instrumented)
+
+
+def _with_delays(x: Array) -> Array:
+    """Regressor (M, n, b) with an empty column for every joint's delay, (M, n, b + n)."""
+    return np.concatenate([x, np.zeros((*x.shape[:2], x.shape[1]))], axis=2)
+
+
+def _rate(model: ArmModel, s: Derivatives, theta: Array, decimation: Decimation) -> Array:
+    """Filtered change per sample of the torque that the rigid model needs for a motion, (M, n), piece by piece."""
+    samples, count = s.q.shape[0], decimation.count(s.q.shape[0])
+    rows = max(1, _CHUNK_SAMPLES // decimation.factor)
+    filtered = np.empty((count, model.n))
+    for first in range(0, count, rows):
+        last = min(first + rows, count)
+        begin, end = first * decimation.factor, (last - 1) * decimation.factor + decimation.taps.size
+        # One more sample at each end, where there is one: the change is that between the neighbours.
+        before, after = max(begin - 1, 0), min(end + 1, samples)
+        torque = model.inverse_dynamics(theta, s.q[before:after], s.qd[before:after], s.qdd[before:after])
+        filtered[first:last] = decimation(np.gradient(torque, axis=0)[begin - before : end - before])
+    return filtered

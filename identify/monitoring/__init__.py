@@ -1,0 +1,1 @@
+"""Repeated identification: history, change tests, the scheduled job and the worker."""

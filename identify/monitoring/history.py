@@ -1,0 +1,281 @@
+"""What was identified so far, in a database: SQLite in a file, or any other that SQLAlchemy reaches by URL."""
+
+import datetime
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from armident.configs import ConfigError
+from armident.daq.recording import Recording
+from armident.identify.document import IdentificationDocument, from_json, to_json
+from armident.identify.monitoring.change_test import Drift
+
+DEFAULT = "sqlite:///history.sqlite"
+_STAMP = re.compile(r"(\d{8}T\d{6})-\d{3}Z")
+
+_tables = sa.MetaData()
+_runs = sa.Table(
+    "identifications",
+    _tables,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("digest", sa.String(64), unique=True, nullable=False),
+    sa.Column("robot", sa.String(128), index=True, nullable=False),
+    sa.Column("recorded", sa.DateTime, index=True, nullable=False),
+    sa.Column("recording", sa.Text),
+    sa.Column("sha256", sa.String(64), nullable=False),
+    sa.Column("samples", sa.Integer, nullable=False),
+    sa.Column("sample_rate_hz", sa.Float, nullable=False),
+    sa.Column("method", sa.String(32), nullable=False),
+    sa.Column("relative_error_pct", sa.Float, nullable=False),
+    sa.Column("converged", sa.Boolean, nullable=False),
+    sa.Column("document", sa.Text, nullable=False),
+)
+_parameters = sa.Table(
+    "parameters",
+    _tables,
+    sa.Column("identification", sa.ForeignKey(_runs.c.id), primary_key=True),
+    sa.Column("name", sa.String(64), primary_key=True),
+    sa.Column("value", sa.Float, nullable=False),
+    sa.Column("std", sa.Float, nullable=False),
+    sa.Column("unit", sa.String(32), nullable=False),
+    sa.Column("essential", sa.Boolean, nullable=False),
+)
+_recordings = sa.Table(
+    "recordings",
+    _tables,
+    sa.Column("sha256", sa.String(64), primary_key=True),
+    sa.Column("path", sa.Text),
+    sa.Column("cell", sa.String(128), index=True),
+    sa.Column("duration_s", sa.Float, nullable=False),
+    sa.Column("in_gaps", sa.Integer),
+    sa.Column("facts", sa.JSON, nullable=False),
+    sa.Column("counters", sa.JSON, nullable=False),
+)
+_comparisons = sa.Table(
+    "comparisons",
+    _tables,
+    sa.Column("identification", sa.ForeignKey(_runs.c.id), primary_key=True),
+    sa.Column("baseline", sa.String(64), primary_key=True),
+    sa.Column("drifted", sa.Boolean, nullable=False),
+    sa.Column("chi_square", sa.Float, nullable=False),
+    sa.Column("degrees", sa.Integer, nullable=False),
+    sa.Column("p_joint", sa.Float, nullable=False),
+    sa.Column("false_alarms", sa.Float, nullable=False),
+    sa.Column("changed", sa.JSON, nullable=False),
+    sa.Column("words", sa.Text, nullable=False),
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """An identification in the history, and when its recording was made (UTC)."""
+
+    number: int
+    recorded: datetime.datetime
+    document: IdentificationDocument
+
+
+class History:
+    """Identifications in a database; its tables are made where they are missing.
+
+    Parameters
+    ----------
+    url
+        As SQLAlchemy understands it: ``sqlite:///history.sqlite``, ``postgresql://USER:PASSWORD@HOST/NAME``.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such database, or its driver is not installed.
+    """
+
+    def __init__(self, url: str = DEFAULT) -> None:
+        try:
+            self._engine = sa.create_engine(_driven(url))
+            _tables.create_all(self._engine)
+        except (sa.exc.SQLAlchemyError, ImportError, OSError) as error:
+            missing = getattr(error, "name", None) == "psycopg"
+            hint = "; install it with: pip install 'armident[postgresql]'" if missing else ""
+            raise ConfigError(f"{_shown(url)}: cannot be used as history: {_one_line(error)}{hint}") from error
+
+    def add(self, document: IdentificationDocument, recorded: datetime.datetime) -> bool:
+        """Keep an identification; whether it is new, since the same one is kept once.
+
+        Parameters
+        ----------
+        document
+            The result.
+        recorded
+            When its recording was made; see :func:`recorded_at`.
+        """
+        text = to_json(document)
+        digest = _digest(document)
+        source = document.recording
+        row = {
+            "digest": digest,
+            "robot": document.robot,
+            "recorded": recorded.astimezone(datetime.UTC).replace(tzinfo=None),
+            "recording": source.path,
+            "sha256": source.sha256,
+            "samples": source.samples,
+            "sample_rate_hz": source.sample_rate_hz,
+            "method": document.method,
+            "relative_error_pct": document.relative_error_pct,
+            "converged": document.converged,
+            "document": text,
+        }
+        try:
+            with self._engine.begin() as connection:
+                done = connection.execute(sa.insert(_runs).values(row))
+                (number,) = done.inserted_primary_key or (None,)
+                rows = [
+                    {
+                        "identification": number,
+                        "name": p.name,
+                        "value": p.value,
+                        "std": p.std,
+                        "unit": p.unit,
+                        "essential": p.essential,
+                    }
+                    for p in document.parameters
+                ]
+                connection.execute(sa.insert(_parameters), rows)
+        except sa.exc.IntegrityError:
+            return False
+        except sa.exc.SQLAlchemyError as error:
+            raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
+        return True
+
+    @staticmethod
+    def facts(recording: Recording) -> dict[str, Any]:
+        """What is known of a recording beside its samples, for `describe`."""
+        return {
+            "sha256": recording.sha256,
+            "path": None if recording.path is None else str(recording.path),
+            "cell": recording.metadata.get("cell"),
+            "duration_s": recording.samples.sync.size / recording.sample_rate_hz,
+            "in_gaps": recording.counters.get("samples.in_gaps"),
+            "facts": dict(recording.metadata),
+            "counters": dict(recording.counters),
+        }
+
+    @staticmethod
+    def began(facts: Mapping[str, Any], document: IdentificationDocument, file: Path) -> datetime.datetime:
+        """When a recording was begun: what it says itself, else by its name or the time of the result's file."""
+        said = facts["facts"].get("started_utc")
+        return recorded_at(document, file) if said is None else datetime.datetime.fromisoformat(said)
+
+    def describe(self, facts: Mapping[str, Any]) -> None:
+        """Keep what is known of a recording; once."""
+        self._insert_once(_recordings, facts)
+
+    def judge(self, document: IdentificationDocument, baseline: IdentificationDocument, drift: Drift) -> None:
+        """Keep what came of the comparison of an identification, added before, with a baseline."""
+        number = sa.select(_runs.c.id).where(_runs.c.digest == _digest(document)).scalar_subquery()
+        row = {
+            "identification": number,
+            "baseline": _digest(baseline),
+            "drifted": drift.drifted,
+            "chi_square": drift.chi_square,
+            "degrees": drift.degrees,
+            "p_joint": drift.p_joint,
+            "false_alarms": drift.false_alarms,
+            "changed": list(drift.changed),
+            "words": drift.words,
+        }
+        self._insert_once(_comparisons, row)
+
+    def _insert_once(self, table: sa.Table, row: Mapping[str, Any]) -> None:
+        try:
+            with self._engine.begin() as connection:
+                connection.execute(sa.insert(table).values(row))
+        except sa.exc.IntegrityError:
+            return
+        except sa.exc.SQLAlchemyError as error:
+            raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
+
+    def first(self, robot: str, cell: str | None = None) -> Run | None:
+        """The identification of an arm whose recording is the oldest, of those that converged; see `runs`."""
+        found = self._read(_of(robot, cell).where(_runs.c.converged).limit(1))
+        return found[0] if found else None
+
+    def runs(self, robot: str | None = None, cell: str | None = None) -> list[Run]:
+        """Identifications in the order in which their recordings were made.
+
+        Parameters
+        ----------
+        robot
+            Name of the robot; ``None``: all.
+        cell
+            Where it stands, as arms of one make often share a name; ``None``: anywhere. Runs of which the history
+            does not know the recording, and so the cell, may be of any.
+        """
+        return self._read(_of(robot, cell))
+
+    def arms(self) -> list[tuple[str, str | None]]:
+        """Robots and their cells, ``None`` where the history does not know them."""
+        query = sa.select(_runs.c.robot, _recordings.c.cell).select_from(_WHERE).distinct()
+        with self._engine.connect() as connection:
+            found = [(robot, cell) for robot, cell in connection.execute(query).all()]
+        return sorted(found, key=lambda arm: (arm[0], arm[1] or ""))
+
+    def cell(self, document: IdentificationDocument) -> str | None:
+        """Cell of an identification's recording, if the history knows it."""
+        query = sa.select(_recordings.c.cell).where(_recordings.c.sha256 == document.recording.sha256)
+        with self._engine.connect() as connection:
+            return connection.execute(query).scalar_one_or_none()
+
+    def _read(self, query: sa.Select[Any]) -> list[Run]:
+        try:
+            with self._engine.connect() as connection:
+                rows = connection.execute(query).all()
+        except sa.exc.SQLAlchemyError as error:
+            raise ConfigError(f"history: cannot be read: {_one_line(error)}") from error
+        return [
+            Run(number, recorded.replace(tzinfo=datetime.UTC), from_json(text, IdentificationDocument, f"run {number}"))
+            for number, recorded, text in rows
+        ]
+
+
+_WHERE = _runs.outerjoin(_recordings, _runs.c.sha256 == _recordings.c.sha256)
+
+
+def _of(robot: str | None, cell: str | None) -> sa.Select[Any]:
+    """Runs of an arm in the order of their recordings."""
+    query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document).select_from(_WHERE)
+    if robot is not None:
+        query = query.where(_runs.c.robot == robot)
+    if cell is not None:
+        query = query.where(sa.or_(_recordings.c.cell == cell, _recordings.c.cell.is_(None)))
+    return query.order_by(_runs.c.recorded, _runs.c.id)
+
+
+def _digest(document: IdentificationDocument) -> str:
+    return hashlib.sha256(to_json(document).encode()).hexdigest()
+
+
+def recorded_at(document: IdentificationDocument, file: Path) -> datetime.datetime:
+    """When a recording was made: by the time in its name, or else by that of the result's file."""
+    found = _STAMP.search(document.recording.path or "")
+    if found is not None:
+        return datetime.datetime.strptime(found[1] + "+0000", "%Y%m%dT%H%M%S%z")
+    return datetime.datetime.fromtimestamp(file.stat().st_mtime, datetime.UTC)
+
+
+def _driven(url: str) -> str:
+    """The URL with the driver that our extra installs, where it names none."""
+    return re.sub(r"^postgres(ql)?://", "postgresql+psycopg://", url)
+
+
+def _shown(url: str) -> str:
+    """The URL without a password in it."""
+    return re.sub(r"(://[^:/@]*):[^@]*@", r"\1:***@", url)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]

@@ -1,0 +1,201 @@
+"""``armident reidentify --recordings``: many recordings, identified in parallel by a Dask cluster, judged in order."""
+
+import glob
+import json
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from armident.configs import ArmidentError, ConfigError, DataError, RobotConfig, load_robot
+from armident.daq.recording import Recording, read_recording
+from armident.identify.document import IdentificationDocument, from_json, load_document, to_json
+from armident.identify.identification.api import identify_recording
+from armident.identify.identification.options import Options
+from armident.identify.monitoring.change_test import Drift, compare
+from armident.identify.monitoring.history import History
+from armident.identify.monitoring.reidentify.options import Asked
+from armident.identify.monitoring.reidentify.summary import told
+from armident.identify.report.files import write_identification
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+DRIFTED, FAILED = 4, 1
+"""Exit codes: an arm has changed; none has, and a recording could not be identified."""
+CONNECT_S = 10.0
+
+_Arm = tuple[str, str | None]
+"""Names of robot and cell, as arms of one make often share a name."""
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What a worker of the cluster sends back: the result's text and file, and what is known of the recording."""
+
+    text: str
+    path: str
+    robot: RobotConfig
+    facts: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Row:
+    """What came of one recording."""
+
+    recording: str
+    error: str | None = None
+    drift: Drift | None = None
+    words: tuple[str, ...] = ()
+    identification: str | None = None
+
+
+def fleet_command(pattern: str, asked: Asked, *, as_json: bool) -> int:
+    """Carry out ``armident reidentify --recordings``; the exit code.
+
+    Recordings are judged in the order of their names. Each is compared with the baseline, or with the first run of its
+    arm (robot and cell) in the history; one that fails does not stop the others.
+
+    Raises
+    ------
+    ConfigError
+        If nothing matches, the scheduler does not answer, or neither it nor workers are given.
+    """
+    paths = [Path(name).resolve() for name in sorted(glob.glob(pattern, recursive=True))]
+    if not paths:
+        raise ConfigError(f"--recordings {pattern}: no such file")
+    robot = None if asked.config is None else load_robot(asked.config)
+    known = None if asked.baseline is None else load_document(asked.baseline, IdentificationDocument)
+    history = History(asked.store)
+    rows: list[Row] = []
+    # Of each arm one baseline for all: an older recording that comes later must not take its place.
+    baselines: dict[_Arm, IdentificationDocument] = {}
+    with cluster(asked.scheduler, asked.workers) as client:
+        futures = [
+            client.submit(identify_one, str(path), robot, _folder(path, asked.out), pure=False) for path in paths
+        ]
+        for path, future in zip(paths, futures, strict=True):
+            row = _judged(path, future, history, known, baselines, asked.false_alarms)
+            future.release()
+            rows.append(row)
+            # One line as soon as it is known: a fleet takes hours.
+            print(_line(row), file=sys.stderr if as_json else sys.stdout, flush=True)
+    if as_json:
+        print(json.dumps({"runs": [_entry(row) for row in rows]}, indent=1))
+    if any(row.drift is not None and row.drift.drifted for row in rows):
+        return DRIFTED
+    return FAILED if any(row.error for row in rows) else 0
+
+
+@contextmanager
+def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
+    """A client of the scheduler at an address, or of one on this machine with so many processes.
+
+    Raises
+    ------
+    ConfigError
+        If Dask is not installed, the scheduler does not answer, or it is not said which.
+    """
+    if scheduler is None and workers is None:
+        raise ConfigError("--recordings: needs --scheduler ADDRESS, or --workers N for processes on this machine")
+    if scheduler is not None and workers is not None:
+        raise ConfigError("--workers: not with --scheduler; its cluster has workers of its own")
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ConfigError("--recordings: Dask is not installed: pip install 'armident[fleet]'") from error
+    # What goes wrong with a recording is in its line; what goes wrong with the cluster is raised.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    if scheduler is None:
+        local = LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0")
+        with local, Client(local) as client:
+            yield client
+        return
+    try:
+        remote = Client(scheduler, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error})") from error
+    with remote:
+        yield remote
+
+
+def identify_one(path: str, robot: RobotConfig | None, out: str) -> Identified:
+    """Identify one recording where this runs, on a worker; a failure is sent back as `ArmidentError`."""
+    try:
+        recording = read_recording(Path(path))
+        done = identify_recording(recording, robot, _options(recording))
+        file, _ = write_identification(done, Path(out))
+    except ArmidentError:
+        raise
+    except Exception as error:
+        raise ArmidentError(f"{type(error).__name__}: {error}") from error
+    return Identified(to_json(done.document), str(file), done.robot, History.facts(recording))
+
+
+def _options(recording: Recording) -> Options:
+    """As the worker of its session would identify it."""
+    session = recording.session
+    return Options() if session is None else Options(**session.identification.model_dump())
+
+
+def _judged(
+    path: Path,
+    future: Any,
+    history: History,
+    known: IdentificationDocument | None,
+    baselines: dict[_Arm, IdentificationDocument],
+    false_alarms: float,
+) -> Row:
+    try:
+        found: Identified = future.result()
+        document = from_json(found.text, IdentificationDocument, str(path))
+        arm = document.robot, found.facts["cell"]
+        first = known or baselines.get(arm) or _first(history, *arm)
+        history.describe(found.facts)
+        history.add(document, History.began(found.facts, document, Path(found.path)))
+        if not document.converged:
+            raise DataError(f"the identification did not converge ({document.stop_reason})")
+        baselines.setdefault(arm, first or document)
+        drift = None if first is None else compare(first, document, false_alarms)
+        if drift is None or first is None:
+            return Row(str(path), words=(f"first run of {_name(*arm)}: the baseline",), identification=found.path)
+        history.judge(document, first, drift)
+    except (ArmidentError, OSError, RuntimeError) as error:
+        return Row(str(path), error=" ".join(str(error).split()))
+    words = tuple(told(drift, found.robot)) if drift.drifted else (drift.words,)
+    return Row(str(path), drift=drift, words=words, identification=found.path)
+
+
+def _first(history: History, robot: str, cell: str | None) -> IdentificationDocument | None:
+    run = history.first(robot, cell)
+    return None if run is None else run.document
+
+
+def _name(robot: str, cell: str | None) -> str:
+    return robot if cell is None else f"{robot} in cell {cell}"
+
+
+def _folder(path: Path, out: Path | None) -> str:
+    name = f"{path.name.removesuffix('.mcap')}.identification"
+    return str((path.parent if out is None else out.resolve()) / name)
+
+
+def _line(row: Row) -> str:
+    if row.error is not None:
+        return f"{row.recording}: failed: {row.error}"
+    verdict = "CHANGED: " if row.drift is not None and row.drift.drifted else ""
+    return f"{row.recording}: {verdict}{'; '.join(row.words)}"
+
+
+def _entry(row: Row) -> dict[str, Any]:
+    drift = row.drift
+    return {
+        "recording": row.recording,
+        "identification": row.identification,
+        "error": row.error,
+        "drift": None if drift is None else drift.entry,
+        "words": list(row.words),
+    }

@@ -1,0 +1,63 @@
+"""The job on Zenoh: what it is doing, and its result, under the same keys as the worker's."""
+
+import json
+import time
+from types import TracebackType
+from typing import Any, Self
+
+import zenoh
+
+from armident.configs import ConfigError, RobotConfig, SessionConfig
+from armident.daq.streaming import Keys, open_session
+
+LINGER_S = 1.0
+"""How long a result stays on offer after it was published: peers that connect late ask for it."""
+
+
+class Announcer:
+    """Publishes status and result of one job.
+
+    It takes the worker's place on Zenoh where no worker runs, and is one of those who listen to it otherwise.
+    """
+
+    def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
+        self._keys = Keys(session.cell, robot.name)
+        try:
+            self._session = open_session(session, "worker")
+        except ConfigError:
+            self._session = open_session(session, "observer")
+        self._last: bytes | None = None
+        self._queryable = self._session.declare_queryable(self._keys.identification, self._answer)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            if self._last is None:
+                query.reply_err(b"no identification yet")
+            else:
+                query.reply(self._keys.identification, self._last)
+
+    def status(self, state: str, **more: Any) -> None:
+        """Say what the job is doing."""
+        content = {"component": "reidentify", "state": state, **more}
+        self._session.put(self._keys.status, json.dumps(content).encode())
+
+    def result(self, text: str) -> None:
+        """Publish an identification document, and answer queries with it from now on."""
+        self._last = text.encode()
+        self._session.put(self._keys.identification, self._last)
+
+    def diagnosis(self, text: str) -> None:
+        """Publish a diagnosis document."""
+        self._session.put(self._keys.diagnosis, text.encode())
+
+    def __enter__(self) -> Self:
+        """Use it in a ``with`` block."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave, after a moment for those who are late."""
+        if self._last is not None and kind is None:
+            time.sleep(LINGER_S)
+        self._session.close()

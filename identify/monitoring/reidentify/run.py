@@ -1,0 +1,282 @@
+"""``armident reidentify`` of one arm: check, move, identify, compare, keep, tell."""
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armident.configs import (
+    ArmidentError,
+    ConfigError,
+    DataError,
+    RobotConfig,
+    SessionConfig,
+    load_robot,
+    load_session,
+    load_trajectory,
+)
+from armident.daq.recording import Recording
+from armident.identify.document import DiagnosisDocument, IdentificationDocument, from_json, to_json
+from armident.identify.effects.terms import arm_model
+from armident.identify.excitation.point_to_point import motion_of
+from armident.identify.excitation.previous_estimate import prior_from
+from armident.identify.identification.api import identify_recording
+from armident.identify.identification.options import Options
+from armident.identify.monitoring.change_test import Drift, Inconclusive, compare
+from armident.identify.monitoring.history import History
+from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
+from armident.identify.monitoring.reidentify.options import Asked
+from armident.identify.monitoring.reidentify.publish import Announcer
+from armident.identify.monitoring.reidentify.record_run import Say, Start, play, start_process
+from armident.identify.monitoring.reidentify.summary import found, told
+from armident.identify.report.files import write_identification
+
+DRIFTED = 4
+"""Exit code: done, and the arm has changed."""
+CHECK_PERIOD = 1e-3
+"""Torques along the trajectory are predicted at this period, s."""
+DIAGNOSIS_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be done, checked before anything moves."""
+
+    config: Path
+    session: SessionConfig
+    robot: RobotConfig
+    baseline: Baseline
+    history: History
+    out: Path
+    false_alarms: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a job; ``drift`` is ``None`` of a first run."""
+
+    document: IdentificationDocument
+    path: Path
+    drift: Drift | None
+    words: tuple[str, ...]
+    diagnosis: Path | None = None
+    findings: tuple[str, ...] = ()
+
+
+def reidentify_command(asked: Asked, *, as_json: bool) -> int:
+    """Carry out ``armident reidentify`` without ``--recordings``; the exit code.
+
+    Raises
+    ------
+    ConfigError, DataError, ArmidentError
+        Before anything moves: if configuration, trajectory, baseline or history are wrong. Later: if bus, drives or
+        guard end the motion, or the recording cannot be identified.
+    """
+    for option, given in (("--scheduler", asked.scheduler), ("--workers", asked.workers)):
+        if given is not None:
+            raise ConfigError(f"{option}: needs --recordings")
+    if asked.config is None:
+        raise ConfigError("--config: give the session of the cell, or --recordings")
+    job = prepare(asked.config, asked.baseline, asked.store, asked.out, asked.false_alarms)
+
+    def say(line: str) -> None:
+        print(f"reidentify: {line}", file=sys.stderr, flush=True)
+
+    with Announcer(job.session, job.robot) as announcer:
+        outcome = carry_out(job, announcer, say)
+    if as_json:
+        print(json.dumps(entry(job, outcome), indent=1))
+    else:
+        show(job, outcome)
+    return DRIFTED if outcome.drift is not None and outcome.drift.drifted else 0
+
+
+def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, false_alarms: float) -> Job:
+    """Load and check all that a job needs.
+
+    Raises
+    ------
+    ConfigError
+        If the session plays nothing, or the trajectory leaves the limits of the robot.
+    DataError
+        If the baseline is of another robot or model.
+    """
+    session = load_session(config)
+    robot = load_robot(session.robot)
+    if session.setpoints is None:
+        raise ConfigError(f"{config}: setpoints: a session without them moves nothing; name an exciting trajectory")
+    if session.sync.role != "producer":
+        raise ConfigError(f"{config}: sync.role: {session.sync.role}; only who sends SYNC can move the arm")
+    if session.recording.trigger is not None:
+        raise ConfigError(f"{config}: recording.trigger: writes only events, the job needs all of the motion")
+    history = History(store)
+    chosen = baseline_of(baseline, history, robot.name, session.cell)
+    check_trajectory(session, robot, chosen)
+    return Job(config, session, robot, chosen, history, out or session.recording.directory, false_alarms)
+
+
+def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Baseline) -> None:
+    """Refuse a trajectory beyond the limits: those of position, velocity, acceleration, and of torque if it is known.
+
+    Torques are those that the baseline's parameters predict; without one the guard alone watches them.
+
+    Raises
+    ------
+    ConfigError
+        Naming the joint, the limit, and by how much it is exceeded.
+    DataError
+        If the baseline is of another model.
+    """
+    assert session.setpoints is not None
+    name = str(session.setpoints.trajectory)
+    trajectory = load_trajectory(session.setpoints.trajectory)
+    trajectory.check(robot, name)
+    if baseline.document is None:
+        return
+    prior = prior_from(baseline.document, robot, baseline.name)
+    torque = arm_model(robot).inverse_dynamics(prior.theta, *motion_of(trajectory, CHECK_PERIOD))
+    for joint, peak in zip(robot.joints, np.abs(torque).max(axis=0), strict=True):
+        if peak > joint.limits.torque:
+            raise ConfigError(
+                f"{name}: {joint.name} needs a torque of {peak:.1f}, allowed is {joint.limits.torque:.1f} "
+                "(predicted by the baseline)"
+            )
+
+
+def carry_out(job: Job, announcer: Announcer, say: Say, start: Start = start_process) -> Outcome:
+    """Do the job; everything that it leaves is kept in the history, and published.
+
+    Parameters
+    ----------
+    job
+        What `prepare` has checked.
+    announcer
+        For Zenoh.
+    say
+        Takes lines that tell how it goes.
+    start
+        How guard and capture are started.
+    """
+    say(f"{job.robot.name} in cell {job.session.cell}; baseline: {job.baseline.name}")
+    announcer.status("moving")
+    job.out.mkdir(parents=True, exist_ok=True)
+    recording = play(job.config, job.out, say, start)
+    say(f"recorded {recording.path}")
+    announcer.status("identifying", recording=str(recording.path))
+    options = Options(**job.session.identification.model_dump())
+    done = identify_recording(recording, job.robot, options)
+    folder = _beside(recording, job.out, "identification")
+    path, _ = write_identification(done, folder)
+    document = done.document
+    for warning in document.warnings:
+        say(f"warning: {warning}")
+    say(f"identified: relative torque error {document.relative_error_pct:.2f} %")
+    if not document.converged:
+        keep(job.history, recording, document, path, None, None)
+        raise DataError(
+            f"{recording.path}: the identification did not converge ({document.stop_reason}): "
+            f"whether the arm has changed is unknown (result: {path})"
+        )
+    try:
+        drift = None if job.baseline.document is None else compare(job.baseline.document, document, job.false_alarms)
+    except Inconclusive as error:
+        keep(job.history, recording, document, path, None, None)
+        raise DataError(f"{recording.path}: {error} (result: {path})") from error
+    keep(job.history, recording, document, path, job.baseline.document, drift)
+    announcer.result(to_json(document))
+    if drift is None:
+        outcome = Outcome(document, path, None, (job.baseline.become(document),))
+    elif not drift.drifted:
+        outcome = Outcome(document, path, drift, (drift.words,))
+    else:
+        say("changed; diagnosing")
+        announcer.status("diagnosing", words=drift.words)
+        outcome = _diagnosed(job, recording, Outcome(document, path, drift, tuple(told(drift, job.robot))), say)
+        if outcome.diagnosis is not None:
+            announcer.diagnosis(outcome.diagnosis.read_text(encoding="utf-8"))
+    announcer.status("done", drifted=drift is not None and drift.drifted, words=list(outcome.words))
+    return outcome
+
+
+def keep(
+    history: History,
+    recording: Recording,
+    document: IdentificationDocument,
+    path: Path,
+    baseline: IdentificationDocument | None,
+    drift: Drift | None,
+) -> None:
+    """Put a run, its recording's facts and its comparison into the history."""
+    facts = History.facts(recording)
+    history.describe(facts)
+    history.add(document, History.began(facts, document, path))
+    if drift is not None and baseline is not None:
+        history.judge(document, baseline, drift)
+
+
+def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Outcome:
+    """The outcome with what ``armident diagnose --baseline`` says; a diagnosis that fails does not undo the verdict."""
+    assert job.baseline.document is not None
+    folder = _beside(recording, job.out, "diagnosis")
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = folder / "baseline.json"
+    numbers.write_text(to_json(job.baseline.document), encoding="utf-8")
+    command = ["diagnose", str(recording.path), "--config", str(job.session.robot), "--baseline", str(numbers)]
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "armident.daq.cli", *command, "--out", str(folder), "--json"],
+            capture_output=True,
+            text=True,
+            timeout=DIAGNOSIS_S,
+            check=False,
+        )
+        if done.returncode not in (0, DRIFTED):
+            raise DataError((done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1])
+        document = from_json(done.stdout, DiagnosisDocument, "diagnosis")
+    except (subprocess.TimeoutExpired, ArmidentError) as error:
+        say(f"warning: no diagnosis: {error}")
+        return outcome
+    findings = tuple(found(document))
+    path = folder / "diagnosis.json"
+    return Outcome(outcome.document, outcome.path, outcome.drift, outcome.words, path, findings)
+
+
+def _beside(recording: Recording, out: Path, suffix: str) -> Path:
+    name = "recording" if recording.path is None else recording.path.name.removesuffix(".mcap")
+    return out / f"{name}.{suffix}"
+
+
+def entry(job: Job, outcome: Outcome) -> dict[str, Any]:
+    """The result as a document."""
+    drift = outcome.drift
+    return {
+        "robot": job.robot.name,
+        "cell": job.session.cell,
+        "recording": outcome.document.recording.path,
+        "identification": str(outcome.path),
+        "baseline": job.baseline.name,
+        "drift": None if drift is None else drift.entry,
+        "words": list(outcome.words),
+        "diagnosis": None if outcome.diagnosis is None else str(outcome.diagnosis),
+        "findings": list(outcome.findings),
+    }
+
+
+def show(job: Job, outcome: Outcome) -> None:
+    """Print the result."""
+    drift = outcome.drift
+    if drift is None or not drift.drifted:
+        print("\n".join(outcome.words))
+    else:
+        print(f"changed since the baseline ({job.baseline.name}), {drift.words.rpartition('(')[2].rstrip(')')}:")
+        print("\n".join(f"  {line}" for line in outcome.words))
+        if outcome.findings:
+            print("diagnosis:")
+            print("\n".join(f"  {line}" for line in outcome.findings))
+    print(f"result: {outcome.path}")
+    if outcome.diagnosis is not None:
+        print(f"diagnosis: {outcome.diagnosis}")

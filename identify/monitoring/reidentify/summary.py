@@ -1,0 +1,107 @@
+"""What a comparison and a diagnosis say in words: which joint, what, from what to what, how sure."""
+
+import re
+
+import numpy as np
+
+from armident.configs import RobotConfig
+from armident.identify.document import DiagnosisDocument
+from armident.identify.monitoring.change_test import Drift
+
+_NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
+CLEAR = 2.0
+"""Parameters of a group that changed are told if they are so many standard deviations off."""
+
+_SHARED = ("ia", "fv", "fc")
+"""Parameters that a coupling of two joints has."""
+
+_MEANINGS = {
+    "fv": "viscous friction",
+    "fc": "Coulomb friction",
+    "ia": "rotor inertia",
+    "off": "torque offset",
+    "mx": "mass moment",
+    "my": "mass moment",
+    "mz": "mass moment",
+}
+
+
+def told(drift: Drift, robot: RobotConfig) -> list[str]:
+    """One line per parameter that has changed, the clearest first, and per group; one if only all together have.
+
+    Parameters
+    ----------
+    drift
+        The comparison.
+    robot
+        For the names of the joints.
+    """
+    lines = [_line(drift, name, robot) + f", chance {_chance(_p_value(drift, name))}" for name in drift.changed]
+    for group in drift.changed_groups:
+        rest = [name for name in group.members if name not in drift.changed]
+        if len(rest) == len(group.members):
+            where = place_of(rest[0], robot)
+            clear = [name for name in rest if _deviations(drift, name) >= CLEAR] or rest
+            values = "; ".join(_line(drift, name, robot).removeprefix(f"{where}: ") for name in clear)
+            lines.append(f"{where}: {group.kind} ({values}), together with chance {_chance(group.p_value)}")
+    if not lines and drift.drifted:
+        z = np.abs(drift.difference) / drift.std
+        most = ", ".join(drift.parameters[k].name for k in np.argsort(-z)[:3])
+        lines.append(
+            f"no single parameter clearly, all together do (chance {_chance(drift.p_joint)}); farthest are {most}"
+        )
+    return lines
+
+
+def _deviations(drift: Drift, name: str) -> float:
+    k = next(k for k, p in enumerate(drift.parameters) if p.name == name)
+    return float(abs(drift.difference[k]) / drift.std[k])
+
+
+def _line(drift: Drift, name: str, robot: RobotConfig) -> str:
+    """Where, what, from what to what, and by how many standard deviations."""
+    k = next(k for k, p in enumerate(drift.parameters) if p.name == name)
+    parameter, before = drift.parameters[k], float(drift.before[k])
+    share = f" ({100 * (parameter.value - before) / abs(before):+.1f} %)" if before else ""
+    return (
+        f"{place_of(name, robot)}: {meaning_of(name)} {name} {before:.4g} -> {parameter.value:.4g} "
+        f"{parameter.unit}{share}, {_deviations(drift, name):.1f} standard deviations"
+    )
+
+
+def _p_value(drift: Drift, name: str) -> float:
+    return next(float(p) for each, p in zip(drift.parameters, drift.p_values, strict=True) if each.name == name)
+
+
+def found(diagnosis: DiagnosisDocument) -> list[str]:
+    """One line per finding of a diagnosis, and one per joint that stays unexplained."""
+    lines = []
+    for finding in diagnosis.findings:
+        values = ", ".join(f"{name} {value:.4g}" for name, value in finding.parameters.items())
+        where = finding.joint if finding.other is None else f"{finding.joint} and {finding.other}"
+        words = finding.evidence.get("says")
+        said = words if isinstance(words, str) else f"{finding.effect.replace('_', ' ')} ({values})"
+        lines.append(
+            f"{where}: {said}; confidence {100 * finding.confidence:.0f} %, torque error "
+            f"{finding.gap_before:.2f} % -> {finding.gap_after:.2f} %"
+        )
+    return lines + [f"{each.joint}: {each.hint}" for each in diagnosis.unexplained]
+
+
+def place_of(name: str, robot: RobotConfig) -> str:
+    """The joint, or the coupling of two, that a base parameter belongs to."""
+    for coupling in robot.couplings:
+        if name in {kind + coupling.name for kind in _SHARED}:
+            return " and ".join(coupling.joints)
+    match = _NAME.match(name)
+    number = 0 if match is None else int(match[2])
+    return robot.joints[number - 1].name if 1 <= number <= robot.n else robot.name
+
+
+def meaning_of(name: str) -> str:
+    """What a parameter is, by the letters that its name begins with."""
+    return next((meaning for kind, meaning in _MEANINGS.items() if name.startswith(kind)), "inertia")
+
+
+def _chance(p: float) -> str:
+    return f"{p:.1g}" if p >= 1e-12 else "below 1e-12"

@@ -1,0 +1,1 @@
+"""Linear equations of the inverse dynamic model, their noise models and factorisations."""

@@ -1,0 +1,180 @@
+"""Autoregressive noise models, whitening and whiteness (thesis section 6.1.3)."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.robot.compiled import compiled
+
+
+@dataclass(frozen=True)
+class ArModel:
+    """``C(z^-1) xi = e`` with ``C = 1 + c_1 z^-1 + ...`` (6.19), ``e`` white of the given variance.
+
+    ``coefficients`` has shape (l,); order 0 is white noise.
+    """
+
+    coefficients: NDArray[np.float64]
+    variance: float
+    aic: float
+
+    @property
+    def order(self) -> int:
+        """Number of coefficients."""
+        return self.coefficients.size
+
+    def whiten(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order, ...): no initial state is invented."""
+        flat = np.ascontiguousarray(x, dtype=np.float64).reshape(x.shape[0], -1)
+        out: NDArray[np.float64] = _convolve(flat, self.coefficients) / np.sqrt(self.variance)
+        return out.reshape((out.shape[0], *x.shape[1:]))
+
+    def widened(self, samples: int) -> "ArModel":
+        """The same filter, its variance times ``((N + l) / (N - l))^2``: for weights and covariances of an estimate.
+
+        Two errors of relative size ``2 l / N`` make the information ``X' Omega^-1 X`` of the model too large.
+        The filter was fitted to the very residuals that it whitens: on others of the same process its error has the
+        variance ``(N + l) / (N - l)`` times as large (Akaike, Fitting autoregressive models for prediction, 1969). And
+        an estimate weighted by it scatters more than one weighted by the process itself, by the relative variance of an
+        AR spectrum, ``2 l / N`` on the average of the frequencies (Berk, Consistent autoregressive spectral estimates,
+        1974), less what the parameters do not feel of it.
+
+        Parameters
+        ----------
+        samples
+            N, length of the residuals from which the model comes, of all experiments together; more than the order.
+        """
+        factor = ((samples + self.order) / (samples - self.order)) ** 2
+        return replace(self, variance=factor * self.variance)
+
+
+WHITE = ArModel(np.empty(0), 1.0, 0.0)
+"""The initial noise model, ``H = 1`` and ``lambda = 1`` (section 6.2.2, step 1)."""
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Autocorrelation of residuals at lags 1..L against the 2-sigma band of white noise."""
+
+    autocorrelation: NDArray[np.float64]
+    bound: float
+
+    @property
+    def lags(self) -> int:
+        """Number of lags tested."""
+        return self.autocorrelation.size
+
+    @property
+    def fraction_outside(self) -> float:
+        """Share of the lags outside the band; white noise has about 0.05."""
+        return float(np.mean(np.abs(self.autocorrelation) > self.bound))
+
+
+def fit_ar(
+    series: Sequence[NDArray[np.float64]], max_order: int, absorbed: NDArray[np.float64] | None = None
+) -> ArModel:
+    """AR model of residuals by Levinson-Durbin on the Yule-Walker equations, order by AIC (6.21 to 6.25).
+
+    Parameters
+    ----------
+    series
+        Residuals of one joint, one array (M,) per experiment. Their mean is not removed: it is noise like the rest.
+    max_order
+        Highest order tried; limited to a tenth of the samples.
+    absorbed
+        Sums over the samples of the autocovariances that the fitted parameters took out of the residuals, at lags
+        0..``max_order``; ``None``: nothing.
+    """
+    total = sum(s.size for s in series)
+    max_order = max(0, min(max_order, total // 10, min(s.size for s in series) - 1))
+    r = np.zeros(max_order + 1) if absorbed is None else absorbed[: max_order + 1].copy()
+    for s in series:
+        r += lagged_sums(s[:, None], max_order)
+    r /= total
+    if r[0] <= 0:
+        return ArModel(np.empty(0), np.finfo(np.float64).tiny, -np.inf)
+    models = list(_levinson(r))
+    criteria = [2 * order + total * float(np.log(variance)) for order, (_, variance) in enumerate(models)]
+    best = int(np.argmin(criteria))
+    return ArModel(*models[best], criteria[best])
+
+
+def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
+    """AR model of a given order whose spectrum ``variance / |C|^2`` follows a given one; its inverse is stable.
+
+    Parameters
+    ----------
+    power
+        Positive spectral density at equally spaced frequencies from zero to the Nyquist frequency.
+    order
+        Order; less where a shorter model is exact.
+    """
+    r = np.fft.irfft(power)[: order + 1]
+    coefficients, variance = list(_levinson(r))[-1]
+    return ArModel(coefficients, variance, -np.inf)
+
+
+def _levinson(r: NDArray[np.float64]) -> Iterator[tuple[NDArray[np.float64], float]]:
+    """Coefficients and variance of the AR models of order 0, 1, ... with autocovariances r (6.21 to 6.23)."""
+    c, variance = np.zeros(0), float(r[0])
+    yield c, variance
+    for order in range(1, r.size):
+        reflection = -(r[order] + c @ r[order - 1 : 0 : -1]) / variance
+        c = np.append(c + reflection * c[::-1], reflection)
+        variance *= 1 - reflection**2
+        if variance <= 1e-14 * r[0]:
+            return
+        yield c, variance
+
+
+def lagged_sums(x: NDArray[np.float64], max_lag: int, first: int = 0) -> NDArray[np.float64]:
+    """``sum_t x(t) . x(t - k)`` for lags 0..max_lag of a vector series (M, m), over t from ``first`` on."""
+    return _lagged_sums(np.ascontiguousarray(x, dtype=np.float64), max_lag, first)
+
+
+def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whiteness:
+    """Autocorrelation of residuals pooled over experiments, with the bound ``2 / sqrt(M)``."""
+    total = sum(s.size for s in series)
+    mean = sum(float(s.sum()) for s in series) / total
+    r = np.zeros(lags + 1)
+    for s in series:
+        centred = s - mean
+        for lag in range(min(lags, centred.size - 1) + 1):
+            r[lag] += centred[lag:] @ centred[: centred.size - lag]
+    return Whiteness(r[1:] / r[0] if r[0] > 0 else np.zeros(lags), 2 / float(np.sqrt(total)))
+
+
+@compiled
+def _lagged_sums(x: NDArray[np.float64], max_lag: int, first: int) -> NDArray[np.float64]:
+    samples, width = x.shape
+    sums, products = np.zeros(max_lag + 1), np.empty(width)
+    for lag in range(max_lag + 1):
+        products[:] = 0.0
+        for k in range(max(lag, first), samples):
+            for c in range(width):
+                products[c] += x[k, c] * x[k - lag, c]
+        for c in range(width):
+            sums[lag] += products[c]
+    return sums
+
+
+PIECE = 2048
+"""Numbers that are filtered at a time."""
+
+
+@compiled
+def _convolve(x: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    order, width = coefficients.size, x.shape[1]
+    out = x[order:].copy()
+    # Row after row in memory, a sample earlier is a row before: one long sum for each coefficient, in pieces that stay
+    # in the cache.
+    late, early = out.ravel(), x.ravel()
+    for begin in range(0, late.size, PIECE):
+        piece = late[begin : begin + PIECE]
+        for i in range(order):
+            c, before = coefficients[i], early[begin + (order - 1 - i) * width :]
+            for m in range(piece.size):
+                piece[m] += c * before[m]
+    return out

@@ -1,0 +1,83 @@
+"""Orthogonal triangularisation of tall, narrow systems: everything that the estimators solve goes through it.
+
+A regression has tens of columns and thousands of rows. General libraries split such a matrix over threads, whose
+waiting for each other costs more than the work as soon as the processor has anything else to do; here it is reduced
+a few rows at a time, in cache, by one thread, and the same rows always give the same bits.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.robot.compiled import compiled
+
+_ROWS = 64
+"""Rows eliminated at a time: with a hundred columns they fit the second-level cache."""
+
+
+def triangularize(
+    *blocks: NDArray[np.float64], columns: int, scales: Sequence[NDArray[np.float64]] = ()
+) -> NDArray[np.float64]:
+    """Reflect ``[A1 A2 ...]`` until its first columns are upper triangular (Householder, ``Q' A``).
+
+    Parameters
+    ----------
+    blocks
+        Arrays (m, p_i) or (m,), side by side.
+    columns
+        How many of the leading columns, b, to make triangular.
+    scales
+        What to divide the columns (p_i,) of the first arrays by.
+
+    Returns
+    -------
+    ndarray
+        The first b rows of ``Q' [A1 A2 ...]``, shape (b, sum of p_i): the triangular factor, then the projections of
+        the other columns on the space of the first.
+    """
+    matrices = [block.reshape(block.shape[0], -1) for block in blocks]
+    ends = np.cumsum([0, *(matrix.shape[1] for matrix in matrices)])
+    work = np.empty((matrices[0].shape[0], ends[-1]))
+    for k, matrix in enumerate(matrices):
+        np.divide(matrix, scales[k] if k < len(scales) else 1.0, out=work[:, ends[k] : ends[k + 1]])
+    top = np.zeros((columns, work.shape[1]))
+    _reflect(work, top)
+    return top
+
+
+@compiled
+def _reflect(a: NDArray[np.float64], top: NDArray[np.float64]) -> None:
+    """Reduce ``a`` (m, p), which is overwritten, into the triangle kept in ``top`` (b, p)."""
+    rows, width = a.shape
+    projection = np.empty(width)
+    for first in range(0, rows, _ROWS):
+        last = min(first + _ROWS, rows)
+        for j in range(top.shape[0]):
+            below = 0.0
+            for i in range(first, last):
+                below += a[i, j] * a[i, j]
+            if below == 0.0:
+                continue
+            pivot = top[j, j]
+            norm = np.sqrt(pivot * pivot + below)
+            if pivot > 0.0:
+                norm = -norm
+            # The reflector is (1, v): the pivot row, then the rows below it.
+            share = (norm - pivot) / norm
+            inverse = 1.0 / (pivot - norm)
+            top[j, j] = norm
+            for k in range(j + 1, width):
+                projection[k] = top[j, k]
+            for i in range(first, last):
+                v = a[i, j] * inverse
+                a[i, j] = v
+                for k in range(j + 1, width):
+                    projection[k] += v * a[i, k]
+            for k in range(j + 1, width):
+                projection[k] *= share
+                top[j, k] -= projection[k]
+            for i in range(first, last):
+                v = a[i, j]
+                for k in range(j + 1, width):
+                    a[i, k] -= v * projection[k]

@@ -1,0 +1,24 @@
+"""Writes result documents and their reports into a folder."""
+
+from pathlib import Path
+
+import yaml
+
+from armident.configs import RobotConfig
+from armident.identify.document import to_json, write_atomically
+from armident.identify.identification.api import Outcome
+
+
+def write_identification(outcome: Outcome, out: Path) -> tuple[Path, Path]:
+    """Write ``identification.json`` and ``report.html`` into a folder; returns their paths."""
+    from armident.identify.report.identification import identification_report
+
+    document, report = out / "identification.json", out / "report.html"
+    write_atomically(document, to_json(outcome.document))
+    write_atomically(report, identification_report(outcome.recording, outcome.robot, outcome.result, outcome.document))
+    return document, report
+
+
+def robot_yaml(robot: RobotConfig) -> str:
+    """A robot configuration as its file."""
+    return yaml.safe_dump(robot.model_dump(mode="json", by_alias=True), sort_keys=False)

@@ -1,0 +1,298 @@
+"""The dynamic model of a serial arm: regressor, inverse and direct dynamics, base parameters."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from armident.configs import ArmidentError, RobotConfig
+from armident.identify.robot.base_parameters import BaseParameters, base_parameters, with_terms
+from armident.identify.robot.chain import (
+    INERTIAL,
+    Chain,
+    Columns,
+    Floats,
+    Values,
+    chain_of,
+    columns_of,
+    standard_names,
+    values_of,
+)
+from armident.identify.robot.kernels import (
+    fill_forward_dynamics,
+    fill_inverse_dynamics,
+    fill_mass_matrices,
+    fill_regressor,
+)
+from armident.identify.robot.motion import Motion
+from armident.identify.robot.terms import ModelTerm
+
+PIECE = 4096
+"""Samples of a long regressor that one processor fills at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmModel:
+    """Inverse dynamic model ``tau = phi(q, qd, qdd) theta`` of a serial arm (thesis equations 2.3, 2.8).
+
+    Everything is joint side and SI. Friction is ``fv qd + fc sign(qd) + off``; where ``sharp_sign`` is
+    false the sign is ``(2/pi) atan(g qd)`` with the ``sign_smoothing`` g of the robot configuration.
+    Additional terms may be given: their linear parameters stand after all others in ``names`` and in
+    ``base.names``. Rigid dynamics (mass matrix, recursion, simulation step) leave them out.
+
+    Examples
+    --------
+    >>> from armident.configs import load_robot
+    >>> model = ArmModel.from_config(load_robot("tx40"))
+    >>> len(model.names), len(model.base.names)
+    (87, 61)
+    >>> model.base.formulas["my5r"]
+    'my5 - mz6'
+    """
+
+    robot: RobotConfig
+    names: tuple[str, ...]
+    chain: Chain
+    columns: Columns
+    base_columns: Columns
+    base: BaseParameters
+    terms: tuple[ModelTerm, ...] = ()
+    anchor: Floats | None = None
+    """Parameters by which terms that depend on the model's own torques predict them, (p,) or (b,)."""
+
+    @classmethod
+    def from_config(cls, robot: RobotConfig, terms: tuple[ModelTerm, ...] = ()) -> Self:
+        """Build the model of a robot configuration.
+
+        Parameters
+        ----------
+        robot
+            The configuration; its ``effects`` are not read here (`armident.identify.effects.terms.arm_model` does).
+        terms
+            Additional torque terms.
+        """
+        chain = chain_of(robot)
+        names = standard_names(robot)
+        columns = columns_of(robot, names)
+        base = base_parameters(robot, chain, columns, names)
+        base_columns = columns_of(robot, tuple(names[k] for k in base.independent))
+        further = tuple(name for term in terms for name in term.names)
+        return cls(robot, names + further, chain, columns, base_columns, with_terms(base, further), terms)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.robot.n
+
+    @property
+    def smoothing(self) -> float:
+        """``g`` of the smoothed sign, s/rad or s/m."""
+        return self.robot.friction.sign_smoothing
+
+    @property
+    def e(self) -> int:
+        """Number of linear parameters of the effects: the last ones of ``names`` and of ``base.names``."""
+        return sum(len(term.names) for term in self.terms)
+
+    @property
+    def of_links(self) -> NDArray[np.bool_]:
+        """Which standard parameters belong to links: not friction, offset, rotor or effect, (p,)."""
+        rigid = self.names[: len(self.names) - self.e]
+        links = [name.rstrip("0123456789") in INERTIAL for name in rigid]
+        return np.array(links + [False] * self.e, dtype=np.bool_)
+
+    def anchored(self, theta: ArrayLike) -> Self:
+        """The same model, its terms predicting torques by ``theta``, (p,) or (b,)."""
+        return replace(self, anchor=np.asarray(theta, dtype=np.float64))
+
+    def without_terms(self) -> Self:
+        """The rigid model alone."""
+        if not self.terms:
+            return self
+        rigid = len(self.names) - self.e
+        return replace(self, names=self.names[:rigid], base=self.base.without(self.e), terms=(), anchor=None)
+
+    def with_gravity(self, gravity: ArrayLike) -> Self:
+        """The same model under another gravity (3,), m/s^2."""
+        return replace(self, chain=self.chain._replace(gravity=np.asarray(gravity, dtype=np.float64)))
+
+    def smooth_sign(self, qd: Floats) -> Floats:
+        """``(2/pi) atan(g qd)`` (thesis appendix B.2)."""
+        smooth: Floats = 2 / np.pi * np.arctan(self.smoothing * qd)
+        return smooth
+
+    def motion(
+        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, dt: float, start: float = 0.0, *, sharp_sign: bool = False
+    ) -> Motion:
+        """A motion as the terms see it; every array (N, n), ``dt`` and ``start`` in s."""
+        q, qd, qdd = self._motion(q, qd, qdd)
+        return Motion(self, q, qd, qdd, dt, start, self.anchor, sharp=sharp_sign)
+
+    def term_regressor(self, motion: Motion) -> Floats:
+        """Columns of the terms, shape (N, n, e): torque per unit of their linear parameters."""
+        columns = [term.columns(motion) for term in self.terms]
+        return np.concatenate(columns, axis=2) if columns else np.zeros((motion.samples, self.n, 0))
+
+    def regressor(
+        self,
+        q: ArrayLike,
+        qd: ArrayLike,
+        qdd: ArrayLike,
+        *,
+        sharp_sign: bool = False,
+        out: Floats | None = None,
+    ) -> Floats:
+        """Regressor of the standard parameters without those of the terms.
+
+        Parameters
+        ----------
+        q, qd, qdd
+            Positions, velocities, accelerations, each (N, n); rad or m, s.
+        sharp_sign
+            ``sign(qd)`` instead of its smoothed form.
+        out
+            Where to write: zeros, or an earlier regressor of this model and length, which saves a large one its memory.
+
+        Returns
+        -------
+        ndarray
+            Shape (N, n, p - e): row j of sample k times ``theta`` is the torque of joint j.
+        """
+        return self._regressor(self.columns, len(self.names) - self.e, q, qd, qdd, sharp_sign, out)
+
+    def base_regressor(
+        self,
+        q: ArrayLike,
+        qd: ArrayLike,
+        qdd: ArrayLike,
+        *,
+        sharp_sign: bool = False,
+        dt: float | None = None,
+        start: float = 0.0,
+    ) -> Floats:
+        """Regressor of the base parameters, shape (N, n, b); see `regressor`.
+
+        Parameters
+        ----------
+        dt, start
+            Sampling period and time of the first sample, s; a model with terms needs the whole motion and these.
+
+        Raises
+        ------
+        ValueError
+            If the model has terms and ``dt`` is missing.
+        """
+        rigid = self.rigid_regressor(q, qd, qdd, sharp_sign=sharp_sign)
+        if not self.terms:
+            return rigid
+        if dt is None:
+            raise ValueError("the terms of a model need the sampling period")
+        further = self.term_regressor(self.motion(q, qd, qdd, dt, start, sharp_sign=sharp_sign))
+        return np.concatenate([rigid, further], axis=2)
+
+    def rigid_regressor(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False) -> Floats:
+        """Regressor of the base parameters without those of the terms, shape (N, n, b - e)."""
+        return self._regressor(self.base_columns, self.base.b - self.e, q, qd, qdd, sharp_sign)
+
+    def inverse_dynamics(
+        self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False
+    ) -> Floats:
+        """Joint torques (N, n) along a motion, by the Newton-Euler recursion (A.22 to A.26), without the terms.
+
+        Parameters
+        ----------
+        theta
+            Standard parameters (p,) or base parameters (b,).
+        q, qd, qdd
+            Each (N, n).
+        """
+        q, qd, qdd = self._motion(q, qd, qdd)
+        out = np.empty_like(q)
+        smoothing = 0.0 if sharp_sign else self.smoothing
+        fill_inverse_dynamics(self.chain, self.values(theta), smoothing, q, qd, qdd, out)
+        return out
+
+    def mass_matrix(self, theta: ArrayLike, q: ArrayLike) -> Floats:
+        """Mass matrices (N, n, n), rotors and couplings included, at postures ``q`` (N, n)."""
+        (q,) = self._motion(q)
+        out = np.empty((q.shape[0], self.n, self.n))
+        fill_mass_matrices(self.chain, self.values(theta), q, out)
+        return out
+
+    def forward_dynamics(self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, tau: ArrayLike) -> Floats:
+        """Joint accelerations (N, n) under torques ``tau`` (N, n), smoothed friction (2.9).
+
+        Raises
+        ------
+        ArmidentError
+            If the mass matrix is not positive definite somewhere; names the sample.
+        """
+        q, qd, tau = self._motion(q, qd, tau)
+        out = np.empty_like(q)
+        failed = fill_forward_dynamics(self.chain, self.values(theta), self.smoothing, q, qd, tau, out)
+        if failed >= 0:
+            raise ArmidentError(f"the mass matrix is not positive definite at sample {failed}: parameters not physical")
+        return out
+
+    def standard_from_base(self, theta_base: ArrayLike) -> Floats:
+        """Fill standard parameters (p,) with the base ones, the others zero: the dynamics are the same."""
+        theta = np.zeros(len(self.names))
+        theta[self.base.independent] = theta_base
+        return theta
+
+    def values(self, theta: ArrayLike) -> Values:
+        """Parameters taken apart for the kernels; ``theta`` is (p,) standard or (b,) base.
+
+        Raises
+        ------
+        ValueError
+            If it has neither length.
+        """
+        vector = np.asarray(theta, dtype=np.float64)
+        if vector.shape == (len(self.names),):
+            return values_of(self.columns, vector, self.smoothing)
+        if vector.shape == (self.base.b,):
+            return values_of(self.base_columns, vector, self.smoothing)
+        raise ValueError(
+            f"theta has shape {vector.shape}; expected ({len(self.names)},) standard or ({self.base.b},) base"
+        )
+
+    def _motion(self, *signals: ArrayLike) -> tuple[Floats, ...]:
+        arrays = tuple(np.ascontiguousarray(signal, dtype=np.float64) for signal in signals)
+        for array in arrays:
+            if array.ndim != 2 or array.shape != (arrays[0].shape[0], self.n):
+                raise ValueError(f"expected signals of shape (N, {self.n}), found {[a.shape for a in arrays]}")
+        return arrays
+
+    def _regressor(
+        self,
+        columns: Columns,
+        width: int,
+        q: ArrayLike,
+        qd: ArrayLike,
+        qdd: ArrayLike,
+        sharp_sign: bool,
+        given: Floats | None = None,
+    ) -> Floats:
+        q, qd, qdd = self._motion(q, qd, qdd)
+        shape = (q.shape[0], self.n, width)
+        if given is not None and given.shape != shape:
+            raise ValueError(f"out has shape {given.shape}; expected {shape}")
+        out = np.zeros(shape) if given is None else given
+        smoothing = 0.0 if sharp_sign else self.smoothing
+
+        def fill(first: int) -> None:
+            rows = slice(first, first + PIECE)
+            fill_regressor(self.chain, columns, smoothing, q[rows], qd[rows], qdd[rows], out[rows])
+
+        if q.shape[0] <= PIECE:
+            fill(0)
+            return out
+        # On all processors: the kernel holds no interpreter lock, and most of the time is the memory's.
+        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+            for _ in pool.map(fill, range(0, q.shape[0], PIECE)):
+                pass
+        return out

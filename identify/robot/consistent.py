@@ -1,0 +1,383 @@
+"""The physically consistent arm nearest to a base estimate: full standard parameters by semidefinite programming.
+
+A link is physical if its pseudo-inertia matrix is positive semidefinite (Wensing, Kim and Slotine 2018; Sousa and
+Cortesao 2014); rotors and friction must not be negative. Base parameters say only what the torques show, ``theta_base =
+K theta`` (thesis section A.3), so that many standard vectors belong to one base vector and, for some, none that is
+physical.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import clarabel as untyped_clarabel
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import linalg, sparse, stats
+
+from armident.configs import ArmidentError, DataError
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.chain import INERTIAL, Floats, Ints
+
+clarabel: Any = untyped_clarabel
+
+Identifiability = Literal["alone", "group", "no"]
+
+REGULARISATION = 1e-8
+"""Price of a kilogram while the distance is sought, in the mean square of the estimate's t values: so little that it
+decides only what data and physics leave open."""
+
+INDIFFERENCE = 0.1
+"""Squared standard deviations that the lightest arm may be farther away than the nearest: no data tell such two apart.
+The very nearest arm often is a limit, of bodies that shrink to points of any mass."""
+
+PRICE_STEP = 3.0
+"""Factor by which the price is raised on the way from the nearest arm to a light one."""
+
+SIGNIFICANCE = 0.05
+"""Probability of calling an estimate of a physical arm incompatible with physics."""
+
+NOTHING = 1e-3
+"""Distance (standard deviations) that counts as none: what the solver's tolerance leaves."""
+
+PROBE = 0.1
+"""Step (standard deviations) of the derivative of the projection."""
+
+TOLERANCE = 1e-9
+"""Of the solver, relative and absolute."""
+
+NULL = 1e-9
+"""Share of a unit vector outside the row space of K under which it is inside."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConsistentParameters:
+    """A physically consistent arm, and how far the estimate is from it; SI, joint side.
+
+    Parameters
+    ----------
+    names, theta
+        Standard parameters (p,).
+    base_names, theta_base
+        Base parameters (b,) of ``theta``.
+    identifiable
+        Per standard parameter (p,): ``alone``, the torques determine it by itself; ``group``, only together with
+        others; ``no``, it does not act on the torques. What is not ``alone`` has a value that the regularisation
+        chose among many.
+    groups
+        Base parameters that each standard one acts through (p,).
+    std
+        Standard deviations (p,) of those determined alone, NaN for the others; those of the estimate before physics
+        was imposed.
+    shifts
+        How far each base parameter moved, in its own standard deviations (b,).
+    distance_std
+        Mahalanobis distance between the estimate and the nearest consistent base parameters, in standard deviations.
+    degrees
+        Dimensions of the base space that physics takes away there; 0 if the estimate is consistent.
+    p_value
+        Probability of such a distance or more for the estimate of a physical arm.
+    compatible, verdict
+        Whether the estimate can be that of a physical arm, and in words.
+    smallest_eigenvalues
+        Smallest eigenvalue of every link's pseudo-inertia (n,).
+    """
+
+    names: tuple[str, ...]
+    theta: Floats
+    base_names: tuple[str, ...]
+    theta_base: Floats
+    identifiable: tuple[Identifiability, ...]
+    groups: tuple[tuple[str, ...], ...]
+    std: Floats
+    shifts: Floats
+    distance_std: float
+    degrees: float
+    p_value: float
+    compatible: bool
+    verdict: str
+    smallest_eigenvalues: Floats
+
+    def document(self) -> dict[str, Any]:
+        """Plain numbers, strings, lists and dictionaries."""
+        rows = zip(self.names, self.theta, self.identifiable, self.groups, self.std, strict=True)
+        return {
+            "parameters": [
+                {
+                    "name": name,
+                    "value": float(value),
+                    "identifiable": how,
+                    "acts_through": list(group),
+                    "std": float(std) if np.isfinite(std) else None,
+                }
+                for name, value, how, group, std in rows
+            ],
+            "base": [
+                {"name": name, "value": float(value), "shift_std": float(shift)}
+                for name, value, shift in zip(self.base_names, self.theta_base, self.shifts, strict=True)
+            ],
+            "distance_std": self.distance_std,
+            "degrees": self.degrees,
+            "p_value": self.p_value,
+            "compatible": self.compatible,
+            "verdict": self.verdict,
+        }
+
+
+def nearest_consistent(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> ConsistentParameters:
+    """Find the physically consistent parameters nearest to a base estimate.
+
+    Minimises ``(K theta - theta_base)' P^-1 (K theta - theta_base)`` over standard parameters whose pseudo-inertias are
+    positive semidefinite and whose rotor inertias, friction and coupling coefficients are not negative. Where that
+    leaves a choice, the lightest arm is taken: the smallest sum of the traces of the pseudo-inertias, second moments
+    divided by the square of the arm's mean length. A consistent estimate keeps its base parameters; for another
+    one all arms that are as near as ``INDIFFERENCE`` allows are a choice.
+
+    Parameters
+    ----------
+    theta_base, covariance
+        Estimate (b,) and its covariance P (b, b), positive definite.
+
+    Returns
+    -------
+    ConsistentParameters
+
+    Raises
+    ------
+    DataError
+        If shapes are wrong, numbers are not finite, or the covariance is not positive definite.
+    ArmidentError
+        If the solver fails.
+
+    Notes
+    -----
+    The verdict: an estimate ``N(truth, P)`` of a physical arm is projected onto the convex set of base parameters of
+    physical arms. Given the face it lands on, its squared distance is at most chi-square with as many degrees of
+    freedom as the face lacks (Wollan and Dykstra 1986); these are the trace of ``I`` minus the derivative of the
+    projection, which also counts curved faces.
+    """
+    theta, p = _checked(model, theta_base, covariance)
+    std = np.sqrt(np.diag(p))
+    factor = std[:, None] * linalg.cholesky(p / np.outer(std, std), lower=True)
+    whitened = linalg.solve_triangular(factor, theta, lower=True)
+    projection = _Projection(model, factor, max(float(np.sqrt(np.mean(whitened**2))), 1.0))
+    standard, residual = projection.nearest(whitened)
+    distance = float(np.linalg.norm(residual))
+    degrees, p_value = 0.0, 1.0
+    if distance > NOTHING:
+        standard = projection.lightest(whitened, standard, distance)
+        degrees = projection.lost_dimensions(whitened)
+        p_value = float(stats.chi2.sf(distance**2, degrees))
+    else:
+        standard = standard + np.linalg.pinv(model.base.regroup) @ (theta - model.base.regroup @ standard)
+    standard = _inside(model, standard)
+    base = model.base.regroup @ standard
+    shifts = np.asarray((base - theta) / std)
+    identifiable = identifiability(model)
+    return ConsistentParameters(
+        names=model.names,
+        theta=standard,
+        base_names=model.base.names,
+        theta_base=base,
+        identifiable=identifiable,
+        groups=tuple(tuple(model.base.names[i] for i in np.flatnonzero(column)) for column in model.base.regroup.T),
+        std=_standard_deviations(model, p, identifiable),
+        shifts=shifts,
+        distance_std=distance,
+        degrees=degrees,
+        p_value=p_value,
+        compatible=p_value >= SIGNIFICANCE,
+        verdict=_verdict(model, distance, degrees, p_value, shifts),
+        smallest_eigenvalues=np.asarray(np.linalg.eigvalsh(pseudo_inertias(model, standard))[:, 0], dtype=np.float64),
+    )
+
+
+def identifiability(model: ArmModel) -> tuple[Identifiability, ...]:
+    """Which standard parameters the torques determine: alone, in a group, or not at all.
+
+    Parameter k is determined alone if its unit vector lies in the row space of the grouping K, that is if no
+    direction that leaves the base parameters unchanged moves it; values and data play no part.
+    """
+    grouping = model.base.regroup
+    outside = np.eye(grouping.shape[1]) - np.linalg.pinv(grouping) @ grouping
+    kinds: list[Identifiability] = []
+    for k, column in enumerate(grouping.T):
+        if not column.any():
+            kinds.append("no")
+        else:
+            kinds.append("alone" if np.linalg.norm(outside[:, k]) < NULL else "group")
+    return tuple(kinds)
+
+
+def pseudo_inertias(model: ArmModel, theta: ArrayLike) -> Floats:
+    """Pseudo-inertia matrices (n, 4, 4) of standard parameters (p,): second moments, first moments and mass."""
+    xx, xy, xz, yy, yz, zz, mx, my, mz, m = model.values(theta).inertial.T
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
+    out = np.empty((model.n, 4, 4))
+    out[:, :3, :3] = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
+    out[:, :3, 3] = out[:, 3, :3] = np.stack([mx, my, mz], axis=1)
+    out[:, 3, 3] = m
+    return out
+
+
+def non_negative(model: ArmModel) -> Ints:
+    """Columns of the standard parameters that cannot be negative besides masses: rotors, friction, couplings."""
+    c = model.columns
+    columns = np.concatenate([c.ia, c.fv, c.fc, c.coupling.ravel()])
+    return np.sort(columns[columns >= 0])
+
+
+class _Projection:
+    """The semidefinite programme for whitened base parameters, set up once and solved for many.
+
+    Variables are the standard parameters and the whitened residual ``r = L^-1 (K theta - theta_base)``, in units of
+    ``scale`` standard deviations: t values of a thousand beside masses of one would spoil the solver's arithmetic.
+    """
+
+    def __init__(self, model: ArmModel, factor: Floats, scale: float) -> None:
+        b, p = model.base.regroup.shape
+        whitened = linalg.solve_triangular(factor, model.base.regroup, lower=True) / scale
+        signed = non_negative(model)
+        length = _length(model)
+        equal = np.hstack([whitened, -np.eye(b)])
+        above = np.zeros((signed.size, p + b))
+        above[np.arange(signed.size), signed] = -1.0
+        rows, cones = [equal, above], [clarabel.ZeroConeT(b), clarabel.NonnegativeConeT(signed.size)]
+        for columns in model.columns.inertial:
+            lmi = np.zeros((10, p + b))
+            lmi[:, columns] = -_triangles(length)
+            rows.append(lmi)
+            cones.append(clarabel.PSDTriangleConeT(4))
+        self._rows, self._cones = np.vstack(rows), cones
+        self._quadratic = np.diag(np.concatenate([np.zeros(p), np.full(b, 2.0)]))
+        self._weight = np.zeros(p + b)
+        for kind, share in (("xx", 0.5 / length**2), ("yy", 0.5 / length**2), ("zz", 0.5 / length**2), ("m", 1.0)):
+            self._weight[model.columns.inertial[:, INERTIAL.index(kind)]] = share
+        # Rotors weigh too, or the choice between rotor and link in one group would be nobody's.
+        rotors = model.columns.ia[model.columns.ia >= 0]
+        self._weight[rotors] = 1 / length**2
+        self._p, self._b, self._scale = p, b, scale
+
+    def nearest(self, whitened: Floats, price: float = REGULARISATION) -> tuple[Floats, Floats]:
+        """Standard parameters (p,) of the nearest consistent arm and the whitened residual (b,)."""
+        right = np.zeros(self._rows.shape[0])
+        right[: self._b] = whitened / self._scale
+        x = _solve(self._quadratic, price * self._weight, self._rows, right, self._cones)
+        return x[: self._p], self._scale * x[self._p :]
+
+    def lightest(self, whitened: Floats, nearest: Floats, distance: float) -> Floats:
+        """Standard parameters (p,) of an arm as light as ``INDIFFERENCE`` allows.
+
+        The price of a kilogram is raised step by step until the squared distance has grown by that much.
+        """
+        best, price = nearest, REGULARISATION
+        while price < 1.0:
+            price *= PRICE_STEP
+            standard, residual = self.nearest(whitened, price)
+            if residual @ residual > distance**2 + INDIFFERENCE:
+                break
+            best = standard
+        return best
+
+    def lost_dimensions(self, whitened: Floats) -> float:
+        """Trace of ``I`` minus the derivative of the projection, at least 1."""
+        _, here = self.nearest(whitened)
+        lost = 0.0
+        for k in range(self._b):
+            moved = whitened.copy()
+            moved[k] += PROBE
+            lost -= (self.nearest(moved)[1][k] - here[k]) / PROBE
+        return float(np.clip(lost, 1.0, self._b))
+
+
+def _solve(quadratic: Floats, linear: Floats, rows: Floats, right: Floats, cones: Sequence[Any]) -> Floats:
+    """Minimise ``x'Qx/2 + c'x`` with ``right - rows x`` in the cones.
+
+    Raises
+    ------
+    ArmidentError
+        If the solver finds no solution.
+    """
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
+    solution = clarabel.DefaultSolver(
+        sparse.csc_matrix(np.triu(quadratic)), linear, sparse.csc_matrix(rows), right, list(cones), settings
+    ).solve()
+    if str(solution.status) not in ("Solved", "AlmostSolved"):
+        raise ArmidentError(f"no consistent parameters found: the solver says {solution.status}")
+    return np.asarray(solution.x, dtype=np.float64)
+
+
+def _checked(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> tuple[Floats, Floats]:
+    theta, p = np.asarray(theta_base, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    b = model.base.b
+    if theta.shape != (b,) or p.shape != (b, b):
+        raise DataError(
+            f"{model.robot.name} has {b} base parameters: found an estimate of shape {theta.shape} with a covariance "
+            f"of shape {p.shape}"
+        )
+    if not (np.isfinite(theta).all() and np.isfinite(p).all()):
+        raise DataError("the base estimate or its covariance is not finite")
+    std = np.sqrt(np.maximum(np.diag(p), 0.0))
+    if not std.all() or np.linalg.eigvalsh(p / np.outer(std, std))[0] <= b * np.finfo(np.float64).eps:
+        raise DataError("the covariance of the base estimate is not positive definite")
+    return theta, p
+
+
+def _inside(model: ArmModel, theta: Floats) -> Floats:
+    """``theta`` moved into the cones by what the solver's tolerance left outside."""
+    inside = theta.copy()
+    signed = non_negative(model)
+    inside[signed] = np.maximum(inside[signed], 0.0)
+    # Adding s to a pseudo-inertia adds s to its mass and second moments, and 2 s to the moments of inertia.
+    smallest = np.linalg.eigvalsh(pseudo_inertias(model, inside))[:, 0]
+    missing = np.where(smallest < 0, -smallest * (1 + 1e-6) + 1e-16, 0.0)
+    for kind, share in (("xx", 2.0), ("yy", 2.0), ("zz", 2.0), ("m", 1.0)):
+        inside[model.columns.inertial[:, INERTIAL.index(kind)]] += share * missing
+    return inside
+
+
+def _triangles(length: float) -> Floats:
+    """Upper triangles (10, 10) of the pseudo-inertia of each unit inertial parameter, lengths in units of ``length``.
+
+    Column by column, off-diagonals times sqrt(2): an isometry, as the solver expects.
+    """
+    scale = np.array([1 / length, 1 / length, 1 / length, 1.0])
+    out = np.empty((10, 10))
+    for k, ten in enumerate(np.eye(10)):
+        xx, xy, xz, yy, yz, zz, mx, my, mz, m = ten
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        matrix = np.zeros((4, 4))
+        matrix[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+        matrix[:3, 3] = matrix[3, :3] = mx, my, mz
+        matrix[3, 3] = m
+        matrix *= np.outer(scale, scale)
+        out[:, k] = [matrix[i, j] * (1.0 if i == j else np.sqrt(2.0)) for j in range(4) for i in range(j + 1)]
+    return out
+
+
+def _length(model: ArmModel) -> float:
+    """Mean of the lengths of the arm that are not zero, m; 1 if all are."""
+    lengths = np.abs(np.concatenate([model.chain.d, model.chain.r]))
+    return float(lengths[lengths > 0].mean()) if lengths.any() else 1.0
+
+
+def _standard_deviations(model: ArmModel, p: Floats, identifiable: Sequence[Identifiability]) -> Floats:
+    """Standard deviations (p,) of the parameters determined alone, ``e_k = K' a`` and ``a' P a``; NaN elsewhere."""
+    combinations = np.linalg.pinv(model.base.regroup)
+    std = np.sqrt(np.einsum("ki,ij,kj->k", combinations, p, combinations))
+    return np.where(np.array(identifiable) == "alone", std, np.nan)
+
+
+def _verdict(model: ArmModel, distance: float, degrees: float, p_value: float, shifts: Floats) -> str:
+    if distance <= NOTHING:
+        return "the estimate is physically consistent as it is"
+    worst = int(np.argmax(np.abs(shifts)))
+    far = (
+        f"the nearest consistent arm is {distance:.2g} standard deviations away in {degrees:.1f} dimensions "
+        f"(p = {p_value:.2g}), most in {model.base.names[worst]} ({shifts[worst]:+.2g})"
+    )
+    if p_value >= SIGNIFICANCE:
+        return f"compatible with physics: {far}"
+    return f"not compatible with physics: {far}; the model lacks something or the standard deviations are too small"

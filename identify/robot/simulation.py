@@ -1,0 +1,372 @@
+"""Closed-loop simulation of the auxiliary model: direct dynamics under a discrete controller.
+
+The thesis integrates with a fixed-step explicit method (ode3). The smoothed Coulomb friction of a small
+wrist joint is too stiff for that at the sample rate, so the friction is linearly implicit here: over one
+sample the mass matrix and the bias forces are extrapolated to its middle from the last two samples
+(second order), and ``M qd' = tau - bias - friction(qd)`` is integrated by the two-stage Rosenbrock method
+of order two that damps any stiffness (Shampine and Reichelt 1997, ``ode23s``), in smaller steps while a
+joint passes through standstill.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.chain import Chain, Floats, Ints, Values
+from armident.identify.robot.compiled import compiled, inlined
+from armident.identify.robot.controller import DiscreteController
+from armident.identify.robot.elementary import arctangents, padded
+from armident.identify.robot.kernels import TWO_OVER_PI, cholesky, fill_mass_matrix, rigid_torque, solve_factored, turn
+
+GAMMA = 1.0 / (2.0 + np.sqrt(2.0))
+"""Rosenbrock parameter that makes the two-stage method of order two L-stable."""
+
+RUNAWAY = 10.0
+"""A joint faster than this many times its configured limit has run away, where nothing else is said."""
+
+
+NEAR_STANDSTILL = 4.0
+"""``g |qd|`` under which the smoothed sign bends so much that its slope changes within a sample."""
+
+STEPS_PER_UNIT = 4.0
+"""Steps per unit of ``g qd`` passed within one sample near standstill."""
+
+MOST_STEPS = 16
+"""Most steps within one sample."""
+
+HISTORY = 1024
+"""Samples the controller's memory takes before it is moved to the front of its arrays again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A simulated motion; all arrays (N, n), joint side, NaN from ``diverged_at`` on.
+
+    Parameters
+    ----------
+    q, qd
+        Positions and velocities at the samples.
+    qdd
+        Accelerations at the samples: the mean of those just before and just after the torque changes.
+    tau
+        Torque held over ``[k, k + 1)``.
+    diverged_at
+        Sample at which the simulation stopped: not finite, too fast, or a mass matrix that is not
+        positive definite; ``None`` if it reached the end.
+    """
+
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    tau: Floats
+    diverged_at: int | None
+
+
+def simulate(
+    model: ArmModel,
+    theta_base: ArrayLike,
+    controller: DiscreteController,
+    q_ref: ArrayLike,
+    dt: float,
+    *,
+    q0: ArrayLike | None = None,
+    qd0: ArrayLike | None = None,
+    max_velocity: ArrayLike | None = None,
+    disturbance: ArrayLike | None = None,
+    inertia: ArrayLike | None = None,
+) -> Simulation:
+    """Simulate the arm under its controller along a reference (thesis equation 2.9, section B.3).
+
+    Parameters
+    ----------
+    theta_base
+        Base parameters (b,) or standard parameters (p,); friction is smoothed.
+    controller
+        Runs once per sample on the position at that sample; its torque is held over the sample.
+    q_ref
+        Reference positions (N, n), rad or m.
+    dt
+        Sampling period, s; that of the controller.
+    q0, qd0
+        State at the first sample, (n,); by default on the reference, with its velocity. Before the first
+        sample the tracking error was constant and the velocity ``qd0``.
+    max_velocity
+        Joint velocities, scalar or (n,), beyond which the simulation counts as diverged; by default ten
+        times the limits of the configuration.
+    disturbance
+        Motor torques (N, n), N m or N, that something else adds to those of the controller, after their saturation;
+        ``tau`` contains them.
+    inertia
+        Of the joints (n,), kg m^2 or kg, beside that of the parameters.
+
+    Raises
+    ------
+    ValueError
+        If shapes or sampling periods do not fit.
+    """
+    reference = np.ascontiguousarray(q_ref, dtype=np.float64)
+    samples, n = reference.shape
+    if n != model.n or controller.n != n or samples < 1:
+        raise ValueError(f"reference (N, {n}) and controller of {controller.n} for an arm of {model.n} joints")
+    if abs(controller.dt - dt) > 1e-9 * dt:
+        raise ValueError(f"the controller runs every {controller.dt} s, the simulation every {dt} s")
+    pushed = np.zeros((0, n)) if disturbance is None else np.ascontiguousarray(disturbance, dtype=np.float64)
+    if disturbance is not None and pushed.shape != reference.shape:
+        raise ValueError(f"disturbance {pushed.shape} for a reference of shape {reference.shape}")
+    if max_velocity is None:
+        max_velocity = [RUNAWAY * joint.limits.velocity for joint in model.robot.joints]
+    start = reference[0] if q0 is None else np.asarray(q0, dtype=np.float64)
+    if qd0 is None:
+        qd0 = (reference[1] - reference[0]) / dt if samples > 1 else np.zeros(n)
+    q, qd, qdd, tau = (np.empty((samples, n)) for _ in range(4))
+    q[0], qd[0] = start, qd0
+    transmission = np.ascontiguousarray(model.robot.transmission_matrix)
+    values = model.values(theta_base)
+    if inertia is not None:
+        values = values._replace(ia=values.ia + np.asarray(inertia, dtype=np.float64))
+    stopped = run(
+        model.chain,
+        values,
+        transmission,
+        np.ascontiguousarray(np.linalg.inv(transmission)),
+        controller.error_taps,
+        controller.position_taps,
+        controller.output_taps,
+        controller.saturation,
+        controller.memory,
+        reference @ transmission.T,
+        pushed,
+        dt,
+        np.broadcast_to(np.asarray(max_velocity, dtype=np.float64), (n,)).copy(),
+        q,
+        qd,
+        qdd,
+        tau,
+        (0,) * n,
+        (0,) * values.coupling_joints.shape[0],
+    )
+    if stopped < 0:
+        return Simulation(q, qd, qdd, tau, None)
+    for signal in (q, qd, qdd, tau):
+        signal[stopped:] = np.nan
+    return Simulation(q, qd, qdd, tau, stopped)
+
+
+@inlined
+def friction(
+    n: int,
+    pairs: int,
+    values: Values,
+    v: Floats,
+    x: Floats,
+    bend: Floats,
+    steep: Floats,
+    force: Floats,
+    slope: Floats,
+    pair_slope: Floats,
+) -> None:
+    """Friction ``force`` (n,) at velocities ``v``, its diagonal ``slope`` (n,) and that of each coupling.
+
+    ``x``, ``bend`` and ``steep`` are scratch of the `padded` number of joints and couplings.
+    """
+    g = values.smoothing
+    for j in range(n):
+        x[j] = g * v[j]
+    for m in range(pairs):
+        x[n + m] = g * (v[values.coupling_joints[m, 0]] + v[values.coupling_joints[m, 1]])
+    arctangents(x, bend, steep)
+    for j in range(n):
+        coulomb = TWO_OVER_PI * values.fc[j]
+        force[j] = values.off[j] + values.fv[j] * v[j] + coulomb * bend[j]
+        slope[j] = values.fv[j] + coulomb * g * steep[j]
+    for m in range(pairs):
+        i, j = values.coupling_joints[m, 0], values.coupling_joints[m, 1]
+        coulomb = TWO_OVER_PI * values.coupling[m, 2]
+        common = coulomb * bend[n + m]
+        pair = coulomb * g * steep[n + m]
+        force[i] += values.coupling[m, 1] * v[j] + common
+        force[j] += values.coupling[m, 1] * v[i] + common
+        slope[i] += pair
+        slope[j] += pair
+        pair_slope[m] = pair + values.coupling[m, 1]
+
+
+@inlined
+def divisions(n: int, pairs: int, values: Values, v: Floats, a: Floats, dt: float) -> int:
+    """How many steps one sample needs: more while a joint with Coulomb friction passes standstill."""
+    most = 1
+    for j in range(n):
+        x, dx = values.smoothing * v[j], values.smoothing * a[j] * dt
+        if values.fc[j] != 0.0 and abs(x) < abs(dx) + NEAR_STANDSTILL:
+            most = max(most, 1 + int(STEPS_PER_UNIT * abs(dx)))
+    for m in range(pairs):
+        i, j = values.coupling_joints[m]
+        x, dx = values.smoothing * (v[i] + v[j]), values.smoothing * (a[i] + a[j]) * dt
+        if values.coupling[m, 2] != 0.0 and abs(x) < abs(dx) + NEAR_STANDSTILL:
+            most = max(most, 1 + int(STEPS_PER_UNIT * abs(dx)))
+    return min(most, MOST_STEPS)
+
+
+@inlined
+def stiffen(
+    n: int, pairs: int, mass: Floats, step: float, coupled: Ints, slope: Floats, pair_slope: Floats, stiff: Floats
+) -> None:
+    """Lower triangle of the matrix of the implicit stages over ``step``, ``mass`` and friction slopes."""
+    for i in range(n):
+        for j in range(i):
+            stiff[i, j] = mass[i, j]
+        stiff[i, i] = mass[i, i] + GAMMA * step * slope[i]
+    for m in range(pairs):
+        i, j = coupled[m, 0], coupled[m, 1]
+        stiff[max(i, j), min(i, j)] += GAMMA * step * pair_slope[m]
+
+
+@compiled
+def run(
+    chain: Chain,
+    values: Values,
+    transmission: Floats,
+    inverse_transmission: Floats,
+    error_taps: Floats,
+    position_taps: Floats,
+    output_taps: Floats,
+    saturation: Floats,
+    memory: int,
+    reference: Floats,
+    disturbance: Floats,
+    dt: float,
+    max_velocity: Floats,
+    q: Floats,
+    qd: Floats,
+    qdd: Floats,
+    tau: Floats,
+    joints: tuple[int, ...],
+    couplings: tuple[int, ...],
+) -> int:
+    """Fill ``q, qd, qdd, tau`` (N, n) from their first sample on; returns where it stopped, or -1.
+
+    ``reference`` (N, n) is that of the motors. ``joints`` and ``couplings`` have one entry each per joint and coupling:
+    the length of a tuple is known when the kernel is compiled, and its short loops become straight code.
+    """
+    samples, n = reference.shape[0], len(joints)
+    coupled = values.coupling_joints
+    pairs = len(couplings)
+    work, factor, stiff_factor = np.empty((n, 6)), np.empty((n, n)), np.empty((n, n))
+    mass, mass_before, middle_mass, stiff = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
+    terms = padded(n + pairs)
+    x, bend, steep = np.zeros(terms), np.empty(terms), np.empty(terms)
+    bias, bias_before, still = np.empty(n), np.empty(n), np.zeros(n)
+    load, k1, k2, middle, rate = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    # State and torque live in arrays of their own: a view of a row costs more than the row.
+    p, v, held, drive = q[0].copy(), qd[0].copy(), np.empty(n), np.empty(n)
+    disturbed = disturbance.shape[0] > 0
+    force, slope, pair_slope = np.empty(n), np.empty(n), np.empty(pairs)
+    force_middle, slope_middle, pair_slope_middle = np.empty(n), np.empty(n), np.empty(pairs)
+    # The newest sample stands in row ``now``; when the rows are used up, the last ones move to the front.
+    rows = memory + HISTORY
+    error, position, output = np.empty((rows, n)), np.empty((rows, n)), np.empty((rows, n))
+    now = memory - 2
+    for k in range(samples):
+        for j in range(n):
+            if not (np.isfinite(p[j]) and abs(v[j]) <= max_velocity[j]):
+                return k
+        turn(n, chain, p, angle, sine, cosine)
+        rigid_torque(n, chain, values, p, v, still, sine, cosine, work, bias)
+        fill_mass_matrix(n, chain, values, p, sine, cosine, mass)
+        friction(n, pairs, values, v, x, bend, steep, force, slope, pair_slope)
+        now += 1
+        if now == rows:
+            for m in range(memory - 1):
+                for i in range(n):
+                    error[m, i] = error[now - memory + 1 + m, i]
+                    position[m, i] = position[now - memory + 1 + m, i]
+                    output[m, i] = output[now - memory + 1 + m, i]
+            now = memory - 1
+        for i in range(n):
+            here = 0.0
+            for j in range(n):
+                here += transmission[i, j] * p[j]
+            error[now, i], position[now, i] = reference[k, i] - here, here
+        if k == 0:
+            for i in range(n):
+                bias_before[i] = bias[i]
+                for j in range(i + 1):
+                    mass_before[i, j] = mass[i, j]
+                balance = speed = 0.0
+                for j in range(n):
+                    balance += inverse_transmission[j, i] * (bias[j] + force[j])
+                    speed += transmission[i, j] * v[j]
+                for back in range(1, memory):
+                    error[now - back, i] = error[now, i]
+                    position[now - back, i] = position[now, i] - back * dt * speed
+                    output[now - back, i] = balance
+        for i in range(n):
+            nu = 0.0
+            for m in range(error_taps.shape[1]):
+                nu += error_taps[i, m] * error[now - m, i]
+            for m in range(position_taps.shape[1]):
+                nu += position_taps[i, m] * position[now - m, i]
+            for m in range(output_taps.shape[1]):
+                nu += output_taps[i, m] * output[now - 1 - m, i]
+            nu = min(max(nu, -saturation[i]), saturation[i])
+            output[now, i] = nu
+            drive[i] = nu + disturbance[k, i] if disturbed else nu
+        for j in range(n):
+            torque = 0.0
+            for i in range(n):
+                torque += transmission[i, j] * drive[i]
+            before = held[j] if k > 0 else torque
+            held[j] = tau[k, j] = torque
+            rate[j] = 0.5 * (before + torque) - bias[j] - force[j]
+        for i in range(n):
+            load[i] = held[i] - (1.5 * bias[i] - 0.5 * bias_before[i])
+            bias_before[i] = bias[i]
+            for j in range(i + 1):
+                middle_mass[i, j] = 1.5 * mass[i, j] - 0.5 * mass_before[i, j]
+                mass_before[i, j] = mass[i, j]
+        # One step over the whole sample is the rule: its factors are on their way while those at the sample are.
+        stiffen(n, pairs, middle_mass, dt, coupled, slope, pair_slope, stiff)
+        if not cholesky(mass, factor, n):
+            return k
+        solvable = cholesky(stiff, stiff_factor, n)
+        for i in range(n):
+            k1[i] = load[i] - force[i]
+        solve_factored(factor, n, rate)
+        solve_factored(stiff_factor, n, k1)
+        for i in range(n):
+            qdd[k, i] = rate[i]
+        if k + 1 == samples:
+            break
+        steps = divisions(n, pairs, values, v, rate, dt)
+        h = dt / steps
+        for _ in range(steps):
+            if steps > 1:
+                friction(n, pairs, values, v, x, bend, steep, force, slope, pair_slope)
+                stiffen(n, pairs, middle_mass, h, coupled, slope, pair_slope, stiff)
+                solvable = cholesky(stiff, stiff_factor, n)
+                for i in range(n):
+                    k1[i] = load[i] - force[i]
+                solve_factored(stiff_factor, n, k1)
+            if not solvable:
+                return k + 1
+            for i in range(n):
+                middle[i] = v[i] + 0.5 * h * k1[i]
+            friction(n, pairs, values, middle, x, bend, steep, force_middle, slope_middle, pair_slope_middle)
+            # M k1 = load - force - gamma h F k1 spares the product with the mass matrix.
+            for i in range(n):
+                k2[i] = force[i] - force_middle[i] + GAMMA * h * slope[i] * k1[i]
+            for m in range(pairs):
+                i, j = coupled[m, 0], coupled[m, 1]
+                k2[i] += GAMMA * h * pair_slope[m] * k1[j]
+                k2[j] += GAMMA * h * pair_slope[m] * k1[i]
+            solve_factored(stiff_factor, n, k2)
+            for i in range(n):
+                new = v[i] + h * (k1[i] + k2[i])
+                p[i] += 0.5 * h * (v[i] + new)
+                v[i] = new
+        for i in range(n):
+            q[k + 1, i], qd[k + 1, i] = p[i], v[i]
+    return -1

@@ -1,0 +1,114 @@
+"""What ``armident reproduce`` does."""
+
+import sys
+from pathlib import Path
+
+from armident.configs import ConfigError
+from armident.identify.cli_tables import Report, progress
+from armident.identify.document import write_atomically
+from armident.identify.thesis import chapter4, chapter5, chapter6
+from armident.identify.thesis.cached_estimates import Laboratory
+from armident.identify.thesis.claims import Claim, judged
+from armident.identify.thesis.context import SIMULATIONS, SIMULATIONS_QUICK, Bench, TableFunction
+from armident.identify.thesis.recordings import EMPS_SESSION, measured_emps, measured_recording, virtual_recording
+from armident.identify.thesis.render import document, markdown, print_tables
+from armident.identify.thesis.tables import Table
+
+TABLES: dict[str, TableFunction] = {**chapter4.TABLES, **chapter5.TABLES, **chapter6.TABLES}
+SLOW = ("4.1", "4.2", "4.3")
+"""Left out by ``--quick``: output errors without decimation, with hundreds of simulations at 5 kHz."""
+FOLDER = Path("reproduction")
+
+
+def reproduce_command(
+    tables: str | None = None,
+    measured: Path | None = None,
+    out: Path | None = None,
+    quick: bool = False,
+    as_json: bool = False,
+) -> None:
+    """Carry out ``armident reproduce``.
+
+    Parameters
+    ----------
+    tables
+        Numbers with commas between them; ``None``: all, with ``quick`` all but the slow ones.
+    measured
+        Folder with the measured TX40, whose columns stand beside those of the virtual one where it can have any, and
+        perhaps the measured EMPS, for claim 5; see ``measured_recording`` and ``measured_emps``.
+    out
+        Folder for ``reproduce.json``, ``reproduce.md`` and the recordings; ``None``: ``reproduction``.
+    quick
+        Fewer simulations, and without the slow tables.
+    as_json
+        Print the JSON document and nothing else.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such table, or the folder cannot be written.
+    DataError
+        If the measured recording cannot be used.
+    """
+    numbers = chosen_tables(tables, quick=quick)
+    folder = out or FOLDER
+    bench = make_bench(folder, measured, quick=quick)
+    with progress("reproduce") as report:
+        found, claims = reproduce(bench, numbers, report)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from error
+    text = document(found, claims, quick=quick)
+    write_atomically(folder / "reproduce.json", text)
+    write_atomically(folder / "reproduce.md", markdown(found, claims))
+    if as_json:
+        sys.stdout.write(text)
+        return
+    print_tables(found, claims)
+    print(f"result: {folder / 'reproduce.json'}\nreport: {folder / 'reproduce.md'}")
+
+
+def chosen_tables(tables: str | None, *, quick: bool) -> list[str]:
+    """The numbers asked for, in the order of the thesis.
+
+    Raises
+    ------
+    ConfigError
+        If one is not among those that can be reproduced.
+    """
+    if tables is None:
+        return [number for number in TABLES if not (quick and number in SLOW)]
+    asked = [number.strip() for number in tables.split(",") if number.strip()]
+    unknown = [number for number in asked if number not in TABLES]
+    if unknown or not asked:
+        raise ConfigError(f"--tables: no table {', '.join(unknown) or 'named'}; there are {', '.join(TABLES)}")
+    return [number for number in TABLES if number in asked]
+
+
+def make_bench(folder: Path, measured: Path | None = None, *, quick: bool = False) -> Bench:
+    """The arms; nothing is recorded or read before it is needed, except the measured arm's files."""
+    real = None
+    if measured is not None:
+        recorded = measured_recording(measured)
+        real = Laboratory(lambda: recorded)
+    return Bench(
+        virtual=Laboratory(lambda: virtual_recording(folder / "recordings")),
+        feedback=Laboratory(lambda: virtual_recording(folder / "recordings", velocity_feedback=True)),
+        measured=real,
+        emps=None if measured is None else measured_emps(measured),
+        simulations=SIMULATIONS_QUICK if quick else SIMULATIONS,
+        axis=Laboratory(lambda: virtual_recording(folder / "recordings", velocity_feedback=True, session=EMPS_SESSION)),
+    )
+
+
+def reproduce(
+    bench: Bench, numbers: list[str], report: Report = lambda stage, share: None
+) -> tuple[list[Table], list[Claim]]:
+    """Tables by their numbers, and the claims that rest on them."""
+    found = []
+    for k, number in enumerate(numbers):
+        report(f"table {number}", k / len(numbers))
+        found.append(TABLES[number](bench))
+    report("claims", 1.0)
+    return found, judged(bench, numbers)

@@ -1,0 +1,203 @@
+"""Configuration files: what is accepted, and that every mistake is named in one line."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from armident.configs import (
+    ConfigError,
+    RobotConfig,
+    config_path,
+    load_robot,
+    load_scenario,
+    load_session,
+    load_suite,
+    load_trajectory,
+)
+from armident.configs.loading import HERE, parse
+from armident.configs.yaml_loader import read_yaml
+
+TX40 = yaml.safe_load((HERE / "robots" / "tx40.yaml").read_text())
+
+
+def robot_with(**changes: object) -> str:
+    return yaml.safe_dump(TX40 | changes)
+
+
+KINDS: dict[str, Callable[[Path], object]] = {
+    "robots": load_robot,
+    "cells": load_session,
+    "suites": load_suite,
+    "trajectories": load_trajectory,
+    "scenarios": load_scenario,
+}
+
+
+@pytest.mark.parametrize(
+    "path", sorted(p for folder in KINDS for p in (HERE / folder).glob("*.yaml")), ids=lambda p: p.name
+)
+def test_every_shipped_configuration_loads(path: Path) -> None:
+    load = KINDS[path.parent.name]
+    assert load(path) == load(path)
+
+
+@pytest.mark.parametrize(
+    "name", ["tx40", "tx40.yaml", "configs/tx40.yaml", "robots/tx40.yaml", str(HERE / "robots" / "tx40.yaml")]
+)
+def test_a_shipped_configuration_is_found_by_its_short_names(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert load_robot(name).n == 6
+
+
+def test_a_file_in_the_working_directory_wins_over_the_shipped_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("tx40.yaml").write_text(robot_with(description="mine"))
+    assert load_robot("tx40.yaml").description == "mine"
+
+
+def test_motor_six_turns_with_joint_five_as_on_the_tx40() -> None:
+    matrix = load_robot("tx40").transmission_matrix
+    assert matrix[5, 4] == matrix[5, 5] == 32.0
+    assert np.allclose(np.linalg.solve(matrix, matrix @ np.arange(6.0)), np.arange(6.0), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (robot_with(transmision=[[1.0]]), "transmision: unknown key; did you mean 'transmission'?"),
+        (robot_with(bandwidth_hz=-1), "bandwidth_hz: input should be greater than 0, found -1"),
+        (robot_with(bandwidth_hz=float("nan")), "bandwidth_hz: "),
+        (robot_with(transmission=[[1.0]]), "transmission: expected 6 rows of 6 numbers"),
+        (robot_with(transmission=[[0.0] * 6] * 6), "transmission: the matrix is singular"),
+        (robot_with(joints=[*TX40["joints"][:5], TX40["joints"][4]]), "joints: names must be unique"),
+        (
+            robot_with(couplings=[{"name": "m6", "joints": ["joint_5", "joint_7"]}]),
+            "couplings: no joint named 'joint_7'",
+        ),
+        (robot_with(schema="armident/robot/2"), "schema: input should be 'armident/robot/1'"),
+        ("joints: [", "line 1"),
+        ("- a\n- b\n", "expected keys and values, found list"),
+    ],
+)
+def test_a_mistake_is_named_in_one_line_with_file_key_and_expectation(text: str, expected: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(text, RobotConfig, "robot.yaml")
+    message = str(caught.value)
+    assert message.startswith("robot.yaml:")
+    assert expected in message
+    assert "\n" not in message
+
+
+def test_a_missing_file_names_what_is_shipped() -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml: no such file .*tx40\.yaml"):
+        config_path("nowhere.yaml")
+
+
+def session_with(tmp_path: Path, **changes: object) -> Path:
+    data = yaml.safe_load((HERE / "cells" / "tx40_cell.yaml").read_text())
+    data["robot"] = str(HERE / "robots" / "tx40.yaml")
+    data["setpoints"]["trajectory"] = str(HERE / "trajectories" / "tx40_excitation.yaml")
+    for drive in data["drives"]:
+        drive["eds"] = str(HERE / "eds" / "cia402_servo.eds")
+    for key, value in changes.items():
+        data[key] = value(data[key]) if callable(value) else value
+    path = tmp_path / "cell.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("robot", "nowhere.yaml", "robot: no such file nowhere.yaml"),
+        ("streams", lambda s: s | {"more": {"tpdo": 1, "objects": ["torque"]}}, "each stream needs a tpdo of its own"),
+        ("streams", lambda s: s | {"more": {"tpdo": 3, "every": 7, "objects": ["torque"]}}, "7 does not divide"),
+        ("streams", {"demand": {"tpdo": 1, "objects": ["demand"]}}, "a stream named 'samples'"),
+        ("drives", lambda d: [*d[:-1], d[0] | {"joint": "joint_6"}], "node_id must be unique"),
+        ("drives", lambda d: [*d[:-1], d[-1] | {"joint": "wrist"}], "'wrist' is not a joint of tx40.yaml"),
+        ("drives", lambda d: [*d[:-1], d[-1] | {"eds": "no.eds"}], "drives[5].eds: no such file no.eds"),
+        ("sync", {"period_us": 20}, "sync.period_us: input should be greater than or equal to 100, found 20"),
+    ],
+)
+def test_a_session_that_cannot_work_is_refused_with_its_key(
+    tmp_path: Path, key: str, value: object, expected: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_session(session_with(tmp_path, **{key: value}))
+    assert expected in str(caught.value)
+
+
+def test_trajectory_starts_and_ends_at_rest_and_reaches_every_waypoint() -> None:
+    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
+    q = trajectory.sample(1e-3)
+    assert np.allclose(q[0], trajectory.start)
+    assert np.allclose(q[-1], trajectory.moves[-1].to)
+    ends = np.cumsum([m.duration + m.dwell for m in trajectory.moves])
+    for end, move in zip(ends, trajectory.moves, strict=True):
+        assert np.allclose(q[round(end / 1e-3)], move.to, atol=1e-9)
+    assert np.abs(np.diff(q[[0, 1, -2, -1]], axis=0)[[0, 2]]).max() < 1e-5
+
+
+def test_trajectory_velocity_is_continuous_and_acceleration_bounded() -> None:
+    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
+    limits = np.array([j.limits.acceleration for j in load_robot("tx40").joints])
+    qd = np.diff(trajectory.sample(1e-4), axis=0) / 1e-4
+    assert (np.abs(np.diff(qd, axis=0)) / 1e-4 <= limits * 1.001).all()
+
+
+def test_a_trajectory_beyond_a_limit_is_refused_with_joint_and_value() -> None:
+    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
+    far = trajectory.model_copy(update={"start": (9.0, *trajectory.start[1:])})
+    with pytest.raises(ConfigError, match=r"joint_1 moves over \[.*9\.000\], allowed is \[-3\.140, 3\.140\]"):
+        far.check(load_robot("tx40"))
+    with pytest.raises(ConfigError, match="6 joints, but emps has 1"):
+        trajectory.check(load_robot("emps"))
+
+
+@pytest.mark.parametrize(
+    ("load", "name", "expected"),
+    [
+        (load_session, "tx40.yaml", "this is a robot file (armident/robot/1); a session file is wanted"),
+        (load_robot, "tx40_cell.yaml", "this is a session file (armident/session/1); a robot file is wanted"),
+        (load_suite, "trajectories/tx40_1.yaml", "this is a trajectory file"),
+    ],
+)
+def test_a_file_of_another_kind_is_named_for_what_it_is(
+    load: Callable[[Path], object], name: str, expected: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=re.escape(expected)):
+        load(config_path(name))
+    path = tmp_path / "nameless.yaml"
+    path.write_text(re.sub(r"(?m)^schema:.*$", "", config_path(name).read_text()))
+    with pytest.raises(ConfigError, match=rf"nameless\.yaml: this looks like a {expected.split()[3]} file \(it has "):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("bandwidth_hz: 5\nbandwidth_hz: 6", "the key 'bandwidth_hz' is there twice"),
+        ("bandwidth_hz: yes", "bandwidth_hz: expected a number or a word, found true"),
+        ("bandwidth_hz: 1:30", "bandwidth_hz: input should be a valid number"),
+        ("description: " + "[" * 5000, "not valid YAML: brackets or indentation too deep"),
+        ("bandwidth_hz: " + "9" * 5000, "not valid YAML"),
+        ("controller: 2024-13-45", "controller: input should be a valid dictionary"),
+    ],
+)
+def test_what_yaml_would_take_for_something_else_is_refused(line: str, expected: str) -> None:
+    text = re.sub(r"(?m)^bandwidth_hz:.*\n", "", (HERE / "robots" / "tx40.yaml").read_text())
+    with pytest.raises(ConfigError) as caught:
+        parse(f"{text}\n{line}\n", RobotConfig, "robot.yaml")
+    assert expected in str(caught.value)
+
+
+def test_numbers_are_those_of_yaml_1_2() -> None:
+    assert read_yaml("[010, 0x1F, 1e-3, 1_000, .5, 2024-01-02]", "x") == ["010", 31, 0.001, 1000, 0.5, "2024-01-02"]

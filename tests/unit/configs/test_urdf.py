@@ -1,0 +1,307 @@
+"""Robots from URDF: the chain that is meant becomes modified Denavit-Hartenberg parameters, all else is refused."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armident.configs import ConfigError, RobotConfig, load_robot
+from armident.configs.mdh import modified_dh
+from armident.configs.urdf import mdh_of, read_chain
+from armident.daq.recording import Recording, Stream, read_recording, write_recording
+from armident.daq.recording.model import Field
+
+LIMIT = '<limit lower="-2" upper="2" velocity="3" effort="50"/>'
+
+# The axes of the Panda as its maker's URDF places them: joint, rpy, xyz.
+PANDA = (
+    ("0 0 0", "0 0 0.333"),
+    ("-1.57079632679 0 0", "0 0 0"),
+    ("1.57079632679 0 0", "0 -0.316 0"),
+    ("1.57079632679 0 0", "0.0825 0 0"),
+    ("-1.57079632679 0 0", "-0.0825 0.384 0"),
+    ("1.57079632679 0 0", "0 0 0"),
+    ("1.57079632679 0 0", "0.088 0 0"),
+)
+
+
+def joint(
+    name: str,
+    ends: str,
+    kind: str = "revolute",
+    axis: str = "0 0 1",
+    xyz: str = "0 0 0",
+    rpy: str = "0 0 0",
+    more: str = LIMIT,
+) -> str:
+    """A joint element; ``ends`` are parent and child."""
+    parent, child = ends.split()
+    return (
+        f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/><parent link="{parent}"/>'
+        f'<child link="{child}"/><axis xyz="{axis}"/>{more}</joint>'
+    )
+
+
+def urdf(folder: Path, *joints: str, links: str = "a b c d e") -> Path:
+    """A URDF with the links named and these joints."""
+    text = "".join(f'<link name="{link}"/>' for link in links.split()) + "".join(joints)
+    file = folder / "arm.urdf"
+    file.write_text(f'<robot name="arm">{text}</robot>')
+    return file
+
+
+def configuration(folder: Path, n: int, joints: str = "", urdf_keys: str = "", **more: str) -> Path:
+    identity = np.eye(n).tolist()
+    accelerations = "\n".join(f"- {{name: j{k}, limits: {{acceleration: 9.0}}}}" for k in range(1, n + 1))
+    keys = "".join(f"{key}: {value}\n" for key, value in more.items())
+    file = folder / "arm.yaml"
+    file.write_text(
+        f"schema: armident/robot/1\nname: arm\nurdf: {{file: arm.urdf{urdf_keys}}}\n{keys}"
+        f"joints:\n{joints or accelerations}\ntransmission: {identity}\n"
+    )
+    return file
+
+
+def two_joints(folder: Path, **second: str) -> Path:
+    return urdf(folder, joint("j1", "a b"), joint("j2", "b c", **second), links="a b c")
+
+
+def test_the_urdf_of_the_panda_gives_the_parameters_its_maker_documents(tmp_path: Path) -> None:
+    joints = [joint(f"j{k}", f"l{k - 1} l{k}", rpy=rpy, xyz=xyz) for k, (rpy, xyz) in enumerate(PANDA, start=1)]
+    urdf(tmp_path, *joints, links=" ".join(f"l{k}" for k in range(8)))
+    found = load_robot(configuration(tmp_path, 7))
+    documented = load_robot("panda")
+    assert [j.mdh for j in found.joints] == [j.mdh for j in documented.joints]
+    assert found.gravity == documented.gravity
+
+
+def test_the_urdf_of_the_kuka_gives_the_shipped_geometry(shared_data: Path) -> None:
+    file = shared_data / "kuka_lwr4" / "kuka_lwr4.urdf"
+    if not file.is_file():
+        pytest.skip(f"no {file.name} in the measured data")
+    joints = read_chain(file, base="lwr_base_link")
+    shipped = load_robot("kuka_lwr4")
+    assert [j.name for j in joints] == [j.name for j in shipped.joints]
+    assert list(mdh_of(joints, file).parameters) == [j.mdh for j in shipped.joints]
+    for found, ours in zip(joints, shipped.joints, strict=True):
+        assert found.limits == ours.limits.model_dump(exclude={"acceleration"})
+
+
+def transform(robot: RobotConfig, q: np.ndarray) -> np.ndarray:
+    """Frame n in frame 0: ``Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r)`` of every joint."""
+    frame = np.eye(4)
+    for value, j in zip(q, robot.joints, strict=True):
+        theta = j.mdh.theta + (value if j.type == "revolute" else 0.0)
+        r = j.mdh.r + (value if j.type == "prismatic" else 0.0)
+        ca, sa, c, s = np.cos(j.mdh.alpha), np.sin(j.mdh.alpha), np.cos(theta), np.sin(theta)
+        about_x = np.array([[1, 0, 0, j.mdh.d], [0, ca, -sa, 0], [0, sa, ca, 0], [0, 0, 0, 1]])
+        about_z = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, r], [0, 0, 0, 1]])
+        frame = frame @ about_x @ about_z
+    return frame
+
+
+@pytest.mark.parametrize("kinds", list(itertools.product(["revolute", "prismatic"], repeat=3)), ids="-".join)
+def test_the_last_link_moves_as_the_urdf_says(tmp_path: Path, kinds: tuple[str, str, str]) -> None:
+    # Axes, in this order: skew, parallel and opposite, intersecting; a fixed joint in between.
+    urdf(
+        tmp_path,
+        joint("j1", "a b", kinds[0], axis="1 2 -1", xyz="0.1 0.2 0.3", rpy="0.4 -0.5 0.6"),
+        joint("mount", "b c", "fixed", xyz="0.3 -0.1 0.2", rpy="0.3 0.1 -1.2"),
+        joint("j2", "c d", kinds[1], axis="0 1 1", xyz="0.1 0 0.4"),
+        joint("j3", "d e", kinds[2], axis="0 -2 -2", xyz="0.2 0.5 0.3"),
+    )
+    robot = load_robot(configuration(tmp_path, 3))
+    joints = read_chain(tmp_path / "arm.urdf")
+    chain = mdh_of(joints, tmp_path / "arm.urdf")
+    q = np.array([0.7, -1.1, 0.4])
+    ours = chain.base @ transform(robot, q)
+    # The same motion as screws about the axes where the URDF has them with all variables zero.
+    moved = np.eye(4)
+    for value, j in zip(q, joints, strict=True):
+        axis, point, step = j.placement[:3, :3] @ j.axis, j.placement[:3, 3], np.eye(4)
+        if j.type == "prismatic":
+            step[:3, 3] = value * axis
+        else:
+            cross = np.cross(axis, np.eye(3)).T
+            step[:3, :3] = np.eye(3) + np.sin(value) * cross + (1 - np.cos(value)) * cross @ cross
+            step[:3, 3] = point - step[:3, :3] @ point
+        moved = moved @ step
+    np.testing.assert_allclose(ours, moved @ chain.frames[-1], atol=1e-12)
+
+
+def test_gravity_is_that_of_the_base_link_however_the_first_axis_lies(tmp_path: Path) -> None:
+    urdf(tmp_path, joint("j1", "a b", axis="0 1 0"), links="a b")
+    robot = load_robot(configuration(tmp_path, 1, gravity="[1.0, 2.0, 3.0]"))
+    base = mdh_of(read_chain(tmp_path / "arm.urdf"), tmp_path).base[:3, :3]
+    np.testing.assert_allclose(base @ np.array(robot.gravity), [1.0, 2.0, 3.0], atol=1e-14)
+    np.testing.assert_array_equal(base[:, 2], [0.0, 1.0, 0.0])
+
+
+def test_joints_take_limits_from_the_urdf_and_the_rest_from_the_configuration(tmp_path: Path) -> None:
+    urdf(
+        tmp_path,
+        joint("J-1", "a b", "prismatic"),
+        joint("j2", "b c", "continuous", more='<limit velocity="4" effort="0"/>'),
+        links="a b c",
+    )
+    first = "- {name: J-1, limits: {acceleration: 9.0, velocity: 1.0}, drive: {signal: torque}, rotor_inertia: false}"
+    second = "- {name: j2, limits: {acceleration: 8.0, torque: 7.0}}"
+    robot = load_robot(configuration(tmp_path, 2, joints=f"{second}\n{first}"))
+    one, two = robot.joints
+    assert (one.name, one.type, one.drive.signal, one.rotor_inertia) == ("j_1", "prismatic", "torque", False)
+    assert (one.limits.position, one.limits.velocity, one.limits.torque) == ((-2.0, 2.0), 1.0, 50.0)
+    assert (two.name, two.type, two.rotor_inertia) == ("j2", "revolute", True)
+    assert two.limits.position == pytest.approx((-2 * np.pi, 2 * np.pi))
+    assert (two.limits.velocity, two.limits.acceleration, two.limits.torque) == (4.0, 8.0, 7.0)
+
+
+def test_a_recording_needs_no_urdf(tmp_path: Path) -> None:
+    two_joints(tmp_path, rpy="1.5708 0 0")
+    robot = load_robot(configuration(tmp_path, 2))
+    count = np.arange(3, dtype=np.int64)
+    fields = {"position": Field("position", "position", "rad", "joint", (1.0, 1.0))}
+    stream = Stream("samples", 1, count, count * 10**6, fields, {"position": np.zeros((3, 2))})
+    write_recording(Recording(None, robot, None, 1000.0, {"samples": stream}), tmp_path / "r.mcap")
+    (tmp_path / "arm.urdf").unlink()
+    assert read_recording(tmp_path / "r.mcap").robot == robot
+
+
+@pytest.mark.parametrize(("written", "exact"), [("1.5708", np.pi / 2), ("-3.14159", -np.pi), ("0.5235", np.pi / 6)])
+def test_an_angle_written_with_few_digits_is_the_multiple_of_15_degrees_that_is_meant(
+    tmp_path: Path, written: str, exact: float
+) -> None:
+    two_joints(tmp_path, rpy=f"{written} 0 0")
+    assert abs(load_robot(configuration(tmp_path, 2)).joints[1].mdh.alpha) == pytest.approx(abs(exact), abs=1e-15)
+
+
+@pytest.mark.parametrize("angle", ["0.5236500", "1.5709"])
+def test_any_other_angle_stays_as_it_is(tmp_path: Path, angle: str) -> None:
+    two_joints(tmp_path, rpy=f"{angle} 0 0")
+    assert abs(load_robot(configuration(tmp_path, 2)).joints[1].mdh.alpha) == pytest.approx(float(angle), abs=1e-14)
+
+
+def test_axes_that_are_parallel_but_for_rounding_have_no_far_away_normal() -> None:
+    tilt = 1e-9
+    axes = [[0.0, 0.0, 1.0], [0.0, np.sin(tilt), np.cos(tilt)], [1.0, 0.0, 0.0]]
+    chain = modified_dh(axes, [[0.0, 0.0, 0.0], [0.3, 0.0, 0.5], [0.3, 0.1, 0.6]], ["j1", "j2", "j3"])
+    assert [p.alpha for p in chain.parameters[:2]] == [0.0, 0.0]
+    assert chain.parameters[1].d == pytest.approx(0.3, abs=1e-9)
+    assert max(abs(p.r) for p in chain.parameters) < 1.0
+
+
+def test_a_part_of_a_tree_is_chosen_by_base_and_tip(tmp_path: Path) -> None:
+    file = urdf(
+        tmp_path,
+        joint("torso", "a b"),
+        joint("left", "b c", xyz="0.5 0 0"),
+        joint("right", "b d"),
+        joint("finger", "c e", "prismatic"),
+    )
+    assert [j.name for j in read_chain(file, base="c")] == ["finger"]
+    # What branches off at the base stands still, what follows the tip is its load.
+    assert [j.name for j in read_chain(file, base="b", tip="c")] == ["left"]
+    with pytest.raises(ConfigError, match=r"link 'b' branches into joints 'left' and 'right'"):
+        read_chain(file, base="a", tip="e")
+
+
+def test_what_is_fixed_to_the_side_is_no_branch(tmp_path: Path) -> None:
+    file = urdf(tmp_path, joint("camera", "b d", "fixed"), joint("j1", "a b"), joint("j2", "b c"), links="a b c d")
+    assert [j.name for j in read_chain(file)] == ["j1", "j2"]
+
+
+MIMIC = LIMIT + '<mimic joint="j1"/>'
+
+
+@pytest.mark.parametrize(
+    ("joints", "words"),
+    [
+        ([joint("x", "b d")], r"link 'b' branches into joints 'j2' and 'x'; only serial chains"),
+        ([joint("m", "b d", "fixed"), joint("x", "d e")], r"link 'b' branches into joints 'j2' and 'm'"),
+        ([joint("x", "c d", more=MIMIC)], r"joint 'x': follows another joint \(mimic\)"),
+        ([joint("x", "c d", "floating")], r"joint 'x': type 'floating' cannot be identified; expected revolute"),
+        ([joint("x", "c d", "planar")], r"joint 'x': type 'planar' cannot be identified"),
+        ([joint("x", "c d", axis="0 0 0")], r"joint 'x': axis: expected a direction"),
+        ([joint("x", "c d", axis="0 0")], r"joint 'x': axis xyz: expected 3 numbers, found '0 0'"),
+        ([joint("x", "c d", xyz="0 0 nan")], r"joint 'x': origin xyz: expected 3 numbers, found '0 0 nan'"),
+        ([joint("x", "c d", rpy="${pi/2} 0 0")], r"joint 'x': origin rpy: .*; expand the xacro first"),
+        ([joint("x", "c d", more='<limit effort="strong"/>')], r"joint 'x': limit effort: expected a number"),
+        ([joint("x", "c c2")], r"joint 'x': child: no link 'c2'"),
+        ([joint("x", "a c")], r"link 'c' is moved by two joints, 'j2' and 'x'"),
+        ([joint("j2", "c d")], r"joint 'j2': there are two of this name"),
+        ([joint("x", "c a")], r"expected one link that no joint moves, found none: the joints form a loop"),
+        ([joint("x", "d e"), joint("y", "e d")], r"links d, e form a loop"),
+        ([joint("x", "c d"), joint("y", "a e", more=LIMIT)], r"link 'a' branches into joints 'j1' and 'y'"),
+        (['<joint name="x" type="fixed"><child link="d"/></joint>'], r"joint 'x': parent: no link ''"),
+        (['<joint type="fixed"/>'], r"joint number 3: has no name"),
+    ],
+)
+def test_what_is_no_serial_chain_is_refused_with_file_and_element(
+    tmp_path: Path, joints: list[str], words: str
+) -> None:
+    links = sorted(set("abc") | {end for j in joints for end in "de" if f'link="{end}"' in j})
+    file = urdf(tmp_path, joint("j1", "a b"), joint("j2", "b c"), *joints, links=" ".join(links))
+    with pytest.raises(ConfigError, match=words) as caught:
+        read_chain(file)
+    assert str(caught.value).startswith(f"{file}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("<robot", "not valid XML: .*line 1"),
+        ("<sdf/>", "expected a URDF with the root element robot, found sdf"),
+        ('<robot><link name="a"/></robot>', "no joint moves between link 'a' and its end"),
+    ],
+)
+def test_a_file_that_is_no_urdf_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "arm.urdf"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=words):
+        read_chain(file)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"urdf_keys": ", tip: z"}, r"arm\.urdf: no link 'z' \(urdf\.tip\); links are a, b, c"),
+        ({"urdf_keys": ", base: b, tip: a"}, r"arm\.urdf: link 'a' \(urdf\.tip\) is not moved by link 'b'"),
+        ({"urdf_keys": ", tipp: a"}, r"arm\.yaml: urdf\.tipp: unknown key; did you mean 'tip'\?"),
+        ({"joints": "- {name: j9}"}, r"arm\.yaml: joints\[0\]\.name: the chain has no joint 'j9'; it has j1, j2"),
+        ({"joints": "- {name: j1}\n- {name: J1}"}, r"arm\.yaml: joints\[1\]\.name: 'J1' is there twice"),
+        ({"joints": "- {name: j1}"}, r"arm\.yaml: joints: j1: limits\.acceleration: not in arm\.urdf, say it here"),
+        ({"joints": "- {name: j1, mdh: {r: 1}}"}, r"arm\.yaml: joints\[0\]\.mdh: unknown key"),
+        ({"joints": "- {name: j1, limits: {velocity: -1}}"}, r"joints\[0\]\.limits\.velocity: input should be greater"),
+        ({"controller": "{kp: [1.0], kv: [1.0]}"}, r"arm\.yaml: controller: expected 2 numbers in kp and in kv"),
+    ],
+)
+def test_a_mistake_in_the_configuration_is_named_with_its_key(tmp_path: Path, keys: dict[str, str], words: str) -> None:
+    two_joints(tmp_path)
+    with pytest.raises(ConfigError, match=words) as caught:
+        load_robot(configuration(tmp_path, 2, **keys))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_misspelt_urdf_key_is_recognised(tmp_path: Path) -> None:
+    file = configuration(tmp_path, 2)
+    file.write_text(file.read_text().replace("urdf:", "urdff:"))
+    with pytest.raises(ConfigError, match=r"urdff: unknown key; did you mean 'urdf'\?"):
+        load_robot(file)
+
+
+def test_a_missing_urdf_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"arm\.yaml: urdf\.file: no such file arm\.urdf"):
+        load_robot(configuration(tmp_path, 2))
+
+
+def test_joints_whose_names_become_the_same_are_refused(tmp_path: Path) -> None:
+    urdf(tmp_path, joint("j 1", "a b"), joint("J_1", "b c"), links="a b c")
+    with pytest.raises(ConfigError, match=r"joint names differ only in case or punctuation: j 1, J_1"):
+        load_robot(configuration(tmp_path, 2))
+
+
+def test_axes_nearly_but_not_quite_parallel_are_refused_with_their_joints(tmp_path: Path) -> None:
+    two_joints(tmp_path, rpy="3.14 0 0", xyz="0.3 0.1 0")
+    with pytest.raises(ConfigError, match=r"arm\.urdf: the axes of j1 and j2 are nearly parallel \(0\.0016 rad\)"):
+        load_robot(configuration(tmp_path, 2))

@@ -1,0 +1,107 @@
+"""What a capture says reaches the journal with its fields, and stderr where there is no journal."""
+
+import os
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from armident.daq.capture.clock import clock_state
+from armident.daq.capture.journal import Line, entry
+
+SAY = """
+import sys
+from pathlib import Path
+from armident.daq.capture.journal import Line, Voice
+voice = Voice({"cell": "press_7", "robot": "tx40"}, Path(sys.argv[1]))
+voice("warning: the disk is full")
+voice(Line("node 2 (joint_2): EMCY 2310h", event="emcy", axis="joint_2", bus="can0", sync=17, code=0x2310))
+voice("two\\nlines")
+voice.close()
+voice("afterwards")
+"""
+
+
+def parsed(datagram: bytes) -> dict[str, str]:
+    """Fields of an entry, as the journal reads them."""
+    fields, at = {}, 0
+    while at < len(datagram):
+        end = datagram.index(b"\n", at)
+        key, equals, value = datagram[at:end].partition(b"=")
+        at = end + 1
+        if not equals:
+            (size,) = struct.unpack_from("<Q", datagram, at)
+            value = datagram[at + 8 : at + 8 + size]
+            assert datagram[at + 8 + size : at + 9 + size] == b"\n"
+            at += 9 + size
+        fields[key.decode()] = value.decode()
+    return fields
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "journal"))
+        listener.settimeout(5.0)
+        yield listener
+
+
+def said(place: Path, stderr: Path, stream: str | None) -> str:
+    """What stands in ``stderr`` after a process has spoken; ``stream`` names the journal's, ``""`` that file itself."""
+    with stderr.open("w") as file:
+        found = os.fstat(file.fileno())
+        environment = {key: value for key, value in os.environ.items() if key != "JOURNAL_STREAM"}
+        if stream is not None:
+            environment["JOURNAL_STREAM"] = stream or f"{found.st_dev}:{found.st_ino}"
+        subprocess.run([sys.executable, "-c", SAY, str(place)], stderr=file, env=environment, check=True, timeout=60)
+    return stderr.read_text()
+
+
+def test_entries_reach_the_journal_with_their_fields(journal: socket.socket, tmp_path: Path) -> None:
+    assert said(tmp_path / "journal", tmp_path / "stderr", "") == "afterwards\n"
+    disk, emcy, lines = (parsed(journal.recv(100_000)) for _ in range(3))
+    common = {"SYSLOG_IDENTIFIER": "armident", "ARMIDENT_CELL": "press_7", "ARMIDENT_ROBOT": "tx40"}
+    assert disk == {"MESSAGE": "warning: the disk is full", "PRIORITY": "4", **common}
+    assert emcy == {
+        "MESSAGE": "node 2 (joint_2): EMCY 2310h",
+        "PRIORITY": "6",
+        **common,
+        "ARMIDENT_EVENT": "emcy",
+        "ARMIDENT_AXIS": "joint_2",
+        "ARMIDENT_BUS": "can0",
+        "ARMIDENT_SYNC": "17",
+        "ARMIDENT_CODE": "8976",
+    }
+    assert lines["MESSAGE"] == "two\nlines"
+
+
+@pytest.mark.parametrize("stream", [None, "1:2", "nonsense"])
+def test_it_is_plain_text_where_stderr_is_no_journal(stream: str | None, tmp_path: Path) -> None:
+    text = said(tmp_path / "nobody", tmp_path / "stderr", stream)
+    assert text == "warning: the disk is full\nnode 2 (joint_2): EMCY 2310h\ntwo\nlines\nafterwards\n"
+
+
+def test_it_is_plain_text_where_the_journal_does_not_listen(tmp_path: Path) -> None:
+    assert "EMCY 2310h\n" in said(tmp_path / "nobody", tmp_path / "stderr", "")
+
+
+def test_a_long_line_is_cut_so_that_it_goes_into_a_datagram() -> None:
+    assert len(entry("x" * 1_000_000, {})) < 10_000
+
+
+def test_a_line_is_a_text_for_everybody_else() -> None:
+    line = Line("no heartbeat", event="heartbeat_lost", sync=5)
+    assert line == "no heartbeat"
+    assert f"{line}!" == "no heartbeat!"
+
+
+def test_the_kernel_tells_the_state_of_its_clock() -> None:
+    state = clock_state()
+    assert abs(state.offset_us) < 10e6
+    assert state.error_us >= 0
+    assert state.largest_error_us >= 0
+    assert isinstance(state.synchronised, bool)

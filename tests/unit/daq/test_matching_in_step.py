@@ -1,0 +1,193 @@
+"""Rows wait for answers no longer than there is something to wait for, and never get those of other SYNCs."""
+
+import numpy as np
+import pytest
+
+from armident.daq.matching.assembler import IN_STEP_S, SYNC_LOST, Assembler, Batch, TpdoStream
+from armident.daq.recording import Gap
+from armident.drivers.can.frames import Frames, frames
+
+PERIOD_NS = 1_000_000
+PERIOD_S = PERIOD_NS * 1e-9
+T0 = 1_700_000_000_000_000_000
+LONGEST_WAIT = 3 * round(IN_STEP_S / PERIOD_S) + 2
+Sent = list[tuple[int, int]]
+"""Identifier and number of frames that come behind a SYNC."""
+
+
+def frames_of(k: int, sent: Sent, with_sync: bool = True, at_ns: int | None = None) -> Frames:
+    """SYNC ``k`` and what comes behind it."""
+    out = frames(with_sync + len(sent))
+    out["t_ns"] = (T0 + k * PERIOD_NS if at_ns is None else at_ns) + 1000 * np.arange(out.size)
+    if with_sync:
+        out["can_id"][0], out["length"][0], out["data"][0, 0] = 0x80, 1, k % 240 + 1
+    for i, (can_id, number) in enumerate(sent, with_sync):
+        out["can_id"][i], out["length"][i] = can_id, 8
+        out["data"][i] = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
+    return out
+
+
+class Bench:
+    """Joints a, b on the first bus, c, d on the second if there is one; what is decided, SYNC by SYNC."""
+
+    def __init__(self, buses: int = 1, foreign: bool = False) -> None:
+        self.joints = ("a", "b", "c", "d")[: 2 * buses]
+        stream = TpdoStream("samples", 1, (0x181, 0x182, 0x181, 0x182)[: 2 * buses], 8)
+        first = None if foreign else 1
+        bus_of = (0, 0, 1, 1)[: 2 * buses]
+        self.assembler = Assembler((stream,), self.joints, PERIOD_NS, first_counter=first, bus_of=bus_of)
+        self.sync: list[int] = []
+        self.gaps: list[Gap] = []
+        self.waited = 0
+
+    def push(self, k: int, *sent: Sent, with_sync: bool = True) -> None:
+        """One SYNC on every bus with what comes behind it."""
+        for bus, some in enumerate(sent):
+            self._take(self.assembler.push(frames_of(k, some, with_sync), sent=k + 1, bus=bus))
+        self.waited = max(self.waited, k - self.decided)
+
+    @property
+    def decided(self) -> int:
+        """The last SYNC whose row or gap is known; gaps that go on are."""
+        totals = self.assembler.counters
+        return totals["samples.expected"] - 1
+
+    def finish(self, sent: int) -> None:
+        """No more comes."""
+        self._take(self.assembler.finish(sent))
+
+    def _take(self, batch: Batch) -> None:
+        rows = batch.rows["samples"]
+        numbers = rows.data[:, :, :8].copy().view("<i8")[:, :, 0]
+        assert np.all(numbers == rows.sync[:, None]), "a value is of another SYNC"
+        self.sync += rows.sync.tolist()
+        self.gaps += batch.gaps
+
+    def missing(self, count: int) -> set[int]:
+        """SYNCs without a row, of the first ``count``."""
+        assert self.assembler.counters["samples.expected"] == count
+        return set(range(count)) - set(self.sync)
+
+
+def answers(k: int) -> Sent:
+    """Of both drives of a bus."""
+    return [(0x181, k), (0x182, k)]
+
+
+def test_a_lost_answer_keeps_rows_waiting_for_some_ten_milliseconds_and_costs_one() -> None:
+    bench = Bench()
+    for k in range(500):
+        bench.push(k, answers(k)[k == 100 :])
+    bench.finish(500)
+    assert bench.missing(500) == {100}
+    assert bench.gaps == [Gap("samples", 100, 100, "a", "lost")]
+    assert bench.waited <= LONGEST_WAIT
+
+
+def test_losses_of_both_drives_are_told_apart_one_after_the_other() -> None:
+    bench = Bench()
+    lost = {(100, 0x181), (110, 0x182), (125, 0x181), (300, 0x182), (301, 0x182)}
+    for k in range(800):
+        bench.push(k, [(cob, k) for cob, _ in answers(k) if (k, cob) not in lost])
+    bench.finish(800)
+    assert bench.missing(800) == {100, 110, 125, 300, 301}
+
+
+def test_a_drive_that_falls_silent_keeps_nothing_waiting_for_long() -> None:
+    bench = Bench()
+    for k in range(1000):
+        bench.push(k, answers(k)[200 <= k < 600 :])
+    bench.finish(1000)
+    assert bench.missing(1000) == set(range(200, 600))
+    assert bench.gaps == [Gap("samples", 200, 599, "a", "lost")]
+    assert bench.waited <= LONGEST_WAIT
+
+
+@pytest.mark.parametrize("held", [5, 35])
+def test_a_drive_that_holds_its_answers_back_for_a_moment_loses_none(held: int) -> None:
+    bench = Bench()
+    for k in range(400):
+        burst = [(0x181, i) for i in range(100, 100 + held + 1)] if k == 100 + held else [(0x181, k)]
+        bench.push(k, [*(burst if not 100 <= k < 100 + held else []), (0x182, k)])
+    bench.finish(400)
+    assert bench.missing(400) == set()
+
+
+@pytest.mark.parametrize("rate", [2, 7, 60])
+def test_answers_that_come_after_they_were_given_up_are_nobody_elses(rate: int) -> None:
+    """A drive is silent for 120 SYNCs, then sends all of it, so many in a period, and is prompt again."""
+    bench, queue = Bench(), list[int]()
+    for k in range(700):
+        queue.append(k)
+        out = [] if 100 <= k < 220 else queue[:rate]
+        queue = queue[len(out) :]
+        bench.push(k, [*((0x181, i) for i in out), (0x182, k)])
+    bench.finish(700)
+    missing = bench.missing(700)
+    assert set(range(100, 175)) <= missing <= set(range(100, 350))
+
+
+@pytest.mark.parametrize("stale", [0, 3, 42])
+def test_after_an_outage_what_is_late_is_matched_and_what_is_stale_is_dropped(stale: int) -> None:
+    """Bus 2 is off for 200 SYNCs; its drives owe some answers, send them afterwards and are late by 300 SYNCs."""
+    bench, queue = Bench(buses=2), list[int]()
+    for k in range(1500):
+        if k in (300, 500):
+            bench.assembler.silence(1, k == 300)
+        if 300 <= k < 500:
+            bench._take(bench.assembler.push(frames_of(k, answers(k)), sent=k + 1, bus=0))
+            bench._take(bench.assembler.push(frames(0), sent=k + 1, bus=1))
+            continue
+        queue.append(k)
+        out = [] if 300 - stale <= k < 300 or 510 <= k < 800 else queue[:20]
+        queue = queue[len(out) :]
+        bench.push(k, answers(k), [(cob, i) for i in out for cob in (0x181, 0x182)])
+    bench.finish(1500)
+    assert bench.missing(1500) == set(range(300 - stale, 500))
+    assert {g.joint for g in bench.gaps} == {"c", "d"}
+    assert {g.reason for g in bench.gaps} == ({"lost", SYNC_LOST} if stale else {SYNC_LOST})
+
+
+@pytest.mark.parametrize("burst", [0, 60])
+def test_drives_that_are_late_on_buses_of_their_own_are_no_witnesses_against_each_other(burst: int) -> None:
+    """All stop for 150 SYNCs, and the host with them: each bus is read for so long at once."""
+    stream = TpdoStream("samples", 1, (0x181, 0x181, 0x181), 8)
+    assembler = Assembler((stream,), ("a", "b", "c"), PERIOD_NS, bus_of=(0, 1, 2))
+    parts = []
+    for k in range(1000):
+        stopped = 400 <= k < 550
+        out = [(0x181, i) for i in range(400, 551)] if k == 550 else [(0x181, k)]
+        parts.append(frames_of(k, [] if stopped else out))
+    for first, last in ((0, 380), (380, 550 + burst), (550 + burst, 1000)):
+        for bus in range(3):
+            assembler.push(np.concatenate(parts[first:last]), sent=1000, bus=bus)
+    assembler.finish(1000)
+    assert assembler.counters["samples.rows"] == 1000
+
+
+def test_what_is_missing_on_one_bus_casts_no_doubt_on_another() -> None:
+    """Joint a stands still and is late in a burst just after an outage of bus 2."""
+    bench = Bench(buses=2)
+    stream = TpdoStream("samples", 1, (0x181, 0x182, 0x181, 0x182), 8)
+    assembler = Assembler((stream,), bench.joints, PERIOD_NS, bus_of=(0, 0, 1, 1))
+    for k in range(600):
+        if k in (200, 300):
+            assembler.silence(1, k == 200)
+        first = [] if 310 <= k < 330 else [(0x181, 7)] * (21 if k == 330 else 1)
+        first += [(0x182, k)]
+        assembler.push(frames_of(k, first), sent=k + 1, bus=0)
+        assembler.push(frames(0) if 200 <= k < 300 else frames_of(k, answers(k)), sent=k + 1, bus=1)
+    assembler.finish(600)
+    assert assembler.counters["samples.in_gaps"] == 100
+
+
+def test_a_foreign_master_that_was_held_up_at_its_first_syncs_is_one_master() -> None:
+    """The second bus is read when the first has had more SYNCs, with a pause among them."""
+    bench = Bench(buses=2, foreign=True)
+    held = [T0 + k * PERIOD_NS + (k >= 30) * 9 * PERIOD_NS for k in range(300)]
+    for first, last in ((0, 100), (100, 300)):
+        for bus in range(2):
+            some = np.concatenate([frames_of(k, answers(k), at_ns=held[k]) for k in range(first, last)])
+            bench._take(bench.assembler.push(some, bus=bus))
+    bench.finish(300)
+    assert bench.missing(300) == set()

@@ -1,0 +1,146 @@
+"""A configuration is reloaded where that can be done without losing a sample; all else is refused in one line."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from armident.configs import ConfigError, SessionConfig, load_robot, load_session
+from armident.configs.loading import HERE
+from armident.daq.capture.files import limits, open_series
+from armident.daq.capture.plan import Order
+from armident.daq.capture.reload import Reloader, differences
+from armident.daq.matching.streams import captured_streams
+from armident.daq.recording import read_recording
+from tests.unit.daq.test_recording import make_recording
+
+
+def cell(path: Path, **changes: Any) -> Path:
+    """The shipped session with changes of its first level, or of one below (``recording={...}``)."""
+    data = yaml.safe_load((HERE / "cells" / "tx40_cell.yaml").read_text())
+    data["robot"] = str(HERE / "robots" / "tx40.yaml")
+    data["setpoints"]["trajectory"] = str(HERE / "trajectories" / "tx40_excitation.yaml")
+    for drive in data["drives"]:
+        drive["eds"] = str(HERE / "eds" / "cia402_servo.eds")
+    for key, value in changes.items():
+        data[key] = {**data.get(key, {}), **value} if isinstance(value, dict) else value
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+class Capture:
+    """Something that is being captured, as far as a reload is concerned."""
+
+    def __init__(self, path: Path) -> None:
+        session = load_session(path)
+        robot = load_robot(session.robot)
+        self.order = Order(session, robot, captured_streams(session, robot), None, path.parent, config=path)
+        self.taken: list[SessionConfig] = []
+        self.said: list[str] = []
+        self.reloader = Reloader(path, self.order, [self.take], self.said.append)
+
+    def take(self, session: SessionConfig) -> None:
+        if session.metrics.port == 1:
+            raise ConfigError("metrics: 127.0.0.1:1 cannot be listened on")
+        self.taken.append(session)
+
+    def reload(self) -> str:
+        """Ask, and go on as a capture does until something was said."""
+        before = len(self.said)
+        self.reloader.ask()
+        until = time.monotonic() + 20
+        while len(self.said) == before and time.monotonic() < until:
+            self.reloader.apply()
+            time.sleep(0.005)
+        return self.said[-1]
+
+
+def test_what_can_change_does(tmp_path: Path) -> None:
+    capture = Capture(cell(tmp_path / "cell.yaml"))
+    cell(tmp_path / "cell.yaml", recording={"rotate_mb": 7.0, "keep_days": 3.0}, zenoh={"commands": True})
+    assert capture.reload().endswith("cell.yaml: recording.keep_days, recording.rotate_mb, zenoh.commands")
+    assert capture.taken[-1].recording.rotate_mb == 7.0
+    assert capture.reload().endswith("nothing has changed")
+    capture.reloader.close()
+
+
+def test_what_is_kept_around_an_event_changes_and_whether_only_events_are_written_does_not(tmp_path: Path) -> None:
+    path = tmp_path / "cell.yaml"
+    capture = Capture(cell(path, recording={"trigger": {"before_s": 5.0, "events": ["command"]}}))
+    cell(path, recording={"trigger": {"before_s": 8.0, "events": ["emcy"]}, "drain_ms": 10, "chunk_ms": 50})
+    said = capture.reload()
+    assert said.endswith(
+        ": recording.chunk_ms, recording.drain_ms, recording.trigger.before_s, recording.trigger.events"
+    )
+    trigger = capture.taken[-1].recording.trigger
+    assert trigger is not None
+    assert (trigger.before_s, trigger.events) == (8.0, ("emcy",))
+    cell(path)
+    assert "recording.trigger: cannot change while it is captured" in capture.reload()
+    capture.reloader.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"sync": {"period_us": 1000}}, "sync.period_us"),
+        ({"recording": {"directory": "elsewhere", "rotate_mb": 5.0}}, "recording.directory"),
+        ({"recording": {"trigger": {"before_s": 5.0}}}, "recording.trigger: cannot change"),
+        ({"zenoh": {"listen": ["tcp/127.0.0.1:7447"]}}, "zenoh.listen"),
+        ({"streams": {"samples": {"tpdo": 1, "objects": ["position", "current"]}}}, "streams.samples.objects"),
+        ({"heartbeat_ms": 50, "cell": "other"}, "cell, heartbeat_ms"),
+        ({"recordings": {}}, "recordings: unknown key; did you mean 'recording'?"),
+        ({"metrics": {"port": 1}}, "metrics: 127.0.0.1:1 cannot be listened on"),
+    ],
+)
+def test_what_cannot_change_is_refused_and_the_capture_goes_on(
+    changes: dict[str, Any], named: str, tmp_path: Path
+) -> None:
+    capture = Capture(cell(tmp_path / "cell.yaml"))
+    cell(tmp_path / "cell.yaml", **changes)
+    said = capture.reload()
+    assert said.startswith("warning: not reloaded, the capture goes on as before: ")
+    assert named in said
+    assert "\n" not in said
+    assert capture.taken == []
+    # And it can still be reloaded, once the file is right again.
+    cell(tmp_path / "cell.yaml", recording={"rotate_minutes": 1.0})
+    assert capture.reload().endswith("recording.rotate_minutes")
+    capture.reloader.close()
+
+
+def test_a_robot_that_changed_is_refused(tmp_path: Path) -> None:
+    robot = tmp_path / "robot.yaml"
+    robot.write_text((HERE / "robots" / "tx40.yaml").read_text())
+    capture = Capture(cell(tmp_path / "cell.yaml", robot=str(robot)))
+    robot.write_text(robot.read_text().replace("name: tx40", "name: tx41"))
+    assert "the robot cannot change while it is captured" in capture.reload()
+    capture.reloader.close()
+
+
+def test_differences_are_named_by_their_keys() -> None:
+    session = load_session("tx40_cell.yaml")
+    sync = session.sync.model_copy(update={"period_us": 400})
+    assert list(differences(session, session.model_copy(update={"sync": sync}))) == ["sync.period_us"]
+
+
+def test_no_row_is_lost_where_rotation_begins_in_the_middle(tmp_path: Path) -> None:
+    session = load_session("tx40_cell.yaml")
+    robot = load_robot(session.robot)
+    streams = captured_streams(session, robot)
+    samples = make_recording(3000).samples
+    with open_series(session, robot, streams, tmp_path, "capture", {}) as writer:
+        for first in range(0, samples.sync.size, 100):
+            if first == 1000:
+                options = session.recording.model_copy(update={"rotate_minutes": 0.1 / 60})
+                writer.limit(*limits(options))
+            part = slice(first, first + 100)
+            writer.turn(int(samples.t_ns[first]))
+            raw = {name: values[part] for name, values in samples.raw.items()}
+            writer.append("samples", samples.sync[part], samples.t_ns[part], raw)
+        writer.close({})
+    read = [read_recording(path) for path in writer.paths]
+    assert len(read) > 3
+    assert [n for part in read for n in part.samples.sync.tolist()] == samples.sync.tolist()

@@ -1,0 +1,225 @@
+"""A capture in several files, old files making room, and a disk that refuses."""
+
+import datetime
+import fcntl
+import resource
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armident.configs import ConfigError
+from armident.daq.recording import (
+    Mark,
+    QueuedSeries,
+    Recording,
+    RecordingSeries,
+    RecordingWriter,
+    StreamLayout,
+    heal_recording,
+    read_recording,
+)
+from armident.daq.recording.retention import Janitor, prune
+from tests.unit.daq.test_recording import make_recording
+
+NAME = "tx40-20260101T000000-000Z"
+
+
+def beginner(recording: Recording, chunk_ns: int = 20_000_000) -> Callable[[Path, int], RecordingWriter]:
+    joints = [joint.name for joint in recording.robot.joints]
+    layouts = [StreamLayout.of(stream, joints) for stream in recording.streams.values()]
+    return lambda path, part: RecordingWriter(
+        path, recording.robot, recording.session, 5000.0, layouts, {"part": str(part)}, chunk_ns
+    )
+
+
+def write(series: RecordingSeries | QueuedSeries, recording: Recording, step: int = 50) -> list[Path]:
+    """Append a recording as a capture does, in batches; the files that were finished on the way."""
+    finished = []
+    samples, demand = recording.streams["samples"], recording.streams["demand"]
+    for first in range(0, samples.sync.size, step):
+        part = slice(first, first + step)
+        finished.append(series.turn(int(samples.t_ns[part][0])))
+        for stream in (samples, demand):
+            here = (stream.sync >= samples.sync[part][0]) & (stream.sync <= samples.sync[part][-1])
+            rows = {name: values[here] for name, values in stream.raw.items()}
+            series.append(stream.name, stream.sync[here], stream.t_ns[here], rows)
+    return [path for path in finished if path is not None]
+
+
+@pytest.mark.parametrize(
+    "limits", [{"max_bytes": 60_000}, {"max_ns": 50_000_000}, {"max_bytes": 90_000, "max_ns": 10**8}]
+)
+def test_every_row_is_in_exactly_one_complete_file(tmp_path: Path, limits: dict[str, int]) -> None:
+    recording = make_recording(3000)
+    with RecordingSeries(beginner(recording), tmp_path, NAME, **limits) as series:
+        finished = write(series, recording)
+        series.close({"frames": 7})
+    assert [p.name for p in series.paths] == [f"{NAME}.{k:04d}.mcap" for k in range(1, len(series.paths) + 1)]
+    assert len(series.paths) > 3
+    assert finished == series.paths[:-1]
+    assert sorted(tmp_path.iterdir()) == series.paths
+    parts = [read_recording(path) for path in series.paths]
+    for number, part in enumerate(parts, start=1):
+        assert part.missing is None
+        assert heal_recording(series.paths[number - 1]).missing is None
+        assert part.metadata["part"] == str(number)
+    for part in parts[:-1]:
+        assert part.counters["samples.rows"] == part.samples.sync.size
+    assert parts[-1].counters == {"frames": 7}
+    for name, stream in recording.streams.items():
+        sync = np.concatenate([part.streams[name].sync for part in parts])
+        np.testing.assert_array_equal(sync, stream.sync[stream.sync <= recording.samples.sync[-1]])
+        for field, values in stream.raw.items():
+            together = np.concatenate([part.streams[name].raw[field] for part in parts])
+            np.testing.assert_array_equal(together, values[: sync.size])
+
+
+def test_without_limits_it_is_one_file_of_the_plain_name(tmp_path: Path) -> None:
+    recording = make_recording(300)
+    with RecordingSeries(beginner(recording), tmp_path, NAME) as series:
+        assert write(series, recording) == []
+        series.close({})
+    assert [p.name for p in tmp_path.iterdir()] == [f"{NAME}.mcap"]
+
+
+def test_where_no_new_file_can_be_begun_the_old_one_goes_on(tmp_path: Path) -> None:
+    recording = make_recording(3000)
+    begin = beginner(recording)
+    refused: list[Path] = []
+
+    def sometimes(path: Path, part: int) -> RecordingWriter:
+        if part == 2 and not refused:
+            refused.append(path)
+            raise ConfigError(f"{path}: cannot be written: No space left on device")
+        return begin(path, part)
+
+    with RecordingSeries(sometimes, tmp_path, NAME, max_bytes=60_000) as series:
+        write(series, recording)
+        problem = series.problem
+        series.close({})
+    assert refused
+    assert problem is not None
+    assert "No space left" in problem
+    # 0.6 s are less than the time until the next attempt: all is in the first file.
+    (part,) = [read_recording(path) for path in series.paths]
+    np.testing.assert_array_equal(part.samples.sync, recording.samples.sync)
+
+
+def test_a_full_disk_costs_rows_and_not_the_rest(tmp_path: Path) -> None:
+    recording = make_recording(6000)
+    mark = Mark("note", 2500, int(recording.samples.t_ns[0]), "said while it was full")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with RecordingSeries(beginner(recording), tmp_path, NAME) as series:
+        third = recording.samples.sync.size // 3
+        samples = recording.samples
+        for k in range(3):
+            if k == 1:
+                series.flush()
+                resource.setrlimit(resource.RLIMIT_FSIZE, (series.path.stat().st_size + 5_000, hard))
+                series.add_marks([mark])
+            part = slice(k * third, (k + 1) * third)
+            for first in range(k * third, (k + 1) * third, 100):
+                rows = slice(first, min(first + 100, part.stop))
+                values = {name: v[rows] for name, v in samples.raw.items()}
+                series.append("samples", samples.sync[rows], samples.t_ns[rows], values)
+            series.flush()
+            if k == 1:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        series.close({"writer.rows_lost": series.lost_rows})
+    read = read_recording(series.path)
+    assert read.missing is None
+    assert read.counters["writer.rows_lost"] == series.lost_rows > 0
+    assert read.samples.sync.size == 3 * third - series.lost_rows
+    kept = np.isin(samples.sync, read.samples.sync)
+    assert kept[:third].all()
+    assert kept[2 * third : 3 * third].all()
+    np.testing.assert_array_equal(read.samples.raw["position"], samples.raw["position"][kept])
+    # What is not there is in the gap list, and what was said meanwhile is there.
+    gaps = [g for g in read.gaps if g.reason == "not written"]
+    numbers = samples.sync[: 3 * third]
+    covered = np.any([(numbers >= g.first) & (numbers <= g.last) for g in gaps], axis=0)
+    np.testing.assert_array_equal(covered, ~kept[: 3 * third])
+    assert mark in read.marks
+
+
+def test_a_file_that_could_not_be_finished_has_its_gaps_told_by_the_next(tmp_path: Path) -> None:
+    recording = make_recording(3000)
+    samples, begin = recording.samples, beginner(recording)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with begin(tmp_path / "1.mcap", 1) as full, begin(tmp_path / "2.mcap", 2) as following:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (full.path.stat().st_size, hard))
+        try:
+            full.append("samples", samples.sync[:100], samples.t_ns[:100], {n: v[:100] for n, v in samples.raw.items()})
+            with pytest.raises(ConfigError):
+                full.close({})
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        following.take_over(full)
+        following.close({})
+    gaps = read_recording(tmp_path / "2.mcap").gaps
+    assert {gap.reason for gap in gaps} == {"not written"}
+    assert [k for gap in gaps for k in range(gap.first, gap.last + 1)] == samples.sync[:100].tolist()
+
+
+def made(directory: Path, stamp: str, name: str = "tx40", suffix: str = ".mcap") -> Path:
+    path = directory / f"{name}-{stamp}-000Z{suffix}"
+    path.write_bytes(b"x" * 100)
+    return path
+
+
+NOW = datetime.datetime(2026, 11, 20, 12, tzinfo=datetime.UTC)
+
+
+def test_recordings_are_deleted_for_their_age(tmp_path: Path) -> None:
+    old, damaged = made(tmp_path, "20261001T000000"), made(tmp_path, "20261002T000000", suffix=".0003.mcap.damaged")
+    young = made(tmp_path, "20261119T000000")
+    others = [
+        made(tmp_path, "20200101T000000", "tx40-left"),
+        made(tmp_path, "20200101T000000", suffix=".identification"),
+        tmp_path / "tx40-notes.mcap",
+    ]
+    others[-1].write_bytes(b"by hand")
+    assert prune(tmp_path, "tx40", NOW, 30.0, None) == [old, damaged]
+    assert sorted(tmp_path.iterdir()) == sorted([young, *others])
+
+
+def test_the_oldest_go_until_there_is_space_enough(tmp_path: Path) -> None:
+    paths = [made(tmp_path, f"202611{day:02d}T000000") for day in range(1, 9)]
+
+    def free(_: Path) -> int:
+        return 1000 - 100 * sum(path.exists() for path in paths)
+
+    assert prune(tmp_path, "tx40", NOW, None, 500, free) == paths[:3]
+    assert prune(tmp_path, "tx40", NOW, None, 500, free) == []
+
+
+def test_a_file_that_is_being_written_stays(tmp_path: Path) -> None:
+    first, second = made(tmp_path, "20261001T000000"), made(tmp_path, "20261002T000000")
+    with first.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert prune(tmp_path, "tx40", NOW, 30.0, None) == [second]
+    assert prune(tmp_path, "tx40", NOW, 30.0, None) == [first]
+
+
+def test_the_janitor_tells_what_it_deletes_and_a_problem_once() -> None:
+    said: list[str] = []
+    looked = threading.Semaphore(0)
+    problem = OSError(5, "Input/output error")
+    answers: list[list[Path] | OSError] = [[], problem, problem, [Path("a.mcap")]]
+
+    def look() -> list[Path]:
+        looked.release()
+        answer = answers.pop() if answers else []
+        if isinstance(answer, OSError):
+            raise answer
+        return answer
+
+    janitor = Janitor(look, said.append, every_s=0.001)
+    for _ in range(6):
+        assert looked.acquire(timeout=10)
+    janitor.close()
+    assert janitor.deleted == 1
+    assert said == ["deleted a.mcap (retention)", "warning: retention: [Errno 5] Input/output error"]

@@ -1,0 +1,39 @@
+"""Readers of other tools' files run apart: what they return arrives, and what becomes of them is said."""
+
+import os
+import signal
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from armident.daq.interchange.sandbox import apart
+
+
+def test_arrays_arrive_and_what_is_none_stays_behind() -> None:
+    found = apart(lambda: {"q": np.arange(6.0).reshape(3, 2), "name": "x", "words": np.array(["a"]), "i": np.arange(3)})
+    assert found.keys() == {"q", "i"}
+    assert np.array_equal(found["q"], np.arange(6.0).reshape(3, 2))
+
+
+def refuse() -> dict[str, Any]:
+    raise KeyError("no such\nthing")
+
+
+def crash() -> dict[str, Any]:
+    os.kill(os.getpid(), signal.SIGSEGV)
+    return {}
+
+
+def hang() -> dict[str, Any]:
+    time.sleep(100)
+    return {}
+
+
+@pytest.mark.parametrize(("read", "words"), [(refuse, "no such"), (crash, "SIGSEGV"), (hang, "SIGKILL")])
+def test_a_reader_that_fails_is_told_of(read: Any, words: str) -> None:
+    begin = time.monotonic()
+    with pytest.raises(ValueError, match=words):
+        apart(read, longest_s=1.0)
+    assert time.monotonic() - begin < 60

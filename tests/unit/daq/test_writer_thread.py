@@ -1,0 +1,307 @@
+"""A series that is written by a thread of its own: nobody waits for the disk, and what it has no time for is told."""
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armident.configs import ConfigError
+from armident.configs.schema.session import RecordingOptions
+from armident.daq.capture.files import gathered
+from armident.daq.recording import (
+    Gap,
+    Mark,
+    QueuedSeries,
+    RecordingSeries,
+    Stream,
+    TriggeredSeries,
+    join_parts,
+    read_recording,
+)
+from armident.daq.recording import writer_thread as queued
+from armident.daq.recording.lost_rows import NOT_WRITTEN
+from tests.unit.daq.test_recording import make_recording
+from tests.unit.daq.test_rotation import NAME, beginner, write
+
+EVERY = {"samples": 1, "demand": 5}
+CHUNK_NS = 20_000_000
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """Whether the disk works; while it does not, it keeps whoever writes waiting."""
+    works, sync = threading.Event(), os.fdatasync
+    works.set()
+
+    def held(descriptor: int) -> None:
+        works.wait()
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", held)
+    yield works
+    works.set()
+
+
+def append(series: QueuedSeries, stream: Stream, first: int, last: int) -> None:
+    """Add the rows from SYNC ``first`` on, and before ``last``."""
+    here = (stream.sync >= first) & (stream.sync < last)
+    rows = {name: values[here] for name, values in stream.raw.items()}
+    series.append(stream.name, stream.sync[here], stream.t_ns[here], rows)
+
+
+def until(true: Callable[[], bool]) -> None:
+    """Wait for something that another thread does."""
+    deadline = time.monotonic() + 30
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_every_row_is_in_exactly_one_file_as_without_a_thread(tmp_path: Path) -> None:
+    recording = make_recording(3000)
+    series = QueuedSeries(
+        RecordingSeries(beginner(recording, 2 * CHUNK_NS), tmp_path, NAME, max_bytes=60_000), EVERY, CHUNK_NS
+    )
+    with series:
+        write(series, recording)
+        series.add_gaps([Gap("samples", 3003, 3003, "joint_1", "no answer")], int(recording.samples.t_ns[-1]))
+        series.add_marks([Mark("note", 17, int(recording.samples.t_ns[14]), "here")])
+        series.close({"frames": 7})
+    assert len(series.paths) > 3
+    parts = [read_recording(path) for path in series.paths]
+    assert all(part.missing is None for part in parts)
+    assert parts[-1].counters == {"frames": 7}
+    assert [mark.text for part in parts for mark in part.marks] == ["here"]
+    assert [gap.first for part in parts for gap in part.gaps] == [3003]
+    whole = join_parts(parts)
+    for name, stream in recording.streams.items():
+        assert np.array_equal(whole.streams[name].sync, stream.sync)
+        for field, values in stream.raw.items():
+            assert np.array_equal(whole.streams[name].raw[field], values)
+
+
+def test_a_killed_capture_loses_no_more_than_a_chunk(tmp_path: Path) -> None:
+    recording = make_recording(1500)
+    series = QueuedSeries(RecordingSeries(beginner(recording, 2 * CHUNK_NS), tmp_path, NAME), EVERY, CHUNK_NS)
+    with series:
+        for first in range(0, 1500, 10):
+            append(series, recording.samples, first, first + 10)
+            until(lambda: series.waiting_rows == 0)
+            # What is on the disk by now, if it ended here.
+            rows = read_recording(series.paths[0]).samples.t_ns if first > 150 else None
+            assert rows is None or recording.samples.t_ns[first] - rows[-1] <= CHUNK_NS + 2_000_000
+
+
+def test_a_disk_that_stands_still_costs_no_row(tmp_path: Path, disk: threading.Event) -> None:
+    recording = make_recording(3000)
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
+    with series:
+        disk.clear()
+        begun = time.monotonic()
+        write(series, recording)
+        # All of it was taken, though not one chunk is on the disk.
+        assert 3000 <= series.waiting_rows <= 3600
+        assert series.lost_rows == 0
+        assert time.monotonic() - begun < 30
+        disk.set()
+        series.flush()
+        assert series.waiting_rows == 0
+        series.close({})
+    (path,) = series.paths
+    assert read_recording(path).samples.sync.tolist() == recording.samples.sync.tolist()
+
+
+def test_what_has_waited_is_not_written_all_at_once(tmp_path: Path, disk: threading.Event) -> None:
+    """Whoever drains the buses wants the processor, too, when the disk is back."""
+    recording = make_recording(1500)
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
+    with series:
+        disk.clear()
+        # At least as long as they took at 5 kHz: 0.3 s.
+        for first in range(0, 1500, 25):
+            append(series, recording.samples, first, first + 25)
+            time.sleep(0.005)
+        disk.set()
+        begun = time.monotonic()
+        until(lambda: series.waiting_rows == 0)
+        assert time.monotonic() - begun > 0.08
+        series.close({})
+    (path,) = series.paths
+    sync = recording.samples.sync
+    assert read_recording(path).samples.sync.tolist() == sync[sync < 1500].tolist()
+
+
+def test_a_clock_that_is_set_keeps_nothing_waiting(tmp_path: Path, disk: threading.Event) -> None:
+    recording = make_recording(1500)
+    stream = recording.samples
+    stream.t_ns[700:] += 3_600_000_000_000
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
+    with series:
+        disk.clear()
+        for first in range(0, 1500, 50):
+            append(series, stream, first, first + 50)
+        disk.set()
+        until(lambda: series.waiting_rows == 0)
+        series.close({})
+    (path,) = series.paths
+    assert read_recording(path).samples.sync.tolist() == stream.sync[stream.sync < 1500].tolist()
+
+
+def test_the_end_waits_for_nothing_but_the_disk(
+    tmp_path: Path, disk: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the pace of this test what has waited would take hours."""
+    monkeypatch.setattr(queued, "CATCH_UP", 1e-7)
+    recording = make_recording(3000)
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
+    with series:
+        disk.clear()
+        write(series, recording)
+        disk.set()
+        series.close({})
+    (path,) = series.paths
+    assert read_recording(path).samples.sync.tolist() == recording.samples.sync.tolist()
+
+
+def test_rows_are_gathered_for_as_long_as_was_said_last(tmp_path: Path) -> None:
+    recording = make_recording(1500)
+    series = QueuedSeries(RecordingSeries(beginner(recording, 2 * CHUNK_NS), tmp_path, NAME), EVERY, CHUNK_NS)
+    sizes = []
+    with series:
+        for first in range(0, 1500, 10):
+            if first == 750:
+                series.gather(CHUNK_NS // 4)
+            append(series, recording.samples, first, first + 10)
+            until(lambda: series.waiting_rows == 0)
+            sizes.append(series.paths[0].stat().st_size)
+        series.close({})
+    # A period is 0.2 ms: ten chunks of 100 rows, then of 25 to 30.
+    assert np.count_nonzero(np.diff(sizes[:70])) in (6, 7)
+    assert np.count_nonzero(np.diff(sizes[80:])) >= 20
+    assert gathered(RecordingOptions(chunk_ms=100, drain_ms=20)) == 50_000_000
+    assert gathered(RecordingOptions(chunk_ms=100, drain_ms=100)) == 25_000_000
+
+
+@pytest.mark.parametrize("limits", [{}, {"max_bytes": 60_000}])
+def test_rows_for_which_there_is_no_room_are_counted_and_become_gaps(
+    tmp_path: Path, disk: threading.Event, limits: dict[str, int]
+) -> None:
+    recording = make_recording(3000)
+    samples, demand = recording.samples, recording.streams["demand"]
+    inner = RecordingSeries(beginner(recording), tmp_path, NAME, **limits)
+    series, lost = QueuedSeries(inner, EVERY, CHUNK_NS, most_bytes=50_000), [0]
+    with series:
+        append(series, samples, 0, 500)
+        series.flush()
+        disk.clear()
+        for first in range(500, 2500, 50):
+            append(series, samples, first, first + 50)
+            append(series, demand, first, first + 50)
+            lost.append(series.lost_rows)
+        assert lost[-1] > 1000
+        assert series.problem is not None
+        assert series.problem.endswith("the disk stands still")
+        disk.set()
+        until(lambda: series.waiting_rows == 0)
+        for first in range(2500, 3000, 50):
+            series.turn(int(samples.t_ns[first]))
+            append(series, samples, first, first + 50)
+            lost.append(series.lost_rows)
+            until(lambda: series.waiting_rows == 0)
+        series.flush()
+        lost.append(series.lost_rows)
+        series.close({})
+    assert lost == sorted(lost)
+    parts = [read_recording(path) for path in series.paths]
+    assert len(parts) == 1 if not limits else len(parts) > 1
+    gaps = [gap for part in parts for gap in part.gaps]
+    (missing,) = [gap for gap in gaps if gap.stream == "samples"]
+    (fewer,) = [gap for gap in gaps if gap.stream == "demand"]
+    assert missing.reason == fewer.reason == NOT_WRITTEN
+    assert 500 < missing.first < missing.last < 2500
+    assert lost[-1] == missing.last - missing.first + 1 + (fewer.last - fewer.first) // 5 + 1
+    left_out = np.arange(missing.first, missing.last + 1)
+    assert np.isin(left_out, samples.sync).all()
+    kept = np.concatenate([part.samples.sync for part in parts])
+    assert np.array_equal(np.sort(np.concatenate([kept, left_out])), samples.sync[samples.sync < 3000])
+
+
+def test_an_event_tells_what_its_last_seconds_lack(tmp_path: Path, disk: threading.Event) -> None:
+    recording = make_recording(3000)
+    inner = TriggeredSeries(
+        lambda number: RecordingSeries(beginner(recording), tmp_path, f"event{number}"), 10**9, 10**8
+    )
+    series = QueuedSeries(inner, EVERY, CHUNK_NS, most_bytes=50_000)
+    with series:
+        append(series, recording.samples, 0, 200)
+        series.trigger(int(recording.samples.t_ns[199]))
+        series.flush()
+        disk.clear()
+        # The end of the first event waits for the disk, and what comes behind it for that.
+        for first in range(200, 2500, 50):
+            series.turn(int(recording.samples.t_ns[first]))
+            append(series, recording.samples, first, first + 50)
+        assert series.lost_rows > 0
+        disk.set()
+        until(lambda: series.waiting_rows == 0)
+        series.turn(int(recording.samples.t_ns[2500]))
+        append(series, recording.samples, 2500, 3000)
+        series.trigger(int(recording.samples.t_ns[2999]))
+        series.flush()
+        lost = series.lost_rows
+        series.close({})
+    parts = [read_recording(path) for path in series.paths]
+    gaps = {gap for part in parts for gap in part.gaps}
+    assert {gap.reason for gap in gaps} == {NOT_WRITTEN}
+    assert sum(gap.last - gap.first + 1 for gap in gaps) == lost
+    left_out = np.concatenate([np.arange(gap.first, gap.last + 1) for gap in sorted(gaps, key=lambda g: g.first)])
+    written = recording.samples.sync[recording.samples.sync < 3000]
+    kept = np.unique(np.concatenate([part.samples.sync for part in parts]))
+    assert np.array_equal(np.sort(np.concatenate([kept, left_out])), written)
+
+
+def test_gaps_and_marks_wait_for_the_disk_however_many_rows_do(tmp_path: Path, disk: threading.Event) -> None:
+    recording = make_recording(1000)
+    gap = Gap("samples", 1000, 1007, "joint_1", "no answer")
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS, most_bytes=10_000)
+    with series:
+        disk.clear()
+        for first in range(0, 1000, 50):
+            append(series, recording.samples, first, first + 50)
+        series.add_gaps([gap], int(recording.samples.t_ns[-1]))
+        disk.set()
+        series.flush()
+        series.close({})
+    assert gap in read_recording(series.paths[0]).gaps
+
+
+def test_what_fails_in_the_thread_is_raised_where_rows_come_from(tmp_path: Path) -> None:
+    recording = make_recording(100)
+    with QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), {"samples": 1}, CHUNK_NS) as series:
+        series.append("another", np.arange(3), np.arange(3), {})
+        with pytest.raises(KeyError, match="another"):
+            series.flush()
+        with pytest.raises(KeyError, match="another"):
+            append(series, recording.samples, 0, 50)
+
+
+def test_a_disk_that_does_not_take_the_end_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = make_recording(100)
+    with QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS) as series:
+        append(series, recording.samples, 0, 50)
+
+        def refuse(descriptor: int) -> None:
+            raise OSError(5, "Input/output error")
+
+        monkeypatch.setattr(os, "fsync", refuse)
+        with pytest.raises(ConfigError, match="could not be finished: Input/output error"):
+            series.close({})
+
+
+def test_nothing_is_left_of_a_capture_that_did_not_begin(tmp_path: Path) -> None:
+    QueuedSeries(RecordingSeries(beginner(make_recording(100)), tmp_path, NAME), EVERY, CHUNK_NS).abort()
+    assert list(tmp_path.iterdir()) == []

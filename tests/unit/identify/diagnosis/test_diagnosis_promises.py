@@ -1,0 +1,190 @@
+"""What a diagnosis promises: a model that is right, numbers told from structure, effects of other packages."""
+
+import json
+import os
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.daq.recording import Recording, write_recording
+from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
+from armident.identify.document import Finding, IdentificationDocument
+from armident.identify.identification.api import identify_recording
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.virtual_robot.offline import simulate_recording
+
+ARMIDENT = [sys.executable, "-m", "armident.daq.cli"]
+PLUGIN = '''
+import numpy as np
+from armident.identify.effects.effect import Effect, Linear, Shape
+
+
+def columns(motion, place, position):
+    """Torque (N, 1) per unit of height: a bell 10 mm wide around a position."""
+    return np.exp(-0.5 * ((motion.q[:, place.joint, None] - position) / 0.01) ** 2)
+
+
+TIGHT_SPOT = Effect(
+    name="tight_spot", title="a tight spot", says="something pushes back near one position",
+    reference="the machine's log book", linear=(Linear("height", ("N m", "N")),), columns=columns,
+    needs="motion across the spot",
+    shapes=(Shape("position", ("rad", "m"), lambda motion, joint: tuple(0.01 * k for k in range(1, 12))),),
+)
+'''
+
+
+def recorded(
+    robot: RobotConfig, seed: int, *effects: HiddenEffect, trajectory: str = "tx40_excitation", repeats: int = 2
+) -> Recording:
+    scenario = Scenario(schema="armident/scenario/1", effects=effects) if effects else None
+    once: Trajectory = load_trajectory(f"trajectories/{trajectory}.yaml")
+    moves = once.model_copy(update={"moves": once.moves * repeats})
+    return simulate_recording(robot, moves, seed, scenario=scenario, period=1e-3)
+
+
+def diagnosed(recording: Recording, robot: RobotConfig, baseline: IdentificationDocument | None = None) -> Diagnosis:
+    experiments, notes = experiments_from_recording(recording, robot)
+    return diagnose(experiments, [], robot, notes=notes, baseline=baseline)
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.1}),
+        HiddenEffect(effect="joint_spring", joint="joint_1", parameters={"stiffness": 60.0}),
+    ],
+    ids=lambda hidden: str(hidden.effect),
+)
+def test_the_resulting_model_has_no_gap_on_a_new_recording(hidden: HiddenEffect) -> None:
+    robot = load_robot("emps")
+    first = diagnosed(recorded(robot, 1, hidden, trajectory="emps_1", repeats=1), robot)
+    assert [f.effect for f in first.document.findings] == [hidden.effect]
+    again = diagnosed(recorded(robot, 2, hidden, trajectory="emps_1", repeats=1), first.robot)
+    assert again.document.verdict == "no_gap"
+
+
+def test_what_could_hide_does_up_to_the_size_that_is_told_and_no_further() -> None:
+    robot = load_robot("emps")
+    told = diagnosed(recorded(robot, 1, trajectory="emps_1", repeats=1), robot).document
+    assert told.verdict == "no_gap"
+    (spring,) = [h for h in told.could_hide if h.effect == "joint_spring"]
+    for share, found in ((0.2, []), (2.0, ["joint_spring"])):
+        stiffness = share * spring.below["ks"]
+        hidden = HiddenEffect(effect="joint_spring", joint="joint_1", parameters={"stiffness": stiffness})
+        document = diagnosed(recorded(robot, 2, hidden, trajectory="emps_1", repeats=1), robot).document
+        assert [f.effect for f in document.findings] == found, share
+
+
+@cache
+def baseline() -> IdentificationDocument:
+    robot = load_robot("tx40")
+    return identify_recording(recorded(robot, 100), robot).document
+
+
+def against_baseline(seed: int, *effects: HiddenEffect) -> list[Finding]:
+    robot = load_robot("tx40")
+    return diagnosed(recorded(robot, seed, *effects), robot, baseline()).document.findings
+
+
+@pytest.mark.slow
+def test_other_friction_of_one_joint_is_another_number_and_no_structure() -> None:
+    cold = HiddenEffect(effect="friction_scale", joint="joint_3", parameters={"factor": 1.3})
+    (finding,) = against_baseline(3, cold)
+    assert (finding.kind, finding.effect, finding.joint) == ("numbers", "friction_change", "joint_3")
+
+
+@pytest.mark.slow
+def test_a_structural_effect_is_no_other_number() -> None:
+    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
+    (finding,) = against_baseline(4, worn)
+    assert (finding.kind, finding.effect, finding.joint) == ("structure", "asymmetric_viscous_friction", "joint_2")
+
+
+@pytest.mark.slow
+def test_the_gain_of_one_drive_is_named() -> None:
+    gain = HiddenEffect(effect="drive_gain_error", joint="joint_2", parameters={"error": 0.1})
+    findings = [f for f in against_baseline(5, gain) if f.effect == "drive_gain_error"]
+    assert [f.joint for f in findings] == ["joint_2"]
+
+
+@pytest.mark.slow
+def test_a_drive_that_gives_twice_its_torque_is_sized_by_what_the_model_with_it_predicts() -> None:
+    """Of the torque that the model without it predicts, which reports half of it, it would be another share."""
+    robot = load_robot("tx40")
+    gain = HiddenEffect(effect="drive_gain_error", joint="joint_1", parameters={"error": 0.96})
+    document = diagnosed(recorded(robot, 8, gain, trajectory="tx40_1", repeats=3), robot).document
+    (finding,) = document.findings
+    assert (finding.effect, finding.joint) == ("drive_gain_error", "joint_1")
+    std = finding.evidence["std"]["gain_error"]
+    assert finding.parameters["gain_error"] == pytest.approx(-0.96 / 1.96, abs=3.0 * std)
+    assert document.simulated is not None
+    before, after = (document.simulated[when]["joint_1"] for when in ("torque_before", "torque_after"))
+    assert after < before
+
+
+@pytest.mark.slow
+def test_like_joints_that_were_exchanged_are_found_though_nothing_else_is_amiss() -> None:
+    robot = load_robot("tx40")
+    both = {"position": 1.0, "torque": 1.0}
+    exchanged = HiddenEffect(effect="joint_order", joint="joint_4", other="joint_5", parameters=both)
+    document = diagnosed(recorded(robot, 5, exchanged, trajectory="tx40_4", repeats=3), robot).document
+    assert [(f.effect, f.joint, f.other) for f in document.findings] == [("joint_order", "joint_4", "joint_5")]
+
+
+@pytest.mark.slow
+def test_a_base_that_was_tilted_is_named() -> None:
+    tilted = HiddenEffect(effect="gravity_direction", joint="joint_1", parameters={"tilt": 0.05, "azimuth": 0.7})
+    assert [f.effect for f in against_baseline(6, tilted)] == ["gravity_direction"]
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> dict[str, str]:
+    """Environment in which a distribution of somebody else's is installed, which brings one effect along."""
+    site = tmp_path / "site"
+    info = site / "tight_spots-1.0.dist-info"
+    info.mkdir(parents=True)
+    (site / "tight_spots.py").write_text(PLUGIN)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tight-spots\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[armident.effects]\ntight_spot = tight_spots:TIGHT_SPOT\n")
+    paths = [str(site), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+def test_an_effect_of_somebody_else_is_listed(elsewhere: dict[str, str]) -> None:
+    listed = subprocess.run(
+        [*ARMIDENT, "effects", "tight_spot"], env=elsewhere, capture_output=True, text=True, check=True
+    )
+    assert "something pushes back near one position" in listed.stdout
+    without = subprocess.run([*ARMIDENT, "effects", "tight_spot"], capture_output=True, text=True, check=False)
+    assert without.returncode == 2
+
+
+def test_an_effect_of_somebody_else_is_found_by_name(elsewhere: dict[str, str], tmp_path: Path) -> None:
+    robot = load_robot("emps")
+    bump = HiddenEffect(
+        effect="torque_bump", joint="joint_1", parameters={"torque": 3.0, "position": 0.06, "width": 0.01}
+    )
+    file = tmp_path / "bump.mcap"
+    write_recording(recorded(robot, 7, bump, trajectory="emps_1", repeats=1), file)
+
+    def run(environment: dict[str, str]) -> dict[str, object]:
+        done = subprocess.run(
+            [*ARMIDENT, "diagnose", str(file), "--out", str(tmp_path / "out"), "--json"],
+            env=environment, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 4, done.stderr
+        document: dict[str, object] = json.loads(done.stdout)
+        return document
+
+    findings = run(elsewhere)["findings"]
+    assert isinstance(findings, list)
+    assert [(f["effect"], f["joint"]) for f in findings] == [("tight_spot", "joint_1")]
+    parameters, std = findings[0]["parameters"], findings[0]["evidence"]["std"]
+    # The torque works against the joint.
+    assert abs(parameters["height"]) == pytest.approx(3.0, abs=4 * std["height"])
+    assert parameters["position"] == pytest.approx(0.06, abs=0.003)

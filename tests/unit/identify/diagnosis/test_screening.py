@@ -1,0 +1,115 @@
+"""Grids of candidates are looked at all at once, and every shape gets what it would get by itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armident.configs import load_robot, load_trajectory
+from armident.configs.schema.robot import Effect
+from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.identify.diagnosis.candidates import Workshop, candidates
+from armident.identify.diagnosis.foretold import foretold
+from armident.identify.diagnosis.regression import Fit, Products
+from armident.identify.diagnosis.state import refit
+from armident.identify.diagnosis.study import Study, build_study
+from armident.identify.diagnosis.trial import directions_beside, noise_with, score_statistics
+from armident.identify.diagnosis.whitening import joints_of
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.virtual_robot.offline import simulate_recording
+
+DELAY = 0.006
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fit:
+    """TX40 whose third torque is recorded late, at 1 kHz."""
+    robot, trajectory = load_robot("tx40"), load_trajectory("trajectories/tx40_excitation.yaml")
+    hidden = HiddenEffect(effect="time_delay", joint="joint_3", parameters={"delay": DELAY})
+    scenario = Scenario(schema="armident/scenario/1", effects=(hidden,))
+    recording = simulate_recording(robot, trajectory, 2, scenario=scenario, period=1e-3, setpoint_every=1)
+    experiments, _ = experiments_from_recording(recording, robot)
+    return refit(build_study(experiments, [], robot), robot, None)[1]
+
+
+@pytest.mark.parametrize(
+    "name", ["stribeck_friction", "coupling_friction", "cogging_torque", "joint_elasticity", "time_delay"]
+)
+def test_every_shape_of_a_grid_gets_the_statistic_that_it_has_by_itself(fitted: Fit, name: str) -> None:
+    """By the projection of the residual on the instruments beside the model, made for one shape alone."""
+    bench = Workshop(fitted.study, fitted.theta)
+    candidate = next(c for c in candidates(bench) if c.effect.name == name)
+    grid = candidate.grid[:6]
+    columns = bench.grid(candidate.effect, candidate.place, grid, fitted.noise)
+    found = score_statistics(fitted, columns, len(grid))
+    for shapes, statistic in zip(grid, found, strict=True):
+        basis = directions_beside(fitted, bench.instruments(candidate.effect, candidate.place, shapes, fitted.noise))
+        assert basis is not None
+        alone = float(np.sum((basis[0].T @ fitted.residual) ** 2))
+        # Through Gram matrices: directions of a thousandth of the columns are kept, so six digits of the square are.
+        assert statistic == pytest.approx(alone, rel=1e-5, abs=1e-6)
+
+
+def test_a_shape_without_an_effect_has_no_statistic_and_spoils_no_other(fitted: Fit) -> None:
+    columns = np.random.default_rng(0).standard_normal((fitted.products.rows[2].shape[0], 4))
+    whole = score_statistics(fitted, [(2, columns)], 4)
+    columns[:, 1], columns[5, 2] = 0.0, np.nan
+    found = score_statistics(fitted, [(2, columns)], 4)
+    np.testing.assert_array_equal(np.isnan(found), [False, True, True, False])
+    np.testing.assert_allclose(found[[0, 3]], whole[[0, 3]], rtol=1e-9)
+    assert np.isnan(score_statistics(fitted, [], 3)).all()
+
+
+def test_products_are_made_anew_only_where_the_noise_is_another(fitted: Fit) -> None:
+    noise = list(fitted.noise)
+    noise[4] = replace(noise[4], variance=2.0 * noise[4].variance)
+    known = Products.of(fitted.equations, noise, fitted.products)
+    fresh = Products.of(fitted.equations, noise)
+    assert [a is b for a, b in zip(known.rows, fitted.products.rows, strict=True)] == [j != 4 for j in range(6)]
+    np.testing.assert_array_equal(known.zx, fresh.zx)
+    np.testing.assert_array_equal(known.zz, fresh.zz)
+    np.testing.assert_array_equal(known.zy, fresh.zy)
+
+
+def test_the_noise_of_joints_that_a_candidate_leaves_alone_stays(fitted: Fit) -> None:
+    bench = Workshop(fitted.study, fitted.theta)
+    candidate = next(c for c in candidates(bench) if c.effect.name == "joint_spring" and c.place.joint == 5)
+    away = np.zeros(fitted.theta.size)
+    found = noise_with(fitted, candidate, (), bench, np.array([0.5]), away)
+    assert [a is b for a, b in zip(found, fitted.noise, strict=True)] == [True] * 5 + [False]
+    # What the model's own parameters absorb of it changes other joints, too.
+    away[:] = 0.1 * fitted.theta
+    found = noise_with(fitted, candidate, (), bench, np.array([0.5]), away)
+    assert not any(a is b for a, b in zip(found, fitted.noise, strict=True))
+
+
+def test_joints_are_those_with_a_number_that_is_not_zero() -> None:
+    columns = np.zeros((50, 4, 2))
+    columns[49, 1, 1], columns[0, 3, 0] = 1e-300, np.nan
+    assert joints_of(columns) == [1, 3]
+    assert joints_of(columns.transpose(0, 1, 2)[:, ::-1]) == [0, 2]
+
+
+def late(study: Study, delay: float, joint: str = "joint_3") -> Study:
+    """The recordings put right by a delay."""
+    stanza = Effect(effect="time_delay", joint=joint, parameters={"delay": delay})
+    return study.of_robot(study.robot.model_copy(update={"effects": (stanza,)}))
+
+
+def test_putting_a_late_torque_right_foretells_less_error_at_its_joint_only(fitted: Fit) -> None:
+    study, right = refit(fitted.study, late(fitted.study, DELAY).robot, fitted)
+    found = foretold(fitted.study, fitted.theta, study, right.theta)
+    assert found is not None
+    before, after = (np.sum(np.concatenate(part) ** 2, axis=0) for part in (found.before, found.after))
+    assert after[2] < 0.97 * before[2]
+    np.testing.assert_allclose(after[[0, 3, 4, 5]], before[[0, 3, 4, 5]], rtol=0.02)
+    # Twice as late is as wrong on the other side.
+    study, wrong = refit(fitted.study, late(fitted.study, 3.0 * DELAY).robot, fitted)
+    other = foretold(fitted.study, fitted.theta, study, wrong.theta)
+    assert other is not None
+    assert np.sum(np.concatenate(other.after)[:, 2] ** 2) > 0.97 * np.sum(np.concatenate(other.before)[:, 2] ** 2)
+
+
+def test_nothing_is_foretold_of_a_model_that_undoes_what_had_been_put_right(fitted: Fit) -> None:
+    study, right = refit(fitted.study, late(fitted.study, DELAY).robot, fitted)
+    assert foretold(study, right.theta, fitted.study, fitted.theta) is None

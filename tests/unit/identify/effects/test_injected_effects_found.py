@@ -1,0 +1,135 @@
+"""Every effect hidden in a virtual arm, in a form of its own, comes out first by name and place."""
+
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.identify.diagnosis.search import Search
+from armident.identify.diagnosis.state import Settings
+from armident.identify.diagnosis.study import build_study
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.virtual_robot.offline import simulate_recording
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+PERIOD = 1e-3
+
+
+@dataclass(frozen=True)
+class Case:
+    """An effect at a place; ``truth`` holds linear parameters that the arm and the catalogue define alike.
+
+    ``leave_out`` is what the configuration does not know of an arm that is as it always was.
+    """
+
+    robot: str
+    effect: str
+    joint: str
+    parameters: dict[str, float] = field(default_factory=dict)
+    truth: dict[str, float] = field(default_factory=dict)
+    other: str | None = None
+    leave_out: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.robot}-{self.effect}-{self.joint}"
+
+
+TX40 = (
+    Case("tx40", "asymmetric_viscous_friction", "joint_2", {"ratio": 0.1}, {"fva": 0.55}),
+    Case("tx40", "asymmetric_coulomb_friction", "joint_2", {"ratio": 0.3}),
+    Case("tx40", "nonlinear_viscous_friction", "joint_1", {"thinning": 0.2}),
+    Case("tx40", "load_dependent_friction", "joint_3", {"coefficient": 0.2}, {"fcl": 0.2}),
+    Case("tx40", "presliding_friction", "joint_1", {"deflection": 0.03}),
+    Case("tx40", "position_dependent_friction", "joint_4", {"ratio": 0.2}, {"fpc": 0.514, "fps": 0.0}),
+    Case("tx40", "friction_drift", "joint_1", {"change": 0.25}),
+    Case("tx40", "coupling_friction", "joint_1", {"coulomb": 0.7, "viscous": 0.2}, {"fcc": 0.7, "fvc": 0.2}, "joint_2"),
+    Case("tx40", "cogging_torque", "joint_5", {"amplitude": 0.45, "phase": 0.5}, {"cgc": 0.2157, "cgs": 0.3949}),
+    Case("tx40", "joint_spring", "joint_2", {"stiffness": 4.0}, {"ks": 4.0}),
+    Case("tx40", "joint_elasticity", "joint_1", {"stiffness": 3400.0}),
+    Case("tx40", "backlash", "joint_1", {"gap": 0.0125}),
+    Case("tx40", "rotor_inertia", "joint_4", truth={"iax": 0.03}, leave_out="rotor_inertia"),
+    Case("tx40", "coupling_friction", "joint_5", other="joint_6", leave_out="couplings"),
+    Case("tx40", "gravity_direction", "joint_1", {"tilt": 0.06}, {"tilt_x": 0.0, "tilt_y": 0.06}),
+    Case("tx40", "drive_gain_error", "joint_3", {"error": 0.2}, {"gain_error": -0.2 / 1.2}),
+    Case("tx40", "drive_gain_saturation", "joint_2", {"drop": 0.05}),
+    Case("tx40", "time_delay", "joint_2", {"delay": 0.004}, {"delay": 0.004}),
+    Case("tx40", "actuator_bandwidth", "joint_1", {"time_constant": 0.005}, {"lag": 0.005}),
+)
+STRIBECK = Case("tx40", "stribeck_friction", "joint_5", {"extra": 1.2, "velocity": 0.36})
+EMPS = (
+    Case("emps", "asymmetric_viscous_friction", "joint_1", {"ratio": 0.05}),
+    Case("emps", "load_dependent_friction", "joint_1", {"coefficient": 0.03}, {"fcl": 0.03}),
+    Case("emps", "presliding_friction", "joint_1", {"deflection": 0.001}),
+    Case("emps", "position_dependent_friction", "joint_1", {"ratio": 0.05}),
+    Case("emps", "friction_drift", "joint_1", {"change": 0.1}),
+    Case("emps", "cogging_torque", "joint_1", {"amplitude": 1.0}),
+    Case("emps", "encoder_eccentricity", "joint_1", {"amplitude": 5e-5, "motor": 1.0}),
+    Case("emps", "backlash", "joint_1", {"gap": 3e-4}),
+    Case("emps", "joint_spring", "joint_1", {"stiffness": 20.0}, {"ks": 20.0}),
+    Case("emps", "time_delay", "joint_1", {"delay": 0.003}, {"delay": 0.003}),
+)
+
+
+def trajectory(name: str) -> Trajectory:
+    """The excitation; of the TX40 three times, so that something can be learnt and something be judged."""
+    once = load_trajectory(f"trajectories/{name}_excitation.yaml")
+    return once.model_copy(update={"moves": once.moves * (3 if name == "tx40" else 1)})
+
+
+def known_of(case: Case) -> RobotConfig:
+    """The configuration of the arm, without what the case leaves out."""
+    robot = load_robot(case.robot)
+    if case.leave_out == "couplings":
+        return robot.model_copy(update={"couplings": ()})
+    if case.leave_out == "rotor_inertia":
+        joints = [
+            joint.model_copy(update={"rotor_inertia": False}) if joint.name == case.joint else joint
+            for joint in robot.joints
+        ]
+        return robot.model_copy(update={"joints": tuple(joints), "initial_parameters": {}})
+    return robot
+
+
+@cache
+def healthy(robot: str) -> Any:
+    """Trials beside the model of a healthy arm."""
+    recording = simulate_recording(load_robot(robot), trajectory(robot), 7, period=PERIOD, setpoint_every=1)
+    experiments, _ = experiments_from_recording(recording, load_robot(robot))
+    with threadpool_limits(1):  # type: ignore[no-untyped-call]
+        return Search(build_study(experiments, [], load_robot(robot)), Settings()).start()
+
+
+@pytest.mark.parametrize("case", [*TX40, STRIBECK, *EMPS], ids=str)
+def test_what_is_hidden_comes_out_first(case: Case) -> None:
+    hidden = HiddenEffect(effect=case.effect, joint=case.joint, other=case.other, parameters=case.parameters)
+    scenario = None if case.leave_out else Scenario(schema="armident/scenario/1", effects=(hidden,))
+    whole, known = load_robot(case.robot), known_of(case)
+    recording = simulate_recording(whole, trajectory(case.robot), 1, scenario=scenario, period=PERIOD, setpoint_every=1)
+    experiments, _ = experiments_from_recording(recording, whole)
+    with threadpool_limits(1):  # type: ignore[no-untyped-call]
+        state = Search(build_study(experiments, [], known), Settings()).start()
+    passing = state.passing(Settings())
+    assert passing, [(t.candidate.key, t.score) for t in state.trials[:3]]
+    names = [joint.name for joint in known.joints]
+    first = passing[0].candidate
+    other = None if first.place.other is None else names[first.place.other]
+    assert (first.effect.name, names[first.place.joint], other) == (case.effect, case.joint, case.other)
+    found = {p.name: k for k, p in enumerate(first.effect.linear)}
+    for name, truth in case.truth.items():
+        value, std = passing[0].values[found[name]], passing[0].std[found[name]]
+        assert abs(value - truth) < 4 * std, (name, value, std, truth)
+
+
+@pytest.mark.parametrize("robot", ["tx40", "emps"])
+def test_nothing_passes_beside_the_model_of_a_healthy_arm(robot: str) -> None:
+    state = healthy(robot)
+    assert not state.passing(Settings())
+    # Not by a hair either: no candidate reaches a tenfold rate of false alarms.
+    assert not state.passing(Settings(false_alarms=0.1))
+    assert np.isfinite([t.score for t in state.trials]).all()

@@ -1,0 +1,53 @@
+"""The closed loop that instruments come from: given up where the identified controller leads astray."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from armident.configs import load_robot, load_trajectory
+from armident.identify.estimators.idim_piv import idim_piv
+from armident.identify.experiment import Experiment
+from armident.identify.identification import solvers as methods
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.options import Method, Options
+from armident.identify.identification.pipeline import identify_experiment
+from armident.virtual_robot.offline import simulate_recording
+
+SLOW = 0.002
+"""Sampling period, s, at which the identified controller of the TX40 swings in simulation."""
+
+
+@pytest.fixture(scope="module")
+def at_500_hz() -> list[Experiment]:
+    robot, trajectory = load_robot("tx40.yaml"), load_trajectory("trajectories/tx40_excitation.yaml")
+    recording = simulate_recording(robot, trajectory, 2, 1.0, None, SLOW, 1)
+    return experiments_from_recording(recording, robot)[0]
+
+
+@pytest.mark.parametrize("method", ["idim-iv", "idim-piv"])
+def test_a_loop_at_the_edge_of_stability_is_replaced(at_500_hz: list[Experiment], method: Method) -> None:
+    """The iterates wander with the identified controller; those of the stand-in come to rest beside least squares."""
+    found = identify_experiment(at_500_hz, load_robot("tx40.yaml"), Options(method=method))
+    assert found.converged
+    assert found.controller["kind"] == "nominal"
+    assert any("a stiff stand-in is used" in warning for warning in found.warnings)
+    ls, ls_std = found.idim_ls
+    assert np.all(found.std < 10 * ls_std)
+    essential = found.essential
+    assert np.all(np.abs(found.theta - ls)[essential] < 0.3 * np.abs(ls)[essential] + 6 * found.std[essential])
+
+
+def test_a_prefilter_that_comes_to_no_rest_is_done_without(
+    at_500_hz: list[Experiment], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same iterations, stopped after the first: the estimate is that of IDIM-IV, which converges."""
+    monkeypatch.setattr(methods, "idim_piv", partial(idim_piv, iterations=1))
+    robot = load_robot("tx40.yaml")
+    found = identify_experiment(at_500_hz, robot, Options())
+    assert found.converged
+    assert any("stopped after 1 iterations without converging" in warning for warning in found.warnings)
+    without = identify_experiment(at_500_hz, robot, Options(method="idim-iv"))
+    np.testing.assert_allclose(found.theta, without.theta, rtol=0, atol=1e-9)
+    # Serial correlation counts, which plain IDIM-IV leaves out.
+    assert np.median(found.std / without.std) > 1.0

@@ -1,0 +1,117 @@
+"""The heart: parameters of the virtual TX40, computed by another library, come back from its recordings."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.identify.effects.terms import arm_model
+from armident.identify.experiment import Experiment
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.options import Method, Options
+from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.identification.result import Identification
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.offline import simulate_recording
+
+ESSENTIAL = (
+    *("zz1r", "fv1", "fc1", "xx2r", "xz2r", "zz2r", "mx2r", "fv2", "fc2", "xx3r", "zz3r", "my3r", "ia3", "fv3", "fc3"),
+    *("mx4", "ia4", "fv4", "fc4", "my5r", "ia5", "fv5", "fc5", "ia6", "fv6", "fc6", "fvm6", "fcm6"),
+)
+"""Table B.4."""
+SEEDS = 20
+
+
+@cache
+def robot() -> RobotConfig:
+    return load_robot("tx40")
+
+
+@cache
+def trajectory() -> Trajectory:
+    return load_trajectory("trajectories/tx40_excitation.yaml")
+
+
+@cache
+def truth() -> NDArray[np.float64]:
+    model = arm_model(robot())
+    plant = plant_parameters(robot())
+    base: NDArray[np.float64] = model.base.regroup @ np.array([plant[name] for name in model.names])
+    return base
+
+
+@cache
+def recorded(seed: int, noise: float) -> tuple[Experiment, ...]:
+    experiments, _ = experiments_from_recording(
+        simulate_recording(robot(), trajectory(), seed=seed, noise=noise), robot()
+    )
+    return tuple(experiments)
+
+
+@cache
+def identified(seed: int, noise: float, options: Options) -> Identification:
+    return identify_experiment(recorded(seed, noise), robot(), options)
+
+
+def essential(result: Identification) -> list[int]:
+    return [result.names.index(name) for name in ESSENTIAL]
+
+
+@pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv"])
+def test_without_noise_the_bias_is_far_below_what_noise_will_cost(method: Method) -> None:
+    clean = identified(0, 0.0, Options(method=method))
+    noisy = identified(0, 1.0, Options())
+    chosen = essential(clean)
+    bias = np.abs(clean.theta - truth())[chosen]
+    assert (bias < 0.15 * noisy.std[chosen]).all()
+    assert clean.relative_error_pct < 0.1
+
+
+def test_relative_error_is_near_the_five_percent_of_the_thesis() -> None:
+    result = identified(0, 1.0, Options())
+    assert 4.0 < result.relative_error_pct < 6.5
+
+
+def test_controller_is_found_without_knowing_its_structure() -> None:
+    clean = identified(0, 0.0, Options(method="idim-iv"))
+    assert clean.controller["kind"] == "crc"
+    assert all(joint["fit_pct"] > 99.9 for joint in clean.controller["joints"])
+    noisy = identified(0, 1.0, Options())
+    assert noisy.controller["kind"] == "crc"
+    assert noisy.controller["velocity_error_pct"] < 10
+
+
+def test_the_same_recording_gives_the_same_bits() -> None:
+    first = identified(0, 1.0, Options())
+    second = identify_experiment(recorded(0, 1.0), robot(), Options())
+    np.testing.assert_array_equal(first.theta, second.theta)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+
+
+def test_a_recording_without_reference_still_gives_the_parameters() -> None:
+    blind = [replace(e, q_ref=None) for e in recorded(0, 1.0)]
+    result = identify_experiment(blind, robot(), Options(method="idim-iv"))
+    chosen = essential(result)
+    assert any("no reference trajectory" in warning for warning in result.warnings)
+    assert (np.abs(result.theta - truth())[chosen] < 5 * identified(0, 1.0, Options()).std[chosen]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_essential_parameters_are_recovered_within_their_own_standard_deviations_over_20_seeds() -> None:
+    deviations, outside = [], []
+    for seed in range(1, SEEDS + 1):
+        experiments, _ = experiments_from_recording(simulate_recording(robot(), trajectory(), seed=seed), robot())
+        result = identify_experiment(experiments, robot(), Options())
+        assert result.converged
+        chosen = essential(result)
+        deviations.append(((result.theta - truth()) / result.std)[chosen])
+        outside.append([w.fraction_outside_2sigma for w in result.whiteness])
+    z = np.abs(np.array(deviations))
+    assert np.mean(z < 3) >= 0.98
+    assert z.max() < 5
+    # White residuals have 5 % of their lags outside; the mean over 20 seeds and 20 lags is known to 1 %.
+    assert (np.mean(outside, axis=0) < 0.08).all()

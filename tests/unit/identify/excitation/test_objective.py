@@ -1,0 +1,106 @@
+"""Trajectories designed for one effect show it better than those for the base parameters, within the same limits."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from armident.configs import ConfigError, config_path, load_robot, load_trajectory
+from armident.identify.cli import trajectory as trajectory_command
+from armident.identify.effects.terms import arm_model
+from armident.identify.excitation.design import aimed_at, assess, design_trajectory
+
+NOISE = np.sqrt([1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523])
+"""Standard deviation of the torque noise of the TX40, N m (thesis table 6.3)."""
+
+
+@pytest.mark.parametrize(
+    ("effect", "against", "parameter", "better"),
+    [
+        ("stribeck_friction", None, "fst1", 0.8),
+        ("cogging_torque", None, "cgc1", 0.8),
+        ("joint_spring", None, "ks1", 0.6),
+        ("stribeck_friction", "presliding_friction", "fst1", 0.8),
+    ],
+)
+def test_an_aim_makes_its_effect_surer_than_the_usual_design(
+    effect: str, against: str | None, parameter: str, better: float
+) -> None:
+    robot = load_robot("emps")
+    aim = aimed_at(robot, effect, None, against)
+    usual = design_trajectory(robot, 6.0, seed=0, noise=[1.0], evaluations=200)
+    assert usual.wanted is None
+    before = assess(arm_model(robot), usual.trajectory, [1.0], aim=aim).wanted
+    design = design_trajectory(robot, 6.0, seed=0, noise=[1.0], evaluations=200, aim=aim)
+    design.trajectory.check(robot)
+    assert before is not None
+    assert design.wanted is not None
+    assert design.wanted[parameter] < better * before[parameter]
+
+
+def test_six_axes_show_the_ripple_of_one_motor_when_asked_for_it() -> None:
+    robot = load_robot("tx40")
+    aim = aimed_at(robot, "cogging_torque", "joint_2", None)
+    design = design_trajectory(robot, 7.5, seed=0, noise=NOISE, evaluations=100, aim=aim)
+    design.trajectory.check(robot)
+    shipped = load_trajectory("trajectories/tx40_excitation.yaml")
+    before = assess(arm_model(robot), shipped, NOISE, aim=aim).wanted
+    assert before is not None
+    assert design.wanted is not None
+    assert set(design.wanted) == {"cgc2", "cgs2"}
+    assert max(design.wanted[name] / before[name] for name in before) < 0.8
+
+
+def test_the_predicted_deviation_is_the_one_that_estimates_have() -> None:
+    """Monte Carlo on the predicted columns: least squares with white noise of the given size."""
+    robot = load_robot("emps")
+    model = arm_model(robot)
+    aim = aimed_at(robot, "joint_spring", None, None)
+    design = design_trajectory(robot, 6.0, seed=0, noise=[2.0], evaluations=20, aim=aim)
+    assert design.wanted is not None
+    q = design.trajectory.sample(1e-3)
+    qd = np.gradient(q, 1e-3, axis=0)
+    x = np.concatenate([model.rigid_regressor(q, qd, np.gradient(qd, 1e-3, axis=0)), q[:, :, None]], axis=2)[::25, 0]
+    rng = np.random.default_rng(0)
+    estimates = [np.linalg.lstsq(x, 2.0 * rng.standard_normal(len(x)), rcond=None)[0][-1] for _ in range(800)]
+    assert np.std(estimates) == pytest.approx(design.wanted["ks1"], rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("robot", "wanted", "joint", "against", "says"),
+    [
+        ("tx40", "wear", None, None, "'wear' is not in the catalogue"),
+        ("tx40", "joint_spring", "elbow", None, "--joint elbow: tx40 has joint_1, joint_2"),
+        ("tx40", "load_dependent_friction", None, None, "depends on the torques of the arm: give .* --known"),
+        ("tx40", "joint_spring", None, "load_dependent_friction", "load_dependent_friction depends on the torques"),
+        ("tx40", "joint_spring", None, "joint_spring", "--against joint_spring: expected another effect"),
+        ("tx40", "sign_error", None, None, "--for sign_error: shows in any motion"),
+        ("emps", "coupling_friction", None, None, "--for coupling_friction: emps has no place for it"),
+        ("tx40", None, "joint_1", None, "--joint joint_1: needs --for"),
+        ("tx40", None, None, "joint_spring", "--against joint_spring: needs --for"),
+    ],
+)
+def test_what_cannot_be_aimed_at_is_refused_with_the_reason(
+    robot: str, wanted: str | None, joint: str | None, against: str | None, says: str
+) -> None:
+    with pytest.raises(ConfigError, match=says):
+        aimed_at(load_robot(robot), wanted, joint, against)
+
+
+def test_effects_that_depend_on_torques_are_aimed_at_with_known_parameters() -> None:
+    robot = load_robot("emps")
+    aim = aimed_at(robot, "time_delay", None, None, [95.0, 200.0, 20.0, -3.0])
+    assert aim is not None
+    assert aim.predicts
+    design = design_trajectory(
+        robot, 6.0, seed=0, noise=[1.0], evaluations=20, aim=aim, theta=[95.0, 200.0, 20.0, -3.0]
+    )
+    assert design.wanted is not None
+    assert np.isfinite(design.wanted["delay1"])
+
+
+def test_the_command_designs_for_an_effect(tmp_path: Path) -> None:
+    out = tmp_path / "spring.yaml"
+    trajectory_command(config_path("emps.yaml"), out, duration=6.0, evaluations=20, wanted="joint_spring")
+    assert len(yaml.safe_load(out.read_text())["moves"]) > 1

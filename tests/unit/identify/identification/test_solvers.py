@@ -1,0 +1,128 @@
+"""Every method by name, from a recording of the virtual arm to the finished document and page."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+
+from armident.configs import ConfigError, load_robot, load_trajectory
+from armident.daq.recording import Recording
+from armident.identify.document import to_json
+from armident.identify.effects.terms import arm_model
+from armident.identify.identification.api import Outcome, identify_recording
+from armident.identify.identification.options import METHODS, Method, Options, parse_decimation, parse_nvr
+from armident.identify.identification.solvers import MEASURED
+from armident.identify.report.identification import identification_report
+from armident.virtual_robot.inertias import plant_parameters
+from armident.virtual_robot.offline import simulate_recording
+
+
+@cache
+def recording() -> Recording:
+    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
+    return simulate_recording(load_robot("tx40"), trajectory, seed=11)
+
+
+@cache
+def identified(options: Options) -> Outcome:
+    return identify_recording(recording(), options=options)
+
+
+def options(method: Method) -> Options:
+    """Output errors take the simulation for the truth: they get the controller's law, not its impulse response."""
+    return Options(method=method, controller="crc" if method in MEASURED else "parametric")
+
+
+@pytest.mark.parametrize("method", [m for m in METHODS if m not in {"clie", "cloe"}])
+def test_every_method_meets_the_arm(method: Method) -> None:
+    outcome = identified(options(method))
+    robot = outcome.robot
+    model = arm_model(robot)
+    plant = plant_parameters(robot)
+    truth = model.base.regroup @ np.array([plant[name] for name in model.names])
+    result = outcome.result
+    assert result.converged, result.stop_reason
+    assert result.relative_error_pct < 5.5
+    chosen = result.essential & (np.abs(truth) > 0)
+    assert chosen.sum() >= 25
+    assert (np.abs(result.theta - truth)[chosen] < 5 * result.std[chosen]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["clie", "cloe"])
+def test_output_errors_meet_the_arm_too(method: Method) -> None:
+    outcome = identified(options(method))
+    assert outcome.result.converged, outcome.result.stop_reason
+    assert outcome.result.relative_error_pct < 5.5
+    assert outcome.document.noise_model["of"] == ("joint position" if method == "cloe" else "joint torque")
+
+
+@pytest.mark.parametrize("method", ["idim-ls", "idim-piv"])
+def test_document_and_page_hold_what_the_tests_say(method: Method) -> None:
+    outcome = identified(options(method))
+    document = json.loads(to_json(outcome.document))
+    assert len(document["diagnostics"]["joints"]) == 6
+    assert (document["diagnostics"]["endogeneity"] is None) == (method == "idim-ls")
+    assert (document["torque_delay_samples"] is None) == (method == "idim-ls")
+    page = identification_report(outcome.recording, outcome.robot, outcome.result, outcome.document)
+    assert "What tests say" in page
+    assert ("Durbin" in page) == (method != "idim-ls")
+
+
+def test_the_torque_is_where_the_drive_holds_it() -> None:
+    delays = identified(options("idim-piv")).document.torque_delay_samples
+    assert delays is not None
+    assert all(abs(samples - 0.5) < 4 * std for samples, std in delays.values())
+
+
+def test_a_physical_arm_is_found_on_request() -> None:
+    outcome = identified(Options(method="idim-iv", physical=True))
+    physical = outcome.document.physical
+    assert physical is not None
+    assert len(physical["parameters"]) == 87
+    assert physical["compatible"]
+    page = identification_report(outcome.recording, outcome.robot, outcome.result, outcome.document)
+    assert "nearest physically consistent arm" in page
+
+
+def test_the_grey_box_agrees_with_the_black_box() -> None:
+    black = identified(options("idim-piv")).result
+    grey = identified(Options(noise_model="grey-box")).result
+    assert grey.noise_model["of"] == "motor position"
+    assert (np.abs(grey.theta - black.theta)[black.essential] < 3 * black.std[black.essential]).all()
+
+
+def test_decimation_from_the_noise_gives_the_same_arm() -> None:
+    """The thesis kept one sample of 125 by hand (section 6.2.3)."""
+    usual = identified(options("idim-iv")).result
+    chosen = identified(Options(method="idim-iv", decimation="noise")).result
+    rate = chosen.noise_model["rate_hz"]
+    assert 5000 / 250 <= rate <= 5000 / 40
+    assert (np.abs(chosen.theta - usual.theta)[usual.essential] < 3 * chosen.std[usual.essential]).all()
+
+
+def test_unweighted_least_squares_is_another_estimate_of_the_same() -> None:
+    weighted, plain = (identified(Options(method="idim-ls", weighted=w)).result for w in (True, False))
+    assert not np.array_equal(weighted.theta, plain.theta)
+    assert abs(weighted.relative_error_pct - plain.relative_error_pct) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"method": "idim"}, "method: 'idim' is not one of idim-piv, idim-iv, idim-ls, didim, clie, cloe, sep-pem"),
+        ({"controller": "pid"}, "controller: 'pid' is not one of crc, parametric, known"),
+        ({"noise_model": "white"}, "noise_model: 'white' is not one of black-box, grey-box"),
+        ({"nvr": parse_nvr("likelyhood")}, "nvr: 'likelyhood' is neither a number nor one of automatic"),
+        ({"nvr": parse_nvr("-1e-5")}, "nvr: expected a ratio above 0, got -1e-05"),
+        ({"bandwidth_hz": 0.0}, "bandwidth_hz: expected a frequency above 0, got 0.0"),
+        ({"max_ar_order": -1}, "max_ar_order: expected 0 or more, got -1"),
+        ({"decimation": 0}, "decimation: expected a number of samples or noise, got 0"),
+        ({"decimation": parse_decimation("some")}, "decimation: expected a number of samples or noise, got some"),
+    ],
+)
+def test_what_is_not_offered_is_refused_by_name(wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        Options(**wrong)  # type: ignore[arg-type]
+    assert message in str(error.value)

@@ -1,0 +1,84 @@
+"""The report of a diagnosis: every finding has a picture of its own, drawn from what its numbers are of."""
+
+import re
+
+import numpy as np
+import pytest
+
+from armident.configs import load_robot, load_trajectory
+from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.report.diagnosis import SHOWN, diagnosis_report, followed_variable, telling_stretch
+from armident.virtual_robot.offline import simulate_recording
+
+HIDDEN = (
+    HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.15}),
+    HiddenEffect(effect="joint_spring", joint="joint_1", parameters={"stiffness": 80.0}),
+)
+
+
+@pytest.fixture(scope="module")
+def diagnosis() -> Diagnosis:
+    robot, trajectory = load_robot("emps"), load_trajectory("trajectories/emps_1.yaml")
+    scenario = Scenario(schema="armident/scenario/1", effects=HIDDEN)
+    experiments, _ = experiments_from_recording(simulate_recording(robot, trajectory, 1, scenario=scenario), robot)
+    found = diagnose(experiments, [], robot)
+    assert {f.effect for f in found.document.findings} == {h.effect for h in HIDDEN}
+    return found
+
+
+def test_the_curves_without_and_with_a_finding_are_those_of_its_errors(diagnosis: Diagnosis) -> None:
+    def error(torque: np.ndarray) -> float:
+        rest = diagnosis.measured - torque
+        return float(100 * np.linalg.norm(rest) / np.linalg.norm(diagnosis.measured))
+
+    for finding, lacking in zip(diagnosis.document.findings, diagnosis.lacking, strict=True):
+        assert lacking is not None
+        assert error(lacking) == pytest.approx(finding.gap_before, rel=1e-6)
+        assert error(diagnosis.after) == pytest.approx(finding.gap_after, rel=1e-6)
+
+
+def test_every_finding_has_a_picture_of_its_own_in_a_page_that_needs_no_other_file(diagnosis: Diagnosis) -> None:
+    page = diagnosis_report(diagnosis, diagnosis.document)
+    sources = re.findall(r'(?:src|href)="([^"]*)"', page)
+    assert all(source.startswith("data:image/svg+xml;base64,") for source in sources)
+    pictures = re.findall(r'<img alt="residual of joint_1" src="([^"]*)"', page)
+    assert len(set(pictures)) == len(HIDDEN)
+    for finding in diagnosis.document.findings:
+        for name, value in finding.parameters.items():
+            assert f'<td>{name}</td><td class="n">{value:.4g}</td>' in page
+
+
+def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: Diagnosis) -> None:
+    told = diagnosis.document.simulated
+    assert told is not None
+    assert "Simulated closed loop" in diagnosis_report(diagnosis, diagnosis.document)
+    partly = diagnosis.document.model_copy(update={"simulated": {"torque_foretold": told["torque_foretold"]}})
+    page = diagnosis_report(diagnosis, partly)
+    assert "Simulated closed loop" not in page
+    assert "Where model and data disagree" in page
+
+
+def test_a_finding_is_drawn_over_what_it_follows(diagnosis: Diagnosis) -> None:
+    over = {}
+    for finding, lacking in zip(diagnosis.document.findings, diagnosis.lacking, strict=True):
+        assert lacking is not None
+        name, unit, _ = followed_variable(diagnosis, 0, (diagnosis.after - lacking)[:, 0])
+        over[finding.effect] = (name, unit)
+    assert over == {
+        "asymmetric_viscous_friction": ("joint speed", "m/s"),
+        "joint_spring": ("joint position", "m"),
+    }
+    noise = np.random.default_rng(1).standard_normal(diagnosis.t.size)
+    assert followed_variable(diagnosis, 0, noise)[:2] == ("the torque it adds", "N")
+
+
+def test_a_long_recording_is_drawn_where_the_finding_changes_most() -> None:
+    added = np.zeros(10 * SHOWN)
+    added[3 * SHOWN + 10 : 3 * SHOWN + 50] = 1.0
+    stretch = telling_stretch(added)
+    assert stretch.stop - stretch.start == SHOWN
+    assert stretch.start <= 3 * SHOWN + 10
+    assert stretch.stop >= 3 * SHOWN + 50
+    assert telling_stretch(added[:SHOWN]) == slice(0, SHOWN)

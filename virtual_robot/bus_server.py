@@ -1,0 +1,171 @@
+"""The virtual drives on one bus: their frames, and canopen for their SDO, NMT and EMCY."""
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import can
+import canopen
+import numpy as np
+
+from armident.configs import ConfigError
+from armident.configs.schema.session import Bus
+from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown, frames
+from armident.drivers.can.socketcan import RECEIVE_TIMEOUT, RawSocket
+from armident.drivers.can.udp import open_bus
+from armident.drivers.canopen.objects import COB_NMT, COB_SDO_REQUEST, COB_SYNC
+from armident.virtual_robot.arm import Motion
+from armident.virtual_robot.node import Drive
+from armident.virtual_robot.pdo_exchange import Exchange
+
+PDO_FILTERS = ((0x180, 0x780), (0x200, 0x700), (0x300, 0x700), (0x400, 0x700), (0x500, 0x780))
+"""Identifiers 180h to 57Fh, which PDOs may have; a socket does not receive what it sends itself."""
+BATCH = 1024
+REOPEN_S = 0.02
+"""How often a bus that is down is looked at."""
+
+
+class Line:
+    """One bus and the drives on it.
+
+    Parameters
+    ----------
+    bus
+        The bus.
+    drives, motion, period
+        As for :class:`Exchange`.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such bus.
+    """
+
+    def __init__(self, bus: Bus, drives: Sequence[Drive], motion: Motion, period: float) -> None:
+        self.config, self.drives = bus, drives
+        self.bus = open_bus(bus, filters=((COB_SYNC, STANDARD_ID_MASK), *PDO_FILTERS))
+        try:
+            self._network = self._connected(canopen.Network())
+        except BaseException:
+            self.bus.close()
+            raise
+        self.exchange = Exchange(drives, motion, period)
+        self.batch = frames(BATCH, fd=self.bus.fd)
+        self._columns = self.batch["can_id"], self.batch["length"], self.batch["data"]
+        self.down = False
+        self._count = self._at = 0
+        self._syncs: list[tuple[int, int]] = []
+        """Counter and time stamp of the SYNCs in ``batch`` that wait for an answer, the next one last."""
+        self._outbox, self._queued = frames(BATCH, fd=self.bus.fd), 0
+        self._tried = 0.0
+        # Compile before anybody waits for an answer.
+        self.take(0, 0, 1)
+
+    def _connected(self, network: Any) -> Any:
+        """Canopen's own bus, to which the kernel passes NMT commands and SDO requests only."""
+        wanted = [COB_NMT, *(COB_SDO_REQUEST + drive.node_id for drive in self.drives)]
+        filters = [{"can_id": can_id, "can_mask": STANDARD_ID_MASK, "extended": False} for can_id in wanted]
+
+        # Whoever takes the error keeps canopen's receive thread alive: its socket and the kernel's heartbeats work
+        # again by themselves when the bus is back. An error that is kept would end every SDO transfer from then on.
+        def forget(error: Exception) -> None:
+            network.notifier.exception = None
+
+        network.listeners[0].on_error = forget
+        try:
+            network.connect(interface=self.config.interface, channel=self.config.channel, can_filters=filters)
+        except (OSError, can.CanError) as error:
+            raise ConfigError(f"bus {self.config.channel}: cannot be opened: {error}") from error
+        return network
+
+    def boot(self) -> None:
+        """Boot-up message, pre-operational, heartbeat."""
+        for drive in self.drives:
+            self._network.add_node(drive)
+            drive.nmt.boot()
+
+    def take(self, start: int, stop: int, sequence: int) -> int:
+        """As :meth:`Exchange.take`, of the frames in ``batch``."""
+        return self.exchange.take(*self._columns, start, stop, sequence)
+
+    def receive(self, wait: bool) -> int:
+        """Take what has arrived into ``batch``; the number of frames.
+
+        Raises
+        ------
+        BusDown
+            If the bus is down.
+        """
+        # In a guest kernel system calls are dear: with one where the bus can.
+        if isinstance(self.bus, RawSocket):
+            return self.bus.receive(self.batch, wait=wait)
+        return self.bus.receive(self.batch) if not wait or self.bus.poll(RECEIVE_TIMEOUT) else 0
+
+    def next_sync(self) -> tuple[int, int] | None:
+        """Counter (0: it carries none) and time stamp of the next SYNC, read from the bus if none has been yet.
+
+        The bus is left alone while it is down, and used again once it is back.
+        """
+        if not self._syncs:
+            self.flush()
+            if self._at < self._count:
+                # Set points behind the last SYNC.
+                self._at = self.take(self._at, self._count, 1)
+            if self.down and not self._is_back():
+                return None
+            try:
+                self._at, self._count = 0, self.receive(wait=False)
+            except BusDown:
+                self._lose()
+            at = np.flatnonzero(self.batch["can_id"][: self._count] == COB_SYNC)
+            counters = np.where(self.batch["length"][at] > 0, self.batch["data"][at, 0], 0)
+            stamps = self.batch["t_ns"][at]
+            self._syncs = list(zip(counters.tolist(), stamps.tolist(), strict=True))[::-1]
+        return self._syncs[-1] if self._syncs else None
+
+    def answer(self, sequence: int) -> None:
+        """Answer the next SYNC and let set points act; ``sequence`` is its counter if it has none."""
+        self._syncs.pop()
+        at = self.take(self._at, self._count, sequence)
+        self._at = at + 1
+        out = self.exchange.out
+        if self._queued + out.size > self._outbox.size:
+            self.flush()
+        self._outbox[self._queued : self._queued + out.size] = out
+        self._queued += out.size
+        self.exchange.act()
+
+    def flush(self) -> None:
+        """Send the answers that are due, in one system call; nothing where the bus is down."""
+        if self._queued:
+            try:
+                self.bus.send(self._outbox[: self._queued])
+            except BusDown:
+                self._lose()
+            self._queued = 0
+
+    def _lose(self) -> None:
+        """The bus is down. What came before is not answered any more: drives queue no answers for a bus that is off."""
+        self._syncs, self._at, self._count = [], 0, 0
+        # The error is told once more if it was sending that found it.
+        for _ in range(2):
+            with suppress(BusDown):
+                while self.receive(wait=False) == BATCH:
+                    pass
+        self.down, self._tried = not self.bus.up, time.monotonic()
+
+    def _is_back(self) -> bool:
+        if time.monotonic() - self._tried < REOPEN_S:
+            return False
+        self._tried = time.monotonic()
+        self.down = not self.bus.up
+        return not self.down
+
+    def close(self) -> None:
+        """Take the drives off the bus."""
+        for drive in self.drives:
+            drive.nmt.halt()
+        with suppress(can.CanError, OSError):
+            self._network.disconnect()
+        self.bus.close()
