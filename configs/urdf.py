@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from armident.configs.errors import ConfigError
 from armident.configs.mdh import MdhChain, modified_dh
-from armident.configs.schema.base import Frozen
+from armident.configs.schema.base import FrozenModel
 from armident.configs.schema.robot import Drive, Positive
 from armident.configs.yaml_loader import is_file
 
@@ -41,7 +41,7 @@ LARGEST = 1e9
 Floats = NDArray[np.float64]
 
 
-class UrdfSource(Frozen):
+class UrdfSource(FrozenModel):
     """Which part of which URDF file: ``file`` relative to the configuration, links ``base`` and ``tip``.
 
     Without ``base`` the chain begins at the root of the tree, without ``tip`` it ends with its last moving joint.
@@ -52,7 +52,7 @@ class UrdfSource(Frozen):
     tip: str | None = None
 
 
-class LimitsGiven(Frozen):
+class LimitsGiven(FrozenModel):
     """Limits that replace, or add to, those of the URDF, which knows none of acceleration."""
 
     position: tuple[float, float] | None = None
@@ -61,7 +61,7 @@ class LimitsGiven(Frozen):
     torque: Positive | None = None
 
 
-class JointGiven(Frozen):
+class JointGiven(FrozenModel):
     """What a configuration says of a joint of the URDF; ``name`` is the URDF's."""
 
     name: str
@@ -70,7 +70,7 @@ class JointGiven(Frozen):
     rotor_inertia: bool | None = None
 
 
-class UrdfGeometry(Frozen):
+class UrdfGeometry(FrozenModel):
     """The keys of a robot configuration that a URDF takes part in; ``gravity`` in the frame of the base link."""
 
     urdf: UrdfSource

@@ -170,9 +170,9 @@ def heal(
     """
     import json
 
-    from armident.daq.recording import heal_recording
+    from armident.daq.recording import recover_recording
 
-    healed = [heal_recording(path) for path in recordings]
+    healed = [recover_recording(path) for path in recordings]
     if as_json:
         print(
             json.dumps(

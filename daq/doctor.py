@@ -23,7 +23,7 @@ from armident.configs import (
 )
 from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
-from armident.daq.capture.files import gathered
+from armident.daq.capture.files import chunk_duration_ns
 from armident.daq.matching.streams import captured_streams
 from armident.daq.streaming.session import configuration, endpoints
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
@@ -187,7 +187,7 @@ def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:
         sum(s.layout.record[0].itemsize / s.layout.every for s in captured_streams(session, robot))
         / session.sync_period
     )
-    span_s = gathered(session.recording) * 1e-9
+    span_s = chunk_duration_ns(session.recording) * 1e-9
     probe = folder / f".armident-doctor.{os.getpid()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)

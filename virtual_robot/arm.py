@@ -17,7 +17,7 @@ Raw32 = NDArray[np.int32]
 Raw16 = NDArray[np.int16]
 
 
-class Motion(Protocol):
+class DriveBackend(Protocol):
     """What stands behind the drives: raw numbers for the coming SYNC, and how to get to the next.
 
     ``position`` (n,) int32 counts, ``current`` (n,) int16 per mille of rated and ``demand`` (n,) int32 counts

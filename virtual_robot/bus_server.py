@@ -15,7 +15,7 @@ from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown, frames
 from armident.drivers.can.socketcan import RECEIVE_TIMEOUT, RawSocket
 from armident.drivers.can.udp import open_bus
 from armident.drivers.canopen.objects import COB_NMT, COB_SDO_REQUEST, COB_SYNC
-from armident.virtual_robot.arm import Motion
+from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.node import Drive
 from armident.virtual_robot.pdo_exchange import Exchange
 
@@ -26,7 +26,7 @@ REOPEN_S = 0.02
 """How often a bus that is down is looked at."""
 
 
-class Line:
+class DriveBus:
     """One bus and the drives on it.
 
     Parameters
@@ -42,7 +42,7 @@ class Line:
         If there is no such bus.
     """
 
-    def __init__(self, bus: Bus, drives: Sequence[Drive], motion: Motion, period: float) -> None:
+    def __init__(self, bus: Bus, drives: Sequence[Drive], motion: DriveBackend, period: float) -> None:
         self.config, self.drives = bus, drives
         self.bus = open_bus(bus, filters=((COB_SYNC, STANDARD_ID_MASK), *PDO_FILTERS))
         try:

@@ -25,7 +25,7 @@ M2, M3 = 6.1697947043828245592553615689730, -0.42772256543218573326238373806514
 
 
 @njit(cache=True, error_model="numpy")
-def resist(q, qd, t, friction, smoothing, pairs, ratio, table, load, out, slope):  # type: ignore[no-untyped-def]
+def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, out, slope):  # type: ignore[no-untyped-def]
     """Friction, couplings (eq. B.1), brakes and hidden torques: torque ``out`` (N,) and ``slope`` (N, N).
 
     ``friction`` (n, 4) holds fv, fc, the offset and the viscous coefficient of the brake; ``pairs`` (C, 4) the two
@@ -64,7 +64,7 @@ def resist(q, qd, t, friction, smoothing, pairs, ratio, table, load, out, slope)
 
 
 @njit(cache=True, error_model="numpy")
-def give(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-def]
+def gear_torques(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-def]
     """Add the torques of the gears that give to ``out`` (N,), their slopes to ``slope`` and ``stiff`` (N, N)."""
     for e in range(gears.shape[0]):
         a, b = int(gears[e, 0]), int(gears[e, 1])
@@ -162,10 +162,10 @@ def advance(  # type: ignore[no-untyped-def]
     hg = h * GAMMA
     for step in range(substeps):
         now = t + (step + 0.5) * h
-        resist(q, qd, now, friction, smoothing, pairs, ratio, table, load, force, slope)
+        friction_torques(q, qd, now, friction, smoothing, pairs, ratio, table, load, force, slope)
         if gives:
             stiff[:, :] = 0.0
-            give(q, qd, gears, force, slope, stiff)
+            gear_torques(q, qd, gears, force, slope, stiff)
         for i in range(total):
             for j in range(total):
                 matrix[i, j] = full[i, j] / hg + slope[i, j]
@@ -189,9 +189,9 @@ def advance(  # type: ignore[no-untyped-def]
             x1[i] = hg * (qd[i] + k1[i])
             q2[i] = q[i] + x1[i]
             qd2[i] = qd[i] + k1[i]
-        resist(q2, qd2, now, friction, smoothing, pairs, ratio, table, load, force, slope)
+        friction_torques(q2, qd2, now, friction, smoothing, pairs, ratio, table, load, force, slope)
         if gives:
-            give(q2, qd2, gears, force, slope, slope)
+            gear_torques(q2, qd2, gears, force, slope, slope)
         for b in range(count):
             j = int(bristles[b, 0])
             z1[b] = inverse[b] * (rate[b] + cross[b] * k1[j])

@@ -49,7 +49,7 @@ from armident.drivers.canopen.objects import (
     NmtState,
     rated_milliamperes,
 )
-from armident.virtual_robot.arm import Motion
+from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.cia402 import MOVING, next_state, statusword
 
 ABORT_UNSUPPORTED = 0x06010000
@@ -180,7 +180,7 @@ class Drive(canopen.LocalNode):
         eds: Path,
         index: int,
         joint: Joint,
-        motion: Motion,
+        motion: DriveBackend,
         changed: Callable[[], None],
         status_changed: Callable[[], None],
         fd: bool = False,

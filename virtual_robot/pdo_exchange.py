@@ -23,7 +23,7 @@ from armident.drivers.canopen.objects import (
     VELOCITY_ACTUAL,
     DriveState,
 )
-from armident.virtual_robot.arm import Motion
+from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.node import FOLLOWING_ERROR, Drive
 
 POSITION, CURRENT, DEMAND, STATUS, VELOCITY, ERROR, CONSTANT = range(7)
@@ -134,7 +134,7 @@ class Exchange:
         SYNC period, s: velocity actual (606Ch) is a difference of positions over it.
     """
 
-    def __init__(self, drives: Sequence[Drive], motion: Motion, period: float) -> None:
+    def __init__(self, drives: Sequence[Drive], motion: DriveBackend, period: float) -> None:
         n = motion.position.size
         self._drives, self._motion, self._period = drives, motion, period
         self._before = motion.position.copy()

@@ -142,7 +142,7 @@ class Plant:
         n = q.size
         out, slope = np.empty(n), np.empty((n, n))
         arguments = (q, qd, t, *self._resisting, out, slope)
-        dynamics.resist(*arguments)
+        dynamics.friction_torques(*arguments)
         for row in self._rows:
             j = int(row[0])
             out[j] += np.sign(qd[j]) * sliding_level(row, qd[j])[0]
@@ -158,7 +158,7 @@ class Plant:
         n, total = self.q.size, self.coordinates.size
         force, slope = np.zeros(total), np.zeros((total, total))
         force[:n] = self.resistance(q[:n], qd[:n], t) - tau
-        dynamics.give(q, qd, self._gears, force, slope, slope)
+        dynamics.gear_torques(q, qd, self._gears, force, slope, slope)
         if self._shaking.size:
             self._shake(t)
         force[self._link] += pin.nonLinearEffects(self.model, self._data, q[self._link], qd[self._link])

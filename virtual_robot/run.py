@@ -13,7 +13,7 @@ from armident.configs import ConfigError, RobotConfig, SessionConfig, load_robot
 from armident.configs.loading import load_scenario
 from armident.daq.recording import read_recording, write_recording
 from armident.virtual_robot import servo
-from armident.virtual_robot.arm import Arm, Motion
+from armident.virtual_robot.arm import Arm, DriveBackend
 from armident.virtual_robot.inertias import base_parameters, plant_parameters, rest_posture
 from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
 from armident.virtual_robot.plant import Plant
@@ -130,7 +130,7 @@ def _write_truth(robot: RobotConfig, q: ArrayLike, path: Path, velocity_feedback
     path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
 
 
-def _replay(session: SessionConfig, robot: RobotConfig, path: Path) -> Motion:
+def _replay(session: SessionConfig, robot: RobotConfig, path: Path) -> DriveBackend:
     names = [joint.name for joint in robot.joints]
     joints = tuple(names.index(node.joint) for node in session.drives)
     return Replay(read_recording(path), robot, session.sync_period, joints)

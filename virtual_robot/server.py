@@ -13,8 +13,8 @@ from armident.configs import RobotConfig, SessionConfig
 from armident.drivers.can.frames import frames
 from armident.drivers.can.socketcan import RECEIVE_TIMEOUT, RawSocket
 from armident.drivers.canopen.objects import DriveState
-from armident.virtual_robot.arm import Motion, counts_per_si
-from armident.virtual_robot.bus_server import BATCH, Line
+from armident.virtual_robot.arm import DriveBackend, counts_per_si
+from armident.virtual_robot.bus_server import BATCH, DriveBus
 from armident.virtual_robot.node import Drive
 
 TOGETHER_S = 0.05
@@ -79,7 +79,7 @@ class Server:
         If a bus is missing or an EDS is unusable.
     """
 
-    def __init__(self, session: SessionConfig, robot: RobotConfig, motion: Motion) -> None:
+    def __init__(self, session: SessionConfig, robot: RobotConfig, motion: DriveBackend) -> None:
         self._session, self._motion = session, motion
         names = [joint.name for joint in robot.joints]
         self._dirty = self._status_dirty = False
@@ -94,12 +94,12 @@ class Server:
         self._latest = 0.0
         self._backlog = self._syncs = 0
         self._seconds = self._cpu = 0.0
-        self._lines: list[Line] = []
+        self._lines: list[DriveBus] = []
         try:
             for bus in session.all_buses:
                 both = zip(self.drives, session.drives, strict=True)
                 here = [drive for drive, node in both if session.bus_of(node) == bus]
-                self._lines.append(Line(bus, here, motion, session.sync_period))
+                self._lines.append(DriveBus(bus, here, motion, session.sync_period))
         except BaseException:
             for line in self._lines:
                 line.close()
@@ -153,7 +153,7 @@ class Server:
         self._cpu += time.process_time() - cpu
         return self.report()
 
-    def _serve_one(self, line: Line, over: Callable[[], bool]) -> None:
+    def _serve_one(self, line: DriveBus, over: Callable[[], bool]) -> None:
         stamps, exchange, bus = line.batch["t_ns"], line.exchange, line.bus
         outbox, queued = frames(BATCH, fd=bus.fd), 0
         while not over():

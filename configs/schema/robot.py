@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from armident.configs.schema.base import Frozen
+from armident.configs.schema.base import FrozenModel
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=64)]
 Positive = Annotated[float, Field(gt=0)]
 
 
-class Mdh(Frozen):
+class Mdh(FrozenModel):
     """Modified Denavit-Hartenberg parameters, frame j-1 to j (thesis section 2.1.1, table B.1).
 
     ``Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r)``; the joint variable is added to
@@ -25,7 +25,7 @@ class Mdh(Frozen):
     r: float = Field(description="m")
 
 
-class Limits(Frozen):
+class Limits(FrozenModel):
     """What a joint may do, in joint coordinates (rad or m, s, N m or N)."""
 
     position: tuple[float, float]
@@ -40,7 +40,7 @@ class Limits(Frozen):
         return self
 
 
-class Drive(Frozen):
+class Drive(FrozenModel):
     """The drive of one motor: how its raw numbers become rad and N m at the motor shaft.
 
     Parameters
@@ -64,7 +64,7 @@ class Drive(Frozen):
     saturation: Positive | None = None
 
 
-class Joint(Frozen):
+class Joint(FrozenModel):
     """One joint with its drive. ``rotor_inertia`` says whether ``ia`` is a parameter of its own."""
 
     name: Name
@@ -75,14 +75,14 @@ class Joint(Frozen):
     rotor_inertia: bool = True
 
 
-class Coupling(Frozen):
+class Coupling(FrozenModel):
     """Friction and inertia between two joints (thesis equation B.1): ``ia<name>, fv<name>, fc<name>``."""
 
     name: Name
     joints: tuple[Name, Name]
 
 
-class Effect(Frozen):
+class Effect(FrozenModel):
     """An effect of the discrepancy catalogue that is part of this robot's model, and its parameters.
 
     Shape parameters (a Stribeck velocity, a harmonic) stay as given; linear ones are estimated with the rest.
@@ -97,7 +97,7 @@ class Effect(Frozen):
     without: tuple[Name, ...] = ()
 
 
-class Friction(Frozen):
+class Friction(FrozenModel):
     """Coulomb friction near standstill.
 
     Parameters
@@ -113,7 +113,7 @@ class Friction(Frozen):
     velocity_threshold: tuple[Annotated[float, Field(ge=0)], ...] | None = None
 
 
-class Controller(Frozen):
+class Controller(FrozenModel):
     """A known cascade ``nu = kv (kp (q_r - q) - qd)`` per motor, in units of the drive's signal.
 
     ``kp`` in 1/s; ``kv`` in units of ``signal`` per (rad/s or m/s). The velocity is the mean over the last
@@ -125,7 +125,7 @@ class Controller(Frozen):
     velocity_samples: Annotated[int, Field(ge=1)] = 1
 
 
-class Preprocessing(Frozen):
+class Preprocessing(FrozenModel):
     """Filters of a published least-squares fit, applied as published (`armident.identify.signals.published_filters`).
 
     Parameters
@@ -148,7 +148,7 @@ class Preprocessing(Frozen):
     decimation_padlen: Annotated[int, Field(ge=0)] = 24
 
 
-class RobotConfig(Frozen):
+class RobotConfig(FrozenModel):
     """A serial arm as the whole service sees it; all values SI, joint side unless said."""
 
     schema_: Literal["armident/robot/1"] = Field(alias="schema")

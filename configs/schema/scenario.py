@@ -4,11 +4,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from armident.configs.schema.base import Frozen
+from armident.configs.schema.base import FrozenModel
 from armident.configs.schema.robot import Name
 
 
-class HiddenEffect(Frozen):
+class HiddenEffect(FrozenModel):
     """One effect on one joint; which parameters it takes is the virtual arm's business.
 
     ``other`` is the second joint of an effect between two.
@@ -20,7 +20,7 @@ class HiddenEffect(Frozen):
     parameters: dict[Name, float] = Field(default_factory=dict)
 
 
-class Scenario(Frozen):
+class Scenario(FrozenModel):
     """What is wrong with the arm."""
 
     schema_: Literal["armident/scenario/1"] = Field(alias="schema")

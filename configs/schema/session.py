@@ -5,14 +5,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from armident.configs.schema.base import Frozen
+from armident.configs.schema.base import FrozenModel
 from armident.configs.schema.robot import Name, Positive
 
 ObjectName = Literal["position", "velocity", "current", "torque", "demand", "status"]
 Every = Annotated[int, Field(ge=1, le=240)]
 
 
-class Bus(Frozen):
+class Bus(FrozenModel):
     """A CAN bus. ``bitrate`` is ``None`` on a virtual bus, which has none.
 
     With ``fd`` TPDOs are CAN FD frames of up to 64 bytes, whose data go at ``data_bitrate``; all else stays classic.
@@ -35,7 +35,7 @@ class Bus(Frozen):
         return self
 
 
-class Sync(Frozen):
+class Sync(FrozenModel):
     """SYNC (CiA 301 section 7.2.5): who sends it, how often, and the overflow of its counter (1019h).
 
     ``source``: who keeps the time where we send it, a loop of our own or the kernel (CAN_BCM).
@@ -47,7 +47,7 @@ class Sync(Frozen):
     source: Literal["loop", "kernel"] = "loop"
 
 
-class Temperature(Frozen):
+class Temperature(FrozenModel):
     """Where a drive has its temperature: an object, its type, degrees Celsius per unit; asked every ``every_s``."""
 
     index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]
@@ -57,7 +57,7 @@ class Temperature(Frozen):
     every_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
 
 
-class DriveNode(Frozen):
+class DriveNode(FrozenModel):
     """One CANopen node and the joint whose motor it drives; ``bus`` is its channel, where there are several."""
 
     joint: Name
@@ -67,7 +67,7 @@ class DriveNode(Frozen):
     temperature: Temperature | None = None
 
 
-class Stream(Frozen):
+class Stream(FrozenModel):
     """One TPDO of every drive, sent on every ``every``-th SYNC, recorded as the topic of this name.
 
     With ``pack`` the drive takes a sample at every SYNC and sends the last ``pack`` of them in one TPDO.
@@ -79,7 +79,7 @@ class Stream(Frozen):
     objects: Annotated[tuple[ObjectName, ...], Field(min_length=1)]
 
 
-class Setpoints(Frozen):
+class Setpoints(FrozenModel):
     """Position set points (607Ah) in cyclic synchronous position mode, interpolated by the drives."""
 
     rpdo: Annotated[int, Field(ge=1, le=4)] = 1
@@ -92,7 +92,7 @@ class Setpoints(Frozen):
 TriggerName = Literal["emcy", "heartbeat_lost", "bus", "command"]
 
 
-class Trigger(Frozen):
+class Trigger(FrozenModel):
     """Write only around events: what happened up to ``before_s`` before one, and until ``after_s`` after it."""
 
     before_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
@@ -100,7 +100,7 @@ class Trigger(Frozen):
     events: Annotated[tuple[TriggerName, ...], Field(min_length=1)] = ("emcy", "heartbeat_lost", "command")
 
 
-class RecordingOptions(Frozen):
+class RecordingOptions(FrozenModel):
     """Where and how recordings are written, when a new file is begun, and how long files are kept.
 
     ``look_hz`` samples per second are there in SI units too, for viewers (0: none). With ``trigger`` only events are
@@ -119,7 +119,7 @@ class RecordingOptions(Frozen):
     trigger: Trigger | None = None
 
 
-class ZenohOptions(Frozen):
+class ZenohOptions(FrozenModel):
     """Zenoh: peers on loopback unless ``config`` names a Zenoh configuration file (JSON5)."""
 
     config: Path | None = None
@@ -130,14 +130,14 @@ class ZenohOptions(Frozen):
     cache_blocks: Annotated[int, Field(ge=0)] = 4096
 
 
-class MetricsOptions(Frozen):
+class MetricsOptions(FrozenModel):
     """An endpoint for Prometheus; off unless it has a port, and on loopback unless it has another address."""
 
     port: Annotated[int, Field(ge=0, le=65_535)] | None = None
     address: str = "127.0.0.1"
 
 
-class IdentificationOptions(Frozen):
+class IdentificationOptions(FrozenModel):
     """What the worker runs on an experiment; the same names as the options of ``armident identify``."""
 
     method: Literal["idim-piv", "idim-iv", "idim-ls", "didim", "clie", "cloe", "sep-pem"] = "idim-piv"
@@ -148,7 +148,7 @@ class IdentificationOptions(Frozen):
     physical: bool = False
 
 
-class SessionConfig(Frozen):
+class SessionConfig(FrozenModel):
     """Everything one cell needs; relative paths are relative to the file they stand in."""
 
     schema_: Literal["armident/session/1"] = Field(alias="schema")

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from armident.configs.schema.base import Frozen
+from armident.configs.schema.base import FrozenModel
 from armident.configs.schema.robot import Name, Positive
 
 Expression = str | float
@@ -16,7 +16,7 @@ Place = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*(\+[a-z][a-z0-9_]*)?$")]
 """A joint, or two of them as ``joint_2+joint_3``."""
 
 
-class SuiteRobot(Frozen):
+class SuiteRobot(FrozenModel):
     """A virtual arm and what it does.
 
     Parameters
@@ -34,7 +34,7 @@ class SuiteRobot(Frozen):
     repeats: Annotated[int, Field(ge=1)] = 1
 
 
-class SuiteEffect(Frozen):
+class SuiteEffect(FrozenModel):
     """An effect of the virtual arm, and what a diagnosis should say of it.
 
     Parameters
@@ -83,7 +83,7 @@ class SuiteEffect(Frozen):
     leave_out: Literal["rotor_inertia", "couplings"] | None = None
 
 
-class SuitePair(Frozen):
+class SuitePair(FrozenModel):
     """Two effects in one arm, each ``(effect, place)`` as in the list of effects."""
 
     robot: Name
@@ -91,7 +91,7 @@ class SuitePair(Frozen):
     levels: tuple[Level, ...] = ("typical", "obvious")
 
 
-class SuiteConfig(Frozen):
+class SuiteConfig(FrozenModel):
     """All cases of the suite.
 
     Parameters

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from armident.configs.errors import ConfigError
-from armident.configs.schema.base import Frozen
+from armident.configs.schema.base import FrozenModel
 from armident.configs.schema.robot import RobotConfig
 
 RAMP_SHARE = 0.4
@@ -20,7 +20,7 @@ REST_TOLERANCE = 1e-4
 """How far from zero a Fourier sum's first velocity and acceleration may be, relative to those of its harmonics."""
 
 
-class Move(Frozen):
+class Move(FrozenModel):
     """All joints go to ``to`` (rad or m) in ``duration`` seconds, then stand still for ``dwell``."""
 
     to: tuple[float, ...]
@@ -28,7 +28,7 @@ class Move(Frozen):
     dwell: Annotated[float, Field(ge=0)] = 0.0
 
 
-class Fourier(Frozen):
+class Fourier(FrozenModel):
     """Finite Fourier sums, periodic and smooth (Swevers 1997).
 
     ``q(t) = start + sum over l of sine[l-1] sin(l w t) + cosine[l-1] (cos(l w t) - 1)``, ``w = 2 pi frequency``.
@@ -70,7 +70,7 @@ class Fourier(Frozen):
         return away
 
 
-class Trajectory(Frozen):
+class Trajectory(FrozenModel):
     """From ``start``, either a sequence of synchronous point-to-point moves, or Fourier sums."""
 
     schema_: Literal["armident/trajectory/1"] = Field(alias="schema")

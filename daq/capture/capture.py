@@ -12,10 +12,17 @@ from pathlib import Path
 
 from armident.configs import ArmidentError, SessionConfig
 from armident.configs.schema.session import Bus
-from armident.daq.capture.files import Tidiness, capture_stamp, gathered, kept_around, limits, open_series
-from armident.daq.capture.host_metadata import host_facts
+from armident.daq.capture.files import (
+    RecordingRetention,
+    capture_stamp,
+    chunk_duration_ns,
+    kept_around,
+    limits,
+    open_series,
+)
+from armident.daq.capture.host_metadata import host_metadata
 from armident.daq.capture.journal import Line, Voice
-from armident.daq.capture.plan import Order, prepare
+from armident.daq.capture.plan import CapturePlan, load_plan
 from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.recorder import Recorder
 from armident.daq.capture.reload import Change, Reloader
@@ -28,7 +35,7 @@ from armident.drivers.can.receiver import Receiver
 from armident.drivers.can.udp import NOTE, open_bus
 from armident.drivers.canopen.emcy_listener import Eavesdropper
 
-__all__ = ["Captured", "Order", "capture", "prepare", "run_capture"]
+__all__ = ["CapturePlan", "Captured", "capture", "load_plan", "run_capture"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,7 @@ class Captured:
 
 
 def capture(
-    order: Order,
+    order: CapturePlan,
     stop: threading.Event,
     say: Callable[[str], None],
     save: threading.Event | None = None,
@@ -83,12 +90,12 @@ def capture(
         stamps = {
             f"timestamps.{channel}": kind for channel, kind in zip(receiver.channels, receiver.stamps, strict=True)
         }
-        metadata = host_facts(now) | {"capture": name, "cell": session.cell} | stamps
+        metadata = host_metadata(now) | {"capture": name, "cell": session.cell} | stamps
         rate = 1.0 / session.sync_period
         notifier = stack.enter_context(closing(Notifier()))
         writer = open_series(session, robot, order.streams, order.directory, name, metadata)
         stack.callback(writer.__exit__, None, None, None)
-        tidiness = stack.enter_context(Tidiness(session.recording, order.directory, robot.name, say))
+        tidiness = stack.enter_context(RecordingRetention(session.recording, order.directory, robot.name, say))
         try:
             if session.all_buses[0].interface == "udp_multicast":
                 say(NOTE)
@@ -129,11 +136,11 @@ def capture(
         return Captured(tuple(writer.paths), counters, tuple(run.sink.marks), trouble)
 
 
-def _exchange_limits(writer: QueuedSeries, tidiness: Tidiness) -> Change:
+def _exchange_limits(writer: QueuedSeries, tidiness: RecordingRetention) -> Change:
     """Changes how often rows are written, when files are full, how long they are kept, and how much around an event."""
 
     def change(session: SessionConfig) -> None:
-        writer.gather(gathered(session.recording))
+        writer.gather(chunk_duration_ns(session.recording))
         writer.limit(*limits(session.recording))
         if session.recording.trigger is not None:
             writer.keep(*kept_around(session.recording.trigger))
@@ -159,7 +166,7 @@ def _connect(run: Recorder, reloader: Reloader, asked: threading.Event, notifier
     run.reload, run.between = ask, between
 
 
-def _opener(bus: Bus, number: int, order: Order) -> Callable[[], FrameBus]:
+def _opener(bus: Bus, number: int, order: CapturePlan) -> Callable[[], FrameBus]:
     """Opens one bus for what the capture wants of it, and for what its controller reports."""
     return lambda: open_bus(bus, filters=order.filters(number), errors=True, hardware=True)
 
@@ -182,7 +189,7 @@ def run_capture(
         If the bus or a drive failed on the way; the file is finished then too.
     """
     say = Voice({})
-    order = prepare(config, out, duration, listen_only, sniff_s, say)
+    order = load_plan(config, out, duration, listen_only, sniff_s, say)
     say.fields = {"cell": order.session.cell, "robot": order.robot.name}
     stop, save, reload = threading.Event(), threading.Event(), threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: save.set())

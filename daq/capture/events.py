@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from armident.configs import ArmidentError, SessionConfig
 from armident.daq.capture.journal import Line
-from armident.daq.capture.plan import Order
+from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Assembler
 from armident.drivers.can.receiver import BusEvent
@@ -16,7 +16,7 @@ SYNC_STOPPED_S = 0.2
 SYNC_STOPPED = 20
 
 
-class Happenings:
+class EventHandler:
     """Takes events in the order they are noticed.
 
     Parameters
@@ -31,7 +31,7 @@ class Happenings:
         Gets the lines.
     """
 
-    def __init__(self, order: Order, assembler: Assembler, sink: Sink, say: Callable[[str], None]) -> None:
+    def __init__(self, order: CapturePlan, assembler: Assembler, sink: Sink, say: Callable[[str], None]) -> None:
         self.counts = dict.fromkeys(COUNTED, 0)
         self.moving = False
         """Whether the arm is moved: what fails then ends the capture."""

@@ -11,7 +11,7 @@ from armident.configs import RobotConfig, SessionConfig
 from armident.configs.schema.session import RecordingOptions, Trigger
 from armident.daq.matching.streams import CapturedStream
 from armident.daq.recording import QueuedSeries, RecordingSeries, RecordingWriter, TriggeredSeries
-from armident.daq.recording.retention import Janitor, prune
+from armident.daq.recording.retention import RetentionThread, prune
 
 
 def open_series(
@@ -34,7 +34,7 @@ def open_series(
     options = session.recording
     layouts = [stream.layout for stream in streams]
     every = {layout.name: layout.every for layout in layouts}
-    chunk_ns = gathered(options)
+    chunk_ns = chunk_duration_ns(options)
 
     def begin(path: Path, part: int) -> RecordingWriter:
         facts = metadata | {"part": str(part)}
@@ -53,7 +53,7 @@ def open_series(
     return QueuedSeries(TriggeredSeries(event, *kept_around(options.trigger)), every, chunk_ns)
 
 
-def gathered(options: RecordingOptions) -> int:
+def chunk_duration_ns(options: RecordingOptions) -> int:
     """Time that the rows of a chunk are gathered for, ns: what is still in the kernel is lost with them."""
     return round(max(options.chunk_ms - 2.5 * options.drain_ms, options.chunk_ms / 4) * 1e6)
 
@@ -84,7 +84,7 @@ def capture_stamp(now: datetime.datetime) -> str:
     return f"{now:%Y%m%dT%H%M%S}-{now.microsecond // 1000:03d}Z"
 
 
-class Tidiness:
+class RecordingRetention:
     """Deletes old recordings of a robot meanwhile, if the options say so; use it in a ``with`` block.
 
     Parameters
@@ -100,7 +100,7 @@ class Tidiness:
     def __init__(self, options: RecordingOptions, directory: Path, robot: str, say: Callable[[str], None]) -> None:
         self.options = options
         self._directory, self._robot = directory, robot
-        self._janitor = Janitor(self._look, say)
+        self._janitor = RetentionThread(self._look, say)
 
     def _look(self) -> list[Path]:
         options = self.options

@@ -10,7 +10,7 @@ from armident.daq.capture.clock import clock_state
 from armident.daq.capture.files import free_space
 from armident.daq.capture.jitter import SyncJitter, worst
 from armident.daq.capture.metrics import Metrics, Value
-from armident.daq.capture.plan import Order
+from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Assembler
@@ -35,7 +35,7 @@ class Health:
 
     def __init__(
         self,
-        order: Order,
+        order: CapturePlan,
         assembler: Assembler,
         receiver: Receiver,
         jitters: list[SyncJitter],

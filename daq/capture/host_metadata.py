@@ -10,7 +10,7 @@ _CLOCK = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource"
 _GIT_TIMEOUT_S = 2.0
 
 
-def host_facts(now: datetime.datetime) -> dict[str, str]:
+def host_metadata(now: datetime.datetime) -> dict[str, str]:
     """Host, kernel, clock, program version and git revision, as far as they can be told."""
     facts = {
         "started_utc": now.astimezone(datetime.UTC).isoformat(timespec="microseconds"),

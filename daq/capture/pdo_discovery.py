@@ -213,7 +213,7 @@ def listen(buses: tuple[Bus, ...], seconds: float) -> list[Frames]:
     return [np.concatenate(part) if part else np.zeros(0, FD_FRAME) for part in parts]
 
 
-def sniff(session: SessionConfig, seconds: float, say: Callable[[str], None]) -> SessionConfig:
+def discover_pdos(session: SessionConfig, seconds: float, say: Callable[[str], None]) -> SessionConfig:
     """Listen for so long, and return the session with the streams that were heard.
 
     Raises

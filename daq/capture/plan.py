@@ -13,7 +13,7 @@ from armident.configs import (
     load_session,
     load_trajectory,
 )
-from armident.daq.capture.pdo_discovery import sniff
+from armident.daq.capture.pdo_discovery import discover_pdos
 from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_streams, node_ids
 from armident.drivers.can.frames import STANDARD_ID_MASK, Filter
 from armident.drivers.canopen.bus_load import check_fits
@@ -21,7 +21,7 @@ from armident.drivers.canopen.objects import COB_SDO_REQUEST, COB_SYNC
 
 
 @dataclass(frozen=True)
-class Order:
+class CapturePlan:
     """What is to be captured."""
 
     session: SessionConfig
@@ -60,14 +60,14 @@ class Order:
         return [(can_id, STANDARD_ID_MASK) for can_id in wanted]
 
 
-def prepare(
+def load_plan(
     config: str | Path,
     out: Path | None,
     duration: float | None,
     listen_only: bool,
     sniff_s: float | None = None,
     say: Callable[[str], None] = print,
-) -> Order:
+) -> CapturePlan:
     """Load and check everything a capture needs; with ``sniff_s`` listen for so long for what the drives send.
 
     Raises
@@ -81,7 +81,7 @@ def prepare(
     if sniff_s is not None:
         if not listen_only:
             raise ConfigError("--sniff: only with --listen-only; otherwise drives are configured as the session says")
-        session = sniff(session, sniff_s, say)
+        session = discover_pdos(session, sniff_s, say)
     trajectory = None
     if session.setpoints is not None and not listen_only:
         if session.sync.role != "producer":
@@ -90,4 +90,4 @@ def prepare(
         trajectory.check(robot, str(session.setpoints.trajectory))
     directory = out if out is not None else session.recording.directory
     streams, again = captured_streams(session, robot), None if sniff_s is not None else config
-    return Order(session, robot, streams, trajectory, directory, duration, listen_only, again)
+    return CapturePlan(session, robot, streams, trajectory, directory, duration, listen_only, again)

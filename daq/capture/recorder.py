@@ -10,13 +10,13 @@ from contextlib import ExitStack, suppress
 import numpy as np
 
 from armident.configs import ArmidentError, SessionConfig
-from armident.daq.capture.events import Happenings
+from armident.daq.capture.events import EventHandler
 from armident.daq.capture.health import Health
 from armident.daq.capture.jitter import SyncJitter, worst
-from armident.daq.capture.plan import Order
+from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.publisher import Publisher
 from armident.daq.capture.remote_commands import Command
-from armident.daq.capture.setpoints import Motion, Standstill, plan_motion
+from armident.daq.capture.setpoints import SetpointSchedule, StandstillDetector, plan_setpoints
 from armident.daq.capture.sink import Sink
 from armident.daq.capture.systemd import Notifier
 from armident.daq.matching.assembler import LATE_S, Assembler
@@ -51,7 +51,7 @@ class Recorder:
 
     def __init__(
         self,
-        order: Order,
+        order: CapturePlan,
         receiver: Receiver,
         eavesdropper: Eavesdropper | None,
         sink: Sink,
@@ -77,13 +77,13 @@ class Recorder:
         )
         self._assembler.warm_up(receiver.warm_up())
         self._jitters = [SyncJitter(period_ns, overflow) for _ in receiver.channels]
-        self._happenings = Happenings(order, self._assembler, sink, say)
+        self._happenings = EventHandler(order, self._assembler, sink, say)
         self.health = Health(order, self._assembler, receiver, self._jitters, sink, publisher, say)
         self._producer: SyncProducer | KernelSync | None = None
         self._master: DriveMaster | None = None
         self._reports: DriveMaster | Eavesdropper | None = eavesdropper
         self._temperatures: TemperaturePoll | None = None
-        self._motion: Motion | None = None
+        self._motion: SetpointSchedule | None = None
         self._span: tuple[int, int] | None = None
         self._save = save
         self.between: Callable[[], None] = lambda: None
@@ -116,7 +116,7 @@ class Recorder:
         if order.trajectory is not None:
             by_joint = dict(zip((d.joint for d in session.drives), self._master.positions(), strict=True))
             actual = np.array([by_joint[joint.name] for joint in order.robot.joints], dtype=np.int64)
-            self._motion = plan_motion(session, order.robot, order.trajectory, actual)
+            self._motion = plan_setpoints(session, order.robot, order.trajectory, actual)
             self._happenings.moving = True
         if order.producing:
             timing = session.sync.period_us, session.sync.counter
@@ -331,7 +331,7 @@ class Recorder:
 
     def _await_standstill(self) -> None:
         """Go on recording until the arm is seen to rest; not for long where nothing is seen of it."""
-        standstill = Standstill(self._order.session, self._order.robot)
+        standstill = StandstillDetector(self._order.session, self._order.robot)
         begin = heard = time.monotonic()
         seen = self.sink.last_sync
         # What drives that are behind tell of earlier says nothing.

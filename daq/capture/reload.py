@@ -12,7 +12,7 @@ from typing import Any
 
 from armident.configs import ArmidentError, ConfigError, SessionConfig, load_robot, load_session
 from armident.daq.capture.journal import Line
-from armident.daq.capture.plan import Order
+from armident.daq.capture.plan import CapturePlan
 
 CHANGEABLE = (
     "recording.rotate_mb",
@@ -49,7 +49,9 @@ class Reloader:
         Takes lines.
     """
 
-    def __init__(self, config: str | Path, order: Order, changes: Sequence[Change], say: Callable[[str], None]) -> None:
+    def __init__(
+        self, config: str | Path, order: CapturePlan, changes: Sequence[Change], say: Callable[[str], None]
+    ) -> None:
         self._config, self._order, self._changes, self._say = config, order, changes, say
         self._session = order.session
         self._asked: SimpleQueue[bool] = SimpleQueue()

@@ -26,7 +26,7 @@ _ALREADY_THERE = 1e-4
 """A joint closer to the start than this (rad or m) needs no approach."""
 
 
-class Standstill:
+class StandstillDetector:
     """Sees in the newest positions whether an arm has come to rest.
 
     At rest is an arm none of whose joints was faster, on average over any 10 ms of the last 50 ms, than 0.2 % of its
@@ -69,7 +69,7 @@ class Standstill:
 
 
 @dataclass(frozen=True)
-class Motion:
+class SetpointSchedule:
     """Set points of a capture; row ``first`` is the start of the experiment, row ``last`` its end."""
 
     plan: SetpointPlan
@@ -85,9 +85,9 @@ class Motion:
         return played_from + (self.first + 1) * every, played_from + (self.last + 1) * every
 
 
-def plan_motion(
+def plan_setpoints(
     session: SessionConfig, robot: RobotConfig, trajectory: Trajectory, actual_counts: NDArray[np.int64]
-) -> Motion:
+) -> SetpointSchedule:
     """Set points from the actual motor positions on.
 
     Parameters
@@ -117,7 +117,7 @@ def plan_motion(
     parts.append(np.repeat(parts[-1][-1:], len(rest), axis=0))
     counts = np.rint(np.concatenate(parts) @ robot.transmission_matrix.T * scale).astype(np.int32)
     cob_ids = tuple(rpdo_cob(options.rpdo, node) for node in node_ids(session, robot))
-    return Motion(SetpointPlan(counts, cob_ids, options.every, bus_numbers(session, robot)), first, last)
+    return SetpointSchedule(SetpointPlan(counts, cob_ids, options.every, bus_numbers(session, robot)), first, last)
 
 
 def approach(

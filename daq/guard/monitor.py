@@ -151,7 +151,7 @@ class Watch:
             Number of the bus, in the order of the session.
         """
         limits = self._limits
-        code = _look(
+        code = check_batch(
             frames["can_id"], frames["length"], frames["data"], now_ns, bus,
             self._kind[bus], self._joint[bus], self._at, self._own_demand, self._every,
             self._raw, self._seen, self._demanded, self._beat, self._silence,
@@ -204,7 +204,7 @@ def _number(data, k, at, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _examine(  # type: ignore[no-untyped-def]
+def check_limits(  # type: ignore[no-untyped-def]
     moved, raw, seen, demanded, per_count, per_mille, positions, efforts, samples, velocity_s,
     low, high, velocity, torque, following, state, value,
 ):  # fmt: skip
@@ -244,7 +244,7 @@ def _examine(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _look(  # type: ignore[no-untyped-def]
+def check_batch(  # type: ignore[no-untyped-def]
     ids, lengths, data, now, bus, kinds, joints, at, own_demand, every, raw, seen, demanded, beat, silence,
     per_count, per_mille, positions, efforts, samples, velocity_s,
     low, high, velocity, torque, following, state, sync, value,
@@ -298,7 +298,7 @@ def _look(  # type: ignore[no-untyped-def]
             positions[samples[j] % positions.shape[0], j] = raw[0, j]
             news = True
         if news and state[ARMED]:
-            code = _examine(
+            code = check_limits(
                 j, raw, seen, demanded, per_count, per_mille, positions, efforts, samples, velocity_s,
                 low, high, velocity, torque, following, state, value,
             )  # fmt: skip

@@ -21,7 +21,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
 from armident.configs.yaml_loader import is_file
-from armident.daq.interchange.sandbox import said
+from armident.daq.interchange.sandbox import error_line
 from armident.daq.matching.assembler import Assembler, Batch
 from armident.daq.matching.streams import CapturedStream, bus_numbers, captured_streams
 from armident.daq.recording import Gap, Recording, Stream
@@ -189,7 +189,9 @@ def _read(path: Path) -> _Log:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except Exception as error:  # whatever python-can's readers say of a file that is not what its name says
-        raise DataError(f"{path}: not a readable {path.suffix[1:]} log (after {done} frames): {said(error)}") from error
+        raise DataError(
+            f"{path}: not a readable {path.suffix[1:]} log (after {done} frames): {error_line(error)}"
+        ) from error
     if not parts:
         raise DataError(f"{path}: no frames in it")
     read = np.concatenate([part[0] for part in parts])

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.configs.yaml_loader import is_file
-from armident.daq.interchange.resample import on_clock
-from armident.daq.interchange.sandbox import apart, said
+from armident.daq.interchange.resample import onto_even_clock
+from armident.daq.interchange.sandbox import error_line, read_in_subprocess
 from armident.daq.recording import Field, Recording, Stream
 from armident.daq.recording.model import Quantity, Side
 
@@ -130,7 +130,7 @@ def import_recording(
         facts |= {"effort": effort.name, "effort_sha256": hashlib.sha256(effort.read_bytes()).hexdigest()}
     if polled:
         try:
-            even = on_clock(raw)
+            even = onto_even_clock(raw)
         except DataError as error:
             raise DataError(f"{path}: {error}") from error
         raw = dict(even.values)
@@ -171,7 +171,7 @@ def _load(path: Path, robot: RobotConfig) -> Source:
             with np.load(path, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
         except Exception as error:  # whatever zipfile, zlib and numpy say of a damaged file
-            raise DataError(f"{path}: not a readable NPZ file: {said(error)}") from error
+            raise DataError(f"{path}: not a readable NPZ file: {error_line(error)}") from error
         return Source(path, _numeric(arrays))
     if kind == ".mat":
         return Source(path, _numeric(_mat(path)))
@@ -197,7 +197,7 @@ def _parquet(path: Path) -> dict[str, Any]:
         table = pyarrow.parquet.read_table(path)  # type: ignore[no-untyped-call]
         return {name: table.column(name).to_numpy() for name in table.column_names}
     except Exception as error:  # whatever pyarrow says of a damaged file
-        raise DataError(f"{path}: not a readable Parquet file: {said(error)}") from error
+        raise DataError(f"{path}: not a readable Parquet file: {error_line(error)}") from error
 
 
 def _mat(path: Path) -> dict[str, NDArray[Any]]:
@@ -212,9 +212,9 @@ def _mat(path: Path) -> dict[str, NDArray[Any]]:
 
     try:
         # Some damaged files take scipy's reader down.
-        return apart(read)
+        return read_in_subprocess(read)
     except (OSError, ValueError) as error:
-        raise DataError(f"{path}: not a readable MAT file: {said(error)}") from error
+        raise DataError(f"{path}: not a readable MAT file: {error_line(error)}") from error
 
 
 def _numeric(arrays: Mapping[str, Any]) -> Table:

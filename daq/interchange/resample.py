@@ -32,7 +32,7 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class OnClock:
+class EvenClockSamples:
     """Even samples, and how many rows were repeats and how many samples were interpolated."""
 
     values: dict[str, Floats]
@@ -40,7 +40,7 @@ class OnClock:
     interpolated: int
 
 
-def on_clock(raw: Mapping[str, Floats]) -> OnClock:
+def onto_even_clock(raw: Mapping[str, Floats]) -> EvenClockSamples:
     """Rows as they were read, as the samples of an even clock.
 
     Repeated rows are dropped and skipped samples interpolated: positions by a cubic spline, efforts linearly. Where
@@ -74,7 +74,7 @@ def on_clock(raw: Mapping[str, Floats]) -> OnClock:
             values[name] = np.ascontiguousarray(CubicSpline(ticks, value[index])(clock))
         else:
             values[name] = np.stack([np.interp(clock, ticks, column) for column in value[index].T], axis=1)
-    return OnClock(values, rows.shape[0] - index.size, clock.size - index.size)
+    return EvenClockSamples(values, rows.shape[0] - index.size, clock.size - index.size)
 
 
 def _advances(q: Floats, rows: Ints) -> Ints:

@@ -10,7 +10,7 @@ from mcap_ros2.writer import Writer
 from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
-from armident.daq.interchange.sandbox import said
+from armident.daq.interchange.sandbox import error_line
 
 TOPIC = "/joint_states"
 _TYPE = "sensor_msgs/msg/JointState"
@@ -64,7 +64,7 @@ def read_joint_states(path: Path, robot: RobotConfig) -> dict[str, NDArray[np.fl
     except DataError:
         raise
     except Exception as error:  # whatever the readers of MCAP, zstd and ROS 2's messages say of a damaged file
-        raise DataError(f"{path}: not a readable rosbag2 file: {said(error)}") from error
+        raise DataError(f"{path}: not a readable rosbag2 file: {error_line(error)}") from error
     if not t:
         raise DataError(f"{path}: no message on {topic}")
     times = np.array(t, dtype=np.int64)

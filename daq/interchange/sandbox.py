@@ -17,13 +17,13 @@ LONGEST_S = 120.0
 _REFUSED = 3
 
 
-def said(error: Exception) -> str:
+def error_line(error: Exception) -> str:
     """What a reader of others says, in one line and not too long; its name where it says nothing."""
     text = " ".join("".join(c if c.isprintable() else " " for c in str(error)).split())
     return text[:200] if text else type(error).__name__
 
 
-def apart(read: Callable[[], Mapping[str, Any]], longest_s: float = LONGEST_S) -> dict[str, NDArray[Any]]:
+def read_in_subprocess(read: Callable[[], Mapping[str, Any]], longest_s: float = LONGEST_S) -> dict[str, NDArray[Any]]:
     """The arrays of real numbers that a reader returns; it runs in a process of its own, which may crash.
 
     Raises
@@ -64,7 +64,7 @@ def _read_into(file: IO[bytes], read: Callable[[], Mapping[str, Any]]) -> int:
         except Exception as error:  # whatever readers of others raise
             file.seek(0)
             file.truncate()
-            file.write(said(error).encode(errors="replace"))
+            file.write(error_line(error).encode(errors="replace"))
             file.flush()
             return _REFUSED
     except BaseException:  # nothing of this process may run on

@@ -13,6 +13,7 @@ from armident.daq.matching.pdo_matching import EVER, count_sync, finish, match
 from armident.daq.matching.state import (
     COUNT_NAMES,
     COUNTER,
+    NEVER,
     ORIGIN,
     RECEIVED,
     SENT_AT,
@@ -21,11 +22,10 @@ from armident.daq.matching.state import (
     TIME,
     TOP,
     TORN,
-    UNSEEN,
-    Decided,
-    Shape,
-    open_books,
-    room_for,
+    MatchedSamples,
+    StreamShape,
+    new_state,
+    output_buffers,
 )
 from armident.daq.recording import Gap
 from armident.drivers.canopen.objects import COB_SDO_REQUEST
@@ -65,9 +65,9 @@ class TpdoStream:
     size: int = 0
 
     @property
-    def shape(self) -> Shape:
+    def shape(self) -> StreamShape:
         """How its frames come."""
-        return Shape(max(self.every, self.pack), self.pack, self.size or self.length, self.length)
+        return StreamShape(max(self.every, self.pack), self.pack, self.size or self.length, self.length)
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class Assembler:
             [max(_FEWEST_LATE, int(seconds * 1e9 / period_ns) // shape.every) for shape in self._shapes]
             for seconds in (LATE_S, PATIENCE_S, IN_STEP_S)
         )
-        self._books = open_books(self._shapes, window, patience, short, where, channel_of, writes_to)
+        self._books = new_state(self._shapes, window, patience, short, where, channel_of, writes_to)
         self._slack = int(self._books.slack[0])
         if first_counter is not None:
             self._books.state[:, COUNTER] = (first_counter - 1) % overflow
@@ -226,7 +226,7 @@ class Assembler:
         syncs = _count_sync(*arguments, longest, self._books)
         if dropped:
             self._books.hole[bus] = self._books.mark[:, TOP] + syncs + 1
-        out = room_for(self._books, syncs)
+        out = output_buffers(self._books, syncs)
         _match(*arguments, longest, self._books, out)
         if dropped:
             self.torn(bus)
@@ -275,7 +275,7 @@ class Assembler:
             Time of the kernel's stamps, ns UTC.
         """
         numbers, times = self._books.state[:, SYNC], self._books.state[:, TIME]
-        known = times != UNSEEN
+        known = times != NEVER
         periods = np.maximum(0, now_ns - times[known]) // self._timing[1]
         last = numbers[known] + np.minimum(np.asarray(dropped)[known], periods)
         return int(max(0, last.max(initial=self.last_sync) - self.last_sync))
@@ -283,7 +283,7 @@ class Assembler:
     def finish(self, sent: int | None = None) -> Batch:
         """No more frames come; ``sent`` SYNC were sent in all, if we know."""
         total = self.last_sync + 1 if sent is None else max(sent, self.last_sync + 1)
-        out = room_for(self._books, total - self.last_sync)
+        out = output_buffers(self._books, total - self.last_sync)
         _finish(total, self._books, out)
         return self._batch(out, True)
 
@@ -291,13 +291,13 @@ class Assembler:
         """Compile the loops for frames like these, so that no SYNC waits for the compiler."""
         few = [_FEWEST_LATE] * len(self._shapes)
         nobody = np.full((self._lossy.size, 1), -1, np.int64)
-        scratch = open_books(self._shapes, few, few, few, self._books.bus_of.tolist(), nobody, nobody)
+        scratch = new_state(self._shapes, few, few, few, self._books.bus_of.tolist(), nobody, nobody)
         arguments = (*_columns(frames), *self._timing, 0)
-        out = room_for(scratch, _count_sync(*arguments, self._longest, scratch))
+        out = output_buffers(scratch, _count_sync(*arguments, self._longest, scratch))
         _match(*arguments, self._longest, scratch, out)
         _finish(0, scratch, out)
 
-    def _batch(self, out: Decided, final: bool) -> Batch:
+    def _batch(self, out: MatchedSamples, final: bool) -> Batch:
         rows, gaps = {}, []
         for s, stream in enumerate(self._streams):
             part = slice(0, int(out.rows[s]))

@@ -31,6 +31,7 @@ from armident.daq.matching.state import (
     FRAMES_UNKNOWN,
     LENGTH,
     LOST,
+    NEVER,
     ORIGIN,
     PACK,
     RECEIVED,
@@ -44,12 +45,11 @@ from armident.daq.matching.state import (
     TPDO_DUPLICATE,
     TPDO_EARLY,
     TPDO_WRONG_LENGTH,
-    UNSEEN,
     WINDOW,
     WRONG_LENGTH,
     WRONG_MAPPING,
-    Books,
-    Decided,
+    MatchedSamples,
+    MatcherState,
 )
 from armident.daq.matching.sync_unwrap import advance
 from armident.drivers.canopen.objects import PDOS, SDO_DOWNLOAD, TPDO_COMMUNICATION, TPDO_MAPPING
@@ -58,7 +58,7 @@ EVER = int(np.iinfo(np.int64).max)
 
 
 @njit(cache=True, nogil=True)
-def _owe(b: Books, bus: int, k: int, s: int) -> None:
+def _owe(b: MatcherState, bus: int, k: int, s: int) -> None:
     """SYNC ``k`` of a bus asks for an answer, if the stream sends on it."""
     if (b.state[bus, ORIGIN] + k) % b.kind[s, EVERY]:
         return
@@ -69,7 +69,7 @@ def _owe(b: Books, bus: int, k: int, s: int) -> None:
         # Loops, not slices: this runs once per SYNC.
         for i in range(b.kind[s, PACK]):
             for other in range(b.state.shape[0]):
-                b.row_t[s, slot, i, other] = UNSEEN
+                b.row_t[s, slot, i, other] = NEVER
         for j in range(b.settled.shape[1]):
             b.row_code[s, slot, j] = LOST
     for i in range(b.kind[s, PACK]):
@@ -78,7 +78,7 @@ def _owe(b: Books, bus: int, k: int, s: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _miss(b: Books, bus: int, first: int, until: int, out: Decided) -> None:
+def _miss(b: MatcherState, bus: int, first: int, until: int, out: MatchedSamples) -> None:
     """SYNCs ``first`` to before ``until`` were sent on the bus, but not received."""
     if until <= first:
         return
@@ -89,7 +89,7 @@ def _miss(b: Books, bus: int, first: int, until: int, out: Decided) -> None:
         if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2:
             settle_all(b, bus, s, False, out)
     for k in range(first, until):
-        b.recent[bus, k % b.recent.shape[1]] = UNSEEN
+        b.recent[bus, k % b.recent.shape[1]] = NEVER
         for s in range(streams):
             _owe(b, bus, k, s)
             if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2:
@@ -105,7 +105,9 @@ def _miss(b: Books, bus: int, first: int, until: int, out: Decided) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _skip_silent(b: Books, bus: int, k: int, t_ns: int, period_ns: int, overflow: int, out: Decided) -> None:
+def _skip_silent(
+    b: MatcherState, bus: int, k: int, t_ns: int, period_ns: int, overflow: int, out: MatchedSamples
+) -> None:
     """With SYNC ``k`` of a bus, those are missing that buses farther behind than their slack should have had."""
     for other in range(b.state.shape[0]):
         last = b.state[other, SYNC]
@@ -131,7 +133,7 @@ def _skip_silent(b: Books, bus: int, k: int, t_ns: int, period_ns: int, overflow
 
 
 @njit(cache=True, nogil=True)
-def _notice_write(b: Books, j: int, request: Any, t_ns: int) -> None:
+def _notice_write(b: MatcherState, j: int, request: Any, t_ns: int) -> None:
     """An SDO request to the drive of a joint: one that writes what its TPDOs hold makes them suspect from now on."""
     index = np.int64((request >> np.uint64(8)) & np.uint64(0xFFFF))
     writes = np.int64((request >> np.uint64(5)) & np.uint64(7)) == SDO_DOWNLOAD
@@ -143,7 +145,7 @@ def _notice_write(b: Books, j: int, request: Any, t_ns: int) -> None:
 @njit(cache=True, nogil=True)
 def count_sync(
     count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
-    bus: int, longest: int, b: Books,
+    bus: int, longest: int, b: MatcherState,
 ) -> int:  # fmt: skip
     """How many SYNC numbers the frames may cover; changes nothing."""
     total, state = 0, b.state.copy()
@@ -157,7 +159,7 @@ def count_sync(
 @njit(cache=True, nogil=True)
 def match(
     count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
-    bus: int, longest: int, b: Books, out: Decided,
+    bus: int, longest: int, b: MatcherState, out: MatchedSamples,
 ) -> None:  # fmt: skip
     """Take ``count`` frames of one bus in the order they came; samples whose fate is decided go to ``out``."""
     n = b.settled.shape[1]
@@ -215,7 +217,7 @@ def match(
 
 
 @njit(cache=True, nogil=True)
-def finish(total: int, b: Books, out: Decided) -> None:
+def finish(total: int, b: MatcherState, out: MatchedSamples) -> None:
     """No more frames come: SYNCs ``0 .. total - 1`` were sent, and what is still owed is lost."""
     for bus in range(b.state.shape[0]):
         last = b.state[bus, SYNC]

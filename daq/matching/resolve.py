@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from armident.daq.matching.state import (
+    ALIGNED_SYNCS,
     AMBIGUOUS,
     BASE,
     BEHIND,
@@ -14,8 +15,8 @@ from armident.daq.matching.state import (
     CALM,
     EMITTED,
     HELD,
-    IN_STEP,
     LENGTH,
+    NEVER,
     NO_SYNC,
     PACED,
     PACK,
@@ -28,28 +29,27 @@ from armident.daq.matching.state import (
     TOP,
     TPDO_DUPLICATE,
     TPDO_LATE,
-    UNSEEN,
     UNSURE,
     WINDOW,
-    Books,
-    Decided,
+    MatchedSamples,
+    MatcherState,
 )
 
 
 @njit(cache=True, nogil=True)
-def slot_of(b: Books, s: int, u: int) -> int:
+def slot_of(b: MatcherState, s: int, u: int) -> int:
     """Where row ``u`` stands in the ring of its stream."""
     return int((u - b.mark[s, BASE]) % b.row_sync.shape[1])
 
 
 @njit(cache=True, nogil=True)
-def _seen(b: Books, s: int, j: int, u: int) -> bool:
+def _seen(b: MatcherState, s: int, j: int, u: int) -> bool:
     """Whether the SYNC of row ``u`` was received on the bus of a joint."""
-    return bool(b.row_t[s, slot_of(b, s, u), b.kind[s, PACK] - 1, b.bus_of[j]] != UNSEEN)
+    return bool(b.row_t[s, slot_of(b, s, u), b.kind[s, PACK] - 1, b.bus_of[j]] != NEVER)
 
 
 @njit(cache=True, nogil=True)
-def _place(b: Books, s: int, j: int, u: int, i: int) -> None:
+def _place(b: MatcherState, s: int, j: int, u: int, i: int) -> None:
     slot = slot_of(b, s, u)
     for w in range(b.answer.shape[3]):
         b.row_data[s, slot, j, w] = b.answer[s, j, i, w]
@@ -59,7 +59,7 @@ def _place(b: Books, s: int, j: int, u: int, i: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _same(b: Books, s: int, j: int, i: int, k: int) -> bool:
+def _same(b: MatcherState, s: int, j: int, i: int, k: int) -> bool:
     """Whether two answers of a drive have the same bytes."""
     same = b.answer_code[s, j, i] == b.answer_code[s, j, k]
     for w in range(-(-b.kind[s, LENGTH] // 8)):
@@ -70,7 +70,7 @@ def _same(b: Books, s: int, j: int, i: int, k: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _without_repeats(b: Books, s: int, j: int, owed: int) -> None:
+def _without_repeats(b: MatcherState, s: int, j: int, owed: int) -> None:
     """More answers than SYNCs: frames that were sent twice are dropped; where they cannot be told, all are in doubt."""
     count = b.pending[s, j]
     b.counts[TPDO_DUPLICATE] += count - owed
@@ -93,7 +93,7 @@ def _without_repeats(b: Books, s: int, j: int, owed: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _was_behind(b: Books, s: int, j: int, rows: int) -> None:
+def _was_behind(b: MatcherState, s: int, j: int, rows: int) -> None:
     """A drive owed the answers to so many SYNCs at once."""
     if rows >= b.behind[s, j] or b.head[b.bus_of[j], s] - b.behind_at[s, j] > 2 * b.kind[s, WINDOW]:
         b.behind[s, j] = rows
@@ -101,7 +101,7 @@ def _was_behind(b: Books, s: int, j: int, rows: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _keep_pace(b: Books, s: int, j: int) -> None:
+def _keep_pace(b: MatcherState, s: int, j: int) -> None:
     """See how a drive keeps up: how far it is behind the rows at its best, and for how long it stays there."""
     head = b.head[b.bus_of[j], s]
     balance = b.pending[s, j] - (head - b.settled[s, j])
@@ -116,14 +116,14 @@ def _keep_pace(b: Books, s: int, j: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _close(b: Books, s: int, j: int, until: int, unsure: bool) -> None:
+def _close(b: MatcherState, s: int, j: int, until: int, unsure: bool) -> None:
     """The rows before ``until`` are settled, all answers taken; whether some may still come to rows given up."""
     b.settled[s, j], b.pending[s, j] = until, 0
-    b.pace[s, j, BEST], b.pace[s, j, STOOD], b.pace[s, j, UNSURE] = UNSEEN, 0, int(unsure)
+    b.pace[s, j, BEST], b.pace[s, j, STOOD], b.pace[s, j, UNSURE] = NEVER, 0, int(unsure)
 
 
 @njit(cache=True, nogil=True)
-def _drop_first(b: Books, s: int, j: int, count: int) -> None:
+def _drop_first(b: MatcherState, s: int, j: int, count: int) -> None:
     """The first answers are to rows that were given up; where frames were sent twice nobody can say how many are."""
     for i in range(1, b.pending[s, j]):
         if _same(b, s, j, i, i - 1):
@@ -138,7 +138,7 @@ def _drop_first(b: Books, s: int, j: int, count: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _may_repeat(b: Books, s: int, j: int) -> bool:
+def _may_repeat(b: MatcherState, s: int, j: int) -> bool:
     """Whether late answers came together that may be one sent twice: the next SYNC shows if there are too many."""
     found = False
     for i in range(1, b.pending[s, j]):
@@ -147,7 +147,7 @@ def _may_repeat(b: Books, s: int, j: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _not_behind(b: Books, s: int, j: int) -> int:
+def _not_behind(b: MatcherState, s: int, j: int) -> int:
     """How many of its answers a drive has certainly sent in time, or all where it is not known to have been behind."""
     count, prompt = b.pending[s, j], 0
     while prompt < count and not b.pace[s, j, UNSURE] and b.label[s, j, prompt] == b.settled[s, j] + prompt:
@@ -162,7 +162,7 @@ def _not_behind(b: Books, s: int, j: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _settle(b: Books, s: int, j: int, final: bool, witness: bool) -> None:
+def _settle(b: MatcherState, s: int, j: int, final: bool, witness: bool) -> None:
     """Close the books of one TPDO of one drive: match what is certain, give up what nobody answers any more."""
     bus = b.bus_of[j]
     head, unsure = b.head[bus, s], b.pace[s, j, UNSURE] != 0
@@ -172,7 +172,7 @@ def _settle(b: Books, s: int, j: int, final: bool, witness: bool) -> None:
     b.fresh[s, j] = 0
     balance, stood = b.pending[s, j] - owed, b.pace[s, j, STOOD]
     # Where answers to rows given up may come in between, as many as SYNCs prove nothing before they keep step.
-    if (balance == 0 and not unsure) or (balance >= 0 and unsure and stood >= IN_STEP):
+    if (balance == 0 and not unsure) or (balance >= 0 and unsure and stood >= ALIGNED_SYNCS):
         if balance > 0:
             _drop_first(b, s, j, balance)
         elif not unsure and not final and b.pace[s, j, HELD] != head - 1 and _may_repeat(b, s, j):
@@ -189,7 +189,7 @@ def _settle(b: Books, s: int, j: int, final: bool, witness: bool) -> None:
     count = b.pending[s, j]
     last = b.label[s, j, count - 1] + 1 if count else b.settled[s, j]
     # It answers every SYNC, and no better than that while others owe nothing: what it still owes is lost.
-    in_step = balance < 0 and stood >= IN_STEP and head - b.pace[s, j, BEST_AT] >= b.kind[s, SHORT]
+    in_step = balance < 0 and stood >= ALIGNED_SYNCS and head - b.pace[s, j, BEST_AT] >= b.kind[s, SHORT]
     in_step = in_step and (witness or b.settled[s, j] < b.hole[bus, s])
     silent = witness and head - last > 2 * b.kind[s, SHORT]
     late = owed > b.kind[s, WINDOW] and head - b.mark[s, BEHIND] > b.kind[s, WINDOW]
@@ -226,7 +226,7 @@ def _settle(b: Books, s: int, j: int, final: bool, witness: bool) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _give_up_refilled(b: Books, s: int, j: int, count: int) -> None:
+def _give_up_refilled(b: MatcherState, s: int, j: int, count: int) -> None:
     """As many answers as SYNCs, where frames were missing lately, may be one lost and a later one sent twice."""
     repeated, unlike = -1, False
     for i in range(1, count):
@@ -239,7 +239,7 @@ def _give_up_refilled(b: Books, s: int, j: int, count: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _give_up_doubtful(b: Books, s: int, j: int, count: int) -> None:
+def _give_up_doubtful(b: MatcherState, s: int, j: int, count: int) -> None:
     """Of answers taken as prompt where one was lost, those that need not have been."""
     # Answers that came in a burst after a silence: with one of them lost, none can be told from the next.
     previous = b.settled[s, j] - 1
@@ -270,7 +270,7 @@ def _give_up_doubtful(b: Books, s: int, j: int, count: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _sample(b: Books, s: int, slot: int, j: int, i: int, word: int) -> Any:
+def _sample(b: MatcherState, s: int, slot: int, j: int, i: int, word: int) -> Any:
     """Eight bytes of sample ``i`` of a packed answer."""
     value = np.uint64(0)
     for octet in range(8 * word, min(b.kind[s, SIZE], 8 * word + 8)):
@@ -281,7 +281,7 @@ def _sample(b: Books, s: int, slot: int, j: int, i: int, word: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _emit(b: Books, s: int, end: int, out: Decided) -> None:
+def _emit(b: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
     """Give out the rows before ``end``; a packed one is as many samples."""
     pack, buses = b.kind[s, PACK], b.state.shape[0]
     words = -(-b.kind[s, SIZE] // 8)
@@ -293,12 +293,12 @@ def _emit(b: Books, s: int, end: int, out: Decided) -> None:
                 continue
             o = out.rows[s]
             out.sync[s, o] = k
-            out.t_ns[s, o] = UNSEEN
+            out.t_ns[s, o] = NEVER
             for bus in range(buses - 1, -1, -1):
-                if b.row_t[s, slot, i, bus] != UNSEEN:
+                if b.row_t[s, slot, i, bus] != NEVER:
                     out.t_ns[s, o] = b.row_t[s, slot, i, bus]
             for j in range(b.settled.shape[1]):
-                seen = b.row_t[s, slot, i, b.bus_of[j]] != UNSEEN
+                seen = b.row_t[s, slot, i, b.bus_of[j]] != NEVER
                 out.code[s, o, j] = b.row_code[s, slot, j] if seen else NO_SYNC
                 for w in range(words):
                     out.data[s, o, j, w] = b.row_data[s, slot, j, w] if pack == 1 else _sample(b, s, slot, j, i, w)
@@ -309,7 +309,7 @@ def _emit(b: Books, s: int, end: int, out: Decided) -> None:
 
 
 @njit(cache=True, nogil=True)
-def settle_all(b: Books, bus: int, s: int, final: bool, out: Decided) -> None:
+def settle_all(b: MatcherState, bus: int, s: int, final: bool, out: MatchedSamples) -> None:
     """Close the books of the drives on one bus, and give out what all drives have settled."""
     n = b.settled.shape[1]
     head = b.head[bus, s]
@@ -330,7 +330,7 @@ def settle_all(b: Books, bus: int, s: int, final: bool, out: Decided) -> None:
                     b.row_data[s, slot, j, w] = b.answer[s, j, 0, w]
                 b.row_code[s, slot, j] = b.answer_code[s, j, 0] if head > b.doubt[s, j] else AMBIGUOUS
                 b.settled[s, j], b.pending[s, j], b.fresh[s, j] = head, 0, 0
-                b.pace[s, j, BEST], b.pace[s, j, STOOD] = UNSEEN, 0
+                b.pace[s, j, BEST], b.pace[s, j, STOOD] = NEVER, 0
                 if b.pace[s, j, PACED] != head:
                     b.pace[s, j, PACED] = head
                     b.pace[s, j, CALM] += 1
@@ -340,7 +340,7 @@ def settle_all(b: Books, bus: int, s: int, final: bool, out: Decided) -> None:
         whole = whole and b.settled[s, j] >= b.hole[b.bus_of[j], s]
         # Buses are read one after the other: what another one was like before, or has become since, says nothing.
         begun, ended = b.pace[s, j, PACED] - b.pace[s, j, CALM], b.pace[s, j, PACED]
-        if begun <= head - IN_STEP and ended >= head - 1:
+        if begun <= head - ALIGNED_SYNCS and ended >= head - 1:
             calm += 1
             calm_here += b.bus_of[j] == bus
     if all_owe and whole:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 LOST, RECEIVED, WRONG_LENGTH, AMBIGUOUS, NO_SYNC, WRONG_MAPPING = range(6)
 """What is known of one joint's sample at one SYNC."""
 
-UNSEEN = int(np.iinfo(np.int64).min)
+NEVER = int(np.iinfo(np.int64).min)
 """The time of a SYNC that was not received."""
 
 # Positions in Books.state, per bus: number, counter and time of the last SYNC, counter of SYNC 0, whether the last
@@ -32,7 +32,7 @@ TOP, BASE, BEHIND, EMITTED = range(4)
 # because one of them may have been sent twice.
 BEST, BEST_AT, STOOD, CALM, PACED, UNSURE, HELD = range(7)
 
-IN_STEP = 8
+ALIGNED_SYNCS = 8
 """A drive whose balance stands for so many rows answers each of them."""
 
 STILL = 3
@@ -67,7 +67,7 @@ SENT_AT = 1 << 16
 """SYNCs of our own have the times kept at which they were sent."""
 
 
-class Books(NamedTuple):
+class MatcherState(NamedTuple):
     """What is owed and what has come; buses ``b``, streams ``s``, joints ``j``, a stream's own SYNCs as ordinals ``u``.
 
     Rows ``u`` of stream ``s`` stand in ring slots ``(u - base) % C`` until every joint has settled them; with nothing
@@ -110,7 +110,7 @@ class Books(NamedTuple):
     row_data: NDArray[np.uint64]
 
 
-class Decided(NamedTuple):
+class MatchedSamples(NamedTuple):
     """Samples whose fate is decided, ``rows[s]`` of each stream; ``t_ns`` is that of the first bus with the SYNC."""
 
     rows: NDArray[np.int64]
@@ -120,7 +120,7 @@ class Decided(NamedTuple):
     data: NDArray[np.uint64]
 
 
-class Shape(NamedTuple):
+class StreamShape(NamedTuple):
     """What a stream is made of: every how many SYNCs a frame is due, its samples, and the bytes of sample and frame."""
 
     every: int
@@ -129,15 +129,15 @@ class Shape(NamedTuple):
     length: int
 
 
-def open_books(
-    shapes: Sequence[Shape],
+def new_state(
+    shapes: Sequence[StreamShape],
     window: list[int],
     patience: list[int],
     short: list[int],
     bus_of: Sequence[int],
     channel_of: NDArray[np.int64],
     writes_to: NDArray[np.int64],
-) -> Books:
+) -> MatcherState:
     """Empty books; ``channel_of`` (buses, identifiers) maps a COB-ID on a bus to ``s n + j``, or -1.
 
     ``writes_to`` maps that of an SDO request likewise to the joint ``j``.
@@ -149,11 +149,11 @@ def open_books(
     pack = max(shape.pack for shape in shapes)
     slack = max(w * s.every for w, s in zip(window, shapes, strict=True))
     recent = RECENT if buses == 1 else RECENT + 2 * slack
-    return Books(
-        state=np.tile(np.array([-1, -1, UNSEEN, 1, 0, 0, 0]), (buses, 1)),
+    return MatcherState(
+        state=np.tile(np.array([-1, -1, NEVER, 1, 0, 0, 0]), (buses, 1)),
         slack=np.full(buses, slack, np.int64),
-        recent=np.full((buses, recent), UNSEEN, np.int64),
-        sent_at=np.full(SENT_AT, UNSEEN, np.int64),
+        recent=np.full((buses, recent), NEVER, np.int64),
+        sent_at=np.full(SENT_AT, NEVER, np.int64),
         sent=np.array([-1]),
         counts=np.zeros(len(COUNT_NAMES), np.int64),
         kind=np.array(
@@ -169,7 +169,7 @@ def open_books(
         writes_to=writes_to,
         head=np.zeros((buses, streams), np.int64),
         hole=np.zeros((buses, streams), np.int64),
-        pace=np.tile(np.array([UNSEEN, 0, 0, 0, 0, 0, UNSEEN]), (streams, n, 1)),
+        pace=np.tile(np.array([NEVER, 0, 0, 0, 0, 0, NEVER]), (streams, n, 1)),
         settled=np.zeros((streams, n), np.int64),
         pending=np.zeros((streams, n), np.int64),
         fresh=np.zeros((streams, n), np.int64),
@@ -177,7 +177,7 @@ def open_books(
         behind=np.zeros((streams, n), np.int64),
         behind_at=np.zeros((streams, n), np.int64),
         doubt=np.zeros((streams, n), np.int64),
-        suspect=np.tile(np.array([0, UNSEEN]), (n, 1)),
+        suspect=np.tile(np.array([0, NEVER]), (n, 1)),
         label=np.zeros((streams, n, answers), np.int64),
         answer=np.zeros((streams, n, answers, words), np.uint64),
         answer_code=np.zeros((streams, n, answers), np.uint8),
@@ -188,12 +188,12 @@ def open_books(
     )
 
 
-def room_for(books: Books, syncs: int) -> Decided:
+def output_buffers(books: MatcherState, syncs: int) -> MatchedSamples:
     """Room for what can be decided when ``syncs`` more SYNC are known of."""
     streams, _, n = books.row_code.shape
     rows = int(((books.mark[:, TOP] - books.mark[:, EMITTED] + 1) * books.kind[:, PACK]).max()) + syncs
     words = int(-(-books.kind[:, SIZE] // 8).max())
-    return Decided(
+    return MatchedSamples(
         rows=np.zeros(streams, np.int64),
         sync=np.empty((streams, rows), np.int64),
         t_ns=np.empty((streams, rows), np.int64),

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from armident.daq.matching.state import BORROWED, COUNTER, FORGOTTEN, ORIGIN, STRAYED, SYNC, TIME, TORN, UNSEEN
+from armident.daq.matching.state import BORROWED, COUNTER, FORGOTTEN, NEVER, ORIGIN, STRAYED, SYNC, TIME, TORN
 
 _EARLY = 0.25
 """By how much of a turn of the counter the time between two SYNCs may be too short, as their stamps say."""
@@ -70,7 +70,7 @@ def _begin(state: Any, recent: Any, bus: int, counter: int, t_ns: int, period_ns
             apart = abs(elapsed - ahead)
             k = state[other, SYNC] + ahead
             room = recent.shape[1]
-            if ahead <= 0 <= k and ahead > -room and recent[other, k % room] != UNSEEN:
+            if ahead <= 0 <= k and ahead > -room and recent[other, k % room] != NEVER:
                 # Known when the other bus had it: a master that was held up since does not matter.
                 apart = abs(t_ns - recent[other, k % room]) / period_ns
             if apart > _MISALIGNED:
@@ -99,11 +99,11 @@ def _heard_elsewhere(state: Any, recent: Any, bus: int, step: int, t_ns: int, pe
         k += (state[bus, SYNC] + step - k) % overflow
         while k <= last:
             at = recent[other, k % room]
-            if at != UNSEEN and abs(t_ns - at) <= nearest:
+            if at != NEVER and abs(t_ns - at) <= nearest:
                 best, nearest = k - state[bus, SYNC], float(abs(t_ns - at))
             elif best == NOWHERE and last - room + 1 < k < last:
                 before, after = recent[other, (k - 1) % room], recent[other, (k + 1) % room]
-                if before != UNSEEN and after != UNSEEN and before < t_ns < after:
+                if before != NEVER and after != NEVER and before < t_ns < after:
                     best = k - state[bus, SYNC]
             k += overflow
     return int(best)
@@ -151,7 +151,7 @@ def _told_by_counter(
     state: Any, b: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int
 ) -> int:
     """By how many SYNCs a bus advances whose SYNC has a counter, as had the one before it."""
-    elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != UNSEEN else 0.0
+    elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != NEVER else 0.0
     step = (counter - state[bus, COUNTER]) % overflow
     if b.sent[0] > state[bus, SYNC]:
         half_turn_ns = period_ns * overflow // 2
@@ -189,12 +189,12 @@ def advance(state: Any, b: Any, bus: int, counter: int, t_ns: int, period_ns: in
         step = _told_by_counter(state, b, bus, counter, t_ns, period_ns, overflow, longest)
     elif counter < 0 and state.shape[0] > 1:
         # Without a counter, time alone keeps the buses together.
-        elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != UNSEEN else 0.0
+        elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != NEVER else 0.0
         step = min(max(1, int(np.rint(elapsed))), max(1, longest))
     else:
         step = 1
     if step > 0:
-        if state[bus, TIME] != UNSEEN:
+        if state[bus, TIME] != NEVER:
             state[bus, STRAYED] -= state[bus, STRAYED] >> FORGOTTEN
             if abs(t_ns - state[bus, TIME] - step * period_ns) > (_ON_TIME + _DRIFT * step) * period_ns:
                 state[bus, STRAYED] += 1 << FORGOTTEN

@@ -3,7 +3,7 @@
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.model import Field, Gap, Mark, Recording, Stream, join_parts
 from armident.daq.recording.reader import read_recording
-from armident.daq.recording.recovery import Healed, heal_recording
+from armident.daq.recording.recovery import Recovered, recover_recording
 from armident.daq.recording.ring_buffer import TriggeredSeries
 from armident.daq.recording.rotation import RecordingSeries
 from armident.daq.recording.writer import RecordingWriter, write_recording
@@ -12,17 +12,17 @@ from armident.daq.recording.writer_thread import QueuedSeries
 __all__ = [
     "Field",
     "Gap",
-    "Healed",
     "Mark",
     "QueuedSeries",
     "Recording",
     "RecordingSeries",
     "RecordingWriter",
+    "Recovered",
     "Stream",
     "StreamLayout",
     "TriggeredSeries",
-    "heal_recording",
     "join_parts",
     "read_recording",
+    "recover_recording",
     "write_recording",
 ]

@@ -19,7 +19,7 @@ Event = tuple[str, int, dict[str, Any]]
 """Topic, SYNC number and entries."""
 
 
-class Spans:
+class RowRanges:
     """Rows of streams, from one SYNC to another; what goes on without a seam is one span.
 
     Parameters
@@ -48,15 +48,15 @@ class Spans:
             first = spans.pop()[0]
         spans.append((first, last))
 
-    def take(self) -> "Spans":
+    def take(self) -> "RowRanges":
         """All of it, which is then elsewhere."""
-        taken = Spans(self._every)
+        taken = RowRanges(self._every)
         taken._spans, self._spans = self._spans, taken._spans
         return taken
 
-    def before(self, other: "Spans") -> "Spans":
+    def before(self, other: "RowRanges") -> "RowRanges":
         """These rows, and those of another that came later."""
-        both = Spans(self._every)
+        both = RowRanges(self._every)
         for spans in (self._spans, other._spans):
             for stream, found in spans.items():
                 for first, last in found:
@@ -75,7 +75,7 @@ class Spans:
         return [Gap(name, *span, None, NOT_WRITTEN) for name, spans in self._spans.items() for span in spans]
 
 
-class Unwritten:
+class LostRows:
     """Rows and events of chunks that failed, and those of the chunk that is being gathered.
 
     Parameters
@@ -85,14 +85,14 @@ class Unwritten:
     """
 
     def __init__(self, every: Mapping[str, int]) -> None:
-        self._gathered, self._lost = Spans(every), Spans(every)
+        self._gathered, self._lost = RowRanges(every), RowRanges(every)
         self.events: list[Event] = []
 
     def gather(self, stream: str, sync: NDArray[np.int64]) -> None:
         """Rows of these SYNCs are in the chunk."""
         self._gathered.add(stream, sync)
 
-    def lose(self, rows: Spans) -> None:
+    def lose(self, rows: RowRanges) -> None:
         """Rows that never came into a chunk are lost."""
         self._lost = self._lost.before(rows)
 
@@ -110,7 +110,7 @@ class Unwritten:
         """The rows that were lost."""
         return self._lost.gaps()
 
-    def take_over(self, other: "Unwritten") -> None:
+    def take_over(self, other: "LostRows") -> None:
         """Take what another file could not be told."""
         self.events += other.events
         self._lost = other._lost.before(self._lost)

@@ -19,14 +19,16 @@ PREFIX = "si_"
 
 
 @dataclass(frozen=True)
-class Look:
+class PreviewChannel:
     """What is shown of one stream: every ``every``-th SYNC, by ``matrix`` (n, n) from the raw values of each field."""
 
     layout: StreamLayout
     matrices: tuple[NDArray[np.float64], ...]
 
     @classmethod
-    def at(cls, stream: StreamLayout, robot: RobotConfig, sample_rate_hz: float, rate_hz: float) -> "Look | None":
+    def at(
+        cls, stream: StreamLayout, robot: RobotConfig, sample_rate_hz: float, rate_hz: float
+    ) -> "PreviewChannel | None":
         """A view of a stream with at most ``rate_hz`` samples per second; ``None`` if it has nothing to show."""
         every = stream.every * max(1, -(-round(sample_rate_hz) // round(max(rate_hz, 1.0) * stream.every)))
         fields, matrices = [], []

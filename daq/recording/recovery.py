@@ -28,7 +28,7 @@ _COPY = 1 << 24
 
 
 @dataclass(frozen=True)
-class Healed:
+class Recovered:
     """What became of a file.
 
     Parameters
@@ -46,7 +46,7 @@ class Healed:
     original: Path | None = None
 
 
-def heal_recording(path: Path | str) -> Healed:
+def recover_recording(path: Path | str) -> Recovered:
     """Make a torn recording an indexed one that any MCAP reader opens.
 
     A file that merely ends too early gets its end in place, so that no space for a copy is needed: what follows its
@@ -74,16 +74,16 @@ def heal_recording(path: Path | str) -> Healed:
             found = _scan(path, data)
             missing = found.missing
             if missing is None:
-                return Healed(path, None)
+                return Recovered(path, None)
             if found.holes:
-                return Healed(path, missing, _rewrite(path, data, found, missing))
+                return Recovered(path, missing, _rewrite(path, data, found, missing))
             file.truncate(found.end)
             file.seek(found.end)
             for part in _ending(found, found.end, missing):
                 file.write(part)
             file.flush()
             os.fsync(file.fileno())
-            return Healed(path, missing)
+            return Recovered(path, missing)
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such recording") from error
     except OSError as error:

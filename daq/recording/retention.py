@@ -79,7 +79,7 @@ def _is_being_written(path: Path) -> bool:
     return False
 
 
-class Janitor:
+class RetentionThread:
     """Prunes from time to time in a thread of its own: deleting gigabytes may take longer than a capture can wait.
 
     Parameters

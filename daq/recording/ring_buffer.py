@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError
-from armident.daq.recording.lost_rows import Spans
+from armident.daq.recording.lost_rows import RowRanges
 from armident.daq.recording.model import Gap, Mark
 from armident.daq.recording.rotation import RETRY_NS, RecordingSeries
 
@@ -128,7 +128,7 @@ class TriggeredSeries:
         elif marks:
             self._keep(_Events(marks[-1].t_ns, marks=tuple(marks)), marks[-1].t_ns)
 
-    def leave_out(self, rows: Spans) -> None:
+    def leave_out(self, rows: RowRanges) -> None:
         """See :meth:`RecordingWriter.leave_out`."""
         if self._series is not None:
             self._series.leave_out(rows)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError
-from armident.daq.recording.lost_rows import Spans
+from armident.daq.recording.lost_rows import RowRanges
 from armident.daq.recording.model import Gap, Mark
 from armident.daq.recording.writer import RecordingWriter
 
@@ -106,7 +106,7 @@ class RecordingSeries:
         """See :meth:`RecordingWriter.add_marks`."""
         self._writer.add_marks(marks)
 
-    def leave_out(self, rows: Spans) -> None:
+    def leave_out(self, rows: RowRanges) -> None:
         """See :meth:`RecordingWriter.leave_out`."""
         self._writer.leave_out(rows)
 

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
-from armident.daq.recording.lost_rows import STANDS_STILL, Spans, Unwritten
+from armident.daq.recording.lost_rows import STANDS_STILL, LostRows, RowRanges
 from armident.daq.recording.model import Gap, Mark, Recording
-from armident.daq.recording.preview import PREFIX, Look
+from armident.daq.recording.preview import PREFIX, PreviewChannel
 from armident.daq.recording.summary import Summary
 
 SCHEMA = "armident/recording/1"
@@ -100,7 +100,7 @@ class RecordingWriter:
         first = 1 + zlib.crc32(repr(texts).encode()) % _MOST_CHANNELS
         self._layouts = {layout.name: (k, layout) for k, layout in enumerate(layouts, start=first)}
         self._topics = {topic: first + len(layouts) + k for k, topic in enumerate(_EVENTS)}
-        looks = [Look.at(layout, robot, sample_rate_hz, look_hz) for layout in layouts if look_hz > 0]
+        looks = [PreviewChannel.at(layout, robot, sample_rate_hz, look_hz) for layout in layouts if look_hz > 0]
         numbers = range(first + len(layouts) + len(_EVENTS), 2**16)
         self._looks = {
             look.layout.name[len(PREFIX) :]: (k, look)
@@ -108,7 +108,7 @@ class RecordingWriter:
         }
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
         self._parts: list[bytes] = []
-        self._unwritten = Unwritten({layout.name: layout.every for layout in layouts})
+        self._unwritten = LostRows({layout.name: layout.every for layout in layouts})
         self._last_ns = 0
         self._indexes: dict[int, list[NDArray[np.uint64]]] = {}
         self._size = 0
@@ -197,7 +197,7 @@ class RecordingWriter:
             self._unwritten.events.append((MARKS_TOPIC, mark.sync, asdict(mark)))
         self._flush_if_full()
 
-    def leave_out(self, rows: Spans) -> None:
+    def leave_out(self, rows: RowRanges) -> None:
         """Rows that nobody could hand to the disk: they are lost as if it had refused them."""
         self.lost_rows += rows.rows
         self.problem = f"{self.path}: {STANDS_STILL}"

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.daq.recording.lost_rows import STANDS_STILL, Spans
+from armident.daq.recording.lost_rows import STANDS_STILL, RowRanges
 from armident.daq.recording.model import Gap, Mark
 from armident.daq.recording.ring_buffer import TriggeredSeries
 from armident.daq.recording.rotation import RecordingSeries
@@ -118,7 +118,7 @@ class QueuedSeries:
         self._failure: BaseException | None = None
         # Of rows, what was handed over and what was done with: each is counted by one thread.
         self._put_bytes = self._put_rows = self._done_bytes = self._done_rows = 0
-        self._left_out, self._left_out_rows, self._told_rows = Spans(every), 0, 0
+        self._left_out, self._left_out_rows, self._told_rows = RowRanges(every), 0, 0
         self._thread: threading.Thread | None = threading.Thread(target=self._run, name="disk", daemon=True)
         self._thread.start()
 

@@ -49,7 +49,7 @@ class HeartbeatSocket:
         self._socket.close()
 
 
-class Silences:
+class HeartbeatMonitor:
     """How long each drive has been silent, and was until its last heartbeat.
 
     A machine that was held up as a whole stamps late what came meanwhile, or has lost it. So where the consumer was

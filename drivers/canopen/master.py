@@ -18,7 +18,7 @@ from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.drivers.can.frames import BusDown
 from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.cia402_enable import POLL_INTERVAL, enable_drive, stand_still, state_of
-from armident.drivers.canopen.heartbeat_monitor import Silences
+from armident.drivers.canopen.heartbeat_monitor import HeartbeatMonitor
 from armident.drivers.canopen.network import NodeNetwork
 from armident.drivers.canopen.objects import Control, DriveState, NmtCommand, NmtState
 from armident.drivers.canopen.pdo_mapping import check_drive, map_drive, mapping_differs
@@ -95,7 +95,7 @@ class DriveMaster:
         self._limit = HEARTBEATS_MISSED * session.heartbeat_ms * 1e-3 + HEARTBEAT_MARGIN
         self._lost: set[str] = set()
         self._joints = {(session.bus_of(d).channel, d.node_id): d.joint for d in session.drives}
-        self._silences: Silences | None = None
+        self._silences: HeartbeatMonitor | None = None
         self._reviving: dict[str, threading.Thread] = {}
         self.suspect: dict[str, tuple[int, int]] = {}
         """From when on, and until when (ns, UTC), the TPDOs of joints are not to be trusted; a new one per change."""
@@ -154,7 +154,7 @@ class DriveMaster:
         for sdo in self._drives:
             self._await_operational(sdo)
         self._heard()
-        self._silences = Silences(self._joints.values(), time.monotonic())
+        self._silences = HeartbeatMonitor(self._joints.values(), time.monotonic())
         self._started, self._started_ns = True, time.time_ns()
         if not enable:
             return
@@ -281,7 +281,7 @@ class DriveMaster:
             for node, at in network.heartbeats.read()
         ]
 
-    def _judge(self, silences: Silences) -> None:
+    def _judge(self, silences: HeartbeatMonitor) -> None:
         """Tell whose heartbeats stay away, and whose are back, by when they came and not by when they are looked at."""
         if time.monotonic() - silences.looked < LOOK_S:
             return

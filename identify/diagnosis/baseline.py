@@ -11,7 +11,7 @@ from armident.configs import DataError
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
 from armident.identify.document import IdentificationDocument
 from armident.identify.effects.effect import Effect, Place
-from armident.identify.regression.equations import COVARIANCE_PASSES, Block, noise_models
+from armident.identify.regression.equations import COVARIANCE_PASSES, ExperimentEquations, noise_models
 
 Array = NDArray[np.float64]
 
@@ -152,7 +152,8 @@ def cautious(fit: Fit) -> Fit:
     A search compares candidates in one recording, and needs neither; two recordings are compared by covariances.
     """
     blocks = [
-        Block(y, x, np.ones(y.shape, dtype=np.bool_), np.arange(float(y.shape[0]))) for x, _, y in fit.equations.train
+        ExperimentEquations(y, x, np.ones(y.shape, dtype=np.bool_), np.arange(float(y.shape[0])))
+        for x, _, y in fit.equations.train
     ]
     for _ in range(COVARIANCE_PASSES - 1):
         fit = fit.renoised(noise_models(blocks, fit.theta, fit.covariance, MAX_AR_ORDER))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.identify.regression.equations import Block, filtered_regressor
+from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.physical import damp_to_physical
@@ -176,7 +176,7 @@ class AuxiliaryModel:
         """Filtered regressor at motions that know no noise, one (M, n, b) per experiment."""
         return [filtered_regressor(self.model, self._in_band(motion), self.decimation) for motion in motions]
 
-    def equations(self, blocks: Sequence[Block], theta: NDArray[np.float64]) -> list[Block]:
+    def equations(self, blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ExperimentEquations]:
         """The equations with the simulated regressor in place of the measured one (2.32).
 
         Raises

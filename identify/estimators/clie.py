@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.output_error import output_error
-from armident.identify.regression.equations import ITERATIONS, Block, Estimate
+from armident.identify.regression.equations import ITERATIONS, Estimate, ExperimentEquations
 
 
 def clie(
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     auxiliary: AuxiliaryModel,
     start: NDArray[np.float64],
     iterations: int = ITERATIONS,

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from armident.configs import DataError
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.output_error import output_error
-from armident.identify.regression.equations import ITERATIONS, Block, Estimate
+from armident.identify.regression.equations import ITERATIONS, Estimate, ExperimentEquations
 
 
 def cloe(
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     positions: Sequence[NDArray[np.float64]],
     auxiliary: AuxiliaryModel,
     start: NDArray[np.float64],

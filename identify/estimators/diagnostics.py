@@ -16,8 +16,8 @@ from scipy import linalg, signal, stats
 from armident.identify.regression.ar_noise import ArModel, lagged_sums
 from armident.identify.regression.equations import (
     MAX_AR_ORDER,
-    Block,
     Estimate,
+    ExperimentEquations,
     instrumental_variable,
     inverse_gram,
     least_squares,
@@ -175,7 +175,7 @@ class Diagnostics:
 def diagnose_estimate(
     names: Sequence[str],
     joints: Sequence[str],
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     estimate: Estimate,
     *,
     instruments: Sequence[Array] | None = None,
@@ -235,7 +235,10 @@ def diagnose_estimate(
 
 
 def instrument_relevance(
-    names: Sequence[str], blocks: Sequence[Block], instruments: Sequence[Array], weights: Sequence[ArModel]
+    names: Sequence[str],
+    blocks: Sequence[ExperimentEquations],
+    instruments: Sequence[Array],
+    weights: Sequence[ArModel],
 ) -> tuple[Relevance, ...]:
     """Shea's partial R^2 and the conditional first-stage F of every parameter.
 
@@ -268,7 +271,7 @@ def instrument_relevance(
 
 def durbin_wu_hausman(
     names: Sequence[str],
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     instruments: Sequence[Array],
     weights: Sequence[ArModel],
     noise: Sequence[ArModel],
@@ -324,7 +327,7 @@ def durbin_wu_hausman(
 def residual_tests(
     names: Sequence[str],
     joints: Sequence[str],
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     estimate: Estimate,
     noise: Sequence[ArModel],
     instruments: Sequence[Array] | None = None,
@@ -451,7 +454,10 @@ def nested_f_test(theta: Array, covariance: Array, kept: NDArray[np.bool_], equa
 
 
 def _check(
-    names: Sequence[str], joints: Sequence[str], blocks: Sequence[Block], instruments: Sequence[Array] | None
+    names: Sequence[str],
+    joints: Sequence[str],
+    blocks: Sequence[ExperimentEquations],
+    instruments: Sequence[Array] | None,
 ) -> None:
     for k, block in enumerate(blocks):
         if block.x.shape[1:] != (len(joints), len(names)):
@@ -531,7 +537,12 @@ def _absorbed(sensitivities: Sequence[Array], covariance: Array, lags: int) -> A
 
 
 def _magnitudes(
-    names: Sequence[str], motion: Sequence[Array], blocks: Sequence[Block], theta: Array, joint: int, order: int
+    names: Sequence[str],
+    motion: Sequence[Array],
+    blocks: Sequence[ExperimentEquations],
+    theta: Array,
+    joint: int,
+    order: int,
 ) -> tuple[tuple[str, ...], Array]:
     """Speed and torque magnitudes of a joint (M, k) at the instants of its residuals, and what they are."""
     against, columns = ["torque"], [[np.abs(x[:, joint] @ theta) for x in motion]]

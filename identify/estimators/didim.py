@@ -9,8 +9,8 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.sensitivity import torque_sensitivities
 from armident.identify.regression.equations import (
     ITERATIONS,
-    Block,
     Estimate,
+    ExperimentEquations,
     Iterations,
     inverse_gram,
     iterate,
@@ -24,7 +24,7 @@ from armident.identify.regression.equations import (
 
 
 def didim(
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     auxiliary: AuxiliaryModel,
     start: NDArray[np.float64],
     iterations: int = ITERATIONS,
@@ -70,8 +70,8 @@ def didim(
 
 
 def solve_didim(
-    blocks: Sequence[Block], auxiliary: AuxiliaryModel, start: NDArray[np.float64], iterations: int
-) -> tuple[Iterations, list[Block]]:
+    blocks: Sequence[ExperimentEquations], auxiliary: AuxiliaryModel, start: NDArray[np.float64], iterations: int
+) -> tuple[Iterations, list[ExperimentEquations]]:
     """The iterations of DIDIM, and the simulated equations at their end."""
     scale = noise = joint_variances(blocks, np.zeros_like(start))
 

@@ -10,7 +10,7 @@ from scipy import signal
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.regression.ar_noise import ArModel, fit_spectrum
-from armident.identify.regression.equations import Block
+from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.robot.controller import DiscreteController
 
 FREQUENCIES = 2048
@@ -45,13 +45,13 @@ class InverseController:
         inverse = np.asarray(np.linalg.inv(auxiliary.model.robot.transmission_matrix), dtype=np.float64)
         return cls(inverse, tuple(fit_spectrum(1.0 / row**2, order) for row in gain))
 
-    def __call__(self, blocks: Sequence[Block]) -> list[Block]:
+    def __call__(self, blocks: Sequence[ExperimentEquations]) -> list[ExperimentEquations]:
         """The same equations, torques (M, n) and regressor (M, n, b), at the motors and through ``C_j^-1``.
 
         An equation of a motor is kept where those of all joints that load it are.
         """
         return [
-            Block(
+            ExperimentEquations(
                 self._filtered(block.y @ self.to_motor),
                 self._filtered(np.einsum("mjb,ji->mib", block.x, self.to_motor, optimize=True)),
                 ~((~block.keep).astype(float) @ np.abs(self.to_motor) > 0.0),

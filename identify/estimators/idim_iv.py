@@ -9,8 +9,8 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
     ITERATIONS,
-    Block,
     Estimate,
+    ExperimentEquations,
     instrumental_variable,
     iterate,
     iv_covariance,
@@ -24,7 +24,7 @@ from armident.identify.regression.equations import (
 
 
 def idim_iv(
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     auxiliary: AuxiliaryModel,
     start: NDArray[np.float64],
     iterations: int = ITERATIONS,

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from armident.identify.regression.equations import (
-    Block,
     Estimate,
+    ExperimentEquations,
     inverse_gram,
     joint_variances,
     least_squares,
@@ -16,7 +16,7 @@ from armident.identify.regression.equations import (
 )
 
 
-def idim_ls(blocks: Sequence[Block], names: Sequence[str], *, weighted: bool = True) -> Estimate:
+def idim_ls(blocks: Sequence[ExperimentEquations], names: Sequence[str], *, weighted: bool = True) -> Estimate:
     """Ordinary, then weighted least squares.
 
     Parameters

@@ -11,8 +11,8 @@ from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
     ITERATIONS,
     MAX_AR_ORDER,
-    Block,
     Estimate,
+    ExperimentEquations,
     iterate,
     joint_variances,
     noise_models,
@@ -26,7 +26,7 @@ NOISE_UPDATES = 6
 
 
 def idim_piv(
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     auxiliary: AuxiliaryModel,
     start: NDArray[np.float64],
     iterations: int = ITERATIONS,
@@ -65,7 +65,7 @@ def idim_piv(
     auxiliary = auxiliary.fresh()
     controller = InverseController.of(auxiliary, max_order) if grey_box else None
 
-    def seen(equations: Sequence[Block]) -> Sequence[Block]:
+    def seen(equations: Sequence[ExperimentEquations]) -> Sequence[ExperimentEquations]:
         return equations if controller is None else controller(equations)
 
     measured = seen(blocks)

@@ -16,7 +16,7 @@ from armident.identify.signals.decimate import Decimation
 
 
 @dataclass
-class FollowedMotion(AuxiliaryModel):
+class MotionInstruments(AuxiliaryModel):
     """The limit of an infinitely stiff controller: the references are the motion, whatever the parameters.
 
     For arms that nothing recorded lets simulate: no reference, and an estimate of inertias so far from physical that no

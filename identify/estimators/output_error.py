@@ -13,8 +13,8 @@ from armident.identify.estimators.sensitivity import Array, Arrays, difference_s
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
     TOLERANCE,
-    Block,
     Estimate,
+    ExperimentEquations,
     column_norms,
     error_variances,
     inverse_gram,
@@ -42,7 +42,7 @@ NEAR = 3.0
 def output_error(
     signal: Signal,
     measured: Arrays,
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     auxiliary: AuxiliaryModel,
     start: Array,
     iterations: int,
@@ -94,25 +94,25 @@ def output_error(
 def _approach(
     signal: Signal,
     measured: Arrays,
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     auxiliary: AuxiliaryModel,
     start: Array,
     iterations: int,
-) -> "_Search":
+) -> "_LevenbergMarquardt":
     """The better of the start and of what pseudo-linear regression makes of it."""
-    given = _Search(signal, measured, blocks, auxiliary, *auxiliary.reachable(start))
+    given = _LevenbergMarquardt(signal, measured, blocks, auxiliary, *auxiliary.reachable(start))
     near, _ = solve_didim(blocks, auxiliary, given.theta, iterations)
-    found = _Search(signal, measured, blocks, auxiliary, *auxiliary.reachable(near.theta))
-    return min(given, found, key=_Search.log_likelihood_loss)
+    found = _LevenbergMarquardt(signal, measured, blocks, auxiliary, *auxiliary.reachable(near.theta))
+    return min(given, found, key=_LevenbergMarquardt.log_likelihood_loss)
 
 
 @dataclass
-class _Search:
+class _LevenbergMarquardt:
     """Where the minimisation stands: theta, its response, and the sensitivities last computed."""
 
     signal: Signal
     measured: Arrays
-    blocks: Sequence[Block]
+    blocks: Sequence[ExperimentEquations]
     auxiliary: AuxiliaryModel
     theta: Array
     response: Response

@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 from armident.configs import DataError
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.equations import Block, column_norms, error_variances, unweighted, weighted_rows
+from armident.identify.regression.equations import (
+    ExperimentEquations,
+    column_norms,
+    error_variances,
+    unweighted,
+    weighted_rows,
+)
 from armident.identify.regression.tall_qr import triangularize
 
 Array = NDArray[np.float64]
@@ -142,7 +148,7 @@ def _quotient(moved: Response, response: Response, step: float) -> Response:
 
 
 def torque_sensitivities(
-    auxiliary: AuxiliaryModel, theta: Array, blocks: Sequence[Block], noise: Sequence[ArModel]
+    auxiliary: AuxiliaryModel, theta: Array, blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
 ) -> Array:
     """Jacobian of the simulated torque (4.4), weighted, shape (rows, b).
 

@@ -11,8 +11,8 @@ from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
     ITERATIONS,
     MAX_AR_ORDER,
-    Block,
     Estimate,
+    ExperimentEquations,
     inverse_gram,
     joint_variances,
     noise_models,
@@ -22,7 +22,7 @@ from armident.identify.regression.equations import (
 
 
 def sep_pem(
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     auxiliary: AuxiliaryModel,
     start: NDArray[np.float64],
     iterations: int = ITERATIONS,

@@ -18,7 +18,7 @@ CLEAN_BASELINE_SEED = 5000
 
 
 @dataclass(frozen=True)
-class HiddenPart:
+class InjectedEffect:
     """One effect of a case.
 
     Parameters
@@ -82,7 +82,7 @@ class Case:
     repeats: int
     period: float
     seed: int
-    parts: tuple[HiddenPart, ...] = ()
+    parts: tuple[InjectedEffect, ...] = ()
     baseline: bool = False
     leave_out: str | None = None
     quick: bool = field(default=False, compare=False)
@@ -169,7 +169,7 @@ def chosen(
     return [case for case in cases if wanted(case)]
 
 
-def twin(case: Case) -> Case:
+def healthy_twin(case: Case) -> Case:
     """The healthy arm on the same trajectory with the same noise, judged by the full model."""
     return Case("clean", None, case.robot, case.config, case.trajectory, case.repeats, case.period, case.seed)
 
@@ -200,11 +200,11 @@ def _clean(suite: SuiteConfig) -> list[Case]:
     return plain + judged
 
 
-def _part(suite: SuiteConfig, effect: SuiteEffect, robot: str, place: str, level: Level) -> HiddenPart:
+def _part(suite: SuiteConfig, effect: SuiteEffect, robot: str, place: str, level: Level) -> InjectedEffect:
     joint, _, other = place.partition("+")
     names = (effect.expected or effect.effect, *effect.same_as.get(robot, ()))
     strength = effect.strength[robot][place] * suite.multiples[level]
-    return HiddenPart(
+    return InjectedEffect(
         effect.effect,
         joint,
         other or None,

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from armident.configs import ArmidentError, ConfigError, load_suite
-from armident.identify.evaluation.cases import Case, all_cases, chosen, twin
+from armident.identify.evaluation.cases import Case, all_cases, chosen, healthy_twin
 from armident.identify.evaluation.markdown import report
 from armident.identify.evaluation.score import score
 from armident.identify.evaluation.show import progress, show
@@ -98,10 +98,10 @@ def judged(cases: Sequence[Case], store: Store) -> tuple[list[Scored], list[Case
     missing = 0
     for case in cases:
         record: Record | None = store.get(case.key)
-        healthy = store.get(twin(case).key) if case.parts else None
+        healthy = store.get(healthy_twin(case).key) if case.parts else None
         if record is not None and (healthy is not None or not case.parts):
             scored.append((case, score(case, record, healthy)))
-        elif store.failure(case.key) or store.failure(twin(case).key):
+        elif store.failure(case.key) or store.failure(healthy_twin(case).key):
             failed.append(case)
         else:
             missing += 1

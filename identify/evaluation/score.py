@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from armident.identify.evaluation.cases import Case, HiddenPart
+from armident.identify.evaluation.cases import Case, InjectedEffect
 from armident.identify.evaluation.store import Record
 
 Document = dict[str, Any]
@@ -109,7 +109,7 @@ def score(case: Case, record: Record, healthy: Record | None) -> Score:
     )
 
 
-def matches(part: HiddenPart, finding: Document) -> bool:
+def matches(part: InjectedEffect, finding: Document) -> bool:
     """Whether a finding (or a rival of one) names a hidden effect and its place; a pair in either order."""
     if finding["effect"] not in part.names:
         return False
@@ -213,15 +213,15 @@ def within(finding: Document, truth: dict[str, float]) -> list[bool]:
     return out
 
 
-def _comes_with(part: HiddenPart, finding: Document) -> bool:
+def _comes_with(part: InjectedEffect, finding: Document) -> bool:
     return finding["effect"] in part.brings and finding["joint"] == part.joint
 
 
-def _among(part: HiddenPart, findings: Sequence[Document]) -> bool:
+def _among(part: InjectedEffect, findings: Sequence[Document]) -> bool:
     return any(matches(part, f) or any(matches(part, rival) for rival in f["alternatives"][:1]) for f in findings)
 
 
-def _called_invisible(part: HiddenPart, truth: dict[str, float], document: Document) -> bool:
+def _called_invisible(part: InjectedEffect, truth: dict[str, float], document: Document) -> bool:
     """Whether the diagnosis says that an effect cannot show, or could hide with parameters of this size."""
     if any(matches(part, entry) for entry in document["not_visible"]):
         return True

@@ -10,7 +10,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from armident.configs import ArmidentError
-from armident.identify.evaluation.cases import BASELINE_SEED, Case, HiddenPart, twin
+from armident.identify.evaluation.cases import BASELINE_SEED, Case, InjectedEffect, healthy_twin
 from armident.identify.evaluation.process import Room
 from armident.identify.evaluation.store import Record, Store
 
@@ -74,7 +74,7 @@ class Lanes:
                     except Empty:
                         return
                     if case.parts:
-                        self._carry_out(twin(case), bench)
+                        self._carry_out(healthy_twin(case), bench)
                     done(case, self._carry_out(case, bench))
             finally:
                 for room in rooms:
@@ -193,7 +193,7 @@ class _Bench:
         self._diagnosis.ask(request, PATIENCE_S)
 
 
-def _effect(part: HiddenPart) -> dict[str, Any]:
+def _effect(part: InjectedEffect) -> dict[str, Any]:
     return {
         "effect": part.effect,
         "joint": part.joint,

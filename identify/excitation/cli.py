@@ -9,10 +9,17 @@ from armident.configs import ConfigError, RobotConfig, load_robot, load_trajecto
 from armident.identify.cli_tables import design_table, progress, wanted_table
 from armident.identify.document import IdentificationDocument, load_document, write_atomically
 from armident.identify.effects.terms import arm_model
-from armident.identify.excitation.design import ASSUMED_NOISE, Design, Shape, aimed_at, assess, design_trajectory
-from armident.identify.excitation.objective import Aim
+from armident.identify.excitation.design import (
+    ASSUMED_NOISE,
+    Design,
+    Shape,
+    design_trajectory,
+    predict_precision,
+    with_objective,
+)
+from armident.identify.excitation.objective import EffectObjective
 from armident.identify.excitation.plot import check_name, draw
-from armident.identify.excitation.previous_estimate import Prior, prior_from
+from armident.identify.excitation.previous_estimate import PreviousEstimate, prior_from
 
 SHAPES: tuple[Shape, ...] = ("moves", "fourier")
 
@@ -54,7 +61,7 @@ def trajectory_command(
     check_name(picture)
     prior = None if known is None else prior_from(load_document(known, IdentificationDocument), robot, str(known))
     theta = None if prior is None else prior.theta
-    aim = aimed_at(robot, wanted, joint, against, theta)
+    aim = with_objective(robot, wanted, joint, against, theta)
     if look_at is not None:
         design = _looked_at(robot, look_at, prior, aim)
     else:
@@ -85,20 +92,20 @@ def trajectory_command(
         _refuse_torque(robot, design, name)
 
 
-def _looked_at(robot: RobotConfig, path: Path, prior: Prior | None, aim: Aim | None) -> Design:
+def _looked_at(robot: RobotConfig, path: Path, prior: PreviousEstimate | None, aim: EffectObjective | None) -> Design:
     trajectory = load_trajectory(path)
     trajectory.check(robot, str(path))
     noise = _assumed(robot) if prior is None else prior.noise
     theta = None if prior is None else prior.theta
-    return assess(arm_model(robot), trajectory, noise, theta=theta, aim=aim)
+    return predict_precision(arm_model(robot), trajectory, noise, theta=theta, aim=aim)
 
 
-def _tell(robot: RobotConfig, design: Design, prior: Prior | None) -> None:
+def _tell(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> None:
     """Print the standard deviations to expect."""
     std = design.std
     if prior is None or std is None:
         model = arm_model(robot)
-        std = assess(model, design.trajectory, _assumed(robot)).std
+        std = predict_precision(model, design.trajectory, _assumed(robot)).std
         assert std is not None
         print(f"noise unknown (no --known): supposed to be {100 * ASSUMED_NOISE:g} % of each joint's torque limit")
         design_table(robot, None, std)

@@ -22,8 +22,15 @@ from scipy.signal import butter, sosfiltfilt
 from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.fourier_series import FourierSearch
-from armident.identify.excitation.objective import Aim, aim_for
-from armident.identify.excitation.point_to_point import CUTOFF, SEARCH_RATE, Search, equations_of, motion_of, slow_share
+from armident.identify.excitation.objective import EffectObjective, effect_objective
+from armident.identify.excitation.point_to_point import (
+    CUTOFF,
+    SEARCH_RATE,
+    PointToPointSearch,
+    equations_of,
+    sample_trajectory,
+    slow_share,
+)
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.signals.decimate import design
@@ -75,7 +82,7 @@ def design_trajectory(
     evaluations: int = 2000,
     margin: float = 0.9,
     theta: ArrayLike | None = None,
-    aim: Aim | None = None,
+    aim: EffectObjective | None = None,
     shape: Shape = "moves",
     harmonics: int | None = None,
     progress: Callable[[float], None] | None = None,
@@ -115,7 +122,7 @@ def design_trajectory(
     sigma = np.array([limit.torque for limit in limits]) if noise is None else np.asarray(noise, dtype=np.float64)
     if sigma.shape != (robot.n,) or not (sigma > 0.0).all():
         raise ConfigError(f"noise: expected {robot.n} positive numbers for {robot.name}")
-    search = Search(robot, model, duration, sigma, margin, theta, aim, np.random.default_rng(seed))
+    search = PointToPointSearch(robot, model, duration, sigma, margin, theta, aim, np.random.default_rng(seed))
     if shape == "fourier":
         trajectory = _search(FourierSearch(search, harmonics), evaluations, progress)
     elif harmonics is not None:
@@ -123,7 +130,7 @@ def design_trajectory(
     else:
         trajectory = _search(search, evaluations, progress)
     trajectory.check(robot, "designed trajectory")
-    return assess(model, trajectory, sigma, known_noise=noise is not None, theta=theta, aim=aim)
+    return predict_precision(model, trajectory, sigma, known_noise=noise is not None, theta=theta, aim=aim)
 
 
 class _Candidates(Protocol[C]):
@@ -153,9 +160,9 @@ def _search(among: _Candidates[C], evaluations: int, progress: Callable[[float],
     return among.trajectory(best)
 
 
-def aimed_at(
+def with_objective(
     robot: RobotConfig, wanted: str | None, joint: str | None, against: str | None, theta: ArrayLike | None = None
-) -> Aim | None:
+) -> EffectObjective | None:
     """The aim that a user writes with ``--for``, ``--joint`` and ``--against``; ``None`` without ``--for``.
 
     Speeds and loads for which the effect is to be visible are those of a usual trajectory of the robot.
@@ -163,7 +170,7 @@ def aimed_at(
     Raises
     ------
     ConfigError
-        See `armident.identify.excitation.objective.aim_for`; or if ``joint`` or ``against`` stand alone.
+        See `armident.identify.excitation.objective.effect_objective`; or if ``joint`` or ``against`` stand alone.
     """
     if wanted is None:
         for option, value in (("--joint", joint), ("--against", against)):
@@ -173,11 +180,11 @@ def aimed_at(
     model = arm_model(robot)
     usual = design_trajectory(robot, seed=0, evaluations=0).trajectory
     period = 1.0 / SEARCH_RATE
-    motion = (model if theta is None else model.anchored(theta)).motion(*motion_of(usual, period), period)
-    return aim_for(robot, wanted, joint, against, motion)
+    motion = (model if theta is None else model.anchored(theta)).motion(*sample_trajectory(usual, period), period)
+    return effect_objective(robot, wanted, joint, against, motion)
 
 
-def assess(
+def predict_precision(
     model: ArmModel,
     trajectory: Trajectory,
     noise: ArrayLike,
@@ -185,7 +192,7 @@ def assess(
     cutoff_hz: float = CUTOFF,
     known_noise: bool = True,
     theta: ArrayLike | None = None,
-    aim: Aim | None = None,
+    aim: EffectObjective | None = None,
 ) -> Design:
     """What a trajectory promises: conditioning and standard deviations after the low-pass filter.
 
@@ -199,7 +206,7 @@ def assess(
         As for `design_trajectory`.
     """
     period = PERIOD
-    q, qd, qdd = motion_of(trajectory, period)
+    q, qd, qdd = sample_trajectory(trajectory, period)
     torque = None if theta is None else model.inverse_dynamics(theta, q, qd, qdd)
     x = model.base_regressor(q, qd, qdd, dt=period)
     keep = max(1, round(0.5 / (cutoff_hz * period)))

@@ -6,7 +6,7 @@ import numpy as np
 
 from armident.configs import Trajectory
 from armident.configs.schema.trajectory import Fourier
-from armident.identify.excitation.point_to_point import Search
+from armident.identify.excitation.point_to_point import PointToPointSearch
 from armident.identify.robot.chain import Floats
 
 HIGHEST_HZ = 1.6
@@ -26,7 +26,7 @@ DIGITS = 7
 
 
 @dataclass(frozen=True)
-class Sums:
+class FourierSeries:
     """Coefficients (2, H, n) of sine and cosine before they are fitted into the limits, and the middle (n,) wanted.
 
     ``share`` (n,) is how much of what the limits allow is used; ``middle`` where in the free range the motion lies, 0
@@ -49,7 +49,7 @@ class FourierSearch:
         How many; ``None``: up to `HIGHEST_HZ`.
     """
 
-    def __init__(self, search: Search, harmonics: int | None = None) -> None:
+    def __init__(self, search: PointToPointSearch, harmonics: int | None = None) -> None:
         self._search, self._rng, self.n = search, search.rng, search.low.size
         self.frequency = 1.0 / search.duration
         self.harmonics = harmonics or max(FEWEST, int(HIGHEST_HZ * search.duration))
@@ -63,12 +63,12 @@ class FourierSearch:
             np.stack([-(rate**2) * np.sin(angle), -(rate**2) * np.cos(angle)]),
         ]
 
-    def random(self) -> Sums:
+    def random(self) -> FourierSeries:
         """Coefficients that fall with the order: as much velocity in each harmonic."""
         coefficients = self._rng.standard_normal((2, self.harmonics, self.n)) / self._weights[0][None, :, None]
-        return Sums(coefficients, self._rng.uniform(0.6, 1.0, self.n), self._rng.uniform(0.0, 1.0, self.n))
+        return FourierSeries(coefficients, self._rng.uniform(0.6, 1.0, self.n), self._rng.uniform(0.0, 1.0, self.n))
 
-    def neighbour(self, candidate: Sums) -> Sums:
+    def neighbour(self, candidate: FourierSeries) -> FourierSeries:
         """The candidate with a few coefficients changed, and perhaps its place."""
         rng, size = self._rng, self._rng.choice(STEPS)
         chosen = rng.random(candidate.coefficients.shape) < rng.choice([0.05, 0.2, 1.0])
@@ -76,9 +76,9 @@ class FourierSearch:
         step = rng.standard_normal(candidate.coefficients.shape) * scale
         share = np.clip(candidate.share + size * rng.standard_normal(self.n) * (rng.random(self.n) < 0.3), 0.2, 1.0)
         middle = np.clip(candidate.middle + size * rng.standard_normal(self.n) * (rng.random(self.n) < 0.3), 0.0, 1.0)
-        return Sums(np.where(chosen, candidate.coefficients + step, candidate.coefficients), share, middle)
+        return FourierSeries(np.where(chosen, candidate.coefficients + step, candidate.coefficients), share, middle)
 
-    def trajectory(self, candidate: Sums) -> Trajectory:
+    def trajectory(self, candidate: FourierSeries) -> Trajectory:
         """The candidate at rest in the beginning, as large as the limits allow."""
         weights = self._weights[:, :, None]
         at_rest = candidate.coefficients - weights * (weights * candidate.coefficients).sum(axis=1, keepdims=True) / (
@@ -105,6 +105,6 @@ class FourierSearch:
             fourier=Fourier(frequency=self.frequency, sine=sine, cosine=cosine),
         )
 
-    def cost(self, candidate: Sums) -> float:
+    def cost(self, candidate: FourierSeries) -> float:
         """As that of moves."""
         return self._search.worth(self.trajectory(candidate))

@@ -23,7 +23,7 @@ CONTAINED = 1e-8
 
 
 @dataclass(frozen=True)
-class Seat:
+class EffectLocation:
     """An effect at a place, at the values of its nonlinear parameters that are to be thought of."""
 
     effect: Effect
@@ -37,10 +37,10 @@ class Seat:
 
 
 @dataclass(frozen=True)
-class Aim:
+class EffectObjective:
     """Effects to be estimated, each with the rival that it is to be told from, or without one."""
 
-    pairs: tuple[tuple[Seat, Seat | None], ...]
+    pairs: tuple[tuple[EffectLocation, EffectLocation | None], ...]
 
     @property
     def predicts(self) -> bool:
@@ -84,7 +84,9 @@ class Aim:
         return found
 
 
-def aim_for(robot: RobotConfig, wanted: str, joint: str | None, against: str | None, motion: Motion) -> Aim:
+def effect_objective(
+    robot: RobotConfig, wanted: str, joint: str | None, against: str | None, motion: Motion
+) -> EffectObjective:
     """Aim at an effect, at one joint or wherever it can sit.
 
     Parameters
@@ -115,13 +117,13 @@ def aim_for(robot: RobotConfig, wanted: str, joint: str | None, against: str | N
     if not here:
         raise ConfigError(f"--for {wanted}: {robot.name} has no place for it")
     if rival is None:
-        return Aim(tuple((seat, None) for seat in here))
+        return EffectObjective(tuple((seat, None) for seat in here))
     there = _seats(rival, robot, at, motion)
     met = [(one, two) for one, two in product(here, there) if _meet(one, two)]
     if not met:
         raise ConfigError(f"--against {against}: never at the same joint as {wanted}")
     # Both must be estimated well for either to be told from the other.
-    return Aim(tuple(pair for one, two in met for pair in ((one, two), (two, one))))
+    return EffectObjective(tuple(pair for one, two in met for pair in ((one, two), (two, one))))
 
 
 def weighted(x: Array, sigma: ArrayLike) -> Array:
@@ -137,7 +139,7 @@ def _designable(name: str, option: str) -> Effect:
     return effect
 
 
-def _seats(effect: Effect, robot: RobotConfig, joint: int | None, motion: Motion) -> list[Seat]:
+def _seats(effect: Effect, robot: RobotConfig, joint: int | None, motion: Motion) -> list[EffectLocation]:
     found = []
     for place in places(effect, robot.n):
         elsewhere = joint is not None and effect.scope != "arm" and joint not in (place.joint, place.other)
@@ -145,24 +147,30 @@ def _seats(effect: Effect, robot: RobotConfig, joint: int | None, motion: Motion
             continue
         every = grid(effect, motion, place)
         chosen = sorted({round(share * (len(every) - 1)) for share in TYPICAL})
-        found.append(Seat(effect, place, tuple(every[k] for k in chosen)))
+        found.append(EffectLocation(effect, place, tuple(every[k] for k in chosen)))
     return found
 
 
-def _meet(one: Seat, two: Seat) -> bool:
+def _meet(one: EffectLocation, two: EffectLocation) -> bool:
     if "arm" in (one.effect.scope, two.effect.scope):
         return True
     return bool({one.place.joint, one.place.other} & {two.place.joint, two.place.other} - {None})
 
 
-def _number(seat: Seat) -> str:
+def _number(seat: EffectLocation) -> str:
     if seat.effect.scope == "arm":
         return ""
     return f"{seat.place.joint + 1}" if seat.place.other is None else f"{seat.place.joint + 1}{seat.place.other + 1}"
 
 
 def _information(
-    seat: Seat, shapes: Shapes, rival: Seat | None, motion: Motion, x: Array, decimation: Decimation, sigma: Array
+    seat: EffectLocation,
+    shapes: Shapes,
+    rival: EffectLocation | None,
+    motion: Motion,
+    x: Array,
+    decimation: Decimation,
+    sigma: Array,
 ) -> tuple[Array, Array]:
     """Information in the columns of an effect alone (k,), and over it what is left beside model and rival (k, k).
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from armident.configs import ConfigError, RobotConfig
 from armident.identify.excitation.design import PERIOD, Design
-from armident.identify.excitation.point_to_point import motion_of
+from armident.identify.excitation.point_to_point import sample_trajectory
 
 SUFFIXES = (".png", ".svg", ".pdf")
 LINE, LIMIT, OUTSIDE = "#2a5d8f", "#b5403a", "#f6dfdd"
@@ -34,7 +34,7 @@ def draw(robot: RobotConfig, design: Design, path: Path, title: str) -> None:
         If the file cannot be written, or its suffix is none of these.
     """
     check_name(path)
-    q, qd, qdd = motion_of(design.trajectory, PERIOD)
+    q, qd, qdd = sample_trajectory(design.trajectory, PERIOD)
     time = np.arange(len(q)) * PERIOD
     columns = [("position", "", q), ("velocity", "/s", qd), ("acceleration", "/s²", qdd)]
     if design.torque is not None:

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from armident.configs import RobotConfig, Trajectory
 from armident.configs.schema.trajectory import RAMP_SHARE, Move
-from armident.identify.excitation.objective import Aim, weighted
+from armident.identify.excitation.objective import EffectObjective, weighted
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.robot.motion import Motion
@@ -65,14 +65,14 @@ def slow_share(robot: RobotConfig, qd: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Moves:
+class PointToPoint:
     """Waypoints (K, n) and paces (K,): how much slower than the limits each move is."""
 
     points: Floats
     paces: Floats
 
 
-class Search:
+class PointToPointSearch:
     """Candidates within the limits, and their cost."""
 
     def __init__(
@@ -83,7 +83,7 @@ class Search:
         sigma: Floats,
         margin: float,
         theta: ArrayLike | None,
-        aim: Aim | None,
+        aim: EffectObjective | None,
         rng: np.random.Generator,
     ) -> None:
         limits = [joint.limits for joint in robot.joints]
@@ -98,7 +98,7 @@ class Search:
         self.aim, self.anchored = aim, model if theta is None else model.anchored(theta)
         self.decimation = design(1.0 / (AIM_FACTOR * SEARCH_RATE), CUTOFF, AIM_FACTOR)
 
-    def random(self) -> Moves:
+    def random(self) -> PointToPoint:
         """Waypoints within reach of each other, the last one home, as many as fit the duration."""
         reach = self.rng.uniform(*REACH) * (self.high - self.low) if self.aim is None else None
         points: list[Floats] = []
@@ -115,7 +115,7 @@ class Search:
             paces.append(pace)
             here = point
         points[-1] = self.home
-        return Moves(np.array(points), np.array(paces))
+        return PointToPoint(np.array(points), np.array(paces))
 
     def _far(self) -> Floats:
         """How far the joints may go in one move (n,), each its own: the wanted one slowly while others hardly move."""
@@ -123,7 +123,7 @@ class Search:
         far: Floats = share * (self.high - self.low)
         return far
 
-    def neighbour(self, candidate: Moves) -> Moves:
+    def neighbour(self, candidate: PointToPoint) -> PointToPoint:
         """The candidate with a few coordinates changed."""
         points, paces = candidate.points.copy(), candidate.paces.copy()
         change = self.rng.random(points.shape) < self.rng.choice([0.03, 0.1, 0.3])
@@ -132,9 +132,9 @@ class Search:
         points = np.where(change, np.clip(points + step, self.low, self.high), points)
         points[-1] = self.home
         change_pace = self.rng.random(paces.shape) < 0.1
-        return Moves(points, np.where(change_pace, self._pace(paces.size), paces))
+        return PointToPoint(points, np.where(change_pace, self._pace(paces.size), paces))
 
-    def trajectory(self, candidate: Moves) -> Trajectory:
+    def trajectory(self, candidate: PointToPoint) -> Trajectory:
         """The moves of a candidate, their durations in whole milliseconds and adding up."""
         durations = self._durations(candidate)
         ends = np.round(np.cumsum(durations), 3)
@@ -146,7 +146,7 @@ class Search:
         )
         return Trajectory(schema="armident/trajectory/1", start=tuple(float(v) for v in self.home), moves=moves)
 
-    def cost(self, candidate: Moves) -> float:
+    def cost(self, candidate: PointToPoint) -> float:
         """Mean logarithm of the standard deviations, raised where conditioning is poor or joints are slow.
 
         Infinite where a limit is exceeded.
@@ -161,7 +161,7 @@ class Search:
         """Cost of a trajectory that keeps the limits of motion; infinite where it exceeds those of torque."""
         factor = 1 if self.aim is None else AIM_FACTOR
         period = 1.0 / (factor * SEARCH_RATE)
-        q, qd, qdd = motion_of(trajectory, period)
+        q, qd, qdd = sample_trajectory(trajectory, period)
         if self.theta is not None:
             torque = self.model.inverse_dynamics(self.theta, q, qd, qdd)
             if (np.abs(torque) > self.torque).any():
@@ -189,7 +189,7 @@ class Search:
             return self.rng.uniform(1.0, SLOWEST_PACE, count)
         return np.exp(self.rng.uniform(0.0, np.log(AIM_SLOWEST_PACE), count))
 
-    def _durations(self, candidate: Moves) -> Floats:
+    def _durations(self, candidate: PointToPoint) -> Floats:
         lengths = np.diff(np.vstack([self.home, candidate.points]), axis=0)
         wanted = np.maximum(self._shortest(lengths), SHORTEST_MOVE) * candidate.paces
         result: Floats = wanted * self.duration / wanted.sum()
@@ -205,7 +205,7 @@ class Search:
 def equations_of(
     model: ArmModel, motion: Motion, decimation: Decimation, sigma: Floats
 ) -> tuple[Floats, Decimation, Floats]:
-    """Weighted base regressor (R, b) at the instants a decimation keeps, with what else an `Aim` asks for."""
+    """Weighted base regressor (R, b) at the instants of a decimation, with what an `EffectObjective` needs besides."""
     kept = decimation.instants(motion.samples)
     x = model.rigid_regressor(motion.q[kept], motion.qd[kept], motion.qdd[kept])
     if model.terms:
@@ -213,7 +213,7 @@ def equations_of(
     return weighted(x, sigma), decimation, sigma
 
 
-def motion_of(trajectory: Trajectory, period: float) -> tuple[Floats, Floats, Floats]:
+def sample_trajectory(trajectory: Trajectory, period: float) -> tuple[Floats, Floats, Floats]:
     """Positions, velocities and accelerations (N, n) along a trajectory, by differences."""
     q = trajectory.sample(period)
     qd = np.gradient(q, period, axis=0)

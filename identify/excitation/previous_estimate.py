@@ -16,14 +16,14 @@ FREQUENCIES = 4096
 
 
 @dataclass(frozen=True)
-class Prior:
+class PreviousEstimate:
     """Base parameters (b,) and standard deviation (n,) of the torque noise below the usual cut-off, N m or N."""
 
     theta: NDArray[np.float64]
     noise: NDArray[np.float64]
 
 
-def prior_from(document: IdentificationDocument, robot: RobotConfig, where: str) -> Prior:
+def prior_from(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:
     """Parameters and noise of an identification of the same robot.
 
     The noise is that of its noise models (6.19) below twice the closed-loop bandwidth, where the regression is made
@@ -47,7 +47,7 @@ def prior_from(document: IdentificationDocument, robot: RobotConfig, where: str)
     rate = float(found["rate_hz"])
     cutoff = min(LS_CUTOFF * robot.bandwidth_hz, rate / 2) if robot.bandwidth_hz is not None else rate / 2
     noise = [_deviation_below(cutoff, rate, joint["variance"], joint["coefficients"]) for joint in found["joints"]]
-    return Prior(np.array([values[name] for name in model.base.names]), np.array(noise))
+    return PreviousEstimate(np.array([values[name] for name in model.base.names]), np.array(noise))
 
 
 def _deviation_below(cutoff_hz: float, rate_hz: float, variance: float, coefficients: list[float]) -> float:

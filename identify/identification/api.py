@@ -13,7 +13,7 @@ from armident.identify.identification.result import Identification
 
 
 @dataclass(frozen=True)
-class Outcome:
+class IdentificationOutcome:
     """An identification with everything its report shows."""
 
     recording: Recording
@@ -27,7 +27,7 @@ def identify_recording(
     robot: RobotConfig | None = None,
     options: Options | None = None,
     progress: Callable[[str, float], None] | None = None,
-) -> Outcome:
+) -> IdentificationOutcome:
     """Identify a recording, whether it was read from a file or assembled from the stream.
 
     Parameters
@@ -49,4 +49,4 @@ def identify_recording(
     robot = robot or recording.robot
     experiments, notes = experiments_from_recording(recording, robot)
     result = identify_experiment(experiments, robot, options or Options(), progress)
-    return Outcome(recording, robot, result, identification_document(result, recording, robot, notes))
+    return IdentificationOutcome(recording, robot, result, identification_document(result, recording, robot, notes))

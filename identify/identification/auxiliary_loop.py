@@ -13,7 +13,7 @@ from armident.identify.controller.crc import JointResponse, identify_crc
 from armident.identify.controller.nominal import known_controller, nominal_controller, saturation
 from armident.identify.controller.parametric import ControlLaw, identify_parametric
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
-from armident.identify.estimators.measured_instruments import FollowedMotion
+from armident.identify.estimators.measured_instruments import MotionInstruments
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import PIV_CUTOFF
 from armident.identify.identification.options import Options
@@ -90,7 +90,7 @@ def closed_loop(
             raise DataError("no closed loop could be simulated: it diverges with every controller and start tried")
         reason = "no closed loop could be simulated with this estimate: instruments from the smoothed motion itself"
         warnings.append(reason)
-        return FollowedMotion.of(model, surrogate(), dt, decimation), ls, {"kind": "followed", "reason": reason}
+        return MotionInstruments.of(model, surrogate(), dt, decimation), ls, {"kind": "followed", "reason": reason}
     _, auxiliary, start, found = closest
     if found["kind"] == "nominal":
         warnings.append(found["reason"])

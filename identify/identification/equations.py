@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from armident.configs.schema.robot import Preprocessing
 from armident.identify.experiment import Experiment
-from armident.identify.regression.equations import Block, filtered_regressor
+from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.decimate import Decimation, design
@@ -84,7 +84,7 @@ def aligned_torque(tau: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def equations(
     model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], decimation: Decimation
-) -> list[Block]:
+) -> list[ExperimentEquations]:
     """Filtered and decimated equations of every experiment.
 
     The sign of the velocity is the smoothed one of the robot's configuration, so all samples can stay, which a linear
@@ -99,7 +99,7 @@ def equations(
         if threshold is not None:
             keep = np.abs(s.qd[kept]) >= np.asarray(threshold)
         t = np.asarray(kept * experiment.dt, dtype=np.float64)
-        blocks.append(Block(y, filtered_regressor(model, s, decimation), keep, t))
+        blocks.append(ExperimentEquations(y, filtered_regressor(model, s, decimation), keep, t))
     return blocks
 
 
@@ -118,9 +118,9 @@ class Prepared:
     model: ArmModel
     experiments: Sequence[Experiment]
     signals: Sequence[Derivatives]
-    _made: dict[Decimation, list[Block]] = field(default_factory=dict, repr=False)
+    _made: dict[Decimation, list[ExperimentEquations]] = field(default_factory=dict, repr=False)
 
-    def equations(self, decimation: Decimation) -> list[Block]:
+    def equations(self, decimation: Decimation) -> list[ExperimentEquations]:
         """:func:`equations` after a decimation, the same arrays whenever it is asked for again."""
         if decimation not in self._made:
             self._made[decimation] = equations(self.model, self.experiments, self.signals, decimation)
@@ -129,7 +129,7 @@ class Prepared:
 
 def published_equations(
     model: ArmModel, experiments: Sequence[Experiment], preprocessing: Preprocessing
-) -> list[Block]:
+) -> list[ExperimentEquations]:
     """Equations by the filters of a published fit: sharp ``sign``, torque as recorded, all rows."""
     p = preprocessing
     blocks = []
@@ -141,5 +141,5 @@ def published_equations(
         filters = (p.decimation, p.decimation_order, p.decimation_ripple_db, p.decimation_padlen)
         y = chebyshev_decimate(experiment.tau[p.drop :], *filters)
         t = np.asarray((p.drop + kept_samples(x.shape[0], p.decimation)) * experiment.dt, dtype=np.float64)
-        blocks.append(Block(y, chebyshev_decimate(x, *filters), np.ones(y.shape, dtype=np.bool_), t))
+        blocks.append(ExperimentEquations(y, chebyshev_decimate(x, *filters), np.ones(y.shape, dtype=np.bool_), t))
     return blocks

@@ -12,7 +12,7 @@ from armident.identify.estimators.diagnostics import Diagnostics
 from armident.identify.identification.options import Options
 from armident.identify.identification.torque_delay import TorqueDelay
 from armident.identify.regression.ar_noise import whiteness
-from armident.identify.regression.equations import Block, Estimate, residuals
+from armident.identify.regression.equations import Estimate, ExperimentEquations, residuals
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import ConsistentParameters
 
@@ -92,9 +92,9 @@ def make_result(
     diagnostics: Diagnostics,
     physical: ConsistentParameters | None,
     delay: TorqueDelay | None,
-    blocks: Sequence[Block],
+    blocks: Sequence[ExperimentEquations],
     ls: Estimate,
-    ls_blocks: Sequence[Block],
+    ls_blocks: Sequence[ExperimentEquations],
     controller: dict[str, Any],
     noise_of: str,
     warnings: Sequence[str],
@@ -146,7 +146,7 @@ def make_result(
     )
 
 
-def relative_errors(blocks: Sequence[Block], theta: Array) -> tuple[float, Array]:
+def relative_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tuple[float, Array]:
     """``|y - X theta| / |y|`` in percent, overall and per joint (n,)."""
     errors = residuals(blocks, theta)
     miss = sum(np.sum(np.where(b.keep, e, 0.0) ** 2, axis=0) for e, b in zip(errors, blocks, strict=True))

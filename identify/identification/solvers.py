@@ -18,7 +18,7 @@ from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.identification.equations import LS_CUTOFF, PIV_CUTOFF, Prepared, decimated_rows, sufficient
 from armident.identify.identification.options import Method, Options
 from armident.identify.identification.torque_delay import TorqueDelay, torque_delay
-from armident.identify.regression.equations import Block, Estimate, joint_variances
+from armident.identify.regression.equations import Estimate, ExperimentEquations, joint_variances
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
 
@@ -103,7 +103,7 @@ class Problem:
     options: Options
 
     @cached_property
-    def blocks(self) -> list[Block]:
+    def blocks(self) -> list[ExperimentEquations]:
         """Equations at measured signals, decimated as the method wants them."""
         return self.prepared.equations(self.auxiliary.decimation)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from armident.identify.experiment import Experiment
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
-    Block,
+    ExperimentEquations,
     filtered_regressor,
     instrumental_variable,
     joint_variances,
@@ -130,10 +130,14 @@ def torque_delay(
     y = [decimation(e.tau) for e in experiments]
     keep = [np.ones(value.shape, dtype=np.bool_) for value in y]
 
-    def solve(zeta: Sequence[Array], phi: Sequence[Array], noise: Sequence[ArModel]) -> tuple[Array, list[Block]]:
+    def solve(
+        zeta: Sequence[Array], phi: Sequence[Array], noise: Sequence[ArModel]
+    ) -> tuple[Array, list[ExperimentEquations]]:
         rows = [weighted_rows(values, keep, noise) for values in (zeta, phi, y)]
         theta = instrumental_variable(*rows)
-        return theta, [Block(*parts, np.zeros(parts[0].shape[0])) for parts in zip(y, phi, keep, strict=True)]
+        return theta, [
+            ExperimentEquations(*parts, np.zeros(parts[0].shape[0])) for parts in zip(y, phi, keep, strict=True)
+        ]
 
     without = [value[:, :, :b] for value in z], [value[:, :, :b] for value in x]
     theta, blocks = solve(*without, unweighted(n))

@@ -50,7 +50,7 @@ class Group:
     chi_square, degrees
         Of their differences, with all other parameters free.
     p_value
-        That an unchanged arm differs so much in them, as in `Drift`.
+        That an unchanged arm differs so much in them, as in `ParameterChangeTest`.
     """
 
     kind: Literal["friction", "masses"]
@@ -62,7 +62,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Drift:
+class ParameterChangeTest:
     """Differences of the parameters of two identifications.
 
     Parameters
@@ -142,7 +142,9 @@ class Drift:
         return f"changed: {what} (chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom)"
 
 
-def compare(baseline: IdentificationDocument, now: IdentificationDocument, false_alarms: float = FALSE_ALARMS) -> Drift:
+def compare(
+    baseline: IdentificationDocument, now: IdentificationDocument, false_alarms: float = FALSE_ALARMS
+) -> ParameterChangeTest:
     """Test whether two identifications can be of the same arm.
 
     The runs are independent, so the covariance of the difference is the sum of both. All base parameters count: those
@@ -198,7 +200,7 @@ def compare(baseline: IdentificationDocument, now: IdentificationDocument, false
         for ((kind, place), rows), found, chance in zip(places.items(), sums, p[len(names) :], strict=True)
     )
     joint = float(stats.chi2.sf(chi_square, degrees))
-    return Drift(
+    return ParameterChangeTest(
         tuple(now.parameters),
         before,
         difference,

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from armident.configs import ConfigError
 from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument, from_json, to_json
-from armident.identify.monitoring.change_test import Drift
+from armident.identify.monitoring.change_test import ParameterChangeTest
 
 DEFAULT = "sqlite:///history.sqlite"
 _STAMP = re.compile(r"(\d{8}T\d{6})-\d{3}Z")
@@ -174,7 +174,9 @@ class History:
         """Keep what is known of a recording; once."""
         self._insert_once(_recordings, facts)
 
-    def judge(self, document: IdentificationDocument, baseline: IdentificationDocument, drift: Drift) -> None:
+    def judge(
+        self, document: IdentificationDocument, baseline: IdentificationDocument, drift: ParameterChangeTest
+    ) -> None:
         """Keep what came of the comparison of an identification, added before, with a baseline."""
         number = sa.select(_runs.c.id).where(_runs.c.digest == _digest(document)).scalar_subquery()
         row = {

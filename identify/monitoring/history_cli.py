@@ -8,7 +8,7 @@ import numpy as np
 
 from armident.configs import ConfigError
 from armident.identify.document import IdentificationDocument, load_document
-from armident.identify.monitoring.change_test import Drift, Inconclusive, compare
+from armident.identify.monitoring.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.history import History, Run, recorded_at
 
 DRIFTED = 4
@@ -56,7 +56,7 @@ def history_command(
     return DRIFTED if last is not None and last.drifted else 0
 
 
-def _compared(first: Run, run: Run, false_alarms: float) -> Drift | None:
+def _compared(first: Run, run: Run, false_alarms: float) -> ParameterChangeTest | None:
     try:
         return compare(first.document, run.document, false_alarms)
     except Inconclusive:
@@ -94,7 +94,7 @@ def _check(parameters: Sequence[str], runs: Sequence[Run]) -> None:
             raise ConfigError(f"--parameter: no {name!r} of {runs[0].document.robot}; there are {', '.join(known)}")
 
 
-def _most_changed(drifts: Sequence[Drift | None], runs: Sequence[Run], most: int = 6) -> list[str]:
+def _most_changed(drifts: Sequence[ParameterChangeTest | None], runs: Sequence[Run], most: int = 6) -> list[str]:
     """Parameters that are farthest from the first run in any later one, in deviations."""
     names = [p.name for p in runs[0].document.parameters if p.essential]
     compared = [drift for drift in drifts if drift is not None]
@@ -108,7 +108,7 @@ def _most_changed(drifts: Sequence[Drift | None], runs: Sequence[Run], most: int
     return sorted(names, key=lambda name: -far[name])[:most]
 
 
-def _entry(run: Run, drift: Drift | None) -> dict[str, object]:
+def _entry(run: Run, drift: ParameterChangeTest | None) -> dict[str, object]:
     document = run.document
     return {
         "recorded": run.recorded.isoformat(),
@@ -120,7 +120,9 @@ def _entry(run: Run, drift: Drift | None) -> dict[str, object]:
     }
 
 
-def _table(title: str, runs: Sequence[Run], drifts: Sequence[Drift | None], parameters: Sequence[str]) -> None:
+def _table(
+    title: str, runs: Sequence[Run], drifts: Sequence[ParameterChangeTest | None], parameters: Sequence[str]
+) -> None:
     from rich.console import Console
     from rich.table import Table
 

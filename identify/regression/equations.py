@@ -47,7 +47,7 @@ ROWS_PER_TASK, SAMPLES_PER_TASK = 256, 4096
 
 
 @dataclass(frozen=True)
-class Block:
+class ExperimentEquations:
     """One experiment after the parallel filter.
 
     Parameters
@@ -161,23 +161,25 @@ def weighted_rows(
     return np.concatenate(rows)
 
 
-def stacked(blocks: Sequence[Block], noise: Sequence[ArModel]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def stacked(
+    blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Regressor (rows, b) and torques (rows,) of 2.20 and 2.21, whitened, without the equations left out."""
     keep = [b.keep for b in blocks]
     return weighted_rows([b.x for b in blocks], keep, noise), weighted_rows([b.y for b in blocks], keep, noise)
 
 
-def residuals(blocks: Sequence[Block], theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def residuals(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """``tau - phi theta`` of each experiment, shape (M, n)."""
     return [block.y - block.x @ theta for block in blocks]
 
 
-def joint_variances(blocks: Sequence[Block], theta: NDArray[np.float64]) -> list[ArModel]:
+def joint_variances(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ArModel]:
     """Serially uncorrelated noise with the residual variance of each joint (2.25, 2.26)."""
     return error_variances(residuals(blocks, theta), [b.keep for b in blocks], theta.size)
 
 
-def residual_norm(blocks: Sequence[Block], theta: NDArray[np.float64], scale: Sequence[ArModel]) -> float:
+def residual_norm(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], scale: Sequence[ArModel]) -> float:
     """Norm of the residuals, each joint in the units of ``scale``."""
     keep = [b.keep for b in blocks]
     return float(np.linalg.norm(weighted_rows(residuals(blocks, theta), keep, scale)))
@@ -200,7 +202,7 @@ def error_variances(
 
 
 def noise_models(
-    blocks: Sequence[Block], theta: NDArray[np.float64], covariance: NDArray[np.float64], max_order: int
+    blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], covariance: NDArray[np.float64], max_order: int
 ) -> list[ArModel]:
     """AR model of each joint's noise from the residuals (6.21 to 6.25).
 
@@ -250,7 +252,7 @@ def _square_root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def whitened_residuals(
-    blocks: Sequence[Block], theta: NDArray[np.float64], noise: Sequence[ArModel]
+    blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], noise: Sequence[ArModel]
 ) -> tuple[tuple[NDArray[np.float64], ...], ...]:
     """Residuals of each joint in standard deviations of its noise model, one array per experiment."""
     return whitened(residuals(blocks, theta), [b.keep for b in blocks], noise)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.equations import Block
+from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.regression.fir import filter_columns
 from armident.identify.regression.tall_qr import triangularize
 from armident.identify.signals.decimate import Decimation
@@ -70,7 +70,9 @@ class IvProducts:
         return (covariance + covariance.T) / 2
 
 
-def iv_products(instruments: Sequence[Array], blocks: Sequence[Block], noise: Sequence[ArModel]) -> IvProducts:
+def iv_products(
+    instruments: Sequence[Array], blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
+) -> IvProducts:
     """Whiten every joint by its noise model and sum the products that the IV equations need.
 
     Parameters
@@ -111,7 +113,9 @@ def iv_products(instruments: Sequence[Array], blocks: Sequence[Block], noise: Se
     return IvProducts(gram, cross / scale, projected, scale)
 
 
-def _combinations(instruments: Sequence[Array], blocks: Sequence[Block], noise: Sequence[ArModel]) -> Array:
+def _combinations(
+    instruments: Sequence[Array], blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
+) -> Array:
     """``T`` (b, b) that makes the columns of ``Z T`` nearly orthonormal, from every so many whitened rows.
 
     Only its diagonal (b,), of the inverse norms, where the columns are far enough from dependent as they are.

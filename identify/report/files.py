@@ -6,10 +6,10 @@ import yaml
 
 from armident.configs import RobotConfig
 from armident.identify.document import to_json, write_atomically
-from armident.identify.identification.api import Outcome
+from armident.identify.identification.api import IdentificationOutcome
 
 
-def write_identification(outcome: Outcome, out: Path) -> tuple[Path, Path]:
+def write_identification(outcome: IdentificationOutcome, out: Path) -> tuple[Path, Path]:
     """Write ``identification.json`` and ``report.html`` into a folder; returns their paths."""
     from armident.identify.report.identification import identification_report
 

@@ -23,7 +23,7 @@ from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.identification.auxiliary_loop import RUNAWAY, initial_parameters
 from armident.identify.identification.equations import equations
 from armident.identify.identification.result import relative_errors
-from armident.identify.regression.equations import MAX_AR_ORDER, Block, Estimate
+from armident.identify.regression.equations import MAX_AR_ORDER, Estimate, ExperimentEquations
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
@@ -188,14 +188,17 @@ class Laboratory:
         dt = self.recording(case).experiment.dt
         return design(dt, GOOD_CUTOFF_HZ, 1) if case.cutoff_hz is None else design(dt, case.cutoff_hz)
 
-    def equations(self, case: Case) -> list[Block]:
+    def equations(self, case: Case) -> list[ExperimentEquations]:
         """Filtered equations of a case; made anew at each call, since at 5 kHz they are large."""
         experiment = self.recording(case).experiment
         blocks = equations(self.model, [experiment], [self.derivatives(case)], self.decimation(case))
         if not case.midway:
             return blocks
         assert case.cutoff_hz is None
-        return [Block(experiment.tau[:-1], between(b.x), b.keep[:-1], b.t[:-1] + experiment.dt / 2) for b in blocks]
+        return [
+            ExperimentEquations(experiment.tau[:-1], between(b.x), b.keep[:-1], b.t[:-1] + experiment.dt / 2)
+            for b in blocks
+        ]
 
     def identified(self, case: Case) -> IdentifiedController:
         """The identified controller of a case (5.2)."""
@@ -248,7 +251,9 @@ class Laboratory:
             blocks = auxiliary.equations(blocks, estimate.theta)
         return Run(estimate, relative_errors(blocks, estimate.theta)[0], seconds, simulations)
 
-    def _iterate(self, method: Method, case: Case, blocks: list[Block], auxiliary: AuxiliaryModel) -> Estimate:
+    def _iterate(
+        self, method: Method, case: Case, blocks: list[ExperimentEquations], auxiliary: AuxiliaryModel
+    ) -> Estimate:
         if case.start == "rotors":
             start = initial_parameters(self.model)
         else:
@@ -270,7 +275,7 @@ class Laboratory:
             case _:
                 raise ValueError(f"{method} does not iterate")
 
-    def simulated(self, run: Run, case: Case) -> list[Block]:
+    def simulated(self, run: Run, case: Case) -> list[ExperimentEquations]:
         """Equations of a case with the regressor simulated with the parameters of a run."""
         return self.auxiliary(case).equations(self.equations(case), run.estimate.theta)
 

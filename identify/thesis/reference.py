@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from armident.configs import config_path
 from armident.configs.loading import parse
-from armident.configs.schema.base import Frozen
+from armident.configs.schema.base import FrozenModel
 from armident.identify.thesis.tables import Cell, Column
 
 FILE = "reference/thesis_tables.yaml"
@@ -16,7 +16,7 @@ REFERENCE = "B.4"
 """The table whose parameters, the essential ones, all others speak of."""
 
 
-class ReferenceTable(Frozen):
+class ReferenceTable(FrozenModel):
     """One table: estimates (value and relative standard deviation in percent, column by column), figures, or words."""
 
     title: str
@@ -54,7 +54,7 @@ class ReferenceTable(Frozen):
         return tuple(columns)
 
 
-class ReferenceTables(Frozen):
+class ReferenceTables(FrozenModel):
     """All tables by their numbers."""
 
     schema_: Literal["armident/reference/1"] = Field(alias="schema")

@@ -32,7 +32,7 @@ from armident.drivers.canopen.objects import (
     TPDO_COMMUNICATION,
     DriveState,
 )
-from armident.virtual_robot.bus_server import Line
+from armident.virtual_robot.bus_server import DriveBus
 from armident.virtual_robot.node import Drive
 
 SIOCGIFFLAGS, SIOCSIFFLAGS, IFF_UP = 0x8913, 0x8914, 1
@@ -148,7 +148,7 @@ def _plain(sent: Sent) -> bool:
 class _Lane:
     """One bus of the farm, its drives, and who listens there independently."""
 
-    def __init__(self, line: Line) -> None:
+    def __init__(self, line: DriveBus) -> None:
         self.line = line
         self.ledger: list[int] = []
         """Number of every SYNC that went over the bus, in order."""
@@ -189,7 +189,7 @@ class Farm:
         """Joints whose drives answer no SYNC."""
         for bus in session.all_buses:
             here = [d for d, n in zip(self.drives, session.drives, strict=True) if session.bus_of(n) == bus]
-            self.lanes.append(_Lane(Line(bus, here, motion, self._period)))
+            self.lanes.append(_Lane(DriveBus(bus, here, motion, self._period)))
         self.orders = Orders()
         self.failed: BaseException | None = None
         self.master = session.sync.role == "consumer"

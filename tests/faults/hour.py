@@ -24,7 +24,7 @@ import armident.daq.capture.capture
 import armident.drivers.can.filtered_socket
 from armident.configs import ArmidentError
 from armident.configs.schema.session import Bus
-from armident.daq.capture.plan import prepare
+from armident.daq.capture.plan import load_plan
 from armident.drivers.can.frames import Frames, frames
 from armident.drivers.canopen.objects import COB_SYNC
 from tests.faults.bus import session_file
@@ -104,13 +104,13 @@ def main() -> int:
         session = session_file(folder, "hour", ["vcan0"], False, False, 10**6 // RATE_HZ, demand=False)
         text = session.read_text().replace("recording: {}", "recording: {rotate_mb: 20, drain_ms: 1}")
         session.write_text(text)
-        order = replace(prepare(session, folder / "out", None, True))
+        order = replace(load_plan(session, folder / "out", None, True))
         return watched(order, MadeUp(count, options.pace), count, folder)
     finally:
         shutil.rmtree(folder)
 
 
-def watched(order: armident.daq.capture.capture.Order, bus: MadeUp, count: int, folder: Path) -> int:
+def watched(order: armident.daq.capture.capture.CapturePlan, bus: MadeUp, count: int, folder: Path) -> int:
     """Capture in this process while another thread looks at memory and makes room."""
 
     def open_bus(config: Bus, **_: object) -> MadeUp:

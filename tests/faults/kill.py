@@ -3,7 +3,7 @@
 Each round captures what six drives send at 1 to 5 kHz and is ended by SIGKILL, every fifth with files that are turned
 over all the time, every third with a drive that does not answer now and then. By the kill an independent socket on the
 bus has heard some SYNCs; those that the files do not account for afterwards are what it cost, at most 100 ms of them.
-Every file opens torn, is healed by ``heal_recording``, and says the same as before; other MCAP readers then open it
+Every file opens torn, is healed by ``recover_recording``, and says the same as before; other MCAP readers then open it
 too. Runs under ``python -m armident.drivers.vcan``.
 """
 
@@ -25,7 +25,7 @@ import numpy as np
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
-from armident.daq.recording import heal_recording, read_recording
+from armident.daq.recording import read_recording, recover_recording
 from armident.daq.recording.model import join_parts
 from armident.drivers.can.frames import STANDARD_ID_MASK
 from armident.drivers.can.socketcan import RawSocket
@@ -116,7 +116,7 @@ class Lane:
         if all(part.missing is None for part in torn):
             wrong.append("nothing is said to be missing")
         for path in files:
-            heal_recording(path)
+            recover_recording(path)
         whole = [read_recording(path) for path in files]
         for path, before, after in zip(files, torn, whole, strict=True):
             if before.sha256 != after.sha256 or before.gaps != after.gaps or before.missing != after.missing:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError
-from armident.daq.recording import Recording, Stream, heal_recording, read_recording
+from armident.daq.recording import Recording, Stream, read_recording, recover_recording
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import forge_recording, spoil_bytes
 from tests.unit.daq.test_recording import make_recording, write_chunked
@@ -45,7 +45,7 @@ def _seeds() -> list[bytes]:
         seeds.append(unfinished)
         torn = Path(folder, "torn.mcap")
         torn.write_bytes(unfinished[: 2 * len(unfinished) // 3])
-        heal_recording(torn)
+        recover_recording(torn)
         seeds.append(torn.read_bytes())
     return seeds
 
@@ -117,13 +117,13 @@ def _check(data: bytes, folder: Path, truth: bool) -> bool:
         raise
     if truth:
         check_truth(read)
-    healed = heal_recording(path)
+    healed = recover_recording(path)
     again = read_recording(path)
     if again.sha256 != read.sha256 or (again.gaps, again.marks) != (read.gaps, read.marks):
         raise MisreadError("healing changed what is read")
     if (read.missing is None) != (again.missing is None):
         raise MisreadError(f"healing changed what is missing: {read.missing!r}, {again.missing!r}")
-    if healed.missing is not None and heal_recording(path).missing is not None:
+    if healed.missing is not None and recover_recording(path).missing is not None:
         raise MisreadError("a healed file had to be healed again")
     return True
 
@@ -131,7 +131,7 @@ def _check(data: bytes, folder: Path, truth: bool) -> bool:
 def _heal_quietly(path: Path) -> None:
     """A file that cannot be read may be refused by the healer, too; in words."""
     try:
-        heal_recording(path)
+        recover_recording(path)
     except (ConfigError, DataError):
         return
 

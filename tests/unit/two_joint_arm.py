@@ -10,7 +10,7 @@ from armident.configs import RobotConfig
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.identification.equations import aligned_torque
-from armident.identify.regression.equations import Block, filtered_regressor
+from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import simulate
@@ -32,7 +32,7 @@ STANDARD = {
 class Recorded:
     """A recording of the arm: equations at measured signals, positions after the same filter, and the loop."""
 
-    blocks: list[Block]
+    blocks: list[ExperimentEquations]
     positions: list[Floats]
     loop: AuxiliaryModel
     truth: Floats
@@ -100,7 +100,7 @@ def recorded(
     y = decimation(aligned_torque(tau))
     x = filtered_regressor(arm, Derivatives(run.q, run.qd, run.qdd, None), decimation)
     instants = np.asarray(decimation.instants(t.size) * DT, dtype=np.float64)
-    blocks = [Block(y, x, np.ones(y.shape, dtype=np.bool_), instants)]
+    blocks = [ExperimentEquations(y, x, np.ones(y.shape, dtype=np.bool_), instants)]
     loop = AuxiliaryModel(
         arm, controller, [q_ref], [(run.q[0], run.qd[0])], DT, decimation, 3 * np.abs(run.qd).max(axis=0)
     )

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from armident.identify.monitoring.reidentify.options import Asked
+from armident.identify.monitoring.reidentify.options import ReidentifyOptions
 
 
 def reidentify(
@@ -45,7 +45,7 @@ def reidentify(
 
     Example: armident reidentify --config cell.yaml --store sqlite:///history.sqlite
     """
-    asked = Asked(config, baseline, store, out, false_alarms, scheduler, workers)
+    asked = ReidentifyOptions(config, baseline, store, out, false_alarms, scheduler, workers)
     if recordings is None:
         from armident.identify.monitoring.reidentify.run import reidentify_command
 

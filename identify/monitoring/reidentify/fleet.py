@@ -15,9 +15,9 @@ from armident.daq.recording import Recording, read_recording
 from armident.identify.document import IdentificationDocument, from_json, load_document, to_json
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.monitoring.change_test import Drift, compare
+from armident.identify.monitoring.change_test import ParameterChangeTest, compare
 from armident.identify.monitoring.history import History
-from armident.identify.monitoring.reidentify.options import Asked
+from armident.identify.monitoring.reidentify.options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.summary import told
 from armident.identify.report.files import write_identification
 
@@ -48,12 +48,12 @@ class Row:
 
     recording: str
     error: str | None = None
-    drift: Drift | None = None
+    drift: ParameterChangeTest | None = None
     words: tuple[str, ...] = ()
     identification: str | None = None
 
 
-def fleet_command(pattern: str, asked: Asked, *, as_json: bool) -> int:
+def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> int:
     """Carry out ``armident reidentify --recordings``; the exit code.
 
     Recordings are judged in the order of their names. Each is compared with the baseline, or with the first run of its

@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 @dataclass(frozen=True)
-class Asked:
+class ReidentifyOptions:
     """The options of the command, as given.
 
     Parameters

@@ -14,7 +14,7 @@ LINGER_S = 1.0
 """How long a result stays on offer after it was published: peers that connect late ask for it."""
 
 
-class Announcer:
+class StatusPublisher:
     """Publishes status and result of one job.
 
     It takes the worker's place on Zenoh where no worker runs, and is one of those who listen to it otherwise.

@@ -22,15 +22,15 @@ from armident.configs import (
 from armident.daq.recording import Recording
 from armident.identify.document import DiagnosisDocument, IdentificationDocument, from_json, to_json
 from armident.identify.effects.terms import arm_model
-from armident.identify.excitation.point_to_point import motion_of
+from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import prior_from
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.monitoring.change_test import Drift, Inconclusive, compare
+from armident.identify.monitoring.change_test import Inconclusive, ParameterChangeTest, compare
 from armident.identify.monitoring.history import History
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
-from armident.identify.monitoring.reidentify.options import Asked
-from armident.identify.monitoring.reidentify.publish import Announcer
+from armident.identify.monitoring.reidentify.options import ReidentifyOptions
+from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say, Start, play, start_process
 from armident.identify.monitoring.reidentify.summary import found, told
 from armident.identify.report.files import write_identification
@@ -61,13 +61,13 @@ class Outcome:
 
     document: IdentificationDocument
     path: Path
-    drift: Drift | None
+    drift: ParameterChangeTest | None
     words: tuple[str, ...]
     diagnosis: Path | None = None
     findings: tuple[str, ...] = ()
 
 
-def reidentify_command(asked: Asked, *, as_json: bool) -> int:
+def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
     """Carry out ``armident reidentify`` without ``--recordings``; the exit code.
 
     Raises
@@ -86,7 +86,7 @@ def reidentify_command(asked: Asked, *, as_json: bool) -> int:
     def say(line: str) -> None:
         print(f"reidentify: {line}", file=sys.stderr, flush=True)
 
-    with Announcer(job.session, job.robot) as announcer:
+    with StatusPublisher(job.session, job.robot) as announcer:
         outcome = carry_out(job, announcer, say)
     if as_json:
         print(json.dumps(entry(job, outcome), indent=1))
@@ -138,7 +138,7 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
     if baseline.document is None:
         return
     prior = prior_from(baseline.document, robot, baseline.name)
-    torque = arm_model(robot).inverse_dynamics(prior.theta, *motion_of(trajectory, CHECK_PERIOD))
+    torque = arm_model(robot).inverse_dynamics(prior.theta, *sample_trajectory(trajectory, CHECK_PERIOD))
     for joint, peak in zip(robot.joints, np.abs(torque).max(axis=0), strict=True):
         if peak > joint.limits.torque:
             raise ConfigError(
@@ -147,7 +147,7 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
             )
 
 
-def carry_out(job: Job, announcer: Announcer, say: Say, start: Start = start_process) -> Outcome:
+def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = start_process) -> Outcome:
     """Do the job; everything that it leaves is kept in the history, and published.
 
     Parameters
@@ -208,7 +208,7 @@ def keep(
     document: IdentificationDocument,
     path: Path,
     baseline: IdentificationDocument | None,
-    drift: Drift | None,
+    drift: ParameterChangeTest | None,
 ) -> None:
     """Put a run, its recording's facts and its comparison into the history."""
     facts = History.facts(recording)

@@ -6,7 +6,7 @@ import numpy as np
 
 from armident.configs import RobotConfig
 from armident.identify.document import DiagnosisDocument
-from armident.identify.monitoring.change_test import Drift
+from armident.identify.monitoring.change_test import ParameterChangeTest
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
 CLEAR = 2.0
@@ -26,7 +26,7 @@ _MEANINGS = {
 }
 
 
-def told(drift: Drift, robot: RobotConfig) -> list[str]:
+def told(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
     """One line per parameter that has changed, the clearest first, and per group; one if only all together have.
 
     Parameters
@@ -53,12 +53,12 @@ def told(drift: Drift, robot: RobotConfig) -> list[str]:
     return lines
 
 
-def _deviations(drift: Drift, name: str) -> float:
+def _deviations(drift: ParameterChangeTest, name: str) -> float:
     k = next(k for k, p in enumerate(drift.parameters) if p.name == name)
     return float(abs(drift.difference[k]) / drift.std[k])
 
 
-def _line(drift: Drift, name: str, robot: RobotConfig) -> str:
+def _line(drift: ParameterChangeTest, name: str, robot: RobotConfig) -> str:
     """Where, what, from what to what, and by how many standard deviations."""
     k = next(k for k, p in enumerate(drift.parameters) if p.name == name)
     parameter, before = drift.parameters[k], float(drift.before[k])
@@ -69,7 +69,7 @@ def _line(drift: Drift, name: str, robot: RobotConfig) -> str:
     )
 
 
-def _p_value(drift: Drift, name: str) -> float:
+def _p_value(drift: ParameterChangeTest, name: str) -> float:
     return next(float(p) for each, p in zip(drift.parameters, drift.p_values, strict=True) if each.name == name)
 
 

@@ -7,7 +7,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from armident.daq.recording import RecordingWriter, StreamLayout, heal_recording, read_recording
+from armident.daq.recording import RecordingWriter, StreamLayout, read_recording, recover_recording
 from tests.unit.daq.test_recording import make_recording
 
 ROWS = 5000
@@ -66,7 +66,7 @@ def test_readers_of_ours_leave_them_alone_and_they_take_little(tmp_path: Path) -
 def test_a_torn_file_with_them_is_healed(tmp_path: Path) -> None:
     written(tmp_path / "r.mcap", 50.0, close=False)
     before = read_recording(tmp_path / "r.mcap")
-    healed = heal_recording(tmp_path / "r.mcap")
+    healed = recover_recording(tmp_path / "r.mcap")
     assert healed.missing == before.missing
     after = read_recording(tmp_path / "r.mcap")
     assert after.sha256 == before.sha256

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from armident.configs import ConfigError, DataError
 from armident.daq.cli import application
-from armident.daq.recording import Recording, heal_recording, read_recording
+from armident.daq.recording import Recording, read_recording, recover_recording
 from tests.unit.daq.test_recording import make_recording, write_chunked
 
 
@@ -50,14 +50,14 @@ def test_a_file_cut_anywhere_is_healed_to_what_our_reader_finds_in_it(tmp_path: 
         path.write_bytes(data[:cut])
         before = read_recording(path)
 
-        healed = heal_recording(path)
+        healed = recover_recording(path)
 
         after = read_recording(path)
         assert healed.missing == before.missing == after.missing
         assert (after.sha256, after.gaps, after.marks) == (before.sha256, before.gaps, before.marks)
         events = len(after.gaps) + len(after.marks)
         assert stock_count(path) == sum(s.sync.size for s in after.streams.values()) + events
-        assert heal_recording(path).missing is None
+        assert recover_recording(path).missing is None
 
 
 def test_the_index_of_a_healed_file_is_that_of_a_finished_one(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_the_index_of_a_healed_file_is_that_of_a_finished_one(tmp_path: Path) ->
     unfinished = (tmp_path / "r.mcap").read_bytes()
     writer.close({})
     (tmp_path / "torn.mcap").write_bytes(unfinished)
-    heal_recording(tmp_path / "torn.mcap")
+    recover_recording(tmp_path / "torn.mcap")
 
     def index(path: Path) -> list[tuple[int, int, dict[int, int]]]:
         with path.open("rb") as file:
@@ -87,7 +87,7 @@ def test_damage_in_the_middle_is_left_out_and_the_damaged_file_kept(tmp_path: Pa
     path.write_bytes(data)
     before = read_recording(path)
 
-    healed = heal_recording(path)
+    healed = recover_recording(path)
 
     after = read_recording(path)
     assert healed.missing is not None
@@ -104,25 +104,25 @@ def test_damage_in_the_middle_is_left_out_and_the_damaged_file_kept(tmp_path: Pa
 def test_a_complete_file_is_left_alone(tmp_path: Path) -> None:
     write_chunked(make_recording(300), tmp_path / "r.mcap").close({})
     before = (tmp_path / "r.mcap").read_bytes()
-    assert heal_recording(tmp_path / "r.mcap").missing is None
+    assert recover_recording(tmp_path / "r.mcap").missing is None
     assert (tmp_path / "r.mcap").read_bytes() == before
 
 
 def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
     writer = write_chunked(make_recording(300), tmp_path / "r.mcap")
     with pytest.raises(ConfigError, match="is being written"):
-        heal_recording(tmp_path / "r.mcap")
+        recover_recording(tmp_path / "r.mcap")
     writer.close({})
-    assert heal_recording(tmp_path / "r.mcap").missing is None
+    assert recover_recording(tmp_path / "r.mcap").missing is None
 
 
 def test_what_is_no_recording_is_refused_and_left_alone(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such recording"):
-        heal_recording(tmp_path / "gone.mcap")
+        recover_recording(tmp_path / "gone.mcap")
     for name, content in (("empty", b""), ("text", b"t,q1\n0,1\n"), ("begun", b"\x89MCAP0\r\n\x01")):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DataError, match=name):
-            heal_recording(tmp_path / name)
+            recover_recording(tmp_path / name)
         assert (tmp_path / name).read_bytes() == content
     with (tmp_path / "other.mcap").open("wb") as file:
         other = Writer(file)
@@ -130,7 +130,7 @@ def test_what_is_no_recording_is_refused_and_left_alone(tmp_path: Path) -> None:
         other.register_channel("/x", "json", other.register_schema("x", "jsonschema", b"{}"))
         other.finish()
     with pytest.raises(DataError, match="not a recording of armident"):
-        heal_recording(tmp_path / "other.mcap")
+        recover_recording(tmp_path / "other.mcap")
 
 
 def test_the_command_says_what_is_missing(tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_a_writer_killed_at_any_moment_leaves_a_file_that_heals(tmp_path: Path) 
             process.send_signal(signal.SIGKILL)
             rest = process.stdout.read().split()
         said = int(rest[-1]) if rest else said
-        healed = heal_recording(path)
+        healed = recover_recording(path)
         kept = read_recording(path).samples
         assert healed.missing == read_recording(path).missing
         # A chunk is 100 rows: what was said to be handed over is on the disk but for the chunk that was being filled.

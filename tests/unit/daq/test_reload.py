@@ -10,7 +10,7 @@ import yaml
 from armident.configs import ConfigError, SessionConfig, load_robot, load_session
 from armident.configs.loading import HERE
 from armident.daq.capture.files import limits, open_series
-from armident.daq.capture.plan import Order
+from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.reload import Reloader, differences
 from armident.daq.matching.streams import captured_streams
 from armident.daq.recording import read_recording
@@ -36,7 +36,7 @@ class Capture:
     def __init__(self, path: Path) -> None:
         session = load_session(path)
         robot = load_robot(session.robot)
-        self.order = Order(session, robot, captured_streams(session, robot), None, path.parent, config=path)
+        self.order = CapturePlan(session, robot, captured_streams(session, robot), None, path.parent, config=path)
         self.taken: list[SessionConfig] = []
         self.said: list[str] = []
         self.reloader = Reloader(path, self.order, [self.take], self.said.append)

@@ -18,10 +18,10 @@ from armident.daq.recording import (
     RecordingSeries,
     RecordingWriter,
     StreamLayout,
-    heal_recording,
     read_recording,
+    recover_recording,
 )
-from armident.daq.recording.retention import Janitor, prune
+from armident.daq.recording.retention import RetentionThread, prune
 from tests.unit.daq.test_recording import make_recording
 
 NAME = "tx40-20260101T000000-000Z"
@@ -64,7 +64,7 @@ def test_every_row_is_in_exactly_one_complete_file(tmp_path: Path, limits: dict[
     parts = [read_recording(path) for path in series.paths]
     for number, part in enumerate(parts, start=1):
         assert part.missing is None
-        assert heal_recording(series.paths[number - 1]).missing is None
+        assert recover_recording(series.paths[number - 1]).missing is None
         assert part.metadata["part"] == str(number)
     for part in parts[:-1]:
         assert part.counters["samples.rows"] == part.samples.sync.size
@@ -217,7 +217,7 @@ def test_the_janitor_tells_what_it_deletes_and_a_problem_once() -> None:
             raise answer
         return answer
 
-    janitor = Janitor(look, said.append, every_s=0.001)
+    janitor = RetentionThread(look, said.append, every_s=0.001)
     for _ in range(6):
         assert looked.acquire(timeout=10)
     janitor.close()

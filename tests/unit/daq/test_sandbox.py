@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from armident.daq.interchange.sandbox import apart
+from armident.daq.interchange.sandbox import read_in_subprocess
 
 
 def test_arrays_arrive_and_what_is_none_stays_behind() -> None:
-    found = apart(lambda: {"q": np.arange(6.0).reshape(3, 2), "name": "x", "words": np.array(["a"]), "i": np.arange(3)})
+    found = read_in_subprocess(
+        lambda: {"q": np.arange(6.0).reshape(3, 2), "name": "x", "words": np.array(["a"]), "i": np.arange(3)}
+    )
     assert found.keys() == {"q", "i"}
     assert np.array_equal(found["q"], np.arange(6.0).reshape(3, 2))
 
@@ -35,5 +37,5 @@ def hang() -> dict[str, Any]:
 def test_a_reader_that_fails_is_told_of(read: Any, words: str) -> None:
     begin = time.monotonic()
     with pytest.raises(ValueError, match=words):
-        apart(read, longest_s=1.0)
+        read_in_subprocess(read, longest_s=1.0)
     assert time.monotonic() - begin < 60

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from armident.configs import load_robot, load_session
-from armident.daq.capture.setpoints import REST_SPAN_S, REST_STEP_S, SHAKE_COUNTS, Standstill
+from armident.daq.capture.setpoints import REST_SPAN_S, REST_STEP_S, SHAKE_COUNTS, StandstillDetector
 from armident.daq.matching.streams import counts_per_si
 
 SESSION, ROBOT = load_session("tx40_cell.yaml"), load_robot("tx40.yaml")
@@ -21,7 +21,7 @@ def counts(q: list[float]) -> NDArray[np.int32]:
 @pytest.mark.parametrize("joint", range(6))
 @pytest.mark.parametrize(("share", "rests"), [(0.0, True), (0.0016, True), (0.0024, False), (-0.0024, False)])
 def test_a_joint_moves_that_is_faster_than_a_five_hundredth_of_its_limit(joint: int, share: float, rests: bool) -> None:
-    standstill, q = Standstill(SESSION, ROBOT), [0.1] * 6
+    standstill, q = StandstillDetector(SESSION, ROBOT), [0.1] * 6
     seen = []
     step = round(REST_STEP_S / SESSION.sync_period)
     for k in range(0, 3 * SPAN, step):
@@ -33,7 +33,7 @@ def test_a_joint_moves_that_is_faster_than_a_five_hundredth_of_its_limit(joint: 
 
 @pytest.mark.parametrize("joint", range(6))
 def test_an_arm_that_swings_does_not_rest_where_it_turns_round(joint: int) -> None:
-    standstill = Standstill(SESSION, ROBOT)
+    standstill = StandstillDetector(SESSION, ROBOT)
     rate = 2 * np.pi * 10.0
     swing = 0.01 * ROBOT.joints[joint].limits.velocity / rate
     for k in range(0, 10 * SPAN, 3):
@@ -43,13 +43,13 @@ def test_an_arm_that_swings_does_not_rest_where_it_turns_round(joint: int) -> No
 
 
 def test_an_encoder_that_flickers_does_not_move() -> None:
-    standstill, rng = Standstill(SESSION, ROBOT), np.random.default_rng(1)
+    standstill, rng = StandstillDetector(SESSION, ROBOT), np.random.default_rng(1)
     seen = [standstill.look(k, rng.integers(0, round(SHAKE_COUNTS), 6, endpoint=True)) for k in range(3 * SPAN)]
     assert set(seen[SPAN:]) == {True}
 
 
 def test_what_was_seen_before_braking_does_not_count_for_long() -> None:
-    standstill, speed = Standstill(SESSION, ROBOT), ROBOT.joints[0].limits.velocity
+    standstill, speed = StandstillDetector(SESSION, ROBOT), ROBOT.joints[0].limits.velocity
     for k in range(SPAN):
         assert not standstill.look(k, counts([speed * k * SESSION.sync_period, 0, 0, 0, 0, 0]))
     rest = counts([speed * SPAN * SESSION.sync_period, 0, 0, 0, 0, 0])
@@ -58,5 +58,5 @@ def test_what_was_seen_before_braking_does_not_count_for_long() -> None:
 
 
 def test_the_same_sync_again_says_nothing_new() -> None:
-    standstill = Standstill(SESSION, ROBOT)
+    standstill = StandstillDetector(SESSION, ROBOT)
     assert not any(standstill.look(5, counts([0.0] * 6)) for _ in range(1000))

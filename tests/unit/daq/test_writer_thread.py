@@ -11,7 +11,7 @@ import pytest
 
 from armident.configs import ConfigError
 from armident.configs.schema.session import RecordingOptions
-from armident.daq.capture.files import gathered
+from armident.daq.capture.files import chunk_duration_ns
 from armident.daq.recording import (
     Gap,
     Mark,
@@ -182,8 +182,8 @@ def test_rows_are_gathered_for_as_long_as_was_said_last(tmp_path: Path) -> None:
     # A period is 0.2 ms: ten chunks of 100 rows, then of 25 to 30.
     assert np.count_nonzero(np.diff(sizes[:70])) in (6, 7)
     assert np.count_nonzero(np.diff(sizes[80:])) >= 20
-    assert gathered(RecordingOptions(chunk_ms=100, drain_ms=20)) == 50_000_000
-    assert gathered(RecordingOptions(chunk_ms=100, drain_ms=100)) == 25_000_000
+    assert chunk_duration_ns(RecordingOptions(chunk_ms=100, drain_ms=20)) == 50_000_000
+    assert chunk_duration_ns(RecordingOptions(chunk_ms=100, drain_ms=100)) == 25_000_000
 
 
 @pytest.mark.parametrize("limits", [{}, {"max_bytes": 60_000}])

@@ -2,7 +2,7 @@
 
 import pytest
 
-from armident.drivers.canopen.heartbeat_monitor import Silences
+from armident.drivers.canopen.heartbeat_monitor import HeartbeatMonitor
 
 BEATS = 0.05
 
@@ -12,21 +12,21 @@ def beats(drive: str, first: float, last: float) -> list[tuple[str, float]]:
     return [(drive, first + BEATS * k) for k in range(round((last - first) / BEATS) + 1)]
 
 
-def looked(silences: Silences, until: float, since: float = 0.0, step: float = 0.02) -> None:
+def looked(silences: HeartbeatMonitor, until: float, since: float = 0.0, step: float = 0.02) -> None:
     """Look all the time, and hear nobody."""
     for k in range(1, round((until - since) / step) + 1):
         silences.look([], since + step * k)
 
 
 def test_heartbeats_that_waited_while_nobody_looked_are_no_silence() -> None:
-    silences = Silences("ab", 0.0)
+    silences = HeartbeatMonitor("ab", 0.0)
     silences.look([*beats("a", 0.1, 1.9), *beats("b", 0.05, 1.95)], 2.0)
     assert silences.ended("a") == pytest.approx(0.1, abs=0.01)
     assert silences.lasts("b") == pytest.approx(0.05)
 
 
 def test_a_drive_that_was_silent_while_others_were_heard_is_told_whoever_was_held_up() -> None:
-    silences = Silences("ab", 0.0)
+    silences = HeartbeatMonitor("ab", 0.0)
     silences.look([("a", 0.1), ("a", 0.9), *beats("b", 0.05, 1.05)], 1.1)
     assert silences.ended("a") == pytest.approx(0.8)
     silences.look(beats("b", 1.15, 2.05), 2.1)
@@ -35,7 +35,7 @@ def test_a_drive_that_was_silent_while_others_were_heard_is_told_whoever_was_hel
 
 
 def test_a_drive_that_stays_away_is_told_in_time() -> None:
-    silences = Silences("a", 0.0)
+    silences = HeartbeatMonitor("a", 0.0)
     looked(silences, 0.44)
     assert silences.lasts("a") == pytest.approx(0.44)
 
@@ -43,7 +43,7 @@ def test_a_drive_that_stays_away_is_told_in_time() -> None:
 @pytest.mark.parametrize("heard", [[], [("a", 1.0), ("b", 1.0)]])
 def test_a_machine_that_stood_still_as_a_whole_has_missed_nobody(heard: list[tuple[str, float]]) -> None:
     """Whether the heartbeats of that time are stamped when it goes on, or have not come yet."""
-    silences = Silences("ab", 0.0)
+    silences = HeartbeatMonitor("ab", 0.0)
     silences.look([("a", 0.15), ("b", 0.2)], 0.22)
     silences.look(heard, 1.01)
     for drive in "ab":
@@ -54,7 +54,7 @@ def test_a_machine_that_stood_still_as_a_whole_has_missed_nobody(heard: list[tup
 
 
 def test_a_machine_that_stands_still_again_and_again_misses_who_is_gone() -> None:
-    silences = Silences("a", 0.0)
+    silences = HeartbeatMonitor("a", 0.0)
     for k in range(1, 5):
         silences.look([], 0.3 * k)
     assert silences.lasts("a") == pytest.approx(0.9)

@@ -21,8 +21,8 @@ from armident.identify.estimators.diagnostics import (
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.regression.ar_noise import WHITE, ArModel
 from armident.identify.regression.equations import (
-    Block,
     Estimate,
+    ExperimentEquations,
     instrumental_variable,
     inverse_gram,
     iv_covariance,
@@ -50,7 +50,7 @@ def coloured(rng: np.random.Generator, samples: int, ar: ArModel, columns: int =
 
 def drawn(
     rng: np.random.Generator, ar: ArModel, *, errors_in_variables: bool, samples: int = 300
-) -> tuple[Block, Array]:
+) -> tuple[ExperimentEquations, Array]:
     """Two joints, three parameters: a smooth motion, a regressor with noise, instruments with other noise."""
     slow, fast = signal.butter(2, 0.1), 0.5
     motion = 3 * signal.lfilter(*slow, rng.standard_normal((samples, 2, 3)), axis=0)
@@ -58,7 +58,7 @@ def drawn(
     z = motion + 0.1 * rng.standard_normal(motion.shape)
     cause = motion if errors_in_variables else x
     y = cause @ THETA + coloured(rng, samples, ar)
-    return Block(y, x, np.ones((samples, 2), np.bool_), np.arange(float(samples))), z
+    return ExperimentEquations(y, x, np.ones((samples, 2), np.bool_), np.arange(float(samples))), z
 
 
 def rejections(p_values: list[float]) -> int:
@@ -114,7 +114,7 @@ def test_hausman_leaves_out_directions_in_which_the_two_estimators_are_one() -> 
     p_values = []
     for _ in range(DRAWS):
         block, z = drawn(rng, WHITE, errors_in_variables=False)
-        one_joint = Block(block.y, block.x * np.array([[[1.0], [0.0]]]), block.keep, block.t)
+        one_joint = ExperimentEquations(block.y, block.x * np.array([[[1.0], [0.0]]]), block.keep, block.t)
         z[:, :, 0] = one_joint.x[:, :, 0]
         # A regressor that is its own instrument is exogenous by assumption: two directions are left.
         found = durbin_wu_hausman(NAMES, [one_joint], [z * np.array([[[1.0], [0.0]]])], [WHITE] * 2, [WHITE] * 2)
@@ -137,7 +137,7 @@ def test_first_stage_f_of_white_errors_is_the_textbook_one() -> None:
     rng = np.random.default_rng(6)
     z = rng.standard_normal((4000, 1, 1))
     x = 0.3 * z + rng.standard_normal(z.shape)
-    block = Block(x[:, :, 0], x, np.ones((4000, 1), np.bool_), np.arange(4000.0))
+    block = ExperimentEquations(x[:, :, 0], x, np.ones((4000, 1), np.bool_), np.arange(4000.0))
     (found,) = instrument_relevance(["zz1"], [block], [z], [WHITE])
     r2 = np.corrcoef(z[:, 0, 0], x[:, 0, 0])[0, 1] ** 2
     # The robust variance is known to about 2 sqrt(lags / M) = 20 %.
@@ -162,7 +162,9 @@ def test_serially_correlated_first_stages_do_not_look_stronger_than_they_are() -
     strong = 0
     for _ in range(300):
         x, z = coloured(rng, 400, slow, 1)[:, :, None], coloured(rng, 400, slow, 1)[:, :, None]
-        (found,) = instrument_relevance(["zz1"], [Block(x[:, :, 0], x, ones, np.arange(400.0))], [z], [WHITE])
+        (found,) = instrument_relevance(
+            ["zz1"], [ExperimentEquations(x[:, :, 0], x, ones, np.arange(400.0))], [z], [WHITE]
+        )
         strong += found.first_stage_f > WEAK_F
     # Without the correction more than a third of such instruments, unrelated to the regressor, pass.
     assert strong < 0.05 * 300

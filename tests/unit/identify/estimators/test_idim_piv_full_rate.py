@@ -21,7 +21,7 @@ from armident.identify.identification.from_recording import experiments_from_rec
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.solvers import decimation_of
-from armident.identify.regression.equations import Block, Estimate, filtered_regressor
+from armident.identify.regression.equations import Estimate, ExperimentEquations, filtered_regressor
 from armident.identify.regression.iv_products import iv_products
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import design
@@ -59,7 +59,7 @@ def recorded() -> tuple[Experiment, Derivatives]:
 
 
 @cache
-def loop(factor: int | None, band_hz: float) -> tuple[list[Block], AuxiliaryModel, Floats]:
+def loop(factor: int | None, band_hz: float) -> tuple[list[ExperimentEquations], AuxiliaryModel, Floats]:
     """Equations, closed loop with identified controller, and the estimate to start from."""
     experiment, motion = recorded()
     plain = decimation_of("idim-ls", experiment.dt, BANDWIDTH_HZ, None)

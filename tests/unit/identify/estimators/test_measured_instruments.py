@@ -7,7 +7,7 @@ from armident.configs import load_robot
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.estimators.idim_ls import idim_ls
-from armident.identify.estimators.measured_instruments import FollowedMotion
+from armident.identify.estimators.measured_instruments import MotionInstruments
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import equations
 from armident.identify.robot.arm import ArmModel
@@ -47,7 +47,7 @@ def test_idim_iv_takes_the_bias_from_a_mass_that_noisy_derivatives_make_too_smal
     blocks = equations(model, [experiment], [noisy], decimation)
     ls = idim_ls(blocks, model.base.names)
     motion = [butterworth(experiment.q, DT, 8.0)]
-    iv = idim_iv(blocks, FollowedMotion.of(model, motion, DT, decimation), ls.theta)
+    iv = idim_iv(blocks, MotionInstruments.of(model, motion, DT, decimation), ls.theta)
     assert ls.theta[0] < 0.95 * THETA[0]
     assert iv.converged
     assert iv.theta[0] == pytest.approx(THETA[0], rel=0.01)
@@ -56,7 +56,7 @@ def test_idim_iv_takes_the_bias_from_a_mass_that_noisy_derivatives_make_too_smal
 def test_torques_are_what_the_motion_needs_and_a_theta_that_is_not_finite_has_none() -> None:
     model, experiment = axis(0)
     motion = butterworth(experiment.q, DT, 8.0)
-    followed = FollowedMotion.of(model, [motion], DT, design(DT, 40.0))
+    followed = MotionInstruments.of(model, [motion], DT, design(DT, 40.0))
     runs = followed.simulate(THETA)
     assert runs is not None
     np.testing.assert_array_equal(runs[0].q, motion)

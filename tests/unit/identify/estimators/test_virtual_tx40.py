@@ -22,7 +22,7 @@ from armident.identify.estimators.sensitivity import sensitivity
 from armident.identify.identification.auxiliary_loop import initial_parameters
 from armident.identify.identification.equations import equations
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.identify.regression.equations import Block, Estimate
+from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.signals.decimate import design
@@ -33,7 +33,7 @@ from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant
 
 Floats = NDArray[np.float64]
-Iterative = Callable[[list[Block], AuxiliaryModel, Floats], Estimate]
+Iterative = Callable[[list[ExperimentEquations], AuxiliaryModel, Floats], Estimate]
 
 CUTOFF_HZ = 20.0
 """Decimation of the thesis (section B.2)."""
@@ -45,7 +45,7 @@ COARSE = 100
 class Recorded:
     """Equations, positions and loop of one recording."""
 
-    blocks: list[Block]
+    blocks: list[ExperimentEquations]
     positions: list[Floats]
     loop: AuxiliaryModel
     ls: Floats

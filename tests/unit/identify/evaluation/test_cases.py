@@ -9,7 +9,7 @@ import yaml
 from armident.configs import ConfigError, config_path, load_robot, load_suite, load_trajectory
 from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.suite import LEVELS
-from armident.identify.evaluation.cases import all_cases, chosen, twin
+from armident.identify.evaluation.cases import all_cases, chosen, healthy_twin
 from armident.virtual_robot.batch import resolved
 from armident.virtual_robot.effects import CATALOGUE, OUTSIDE, hidden_effects
 
@@ -82,9 +82,9 @@ def test_a_twin_is_the_healthy_arm_of_the_same_run_and_one_of_the_clean_cases() 
     keys = {c.key for c in CASES if c.kind == "clean"}
     for case in CASES:
         if case.parts:
-            assert twin(case).run == case.run
-            assert not twin(case).parts
-            assert twin(case).key in keys
+            assert healthy_twin(case).run == case.run
+            assert not healthy_twin(case).parts
+            assert healthy_twin(case).key in keys
 
 
 def test_the_quick_subset_has_every_effect_and_both_arms() -> None:

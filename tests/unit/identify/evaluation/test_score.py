@@ -5,18 +5,18 @@ from typing import Any
 
 import pytest
 
-from armident.identify.evaluation.cases import Case, HiddenPart
+from armident.identify.evaluation.cases import Case, InjectedEffect
 from armident.identify.evaluation.markdown import report, shortfalls
 from armident.identify.evaluation.score import Score, closed_share, matches, score, within
 from armident.identify.evaluation.tables import clopper_pearson, tables
 
-SPRING = HiddenPart("joint_spring", "joint_2", None, ("joint_spring",), {}, {}, 1.0)
-SHAFT = HiddenPart("coupling_friction", "joint_4", "joint_5", ("coupling_friction",), {}, {}, 1.0)
-GRIPPER = HiddenPart("payload", "joint_6", None, ("payload", "rotor_inertia"), {}, {}, 1.0, arm=True)
+SPRING = InjectedEffect("joint_spring", "joint_2", None, ("joint_spring",), {}, {}, 1.0)
+SHAFT = InjectedEffect("coupling_friction", "joint_4", "joint_5", ("coupling_friction",), {}, {}, 1.0)
+GRIPPER = InjectedEffect("payload", "joint_6", None, ("payload", "rotor_inertia"), {}, {}, 1.0, arm=True)
 
 
 def case(
-    *parts: HiddenPart, kind: Any = "effect", level: Any = "typical", seed: int = 1, baseline: bool = False
+    *parts: InjectedEffect, kind: Any = "effect", level: Any = "typical", seed: int = 1, baseline: bool = False
 ) -> Case:
     return Case(kind, level, "tx40", "tx40.yaml", "t.yaml", 1, 1e-3, seed, parts, baseline)
 

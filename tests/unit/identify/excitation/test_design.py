@@ -5,7 +5,7 @@ import pytest
 
 from armident.configs import ConfigError, load_robot, load_trajectory
 from armident.identify.effects.terms import arm_model
-from armident.identify.excitation.design import assess, design_trajectory
+from armident.identify.excitation.design import design_trajectory, predict_precision
 from armident.identify.robot.arm import ArmModel
 
 NOISE = np.sqrt([1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523])
@@ -39,12 +39,12 @@ def test_shipped_trajectory_keeps_all_limits_torques_included(tx40: ArmModel) ->
 
 
 def test_shipped_trajectory_conditions_the_base_regressor_like_the_thesis(tx40: ArmModel) -> None:
-    design = assess(tx40, load_trajectory("trajectories/tx40_excitation.yaml"), NOISE)
+    design = predict_precision(tx40, load_trajectory("trajectories/tx40_excitation.yaml"), NOISE)
     assert design.condition <= 200.0
 
 
 def test_shipped_trajectory_promises_the_accuracy_of_table_b4(tx40: ArmModel) -> None:
-    design = assess(tx40, load_trajectory("trajectories/tx40_excitation.yaml"), NOISE)
+    design = predict_precision(tx40, load_trajectory("trajectories/tx40_excitation.yaml"), NOISE)
     assert design.std is not None
     std = dict(zip(tx40.base.names, design.std, strict=True))
     ratios = {name: 100.0 * std[name] / abs(value) / percent for name, (value, percent) in TABLE_B4.items()}
@@ -54,7 +54,7 @@ def test_shipped_trajectory_promises_the_accuracy_of_table_b4(tx40: ArmModel) ->
 
 
 def test_shipped_trajectory_is_seldom_slow(tx40: ArmModel) -> None:
-    design = assess(tx40, load_trajectory("trajectories/tx40_excitation.yaml"), NOISE)
+    design = predict_precision(tx40, load_trajectory("trajectories/tx40_excitation.yaml"), NOISE)
     assert (design.slow_share < 0.2).all()
 
 

@@ -10,7 +10,7 @@ from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, l
 from armident.configs.schema.trajectory import Fourier
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.cli import trajectory_command
-from armident.identify.excitation.design import assess, design_trajectory
+from armident.identify.excitation.design import design_trajectory, predict_precision
 
 NOISE = np.sqrt([1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523])
 """Standard deviation of the torque noise of the TX40 after the decimate filter, N m (thesis table 6.3)."""
@@ -66,7 +66,7 @@ def test_sums_tell_as_much_as_moves(robot: RobotConfig, designed: Trajectory) ->
     """In the geometric mean of all standard deviations, for as many candidates; conditioned like the thesis's."""
     model = arm_model(robot)
     moves = design_trajectory(robot, 7.5, seed=1, noise=NOISE, evaluations=400)
-    sums = assess(model, designed, NOISE)
+    sums = predict_precision(model, designed, NOISE)
     assert moves.std is not None
     assert sums.std is not None
     assert np.exp(np.log(sums.std / moves.std).mean()) < 1.15

@@ -9,7 +9,7 @@ import yaml
 from armident.configs import ConfigError, config_path, load_robot, load_trajectory
 from armident.identify.cli import trajectory as trajectory_command
 from armident.identify.effects.terms import arm_model
-from armident.identify.excitation.design import aimed_at, assess, design_trajectory
+from armident.identify.excitation.design import design_trajectory, predict_precision, with_objective
 
 NOISE = np.sqrt([1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523])
 """Standard deviation of the torque noise of the TX40, N m (thesis table 6.3)."""
@@ -28,10 +28,10 @@ def test_an_aim_makes_its_effect_surer_than_the_usual_design(
     effect: str, against: str | None, parameter: str, better: float
 ) -> None:
     robot = load_robot("emps")
-    aim = aimed_at(robot, effect, None, against)
+    aim = with_objective(robot, effect, None, against)
     usual = design_trajectory(robot, 6.0, seed=0, noise=[1.0], evaluations=200)
     assert usual.wanted is None
-    before = assess(arm_model(robot), usual.trajectory, [1.0], aim=aim).wanted
+    before = predict_precision(arm_model(robot), usual.trajectory, [1.0], aim=aim).wanted
     design = design_trajectory(robot, 6.0, seed=0, noise=[1.0], evaluations=200, aim=aim)
     design.trajectory.check(robot)
     assert before is not None
@@ -41,11 +41,11 @@ def test_an_aim_makes_its_effect_surer_than_the_usual_design(
 
 def test_six_axes_show_the_ripple_of_one_motor_when_asked_for_it() -> None:
     robot = load_robot("tx40")
-    aim = aimed_at(robot, "cogging_torque", "joint_2", None)
+    aim = with_objective(robot, "cogging_torque", "joint_2", None)
     design = design_trajectory(robot, 7.5, seed=0, noise=NOISE, evaluations=100, aim=aim)
     design.trajectory.check(robot)
     shipped = load_trajectory("trajectories/tx40_excitation.yaml")
-    before = assess(arm_model(robot), shipped, NOISE, aim=aim).wanted
+    before = predict_precision(arm_model(robot), shipped, NOISE, aim=aim).wanted
     assert before is not None
     assert design.wanted is not None
     assert set(design.wanted) == {"cgc2", "cgs2"}
@@ -56,7 +56,7 @@ def test_the_predicted_deviation_is_the_one_that_estimates_have() -> None:
     """Monte Carlo on the predicted columns: least squares with white noise of the given size."""
     robot = load_robot("emps")
     model = arm_model(robot)
-    aim = aimed_at(robot, "joint_spring", None, None)
+    aim = with_objective(robot, "joint_spring", None, None)
     design = design_trajectory(robot, 6.0, seed=0, noise=[2.0], evaluations=20, aim=aim)
     assert design.wanted is not None
     q = design.trajectory.sample(1e-3)
@@ -85,12 +85,12 @@ def test_what_cannot_be_aimed_at_is_refused_with_the_reason(
     robot: str, wanted: str | None, joint: str | None, against: str | None, says: str
 ) -> None:
     with pytest.raises(ConfigError, match=says):
-        aimed_at(load_robot(robot), wanted, joint, against)
+        with_objective(load_robot(robot), wanted, joint, against)
 
 
 def test_effects_that_depend_on_torques_are_aimed_at_with_known_parameters() -> None:
     robot = load_robot("emps")
-    aim = aimed_at(robot, "time_delay", None, None, [95.0, 200.0, 20.0, -3.0])
+    aim = with_objective(robot, "time_delay", None, None, [95.0, 200.0, 20.0, -3.0])
     assert aim is not None
     assert aim.predicts
     design = design_trajectory(

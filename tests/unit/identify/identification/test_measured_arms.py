@@ -25,7 +25,7 @@ from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.estimators.idim_ls import idim_ls
-from armident.identify.estimators.measured_instruments import FollowedMotion
+from armident.identify.estimators.measured_instruments import MotionInstruments
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import LS_CUTOFF, PIV_CUTOFF, decimated_rows, equations, least_rows
 from armident.identify.identification.from_recording import experiments_from_recording
@@ -33,7 +33,7 @@ from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification, relative_errors
 from armident.identify.identification.solvers import decimation_of
-from armident.identify.regression.equations import Block
+from armident.identify.regression.equations import ExperimentEquations
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
@@ -98,7 +98,7 @@ def least_squares(experiments: Sequence[Experiment], robot: RobotConfig) -> Iden
 
 def prepared(
     robot: RobotConfig, experiments: Sequence[Experiment], theta: np.ndarray | None = None
-) -> tuple[list[Block], list[Derivatives], Decimation]:
+) -> tuple[list[ExperimentEquations], list[Derivatives], Decimation]:
     """What `identify_experiment` makes of experiments by default; effects predict torques by ``theta``."""
     assert robot.bandwidth_hz is not None
     dt = experiments[0].dt
@@ -268,7 +268,7 @@ def followed(robot: RobotConfig, experiments: Sequence[Experiment]) -> tuple[np.
     assert robot.bandwidth_hz is not None
     dt = experiments[0].dt
     motion = [butterworth(s.q, dt, min(PIV_CUTOFF * robot.bandwidth_hz, 0.4 / dt)) for s in signals]
-    auxiliary = FollowedMotion.of(arm_model(robot), motion, dt, decimation)
+    auxiliary = MotionInstruments.of(arm_model(robot), motion, dt, decimation)
     found = idim_iv(blocks, auxiliary, ls.theta)
     return found.theta, (found.theta - ls.theta) / ls.std, found.converged
 

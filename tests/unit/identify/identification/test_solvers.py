@@ -10,7 +10,7 @@ from armident.configs import ConfigError, load_robot, load_trajectory
 from armident.daq.recording import Recording
 from armident.identify.document import to_json
 from armident.identify.effects.terms import arm_model
-from armident.identify.identification.api import Outcome, identify_recording
+from armident.identify.identification.api import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import METHODS, Method, Options, parse_decimation, parse_nvr
 from armident.identify.identification.solvers import MEASURED
 from armident.identify.report.identification import identification_report
@@ -25,7 +25,7 @@ def recording() -> Recording:
 
 
 @cache
-def identified(options: Options) -> Outcome:
+def identified(options: Options) -> IdentificationOutcome:
     return identify_recording(recording(), options=options)
 
 

@@ -8,7 +8,7 @@ from scipy import signal
 from armident.identify.regression.ar_noise import ArModel, fit_ar, fit_spectrum, lagged_sums, whiteness
 from armident.identify.regression.equations import (
     LONG_SERIES,
-    Block,
+    ExperimentEquations,
     absorbed_sums,
     inverse_gram,
     least_squares,
@@ -84,7 +84,9 @@ def test_errors_of_parameters_are_as_large_as_said_although_the_noise_model_is_a
         white = rng.standard_normal((samples + 500, 1 + parameters))
         noise = signal.lfilter([1.0], np.append(1.0, coefficients), white[:, :1], axis=0)[500:]
         x = signal.lfilter([1.0], [1.0, -0.9], white[:, 1:], axis=0)[500:]
-        block = Block(noise, x[:, None, :], np.ones((samples, 1), np.bool_), np.arange(samples, dtype=np.float64))
+        block = ExperimentEquations(
+            noise, x[:, None, :], np.ones((samples, 1), np.bool_), np.arange(samples, dtype=np.float64)
+        )
         known[run] = squared_distance(*weighted([block], [ArModel(coefficients, 1.0, 0.0)]))
         models = [ArModel(np.empty(0), float(np.var(noise)), 0.0)]
         for _ in range(5):
@@ -112,7 +114,9 @@ def test_stretches_of_a_long_series_say_what_the_parameters_absorbed() -> None:
     np.testing.assert_array_equal(absorbed_sums(short, factor, lags), lagged_sums(short @ factor, lags))
 
 
-def weighted(blocks: list[Block], models: list[ArModel]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def weighted(
+    blocks: list[ExperimentEquations], models: list[ArModel]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     x, y = stacked(blocks, models)
     return least_squares(x, y), inverse_gram(x)
 

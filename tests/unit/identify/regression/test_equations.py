@@ -9,7 +9,7 @@ from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
-    Block,
+    ExperimentEquations,
     instrumental_variable,
     inverse_gram,
     iterate,
@@ -74,14 +74,14 @@ def test_unexcited_parameters_are_named() -> None:
     x[:, 0, 2] = 2 * x[:, 0, 1]
     keep = np.ones((100, 1), dtype=np.bool_)
     with pytest.raises(DataError, match="not excited: fv1, off1"):
-        idim_ls([Block(x[:, :, 0], x, keep, np.arange(100.0))], ["zz1", "fv1", "off1"])
+        idim_ls([ExperimentEquations(x[:, :, 0], x, keep, np.arange(100.0))], ["zz1", "fv1", "off1"])
 
 
 def test_a_joint_that_is_noisier_counts_less() -> None:
     rng = np.random.default_rng(5)
     x = np.ones((5000, 2, 1))
     y = np.stack([1 + 0.01 * rng.standard_normal(5000), 3 + 10 * rng.standard_normal(5000)], axis=1)
-    estimate = idim_ls([Block(y, x, np.ones((5000, 2), dtype=np.bool_), np.arange(5000.0))], ["off1"])
+    estimate = idim_ls([ExperimentEquations(y, x, np.ones((5000, 2), dtype=np.bool_), np.arange(5000.0))], ["off1"])
     assert abs(estimate.theta[0] - 1) < 0.05
 
 
@@ -92,7 +92,7 @@ def test_ordinary_least_squares_knows_its_scatter_where_joints_differ() -> None:
         rng = np.random.default_rng(seed)
         x = rng.standard_normal((200, 2, 2))
         y = x @ np.array([1.0, -2.0]) + rng.standard_normal((200, 2)) * [0.1, 3.0]
-        estimate = idim_ls([Block(y, x, keep, t)], ["a", "b"], weighted=False)
+        estimate = idim_ls([ExperimentEquations(y, x, keep, t)], ["a", "b"], weighted=False)
         np.testing.assert_allclose(estimate.theta, np.linalg.lstsq(x.reshape(-1, 2), y.ravel(), rcond=None)[0])
         found.append(estimate.theta)
         promised = estimate.std

@@ -7,7 +7,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.equations import Block, instrumental_variable, iv_covariance, stacked, weighted_rows
+from armident.identify.regression.equations import (
+    ExperimentEquations,
+    instrumental_variable,
+    iv_covariance,
+    stacked,
+    weighted_rows,
+)
 from armident.identify.regression.fir import filter_columns
 from armident.identify.regression.iv_products import CHUNK_ROWS, iv_products
 
@@ -23,7 +29,7 @@ NOISE = [
 
 def problem(
     samples: int, columns: int, likeness: float = 0.0, left_out: bool = False
-) -> tuple[list[Floats], list[Block]]:
+) -> tuple[list[Floats], list[ExperimentEquations]]:
     """Two experiments of three joints; the last two regressors differ by a share of 10 to the ``-likeness``."""
     rng = np.random.default_rng(3)
     instruments, blocks = [], []
@@ -36,7 +42,7 @@ def problem(
             keep[::3, 0], keep[m // 2 :, 2] = False, False
         y = x @ (1 / np.logspace(-3, 3, columns)) + rng.standard_normal((m, 3))
         instruments.append(z)
-        blocks.append(Block(y, x, keep, np.arange(m, dtype=np.float64)))
+        blocks.append(ExperimentEquations(y, x, keep, np.arange(m, dtype=np.float64)))
     return instruments, blocks
 
 
@@ -56,7 +62,7 @@ def test_estimate_and_covariance_are_those_of_the_triangular_factors(samples: in
 def test_regressors_alike_to_six_digits_cost_the_sums_no_more_digits_than_the_triangular_factors() -> None:
     instruments, blocks = problem(20000, 7, likeness=6.0)
     truth = 1 / np.logspace(-3, 3, 7)
-    silent = [Block(b.x @ truth, b.x, b.keep, b.t) for b in blocks]
+    silent = [ExperimentEquations(b.x @ truth, b.x, b.keep, b.t) for b in blocks]
 
     found = iv_products(instruments, silent, NOISE).theta
 

@@ -7,21 +7,21 @@ import pytest
 
 from armident.configs import load_robot, load_trajectory
 from armident.identify.document import IdentificationDocument, load_document
-from armident.identify.identification.api import Outcome, identify_recording
+from armident.identify.identification.api import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.report.files import write_identification
 from armident.virtual_robot.offline import simulate_recording
 
 
 @pytest.fixture(scope="module")
-def outcome() -> Outcome:
+def outcome() -> IdentificationOutcome:
     robot = load_robot("tx40.yaml")
     trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
     return identify_recording(simulate_recording(robot, trajectory, seed=1), options=Options(method="idim-ls"))
 
 
 @pytest.fixture(scope="module")
-def page(outcome: Outcome, tmp_path_factory: pytest.TempPathFactory) -> str:
+def page(outcome: IdentificationOutcome, tmp_path_factory: pytest.TempPathFactory) -> str:
     _, report = write_identification(outcome, tmp_path_factory.mktemp("out"))
     return report.read_text(encoding="utf-8")
 
@@ -32,18 +32,20 @@ def test_the_report_needs_no_other_file(page: str) -> None:
     assert all(source.startswith("data:image/svg+xml;base64,") for source in sources)
 
 
-def test_every_essential_parameter_stands_in_the_report_with_its_value(outcome: Outcome, page: str) -> None:
+def test_every_essential_parameter_stands_in_the_report_with_its_value(
+    outcome: IdentificationOutcome, page: str
+) -> None:
     essential = [p for p in outcome.document.parameters if p.essential]
     assert essential
     for p in essential:
         assert re.search(rf"<td>{p.name}</td><td class=\"n\">{p.value:.4f}</td>", page), p.name
 
 
-def test_warnings_reach_the_reader(outcome: Outcome, page: str) -> None:
+def test_warnings_reach_the_reader(outcome: IdentificationOutcome, page: str) -> None:
     assert page.count('class="warn"') == len(outcome.document.warnings)
 
 
-def test_the_document_is_written_beside_the_report(outcome: Outcome, tmp_path: Path) -> None:
+def test_the_document_is_written_beside_the_report(outcome: IdentificationOutcome, tmp_path: Path) -> None:
     document, report = write_identification(outcome, tmp_path / "deep" / "out")
     assert load_document(document, IdentificationDocument) == outcome.document
     assert sorted(p.name for p in report.parent.iterdir()) == ["identification.json", "report.html"]

@@ -8,7 +8,7 @@ from armident.configs import DataError, load_robot
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.identification.equations import aligned_torque
-from armident.identify.regression.equations import Block, Estimate, filtered_regressor
+from armident.identify.regression.equations import Estimate, ExperimentEquations, filtered_regressor
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.identify.signals.standstill import SLOW_SHARE, moving, velocity_threshold
@@ -58,7 +58,8 @@ def fitted(share: float, sharp_sign: bool) -> Estimate:
     keep = moving(s.qd, velocity_threshold([s], share), low_pass)
     x = filtered_regressor(model, s, low_pass, sharp_sign=sharp_sign)
     return idim_ls(
-        [Block(low_pass(aligned_torque(tau)), x, keep, np.asarray(kept * DT, dtype=np.float64))], model.base.names
+        [ExperimentEquations(low_pass(aligned_torque(tau)), x, keep, np.asarray(kept * DT, dtype=np.float64))],
+        model.base.names,
     )
 
 
