@@ -84,6 +84,7 @@ TAKES: dict[str, tuple[str, ...]] = {
     "worn_2": (*CELL, *WORN, "--seed", "12", "--to-file"),
     "worn_3": (*CELL, *WORN, "--seed", "13", "--to-file"),
     "gripper": (*CELL, *GRIPPER, "--seed", "21", "--to-file"),
+    "transients": (*CELL, *GRIPPER, "--seed", "1", "--to-file"),
     "miswired": (*CELL, *MISWIRED, "--seed", "31", "--to-file"),
 }  # fmt: skip
 """Recordings and the arguments that make them; the file to write comes last."""
@@ -136,12 +137,16 @@ CASES: tuple[Case, ...] = (
     *(Case(f"virtual-{method}", "identify", ("virtual",), ("--method", method)) for method in METHODS),
     Case("diagnose-worn", "diagnose", ("worn_1", "worn_2", "worn_3")),
     Case("diagnose-healthy", "diagnose", ("healthy",)),
-    Case(
-        "diagnose-gripper-baseline",
-        "diagnose",
-        ("gripper",),
-        ("--baseline", f"{BASELINE}/identification.json"),
-        needs=BASELINE,
+    # With the first seed a structure and numbers are found; with the second something is left that comes in bursts.
+    *(
+        Case(
+            f"diagnose-{take}-baseline",
+            "diagnose",
+            (take,),
+            ("--baseline", f"{BASELINE}/identification.json"),
+            needs=BASELINE,
+        )
+        for take in ("gripper", "transients")
     ),
     # Beyond the stories of the demo: mistakes of wiring, and a measured machine that leaves something unexplained.
     Case("diagnose-miswired", "diagnose", ("miswired",)),
@@ -294,12 +299,11 @@ class Comparison:
     def documents(self, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
         """Compare two documents, with old or new names."""
         old, new = renamed(dict(before)), renamed(dict(after))
-        if old.get("verdict") != new.get("verdict"):
-            self.differ("verdict", old.get("verdict"), new.get("verdict"))
         found, told = findings(old), findings(new)
         if found != told:
-            # Without the same findings in the same order no further number can be the same.
+            # Without the same findings in the same order hardly any number can be the same.
             self.differ("findings", found, told)
+            self.values(old.get("verdict"), new.get("verdict"), "verdict")
             return
         for document in (old, new):
             for key in SKIPPED_AT_TOP:
