@@ -1,4 +1,4 @@
-"""What a site edits, and the one schema that loads and checks it."""
+"""Configuration files of robots, sessions, trajectories, scenarios and suites, and the schema that checks them."""
 
 from armident.configs.errors import ArmidentError, ConfigError, DataError
 from armident.configs.loading import config_path, load_robot, load_scenario, load_session, load_suite, load_trajectory

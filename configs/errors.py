@@ -1,19 +1,19 @@
-"""The exceptions every room shares, and the exit code each one stands for."""
+"""Exceptions of all packages, with the exit code of each."""
 
 
 class ArmidentError(Exception):
-    """An error with a message meant for the user: one line that says what and where."""
+    """Base of all errors with a message for the user: one line that names the problem and its place."""
 
     exit_code = 1
 
 
 class ConfigError(ArmidentError):
-    """Usage or configuration is wrong; the message names the file, the key and what was expected."""
+    """Error of usage or configuration; the message names the file, the key and the expected value."""
 
     exit_code = 2
 
 
 class DataError(ArmidentError):
-    """The data cannot support the request; the message says why."""
+    """Error of data that cannot support the request; the message gives the reason."""
 
     exit_code = 3

@@ -1,4 +1,4 @@
-"""Requests and answers as JSON, one a line: how one room works for another as a process."""
+"""JSON-lines server: one request per line on stdin, one answer per line on stdout."""
 
 import json
 import os
@@ -15,8 +15,13 @@ Document = dict[str, Any]
 def serve(handle: Callable[[Document], Document]) -> None:
     """Answer every request on stdin with one line on stdout until stdin ends.
 
-    An answer carries the ``id`` of its request; if ``handle`` raises, it carries ``error`` instead of results. Whatever
-    else the process prints goes to stderr.
+    An answer carries the ``id`` of its request. If ``handle`` raises, the answer carries ``error`` instead of results.
+    All other output of the process goes to stderr.
+
+    Parameters
+    ----------
+    handle
+        Function from a request to the fields of its answer.
     """
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Arithmetic in configuration files: numbers, names, ``+ - * / **``, parentheses and a few functions."""
+"""Arithmetic expressions in configuration files: numbers, names, ``+ - * / **``, parentheses and a few functions."""
 
 import ast
 import math
@@ -19,21 +19,21 @@ _CONSTANTS = {"pi": math.pi}
 
 
 def evaluate(expression: str | float, names: Mapping[str, float], where: str = "expression") -> float:
-    """Value of an expression.
+    """Value of an arithmetic expression.
 
     Parameters
     ----------
     expression
         A number, or text such as ``0.3 * fc``.
     names
-        What its names stand for.
+        Values of the names that the expression may use.
     where
-        How messages name it.
+        Name of the expression in messages.
 
     Raises
     ------
     ConfigError
-        If it is no such expression, a name is unknown, or there is no finite value.
+        If the text is not an expression, a name is unknown, or the value is not finite.
     """
     if not isinstance(expression, str):
         return float(expression)

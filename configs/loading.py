@@ -1,4 +1,4 @@
-"""Reads a configuration file once, checks it once, and says in one line what is wrong with it."""
+"""Loading and checking of configuration files; an error is one line that names file, key and expected value."""
 
 import difflib
 from pathlib import Path
@@ -23,24 +23,24 @@ KINDS: dict[str, type[BaseModel]] = {
     "suite": SuiteConfig,
     "scenario": Scenario,
 }
-"""Kinds of files, by the word for them in their ``schema``."""
+"""Kinds of files by the word in their ``schema`` key."""
 SHIPPED = ("robots", "cells", "trajectories", "scenarios", "suites", "eds")
-"""Folders of shipped files, in the order in which a bare name is looked up."""
+"""Folders of shipped files, in the order of the search for a bare name."""
 _LONGEST = 80
-"""Most characters of a file that a message repeats."""
+"""Maximum number of characters of a file that a message quotes."""
 T = TypeVar("T", bound=BaseModel)
 
 
 def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells")) -> Path:
-    """Find the file that a user names: the path as given, else a file that is shipped with armident.
+    """Path of a configuration file: the path as given, else a file that is shipped with armident.
 
     Parameters
     ----------
     name
         A path, or the name of a shipped file. ``tx40.yaml``, ``configs/tx40.yaml``, ``robots/tx40.yaml`` and ``tx40``
-        all find the shipped ``configs/robots/tx40.yaml`` where the working directory has no file of that name.
+        all find the shipped ``configs/robots/tx40.yaml`` if the working directory has no file of that name.
     listed
-        Folders of shipped files that the message lists where there is no such file.
+        Folders of shipped files that the error message lists.
 
     Raises
     ------
@@ -68,15 +68,20 @@ def _shipped(path: Path) -> Path | None:
 
 
 def load_robot(name: str | Path) -> RobotConfig:
-    """A robot configuration from a file.
+    """Load a robot configuration.
 
-    Where the file has a key ``urdf`` (see `armident.configs.urdf`), joints and geometry come from there:
-    ``joints`` then only adds to them, by name, and ``gravity`` is that of the URDF's base link.
+    If the file has a key ``urdf`` (see `armident.configs.urdf`), joints and geometry come from the URDF. In this case
+    ``joints`` only adds to the URDF's joints, by name, and ``gravity`` is given in the frame of its base link.
+
+    Parameters
+    ----------
+    name
+        A path, or the name of a shipped file (see `config_path`).
 
     Raises
     ------
     ConfigError
-        Naming file, key and what was expected.
+        If the file is missing or wrong; names file, key and expected value.
     """
     path = config_path(name)
     data = _read_mapping(_read_text(path), str(path))
@@ -88,25 +93,35 @@ def load_robot(name: str | Path) -> RobotConfig:
 
 
 def load_trajectory(name: str | Path) -> Trajectory:
-    """A reference trajectory from a file.
+    """Load a reference trajectory.
+
+    Parameters
+    ----------
+    name
+        A path, or the name of a shipped file (see `config_path`).
 
     Raises
     ------
     ConfigError
-        Naming file, key and what was expected.
+        If the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name), Trajectory)
 
 
 def load_session(name: str | Path) -> SessionConfig:
-    """A session configuration from a file, its relative paths made absolute.
+    """Load a session configuration and make its relative paths absolute.
 
-    A relative path is looked up beside the file first, then among the shipped files (see `config_path`).
+    A relative path is searched beside the file first, then among the shipped files (see `config_path`).
+
+    Parameters
+    ----------
+    name
+        A path, or the name of a shipped file (see `config_path`).
 
     Raises
     ------
     ConfigError
-        Naming file, key and what was expected.
+        If the file is missing or wrong; names file, key and expected value.
     """
     path = config_path(name)
     session = _load(path, SessionConfig)
@@ -143,18 +158,23 @@ def load_session(name: str | Path) -> SessionConfig:
 
 
 def load_suite(name: str | Path) -> SuiteConfig:
-    """A suite of hidden effects from a file.
+    """Load the cases of a diagnosis suite.
+
+    Parameters
+    ----------
+    name
+        A path, or the name of a shipped file (see `config_path`).
 
     Raises
     ------
     ConfigError
-        Naming file, key and what was expected.
+        If the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name), SuiteConfig)
 
 
 def load_scenario(name: str | Path) -> Scenario:
-    """Load the effects that are injected into a virtual arm from a file.
+    """Load the hidden effects of a virtual arm.
 
     Parameters
     ----------
@@ -164,7 +184,7 @@ def load_scenario(name: str | Path) -> Scenario:
     Raises
     ------
     ConfigError
-        Naming file, key and what was expected.
+        If the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name, listed=("scenarios",)), Scenario)
 
@@ -174,12 +194,21 @@ def _load(path: Path, kind: type[T]) -> T:
 
 
 def parse(text: str, kind: type[T], where: str) -> T:
-    """A configuration object from YAML text; ``where`` is how messages name it.
+    """Parse YAML text into a configuration object.
+
+    Parameters
+    ----------
+    text
+        YAML text.
+    kind
+        Class of the configuration object.
+    where
+        Name of the text in messages.
 
     Raises
     ------
     ConfigError
-        Naming ``where``, the key and what was expected.
+        If the text is wrong; names ``where``, key and expected value.
     """
     return _checked(_read_mapping(text, where), kind, where)
 
@@ -207,21 +236,21 @@ def _checked(data: dict[str, Any], kind: type[T], where: str) -> T:
     except ValidationError as error:
         other = _other_kind(data, kind)
         raise ConfigError(f"{where}: {other or _first_problem(error, kind, data)}") from error
-    misread = _truth_as_number(data, model.model_dump(by_alias=True), "")
-    if misread is not None:
-        raise ConfigError(f"{where}: {misread}")
+    mismatch = _boolean_mismatch(data, model.model_dump(by_alias=True), "")
+    if mismatch is not None:
+        raise ConfigError(f"{where}: {mismatch}")
     return model
 
 
 def _other_kind(data: dict[str, Any], kind: type[BaseModel]) -> str | None:
-    """What is said of a file that is another kind of file than the one wanted; ``None`` if it looks like that one."""
+    """Message for a file of another kind than expected; ``None`` if it looks like the expected kind."""
     if kind not in KINDS.values():
         return None
     wanted = next(name for name, one in KINDS.items() if one is kind)
-    said = str(data.get("schema", ""))
+    schema = str(data.get("schema", ""))
     for name in KINDS:
-        if said.startswith(f"armident/{name}/"):
-            return None if name == wanted else f"this is a {name} file ({said}); a {wanted} file is wanted"
+        if schema.startswith(f"armident/{name}/"):
+            return None if name == wanted else f"this is a {name} file ({schema}); a {wanted} file is wanted"
     shared = {name: len(data.keys() & _own_keys(one)) for name, one in KINDS.items()}
     best = max(shared, key=lambda name: shared[name])
     if shared[best] > shared[wanted]:
@@ -231,22 +260,22 @@ def _other_kind(data: dict[str, Any], kind: type[BaseModel]) -> str | None:
 
 
 def _own_keys(kind: type[BaseModel]) -> set[str]:
-    """Keys of the first level that say of what kind a file is."""
+    """Keys of the first level that identify the kind of a file."""
     keys = {field.alias or name for name, field in kind.model_fields.items()} - {"schema", "description"}
     return keys | ({"urdf"} if kind is RobotConfig else set())
 
 
-def _truth_as_number(said: Any, understood: Any, key: str) -> str | None:
-    """What is said of the first true or false (in YAML also yes, no, on, off) taken as a number, or the reverse."""
-    if isinstance(said, bool) != isinstance(understood, bool):
-        wanted = "true or false" if isinstance(understood, bool) else "a number or a word"
-        return f"{key}: expected {wanted}, found {str(said).lower():.80}"
+def _boolean_mismatch(given: Any, parsed: Any, key: str) -> str | None:
+    """Message for the first boolean (in YAML also yes, no, on, off) that was parsed as a number, or the reverse."""
+    if isinstance(given, bool) != isinstance(parsed, bool):
+        wanted = "true or false" if isinstance(parsed, bool) else "a number or a word"
+        return f"{key}: expected {wanted}, found {str(given).lower():.80}"
     below: list[tuple[Any, Any, str]] = []
-    if isinstance(said, dict) and isinstance(understood, dict):
-        below = [(value, understood.get(k), f"{key}.{k}" if key else str(k)) for k, value in said.items()]
-    elif isinstance(said, list) and isinstance(understood, tuple | list):
-        below = [(one, other, f"{key}[{k}]") for k, (one, other) in enumerate(zip(said, understood, strict=False))]
-    return next((found for entry in below if (found := _truth_as_number(*entry)) is not None), None)
+    if isinstance(given, dict) and isinstance(parsed, dict):
+        below = [(value, parsed.get(k), f"{key}.{k}" if key else str(k)) for k, value in given.items()]
+    elif isinstance(given, list) and isinstance(parsed, tuple | list):
+        below = [(one, other, f"{key}[{k}]") for k, (one, other) in enumerate(zip(given, parsed, strict=False))]
+    return next((found for entry in below if (found := _boolean_mismatch(*entry)) is not None), None)
 
 
 def _first_problem(error: ValidationError, kind: type[BaseModel], data: dict[str, Any]) -> str:
@@ -271,13 +300,13 @@ def _first_problem(error: ValidationError, kind: type[BaseModel], data: dict[str
 
 
 def _shown(text: object, longest: int = _LONGEST) -> str:
-    """A text as a message shows it: in one line, and not longer than it is worth."""
+    """Text on one line without control characters, cut after ``longest`` characters."""
     line = "".join(c if c.isprintable() else "?" for c in str(text))
     return line if len(line) <= longest else f"{line[: longest - 3]}..."
 
 
 def _keys(kind: type[BaseModel]) -> set[str]:
-    """All key names of a schema, nested ones too."""
+    """All key names of a schema, including nested ones."""
     keys: set[str] = set()
     todo: list[Any] = [kind.model_json_schema()]
     while todo:

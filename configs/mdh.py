@@ -10,16 +10,17 @@ from armident.configs.errors import ConfigError
 from armident.configs.schema.robot import Mdh
 
 PARALLEL = 1e-6
-"""Axes whose angle is below this (rad) are parallel: a micrometre per metre, less than any arm is built to."""
+"""Largest angle (rad) of parallel axes: a micrometre per metre, below the tolerance of any arm."""
 
 DIGITS = 12
-"""Decimals of a length (m), and of an angle's deviation from a right angle (rad), beyond which all is rounding."""
+"""Significant decimals of a length (m) and of an angle's deviation from a right angle (rad); the rest is rounding."""
 
 COINCIDENT = 10.0**-DIGITS
+"""Largest distance (m) of coincident points, and largest rounding error of an angle (rad)."""
 
 FARTHEST = 100.0
-"""Multiple of the chain's size beyond which a common normal is out of reach: parameters about a point so far away
-cannot be told from each other."""
+"""Largest distance of a common normal, as a multiple of the chain's size. Beyond it the parameters about the normal are
+not distinguishable numerically."""
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +34,7 @@ class MdhChain:
     base
         Frame 0 in the frame that the axes were given in, homogeneous, shape (4, 4); its z is the first axis.
     parameters
-        One per joint; ``theta`` (revolute) or ``r`` (prismatic) hold the offset of the joint variable.
+        One per joint; ``theta`` (revolute) or ``r`` (prismatic) holds the offset of the joint variable.
     frames
         Frames 1 to n in the frame of the axes, all joint variables zero, shape (n, 4, 4).
     """
@@ -44,32 +45,33 @@ class MdhChain:
 
 
 def modified_dh(axes: ArrayLike, points: ArrayLike, names: Sequence[str]) -> MdhChain:
-    """Place the link frames of Khalil and Kleinfinger on the axes of a serial chain.
+    """Modified Denavit-Hartenberg parameters of a serial chain (Khalil and Kleinfinger 1986, thesis section 2.1.1).
 
-    ``z_j`` is the axis of joint j, ``x_j`` the common normal of axes j and j+1. What that leaves free: of the two
-    senses of ``x_j`` the one with the smaller ``|theta_j|``; between parallel axes the normal with ``r_j = 0``; for
-    the last frame ``theta_n = r_n = 0``; for frame 0 ``alpha_1 = d_1 = 0`` with ``x_0`` towards the given x.
+    ``z_j`` is the axis of joint j, ``x_j`` the common normal of axes j and j+1. The remaining freedom is fixed by
+    convention. Of the two senses of ``x_j`` the one with the smaller ``|theta_j|`` is taken, and between parallel axes
+    the normal with ``r_j = 0``. The last frame has ``theta_n = r_n = 0``, and frame 0 has ``alpha_1 = d_1 = 0`` with
+    ``x_0`` towards the given x.
 
     Parameters
     ----------
     axes
-        Unit vectors (n, 3) along which, or about which, the joint variables count positively; all variables zero.
+        Unit vectors of the joint axes in the direction of positive motion, all joint variables zero, shape (n, 3).
     points
-        A point on each axis (n, 3), m.
+        A point on each axis, shape (n, 3), m.
     names
-        Of the joints, for messages.
+        Joint names for messages, length n.
 
     Raises
     ------
     ConfigError
-        If two axes are so nearly parallel that their common normal is out of reach.
+        If two axes are nearly but not exactly parallel, so that their common normal is too far away.
     """
     z = np.array(axes, dtype=np.float64)
     p = np.asarray(points, dtype=np.float64)
     n = z.shape[0]
     reach = FARTHEST * float(np.linalg.norm(p - p[0], axis=1).max()) + COINCIDENT
     x = _across(z[0])
-    # The point of axis j where the frame sits if r_j = 0.
+    # The point of axis j that is the origin of frame j if r_j = 0.
     foot = p[0] - float(p[0] @ z[0]) * z[0]
     base = _frame(x, z[0], foot)
     alpha, d = 0.0, 0.0
@@ -99,7 +101,7 @@ def modified_dh(axes: ArrayLike, points: ArrayLike, names: Sequence[str]) -> Mdh
 
 
 def _common_normal(z: Floats, p: Floats, j: int, x: Floats, foot: Floats) -> tuple[Floats, Floats, bool]:
-    """Direction of the normal of axes j and j+1, its point on axis j, and whether the axes are parallel."""
+    """Direction of the normal of axes j and j+1, its point on axis j, and True if the axes are parallel."""
     if j + 1 == z.shape[0]:
         return x, foot, False
     gap = p[j + 1] - foot

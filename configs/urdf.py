@@ -1,7 +1,7 @@
-"""The geometry of a robot from URDF: the chain from base to tip, as modified Denavit-Hartenberg parameters.
+"""Geometry of a robot from URDF: the chain from base to tip as modified Denavit-Hartenberg parameters.
 
-Of the file only links and joints are read: origins, axes, types and limits. Masses, meshes and transmissions are
-not: the dynamics are what is identified.
+Only origins, axes, types and limits of the joints are read. Masses, meshes and transmissions are ignored, because the
+dynamics are identified.
 """
 
 import math
@@ -24,27 +24,34 @@ from armident.configs.schema.robot import Drive, Positive
 from armident.configs.yaml_loader import is_file
 
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
-"""URDF joint types that a chain may have, besides ``fixed``, and what they are to the model."""
+"""Joint type of the model by URDF joint type; a chain may have these and ``fixed``."""
 
 ENDLESS = (-2.0 * math.pi, 2.0 * math.pi)
-"""Position limits (rad) of a continuous joint where the configuration gives none."""
+"""Position limits (rad) of a continuous joint if the configuration gives none."""
 
 WRITTEN_DECIMALS = 4
-"""An angle with at least so many decimals that equals a multiple of 15 degrees to these decimals is that multiple."""
+"""Minimum number of decimals of an angle that is rounded to the multiple of 15 degrees with the same decimals."""
 
 LONGEST = 500
-"""No attribute has more characters than this."""
+"""Maximum length of an attribute in characters; longer ones are refused."""
 
 LARGEST = 1e9
-"""No number of an arm is larger than this, in SI units."""
+"""Largest magnitude of a number in a URDF, SI units; larger ones are refused."""
 
 Floats = NDArray[np.float64]
 
 
 class UrdfSource(FrozenModel):
-    """Which part of which URDF file: ``file`` relative to the configuration, links ``base`` and ``tip``.
+    """Part of a URDF file to read.
 
-    Without ``base`` the chain begins at the root of the tree, without ``tip`` it ends with its last moving joint.
+    Parameters
+    ----------
+    file
+        Path relative to the configuration.
+    base
+        First link of the chain; ``None``: the root of the tree.
+    tip
+        Last link of the chain; ``None``: the chain ends with its last moving joint.
     """
 
     file: str
@@ -53,7 +60,17 @@ class UrdfSource(FrozenModel):
 
 
 class LimitsGiven(FrozenModel):
-    """Limits that replace, or add to, those of the URDF, which knows none of acceleration."""
+    """Limits that replace those of the URDF or add to them; URDF has no limit of acceleration.
+
+    Parameters
+    ----------
+    position
+        Lower and upper limit, rad or m.
+    velocity, acceleration
+        Largest magnitudes, rad or m, per s and per s^2.
+    torque
+        Largest magnitude, N m or N.
+    """
 
     position: tuple[float, float] | None = None
     velocity: Positive | None = None
@@ -62,7 +79,17 @@ class LimitsGiven(FrozenModel):
 
 
 class JointGiven(FrozenModel):
-    """What a configuration says of a joint of the URDF; ``name`` is the URDF's."""
+    """Additions of a configuration to a joint of the URDF.
+
+    Parameters
+    ----------
+    name
+        Name of the joint in the URDF.
+    limits
+        Limits that replace those of the URDF or add to them.
+    drive, rotor_inertia
+        As in `armident.configs.schema.robot.Joint`.
+    """
 
     name: str
     limits: LimitsGiven = LimitsGiven()
@@ -71,7 +98,17 @@ class JointGiven(FrozenModel):
 
 
 class UrdfGeometry(FrozenModel):
-    """The keys of a robot configuration that a URDF takes part in; ``gravity`` in the frame of the base link."""
+    """Keys of a robot configuration that are combined with a URDF.
+
+    Parameters
+    ----------
+    urdf
+        Part of the URDF to read.
+    joints
+        Additions to its joints.
+    gravity
+        Acceleration of gravity in the frame of the base link, m/s^2.
+    """
 
     urdf: UrdfSource
     joints: tuple[JointGiven, ...] = ()
@@ -91,7 +128,7 @@ class UrdfJoint:
     axis
         Unit vector in that frame, shape (3,).
     limits
-        What the file says: ``position`` (rad or m), ``velocity``, ``torque``.
+        Limits of the file: ``position`` (rad or m), ``velocity`` (rad/s or m/s), ``torque`` (N m or N).
     """
 
     name: str
@@ -102,12 +139,14 @@ class UrdfJoint:
 
 
 def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
-    """``joints`` and ``gravity`` of a robot configuration whose geometry a URDF gives.
+    """Convert the geometry of a URDF to ``joints`` and ``gravity`` of a robot configuration.
 
     Parameters
     ----------
     given
-        The keys concerned, as read from the configuration ``where``.
+        Keys of the robot configuration that are combined with the URDF.
+    where
+        Path of the robot configuration.
 
     Returns
     -------
@@ -117,7 +156,7 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
     Raises
     ------
     ConfigError
-        If the URDF is wrong or not a serial chain, naming file and element, or what it leaves open is not given.
+        If the URDF is wrong or not a serial chain (names file and element), or if a limit is missing in both files.
     """
     file = where.resolve().parent / given.urdf.file
     if not is_file(file):
@@ -152,13 +191,26 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
 
 
 def joint_name(name: str) -> str:
-    """Name of a joint in a configuration: lower case, everything but letters and digits an underscore."""
+    """Name of a joint in a configuration: lower case, with other characters than letters and digits as underscores.
+
+    Parameters
+    ----------
+    name
+        Name of the joint in the URDF.
+    """
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
     return plain if plain[:1].isalpha() else f"joint_{plain}"
 
 
 def mdh_of(joints: tuple[UrdfJoint, ...], file: Path) -> MdhChain:
-    """Modified Denavit-Hartenberg parameters of a chain, its frames in the base link.
+    """Modified Denavit-Hartenberg parameters of a chain, with frames in the base link.
+
+    Parameters
+    ----------
+    joints
+        Moving joints from base to tip.
+    file
+        Path of the URDF for messages.
 
     Raises
     ------
@@ -173,15 +225,25 @@ def mdh_of(joints: tuple[UrdfJoint, ...], file: Path) -> MdhChain:
 
 
 def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> tuple[UrdfJoint, ...]:
-    """Moving joints between two links of a URDF, fixed joints merged into the placements.
+    """Moving joints between two links of a URDF, with fixed joints merged into the placements.
 
-    Side branches that cannot move are part of the link they are fixed to. What branches off at the base stands
-    still, and what comes after the tip is taken as its load.
+    Side branches that cannot move belong to the link they are fixed to. Branches at the base are ignored, and links
+    after the tip are its load.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    base
+        First link of the chain; ``None``: the root of the tree.
+    tip
+        Last link of the chain; ``None``: the chain ends with its last moving joint.
 
     Raises
     ------
     ConfigError
-        Naming file and element: not a URDF, a tree that is not one, a branch, a joint no serial chain has.
+        If the file is not a URDF or not a tree, if the chain branches, or if a joint is not of a serial chain.
+        Names file and element.
     """
     tree = _read_tree(file)
     base = tree.root() if base is None else tree.known(base, "urdf.base")
@@ -198,7 +260,7 @@ def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> t
 
 @dataclass(frozen=True)
 class _Tree:
-    """Joint elements by the link they move and by the link they are on."""
+    """Joint elements by child link (``above``) and by parent link (``below``)."""
 
     file: Path
     links: frozenset[str]
@@ -257,7 +319,7 @@ class _Tree:
             )
 
     def _moves(self, element: ET.Element) -> bool:
-        """Whether this joint or any after it moves."""
+        """Return True if this joint or any joint after it moves."""
         return self.type_of(element) != "fixed" or any(
             self._moves(after) for after in self.below.get(_end(element, "child"), [])
         )
@@ -266,7 +328,7 @@ class _Tree:
         return element.get("type", "")
 
     def origin(self, element: ET.Element) -> Floats:
-        """Placement of a joint in the link it is on (4, 4)."""
+        """Placement of a joint in its parent link, homogeneous, shape (4, 4)."""
         found = element.find("origin")
         frame = np.eye(4)
         if found is not None:
@@ -291,7 +353,7 @@ class _Tree:
         return UrdfJoint(str(element.get("name")), kind, placement, axis / length, self._limits(element))
 
     def _limits(self, element: ET.Element) -> dict[str, Any]:
-        """What the file says of limits; zero velocities and efforts are placeholders."""
+        """Limits of the file; zero velocities and efforts are placeholders."""
         limits: dict[str, Any] = {}
         found = element.find("limit")
         values = {
@@ -366,7 +428,18 @@ def _read_tree(file: Path) -> _Tree:
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> Floats:
-    """Rotation matrix of URDF's fixed-axis angles, exact for right angles: ``Rot(z, y) Rot(y, p) Rot(x, r)``."""
+    """Rotation matrix of URDF's fixed-axis angles, exact for right angles: ``Rot(z, y) Rot(y, p) Rot(x, r)``.
+
+    Parameters
+    ----------
+    roll, pitch, yaw
+        Angles, rad.
+
+    Returns
+    -------
+    ndarray
+        Rotation matrix, shape (3, 3).
+    """
     (cr, sr), (cp, sp), (cy, sy) = (_cos_sin(angle) for angle in (roll, pitch, yaw))
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
     about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
@@ -381,7 +454,7 @@ def _cos_sin(angle: float) -> tuple[float, float]:
 
 
 def _angle(word: str) -> float:
-    """An angle as written, or the multiple of 15 degrees that it rounds or cuts off."""
+    """Angle (rad) as written, or the multiple of 15 degrees of which it is a rounded or truncated value."""
     value = float(word)
     multiple = round(value / (math.pi / 12)) * (math.pi / 12)
     exponent = Decimal(word).as_tuple().exponent
@@ -398,6 +471,6 @@ def _is_finite(word: str) -> bool:
 
 
 def _end(element: ET.Element, end: str) -> str:
-    """Link name of the ``parent`` or ``child`` of a joint; empty if it has none."""
+    """Name of the ``parent`` or ``child`` link of a joint; empty if it has none."""
     found = element.find(end)
     return "" if found is None else found.get("link", "")

@@ -1,4 +1,4 @@
-"""Reads YAML as people mean it: a key once, and no numbers or dates that nobody thought of writing."""
+"""Strict YAML: duplicate keys are errors, numbers follow YAML 1.2, and there are no dates."""
 
 import os.path
 import re
@@ -15,19 +15,31 @@ _FLOAT = re.compile(
     r"^[-+]?(?:(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?|[0-9][0-9_]*[eE][-+]?[0-9]+)$"
     r"|^[-+]?\.(?:inf|Inf|INF)$|^\.(?:nan|NaN|NAN)$"
 )
-"""As in YAML 1.2: YAML 1.1 takes 010 as 8, 1:30 as 90, and 1e-3 as a word."""
+"""Numbers of YAML 1.2; YAML 1.1 reads 010 as 8, 1:30 as 90, and 1e-3 as a string."""
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; no error either where its name is too long or its folder may not be entered."""
+    """Return True if the file exists; no error if its name is too long or its folder is not accessible.
+
+    Parameters
+    ----------
+    path
+        Path of the file.
+    """
     return os.path.isfile(path)
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2's numbers, no dates, and no key twice."""
+    """Safe loader with the numbers of YAML 1.2, without dates and without duplicate keys."""
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        """A mapping whose own keys are all different; those that are merged in (<<) come later and give way to them."""
+        """Compose a mapping and refuse duplicate keys; keys merged in (<<) come later and do not override.
+
+        Parameters
+        ----------
+        anchor
+            Anchor of the node.
+        """
         node = super().compose_mapping_node(anchor)
         seen = set()
         for key, _ in node.value:
@@ -51,12 +63,19 @@ for _tag, _pattern, _first in (
 
 
 def read_yaml(text: str, where: str) -> Any:
-    """What a YAML text says; ``where`` is how messages name it.
+    """Parse a YAML text.
+
+    Parameters
+    ----------
+    text
+        YAML text.
+    where
+        Name of the text in messages.
 
     Raises
     ------
     ConfigError
-        If it is no YAML, in one line that names the line of the file.
+        If the text is not valid YAML; one line that names the line of the file.
     """
     try:
         return yaml.load(text, _Loader)

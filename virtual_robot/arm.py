@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import Scenario
+from armident.configs.units import counts_per_si
 from armident.virtual_robot import servo
 from armident.virtual_robot.effects import hidden_effects
 from armident.virtual_robot.effects.signals import Signals
@@ -149,19 +150,3 @@ class Arm:
             signals.rewired_torque(current, self.current)
             signals.rewired_position(position, self.position)
             signals.rewired_position(demand, self.demand)
-
-
-def counts_per_si(robot: RobotConfig) -> NDArray[np.float64]:
-    """Return encoder counts per rad (revolute) or metre (prismatic) of each motor, shape (n,).
-
-    Raises
-    ------
-    ConfigError
-        If a joint's drive has no encoder resolution.
-    """
-    out = []
-    for joint in robot.joints:
-        if joint.drive.counts_per_unit is None:
-            raise ConfigError(f"robot {robot.name!r}: {joint.name}.drive.counts_per_unit: a drive on a bus needs it")
-        out.append(joint.drive.counts_per_unit / (2 * np.pi if joint.type == "revolute" else 1.0))
-    return np.array(out)

@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig, Trajectory
 from armident.configs.schema.scenario import Scenario
+from armident.configs.units import counts_per_si
 from armident.daq.recording import Field, Mark, Recording, Stream
 from armident.virtual_robot import servo
-from armident.virtual_robot.arm import Arm, counts_per_si
+from armident.virtual_robot.arm import Arm
 
 Effort = Literal["current", "voltage", "torque"]
 

@@ -4,8 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig
+from armident.configs.units import counts_per_si
 from armident.daq.recording import Recording, Stream
-from armident.virtual_robot.arm import Raw32, counts_per_si
+from armident.virtual_robot.arm import Raw32
 
 RATE_TOLERANCE = 1e-3
 """Relative difference allowed between the recording's sample rate and the SYNC rate."""

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, SessionConfig
+from armident.configs.units import counts_per_si
 from armident.drivers.can.frames import frames
 from armident.drivers.can.socketcan import RECEIVE_TIMEOUT, RawSocket
 from armident.drivers.canopen.objects import DriveState
-from armident.virtual_robot.arm import DriveBackend, counts_per_si
+from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.bus_server import BATCH, DriveBus
 from armident.virtual_robot.node import Drive
 

@@ -1,1 +1,1 @@
-"""The pydantic models of every kind of configuration file."""
+"""Pydantic models of all kinds of configuration files."""

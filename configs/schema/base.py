@@ -1,9 +1,9 @@
-"""The base of every configuration object: frozen, and without unknown keys."""
+"""Base class of all configuration objects."""
 
 from pydantic import BaseModel, ConfigDict
 
 
 class FrozenModel(BaseModel):
-    """A configuration object: read once, checked once, passed on unchanged."""
+    """Immutable configuration object that refuses unknown keys, infinities and NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

@@ -1,4 +1,4 @@
-"""The robot: geometry, transmission, drives and the terms of its dynamic model."""
+"""Schema of a robot: geometry, transmission, drives and the terms of its dynamic model."""
 
 from typing import Annotated, Literal, Self
 
@@ -17,6 +17,13 @@ class Mdh(FrozenModel):
 
     ``Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r)``; the joint variable is added to
     ``theta`` of a revolute joint and to ``r`` of a prismatic one.
+
+    Parameters
+    ----------
+    alpha, theta
+        Angles, rad.
+    d, r
+        Lengths, m.
     """
 
     alpha: float = Field(description="rad")
@@ -26,7 +33,17 @@ class Mdh(FrozenModel):
 
 
 class Limits(FrozenModel):
-    """What a joint may do, in joint coordinates (rad or m, s, N m or N)."""
+    """Limits of a joint, joint side.
+
+    Parameters
+    ----------
+    position
+        Lower and upper limit, rad or m.
+    velocity, acceleration
+        Largest magnitudes, rad/s or m/s, and rad/s^2 or m/s^2.
+    torque
+        Largest magnitude, N m or N.
+    """
 
     position: tuple[float, float]
     velocity: Positive
@@ -41,12 +58,12 @@ class Limits(FrozenModel):
 
 
 class Drive(FrozenModel):
-    """The drive of one motor: how its raw numbers become rad and N m at the motor shaft.
+    """Drive of one motor: conversion of its raw numbers to rad and N m at the motor shaft.
 
     Parameters
     ----------
     signal
-        What the drive reports as effort: ``current`` (A), ``voltage`` (V) or ``torque`` (N m, N).
+        Quantity that the drive reports as effort: ``current`` (A), ``voltage`` (V) or ``torque`` (N m, N).
     gain
         Shaft torque (N m) or force (N) per unit of ``signal``; thesis equation 2.14 without the gear ratio.
     rated
@@ -65,7 +82,21 @@ class Drive(FrozenModel):
 
 
 class Joint(FrozenModel):
-    """One joint with its drive. ``rotor_inertia`` says whether ``ia`` is a parameter of its own."""
+    """One joint with its drive.
+
+    Parameters
+    ----------
+    name, type
+        Name, and ``revolute`` or ``prismatic``.
+    mdh
+        Modified Denavit-Hartenberg parameters.
+    limits
+        Limits of motion and torque, joint side.
+    drive
+        Drive of the joint's motor.
+    rotor_inertia
+        ``True`` if the rotor inertia ``ia`` is a separate parameter of the model.
+    """
 
     name: Name
     type: Literal["revolute", "prismatic"] = "revolute"
@@ -76,18 +107,33 @@ class Joint(FrozenModel):
 
 
 class Coupling(FrozenModel):
-    """Friction and inertia between two joints (thesis equation B.1): ``ia<name>, fv<name>, fc<name>``."""
+    """Coupling of two joints by friction and inertia (thesis equation B.1).
+
+    Parameters
+    ----------
+    name
+        Suffix of the parameters ``ia<name>``, ``fv<name>`` and ``fc<name>``.
+    joints
+        Names of the two joints.
+    """
 
     name: Name
     joints: tuple[Name, Name]
 
 
 class Effect(FrozenModel):
-    """An effect of the discrepancy catalogue that is part of this robot's model, and its parameters.
+    """Effect of the diagnosis catalogue that is part of the robot's model.
 
-    Shape parameters (a Stribeck velocity, a harmonic) stay as given; linear ones are estimated with the rest.
-    ``other`` is the second joint of an effect between two. Linear parameters named in ``without`` are left out: what
-    they stand for, the rigid model of this arm has already.
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    joint, other
+        Joint of the effect; second joint of an effect between two joints.
+    parameters
+        Values of the nonlinear parameters (a Stribeck velocity, a harmonic); linear ones are estimated.
+    without
+        Linear parameters to leave out, because the rigid model of this arm has an equivalent one.
     """
 
     effect: Name
@@ -105,8 +151,8 @@ class Friction(FrozenModel):
     sign_smoothing
         ``g`` (s/rad or s/m) in ``sign(qd) -> (2/pi) atan(g qd)``, used in simulation (thesis appendix B.2).
     velocity_threshold
-        Per joint (rad/s or m/s): samples of a joint slower than this say nothing about its friction and
-        are left out of that joint's equations. ``None``: chosen from the data.
+        Per joint (rad/s or m/s): samples of a joint slower than this are left out of that joint's equations, because
+        its friction is undefined there. ``None``: chosen from the data.
     """
 
     sign_smoothing: Positive = 150.0
@@ -114,10 +160,16 @@ class Friction(FrozenModel):
 
 
 class Controller(FrozenModel):
-    """A known cascade ``nu = kv (kp (q_r - q) - qd)`` per motor, in units of the drive's signal.
+    """Known cascade controller ``nu = kv (kp (q_r - q) - qd)`` per motor, in units of the drive's signal.
 
-    ``kp`` in 1/s; ``kv`` in units of ``signal`` per (rad/s or m/s). The velocity is the mean over the last
-    ``velocity_samples`` sampling periods.
+    Parameters
+    ----------
+    kp
+        Position gains, 1/s, length n.
+    kv
+        Velocity gains, units of ``signal`` per rad/s or m/s, length n.
+    velocity_samples
+        Number of sampling periods over which the velocity ``qd`` is averaged.
     """
 
     kp: tuple[Positive, ...]
@@ -131,11 +183,13 @@ class Preprocessing(FrozenModel):
     Parameters
     ----------
     cutoff_hz, order, padlen
-        Zero-phase Butterworth on the positions, before central differences.
+        Cut-off (Hz), order and padding of the zero-phase Butterworth filter on the positions, before central
+        differences.
     drop
-        Samples dropped at the start.
+        Number of samples dropped at the start.
     decimation, decimation_order, decimation_ripple_db, decimation_padlen
-        Zero-phase Chebyshev low-pass on torque and regressor, and the factor of decimation.
+        Decimation factor, and order, ripple (dB) and padding of the zero-phase Chebyshev low-pass on torque and
+        regressor.
     """
 
     cutoff_hz: Positive
@@ -149,7 +203,35 @@ class Preprocessing(FrozenModel):
 
 
 class RobotConfig(FrozenModel):
-    """A serial arm as the whole service sees it; all values SI, joint side unless said."""
+    """Serial robot arm; all values in SI units, joint side unless stated otherwise.
+
+    Parameters
+    ----------
+    schema_
+        Key ``schema``: version of the file format.
+    name, description
+        Name, and free text.
+    gravity
+        Acceleration of gravity in frame 0, m/s^2.
+    joints
+        Joints from base to tip, length n.
+    transmission
+        Matrix ``R`` with ``q_motor = R q``, n rows (motors) of n numbers (joints).
+    couplings
+        Friction and inertia between joints.
+    effects
+        Effects of the diagnosis catalogue that are part of the model.
+    friction
+        Coulomb friction near standstill.
+    controller
+        Known controller of the drives; ``None``: unknown.
+    bandwidth_hz
+        Closed-loop bandwidth, Hz; ``None``: estimated from the data.
+    initial_parameters
+        Start values of the iterative methods, by parameter name, SI.
+    preprocessing
+        Filters of a published IDIM-LS fit, with a sharp ``sign(qd)``; ``None``: filters from the bandwidth.
+    """
 
     schema_: Literal["armident/robot/1"] = Field(alias="schema")
     name: Name
@@ -199,5 +281,5 @@ class RobotConfig(FrozenModel):
 
     @property
     def transmission_matrix(self) -> NDArray[np.float64]:
-        """``R`` of shape (n, n): ``q_motor = R q`` and ``tau = R' tau_motor``."""
+        """Matrix ``R`` of shape (n, n): ``q_motor = R q`` and ``tau = R' tau_motor`` (thesis equation 2.14)."""
         return np.array(self.transmission, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Scenarios: effects hidden in the virtual arm that no identification code is told of."""
+"""Schema of a scenario: effects that are hidden in a virtual arm and unknown to identification and diagnosis."""
 
 from typing import Annotated, Literal
 
@@ -9,9 +9,16 @@ from armident.configs.schema.robot import Name
 
 
 class HiddenEffect(FrozenModel):
-    """One effect on one joint; which parameters it takes is the virtual arm's business.
+    """One effect at one joint; the virtual arm defines and checks its parameters.
 
-    ``other`` is the second joint of an effect between two.
+    Parameters
+    ----------
+    effect
+        Name of the effect (``armident robot --list-effects``).
+    joint, other
+        Joint of the effect; second joint of an effect between two joints.
+    parameters
+        Values by name, joint side, SI.
     """
 
     effect: Name
@@ -21,7 +28,17 @@ class HiddenEffect(FrozenModel):
 
 
 class Scenario(FrozenModel):
-    """What is wrong with the arm."""
+    """Hidden effects of one virtual arm.
+
+    Parameters
+    ----------
+    schema_
+        Key ``schema``: version of the file format.
+    description
+        Free text.
+    effects
+        The hidden effects.
+    """
 
     schema_: Literal["armident/scenario/1"] = Field(alias="schema")
     description: str = ""

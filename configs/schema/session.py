@@ -1,4 +1,4 @@
-"""The session: which buses, which drives, what is streamed, recorded, published and identified."""
+"""Schema of a session: buses, drives, streams, recording, publication and identification."""
 
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -13,9 +13,18 @@ Every = Annotated[int, Field(ge=1, le=240)]
 
 
 class Bus(FrozenModel):
-    """A CAN bus. ``bitrate`` is ``None`` on a virtual bus, which has none.
+    """A CAN bus.
 
-    With ``fd`` TPDOs are CAN FD frames of up to 64 bytes, whose data go at ``data_bitrate``; all else stays classic.
+    Parameters
+    ----------
+    interface, channel
+        Kind of bus, and its interface name or multicast address.
+    bitrate
+        Nominal bit rate, bit/s; ``None`` on a virtual bus, which has none.
+    fd
+        ``True`` if TPDOs are CAN FD frames of up to 64 bytes; all other frames are classic.
+    data_bitrate
+        Bit rate of the data phase of CAN FD frames, bit/s; ``None`` on a virtual bus.
     """
 
     interface: Literal["socketcan", "udp_multicast"] = "socketcan"
@@ -36,9 +45,18 @@ class Bus(FrozenModel):
 
 
 class Sync(FrozenModel):
-    """SYNC (CiA 301 section 7.2.5): who sends it, how often, and the overflow of its counter (1019h).
+    """SYNC (CiA 301 section 7.2.5).
 
-    ``source``: who keeps the time where we send it, a loop of our own or the kernel (CAN_BCM).
+    Parameters
+    ----------
+    role
+        ``producer`` if this machine sends SYNC, ``consumer`` if another node does.
+    period_us
+        SYNC period, us.
+    counter
+        Overflow of the SYNC counter (1019h).
+    source
+        Timer of the producer: ``loop`` in this process, or ``kernel`` (CAN_BCM).
     """
 
     role: Literal["producer", "consumer"] = "producer"
@@ -48,7 +66,17 @@ class Sync(FrozenModel):
 
 
 class Temperature(FrozenModel):
-    """Where a drive has its temperature: an object, its type, degrees Celsius per unit; asked every ``every_s``."""
+    """Object of a drive that holds its temperature.
+
+    Parameters
+    ----------
+    index, subindex, type
+        The object and its data type.
+    scale
+        Degrees Celsius per unit.
+    every_s
+        Polling interval, s.
+    """
 
     index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]
     subindex: Annotated[int, Field(ge=0, le=255)] = 0
@@ -58,7 +86,21 @@ class Temperature(FrozenModel):
 
 
 class DriveNode(FrozenModel):
-    """One CANopen node and the joint whose motor it drives; ``bus`` is its channel, where there are several."""
+    """One CANopen node and the joint whose motor it drives.
+
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    node_id
+        CANopen node id.
+    eds
+        Electronic data sheet of the drive.
+    bus
+        Channel of the node's bus; required if there are several buses.
+    temperature
+        Object that holds the drive's temperature; ``None``: not polled.
+    """
 
     joint: Name
     node_id: Annotated[int, Field(ge=1, le=127)]
@@ -68,9 +110,18 @@ class DriveNode(FrozenModel):
 
 
 class Stream(FrozenModel):
-    """One TPDO of every drive, sent on every ``every``-th SYNC, recorded as the topic of this name.
+    """One TPDO of every drive, recorded as the topic of the stream's name.
 
-    With ``pack`` the drive takes a sample at every SYNC and sends the last ``pack`` of them in one TPDO.
+    Parameters
+    ----------
+    tpdo
+        Number of the TPDO.
+    every
+        Number of SYNCs between two TPDOs.
+    pack
+        Number of samples per TPDO: the drive samples at every SYNC and sends the last ``pack`` samples together.
+    objects
+        Objects mapped into the TPDO, in this order.
     """
 
     tpdo: Annotated[int, Field(ge=1, le=4)]
@@ -80,7 +131,21 @@ class Stream(FrozenModel):
 
 
 class Setpoints(FrozenModel):
-    """Position set points (607Ah) in cyclic synchronous position mode, interpolated by the drives."""
+    """Position set points (607Ah) in cyclic synchronous position mode, interpolated by the drives (60C2h).
+
+    Parameters
+    ----------
+    rpdo
+        Number of the RPDO.
+    every
+        Number of SYNCs between two set points.
+    trajectory
+        File of the reference trajectory.
+    repeat
+        Number of runs of the trajectory.
+    settle_s
+        Time at rest before and after the trajectory, s.
+    """
 
     rpdo: Annotated[int, Field(ge=1, le=4)] = 1
     every: Every = 5
@@ -93,7 +158,15 @@ TriggerName = Literal["emcy", "heartbeat_lost", "bus", "command"]
 
 
 class Trigger(FrozenModel):
-    """Write only around events: what happened up to ``before_s`` before one, and until ``after_s`` after it."""
+    """Triggered recording: only samples around events are written.
+
+    Parameters
+    ----------
+    before_s, after_s
+        Recorded time before and after an event, s.
+    events
+        Kinds of events that trigger.
+    """
 
     before_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
     after_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
@@ -101,11 +174,24 @@ class Trigger(FrozenModel):
 
 
 class RecordingOptions(FrozenModel):
-    """Where and how recordings are written, when a new file is begun, and how long files are kept.
+    """Options of recordings: directory, rotation and retention.
 
-    ``look_hz`` samples per second are there in SI units too, for viewers (0: none). With ``trigger`` only events are
-    written. Without ``rotate_mb`` and ``rotate_minutes`` a capture is one file; without ``keep_days`` and
-    ``min_free_gb`` nothing is ever deleted.
+    Parameters
+    ----------
+    directory
+        Directory of the recordings.
+    chunk_ms
+        Duration of an MCAP chunk, ms.
+    drain_ms
+        Interval at which received frames are read, ms.
+    rotate_mb, rotate_minutes
+        Size (MB) and duration (min) after which a new file is begun; without both a capture is one file.
+    keep_days, min_free_gb
+        Age (days) and free space (GB) that delete the oldest files; without both nothing is deleted.
+    look_hz
+        Rate of an additional channel in SI units for viewers, samples/s; 0: none.
+    trigger
+        Triggered recording; ``None``: everything is written.
     """
 
     directory: Path = Path("recordings")
@@ -120,7 +206,21 @@ class RecordingOptions(FrozenModel):
 
 
 class ZenohOptions(FrozenModel):
-    """Zenoh: peers on loopback unless ``config`` names a Zenoh configuration file (JSON5)."""
+    """Options of Zenoh; by default a peer on loopback.
+
+    Parameters
+    ----------
+    config
+        Zenoh configuration file (JSON5).
+    listen, connect
+        Endpoints to listen on and to connect to.
+    commands
+        ``True`` if remote commands are accepted.
+    queue_blocks
+        Maximum number of blocks that wait for publication.
+    cache_blocks
+        Number of published blocks kept for subscribers that missed them.
+    """
 
     config: Path | None = None
     listen: tuple[str, ...] = ()
@@ -131,14 +231,38 @@ class ZenohOptions(FrozenModel):
 
 
 class MetricsOptions(FrozenModel):
-    """An endpoint for Prometheus; off unless it has a port, and on loopback unless it has another address."""
+    """Endpoint for Prometheus.
+
+    Parameters
+    ----------
+    port
+        TCP port; ``None``: no endpoint.
+    address
+        Address to listen on; loopback by default.
+    """
 
     port: Annotated[int, Field(ge=0, le=65_535)] | None = None
     address: str = "127.0.0.1"
 
 
 class IdentificationOptions(FrozenModel):
-    """What the worker runs on an experiment; the same names as the options of ``armident identify``."""
+    """Options of the identification worker, by the names of the options of ``armident identify``.
+
+    Parameters
+    ----------
+    method
+        Estimator.
+    derivatives
+        Method that estimates velocities and accelerations from positions.
+    controller
+        Source of the controller in the simulated closed loop.
+    nvr
+        Noise variance ratio of IRWSM, or the method that selects it.
+    noise_model
+        Noise model of the estimator.
+    physical
+        ``True`` if the parameters are projected onto the physically consistent ones.
+    """
 
     method: Literal["idim-piv", "idim-iv", "idim-ls", "didim", "clie", "cloe", "sep-pem"] = "idim-piv"
     derivatives: Literal["irwsm", "irwsm2", "bandpass"] = "irwsm"
@@ -149,7 +273,35 @@ class IdentificationOptions(FrozenModel):
 
 
 class SessionConfig(FrozenModel):
-    """Everything one cell needs; relative paths are relative to the file they stand in."""
+    """Session of one cell; relative paths are relative to the file that contains them.
+
+    Parameters
+    ----------
+    schema_
+        Key ``schema``: version of the file format.
+    cell
+        Name of the cell, part of the Zenoh keys.
+    robot
+        Robot configuration.
+    bus, buses
+        The only bus, or all of several buses.
+    sync
+        SYNC producer and period.
+    drives
+        CANopen nodes, one per joint.
+    emcy_texts
+        Texts of vendor-specific emergency error codes.
+    heartbeat_ms
+        Heartbeat period of the drives (1017h), ms.
+    sdo_timeout_s
+        Longest wait for an SDO answer, s.
+    streams
+        TPDOs by stream name; ``samples`` is required.
+    setpoints
+        Reference trajectory that is played; ``None``: none.
+    recording, zenoh, metrics, identification
+        Options of recordings, Zenoh, Prometheus and the identification worker.
+    """
 
     schema_: Literal["armident/session/1"] = Field(alias="schema")
     cell: Name
@@ -222,18 +374,30 @@ class SessionConfig(FrozenModel):
 
     @property
     def all_buses(self) -> tuple[Bus, ...]:
-        """The buses of the session, one or several."""
+        """All buses of the session."""
         return self.buses or (self.bus,)
 
     def bus_of(self, drive: DriveNode) -> Bus:
-        """The bus that a drive is on."""
+        """Bus of a drive.
+
+        Parameters
+        ----------
+        drive
+            A drive of the session.
+        """
         return next((bus for bus in self.all_buses if bus.channel == drive.bus), self.all_buses[0])
 
     def drives_on(self, bus: Bus) -> tuple[DriveNode, ...]:
-        """The drives on a bus."""
+        """All drives on a bus.
+
+        Parameters
+        ----------
+        bus
+            A bus of the session.
+        """
         return tuple(drive for drive in self.drives if self.bus_of(drive) == bus)
 
     @property
     def sync_period(self) -> float:
-        """Time between two SYNC, s."""
+        """SYNC period, s."""
         return self.sync.period_us * 1e-6

@@ -1,4 +1,4 @@
-"""The suite of a diagnosis: which effects are hidden where and how strongly, and what counts as found."""
+"""Schema of a diagnosis suite: hidden effects with joints and strengths, and the criteria of a correct finding."""
 
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -17,16 +17,16 @@ Place = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*(\+[a-z][a-z0-9_]*)?$")]
 
 
 class SuiteRobot(FrozenModel):
-    """A virtual arm and what it does.
+    """A virtual arm and its trajectories.
 
     Parameters
     ----------
     config
-        The robot configuration, which is also the model that is diagnosed.
+        Robot configuration, which is also the model under diagnosis.
     trajectories
-        References; run number k takes the k-th, and begins again after the last.
+        Reference trajectories; run k takes trajectory k, cyclically.
     repeats
-        How often the trajectory is run in one recording.
+        Number of runs of the trajectory in one recording.
     """
 
     config: Path
@@ -35,37 +35,37 @@ class SuiteRobot(FrozenModel):
 
 
 class SuiteEffect(FrozenModel):
-    """An effect of the virtual arm, and what a diagnosis should say of it.
+    """An effect of the virtual arm and the expected finding of a diagnosis.
 
     Parameters
     ----------
     effect
-        Its name.
+        Name of the effect in the virtual arm.
     parameters
-        Of the virtual arm, as expressions in ``s`` (the strength) and in what the virtual arm knows of the joint:
-        ``fv``, ``fc``, ``ia``, ``inertia``, ``speed``, ``torque``, ``span``, ``ratio``.
+        Parameters of the effect, as expressions in ``s`` (the strength) and in properties of the joint: ``fv``,
+        ``fc``, ``ia``, ``inertia``, ``speed``, ``torque``, ``span``, ``ratio``.
     strength
-        ``s`` at which the effect is just detectable, by robot and place.
+        ``s`` at which the effect is just detectable, by robot and location.
     levels
-        The levels of strength that make sense.
+        Levels of strength that are tested.
     expected
-        Name in the diagnosis; ``None``: the same.
+        Name of the effect in the diagnosis; ``None``: the same name.
     truth
-        Linear parameters of the diagnosis as expressions in the effect's parameters and the same names.
+        Linear parameters of the diagnosis, as expressions in the effect's parameters and the same names.
     same_as
-        Other names that mean the same by physics, by robot.
-    rescales
-        Whether reported torques have another size with it: percentages of them are none of the healthy arm's.
+        Other effects that are physically equivalent, by robot.
     brings
-        Effects that the arm gets with it, so that they are no mistake beside its name.
+        Effects that accompany this one in the virtual arm; findings of them are correct.
+    rescales
+        ``True`` if the effect rescales reported torques, so that percentages do not compare with the healthy arm's.
     baseline
-        Robots on which it shows against the numbers of a healthy arm only.
+        Robots on which the effect is detectable against a baseline only.
     hide
-        ``False``: the healthy arm has it already.
+        ``False`` if the healthy arm has the effect already.
     arm
-        Whether it is of the arm as a whole, so that no joint of a finding is wrong.
+        ``True`` if the effect concerns the arm as a whole, so that any joint of a finding is correct.
     leave_out
-        What the model that is diagnosed does not have, although the arm has it.
+        Terms of the arm that the model under diagnosis lacks.
     """
 
     effect: Name
@@ -84,7 +84,17 @@ class SuiteEffect(FrozenModel):
 
 
 class SuitePair(FrozenModel):
-    """Two effects in one arm, each ``(effect, place)`` as in the list of effects."""
+    """Two effects in one arm.
+
+    Parameters
+    ----------
+    robot
+        Name of the robot in the suite.
+    effects
+        Two pairs of effect and location from the list of effects.
+    levels
+        Levels of strength that are tested.
+    """
 
     robot: Name
     effects: tuple[tuple[Name, Place], tuple[Name, Place]]
@@ -96,16 +106,26 @@ class SuiteConfig(FrozenModel):
 
     Parameters
     ----------
+    schema_
+        Key ``schema``: version of the file format.
     period
-        Sampling period of the recordings, s; the drives keep their own.
+        Sampling period of the recordings, s; the drives keep their own control period.
     runs
-        Runs of each effect, place and level: seeds 1 to ``runs``, each with its own trajectory.
+        Number of runs of each effect, location and level: seeds 1 to ``runs``, each with its own trajectory.
     multiples
-        Strength of each level over the one that is just detectable.
+        Strength of each level relative to the just detectable one.
+    robots
+        Virtual arms by name.
     clean
-        Healthy arms, by robot.
+        Number of healthy arms, by robot.
     clean_against_baseline
-        Healthy arms judged against the numbers of another healthy run, by robot.
+        Number of healthy arms compared with a baseline from another healthy run, by robot.
+    effects
+        Effects of the diagnosis catalogue.
+    pairs
+        Pairs of effects in one arm.
+    outside
+        Effects outside the diagnosis catalogue.
     """
 
     schema_: Literal["armident/suite/1"] = Field(alias="schema")
@@ -136,5 +156,11 @@ class SuiteConfig(FrozenModel):
         return self
 
     def effect(self, name: str) -> SuiteEffect | None:
-        """The first entry of that name among the effects of the catalogue."""
+        """First entry of a name among the effects of the catalogue; ``None`` if there is none.
+
+        Parameters
+        ----------
+        name
+            Name of the effect in the virtual arm.
+        """
         return next((e for e in self.effects if e.effect == name), None)

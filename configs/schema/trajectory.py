@@ -1,4 +1,4 @@
-"""Reference trajectories: point-to-point moves with smoothed trapezoidal velocities (B.4), or Fourier sums."""
+"""Schema of a trajectory: point-to-point moves with smoothed trapezoidal velocities (B.4), or Fourier series."""
 
 from typing import Annotated, Literal, Self
 
@@ -11,17 +11,27 @@ from armident.configs.schema.base import FrozenModel
 from armident.configs.schema.robot import RobotConfig
 
 RAMP_SHARE = 0.4
-"""Share of a move spent accelerating; as much again decelerating, the rest at constant speed."""
+"""Fraction of a move's duration spent accelerating, and again decelerating; the rest is at constant speed."""
 
 LONGEST_S = 3600.0
-"""Longest trajectory, s: its set points are in memory while it is played."""
+"""Longest trajectory, s; its set points are kept in memory while it is played."""
 
 REST_TOLERANCE = 1e-4
-"""How far from zero a Fourier sum's first velocity and acceleration may be, relative to those of its harmonics."""
+"""Largest initial velocity and acceleration of a Fourier series, relative to those of its harmonics."""
 
 
 class Move(FrozenModel):
-    """All joints go to ``to`` (rad or m) in ``duration`` seconds, then stand still for ``dwell``."""
+    """Synchronous point-to-point move of all joints.
+
+    Parameters
+    ----------
+    to
+        Target, rad or m, length n.
+    duration
+        Duration of the move, s.
+    dwell
+        Time at rest after the move, s.
+    """
 
     to: tuple[float, ...]
     duration: Annotated[float, Field(gt=0)]
@@ -29,19 +39,19 @@ class Move(FrozenModel):
 
 
 class Fourier(FrozenModel):
-    """Finite Fourier sums, periodic and smooth (Swevers 1997).
+    """Finite Fourier series, periodic and smooth (Swevers et al. 1997).
 
     ``q(t) = start + sum over l of sine[l-1] sin(l w t) + cosine[l-1] (cos(l w t) - 1)``, ``w = 2 pi frequency``.
 
     Parameters
     ----------
     frequency
-        Of the first harmonic, Hz.
+        Frequency of the first harmonic, Hz.
     sine, cosine
-        Coefficients (rad or m), one row a harmonic, one column a joint. ``sum l sine_l`` and ``sum l^2 cosine_l`` are
-        zero: the motion begins and ends at rest.
+        Coefficients (rad or m), one row per harmonic, one column per joint. ``sum l sine_l`` and ``sum l^2 cosine_l``
+        are zero: the motion begins and ends at rest.
     periods
-        How often the period is played.
+        Number of periods.
     """
 
     frequency: Annotated[float, Field(gt=0)]
@@ -64,14 +74,37 @@ class Fourier(FrozenModel):
         return self
 
     def sample(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance from the start at times ``t`` (N,); shape (N, n)."""
+        """Displacement from the start.
+
+        Parameters
+        ----------
+        t
+            Times, s, shape (N,).
+
+        Returns
+        -------
+        ndarray
+            Displacement, rad or m, shape (N, n).
+        """
         angle = 2 * np.pi * self.frequency * t[:, None] * np.arange(1.0, len(self.sine) + 1)
         away: NDArray[np.float64] = np.sin(angle) @ np.array(self.sine) + (np.cos(angle) - 1.0) @ np.array(self.cosine)
         return away
 
 
 class Trajectory(FrozenModel):
-    """From ``start``, either a sequence of synchronous point-to-point moves, or Fourier sums."""
+    """Reference trajectory: either a sequence of synchronous point-to-point moves or a Fourier series.
+
+    Parameters
+    ----------
+    schema_
+        Key ``schema``: version of the file format.
+    start
+        Start position, rad or m, length n.
+    moves
+        Moves, one after the other.
+    fourier
+        Fourier series in place of moves.
+    """
 
     schema_: Literal["armident/trajectory/1"] = Field(alias="schema")
     start: tuple[float, ...]
@@ -93,13 +126,24 @@ class Trajectory(FrozenModel):
 
     @property
     def duration(self) -> float:
-        """Length of the whole trajectory, s."""
+        """Duration of the whole trajectory, s."""
         if self.fourier is not None:
             return self.fourier.periods / self.fourier.frequency
         return sum(move.duration + move.dwell for move in self.moves)
 
     def sample(self, period: float) -> NDArray[np.float64]:
-        """Positions at ``0, period, 2 period, ...`` up to the end; shape (N, n), rad or m."""
+        """Positions at ``0, period, 2 period, ...`` up to the end.
+
+        Parameters
+        ----------
+        period
+            Sampling period, s.
+
+        Returns
+        -------
+        ndarray
+            Positions, rad or m, shape (N, n).
+        """
         t: NDArray[np.float64] = np.arange(round(self.duration / period) + 1, dtype=np.float64) * period
         if self.fourier is not None:
             return np.array(self.start) + self.fourier.sample(t)
@@ -113,12 +157,19 @@ class Trajectory(FrozenModel):
         return q
 
     def check(self, robot: RobotConfig, where: str = "trajectory") -> None:
-        """Refuse a trajectory that leaves the limits of the robot.
+        """Refuse a trajectory that exceeds the limits of the robot.
+
+        Parameters
+        ----------
+        robot
+            Robot with limits of position, velocity and acceleration.
+        where
+            Name of the trajectory in messages.
 
         Raises
         ------
         ConfigError
-            Naming the joint, the limit, and by how much it is exceeded.
+            If a limit is exceeded; names joint, limit and value.
         """
         if len(self.start) != robot.n:
             raise ConfigError(f"{where}: {len(self.start)} joints, but {robot.name} has {robot.n}")
@@ -143,7 +194,7 @@ class Trajectory(FrozenModel):
 
 
 def _smooth_step(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From 0 to 1 for ``s`` in [0, 1] with a trapezoidal velocity whose ramps are half cosines."""
+    """Step from 0 to 1 for ``s`` in [0, 1] with a trapezoidal velocity whose ramps are half cosines."""
     a = RAMP_SHARE
     v = 1.0 / (1.0 - a)
     s = np.clip(s, 0.0, 1.0)

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, SessionConfig, Trajectory
 from armident.configs.schema.trajectory import RAMP_SHARE, Move
-from armident.daq.matching.streams import bus_numbers, counts_per_si, node_ids
+from armident.configs.units import counts_per_si
+from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.canopen.objects import rpdo_cob
 from armident.drivers.canopen.sync_producer import SetpointPlan
 

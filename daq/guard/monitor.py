@@ -7,6 +7,7 @@ from numba import njit
 
 from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.configs.schema.session import Stream
+from armident.configs.units import counts_per_si
 from armident.daq.guard.limits import (
     HEARTBEAT_MARGIN_S,
     HEARTBEATS_MISSED,
@@ -16,7 +17,7 @@ from armident.daq.guard.limits import (
     VELOCITY_S,
     Limits,
 )
-from armident.daq.matching.streams import bus_numbers, counts_per_si, node_ids
+from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.can.frames import Frames
 from armident.drivers.canopen.emcy import emcy_text
 from armident.drivers.canopen.objects import (

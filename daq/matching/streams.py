@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.configs.schema.session import ObjectName
+from armident.configs.units import counts_per_si
 from armident.daq.matching.assembler import Rows, TpdoStream
 from armident.daq.recording import Field, StreamLayout
 from armident.daq.recording.model import Quantity
@@ -86,20 +87,3 @@ def field_of(name: ObjectName, robot: RobotConfig) -> Field:
     unit = "rad" if all(joint.type == "revolute" for joint in robot.joints) else "m"
     per_count = tuple(float(1 / x) for x in counts_per_si(robot))
     return Field(name, quantity, f"{unit}/s" if name == "velocity" else unit, "motor", per_count)
-
-
-def counts_per_si(robot: RobotConfig) -> NDArray[np.float64]:
-    """Encoder counts per rad (or m) of each motor, (n,).
-
-    Raises
-    ------
-    ConfigError
-        If a drive has no ``counts_per_unit``.
-    """
-    counts = []
-    for joint in robot.joints:
-        if joint.drive.counts_per_unit is None:
-            raise ConfigError(f"{robot.name}: joints.{joint.name}.drive.counts_per_unit: needed to capture its drive")
-        turn = 2 * np.pi if joint.type == "revolute" else 1.0
-        counts.append(joint.drive.counts_per_unit / turn)
-    return np.array(counts)

@@ -17,9 +17,9 @@ import pytest
 import yaml
 
 from armident.configs import config_path, load_robot
+from armident.configs.units import counts_per_si
 from armident.daq.capture.capture import capture, load_plan
 from armident.daq.matching.assembler import LATE_S
-from armident.daq.matching.streams import counts_per_si
 from armident.daq.recording import read_recording
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]

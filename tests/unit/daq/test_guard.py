@@ -5,9 +5,10 @@ import pytest
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
+from armident.configs.units import counts_per_si
 from armident.daq.guard.limits import limits_of
 from armident.daq.guard.monitor import Watch
-from armident.daq.matching.streams import bus_numbers, counts_per_si, node_ids
+from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.can.frames import Frames, frames
 from armident.drivers.canopen.objects import COB_SYNC, TpdoLayout, rpdo_cob, tpdo_cob
 

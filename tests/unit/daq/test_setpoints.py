@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from armident.configs import load_robot, load_session
+from armident.configs.units import counts_per_si
 from armident.daq.capture.setpoints import REST_SPAN_S, REST_STEP_S, SHAKE_COUNTS, StandstillDetector
-from armident.daq.matching.streams import counts_per_si
 
 SESSION, ROBOT = load_session("tx40_cell.yaml"), load_robot("tx40.yaml")
 SPAN = round(REST_SPAN_S / SESSION.sync_period)

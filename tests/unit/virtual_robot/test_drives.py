@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot
 from armident.configs.loading import load_scenario
 from armident.configs.schema.trajectory import Move
+from armident.configs.units import counts_per_si
 from armident.daq.recording import Recording
 from armident.drivers.canopen.objects import Control, DriveState, drive_state
-from armident.virtual_robot.arm import Arm, counts_per_si
+from armident.virtual_robot.arm import Arm
 from armident.virtual_robot.cia402 import next_state, statusword
 from armident.virtual_robot.inertias import rest_posture
 from armident.virtual_robot.noise import DECIMATED_VARIANCE, RESIDUAL_VARIANCE, Noise

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from armident.configs import ConfigError, RobotConfig, load_robot
+from armident.configs.units import counts_per_si
 from armident.virtual_robot import inertias
-from armident.virtual_robot.arm import counts_per_si
 from armident.virtual_robot.model import build_model, pin
 from armident.virtual_robot.plant import Plant
 
