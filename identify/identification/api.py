@@ -1,11 +1,12 @@
-"""What the commands and the worker do with a recording: identify it, diagnose it, write the results."""
+"""Identification of recordings: from raw samples to the result and its document."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument, identification_document
+from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
@@ -14,39 +15,85 @@ from armident.identify.identification.result import Identification
 
 @dataclass(frozen=True)
 class IdentificationOutcome:
-    """An identification with everything its report shows."""
+    """An identification with everything that its report shows.
 
-    recording: Recording
+    Parameters
+    ----------
+    recordings
+        The recordings it was made from.
+    robot
+        The configuration it is of.
+    result
+        The estimate with its curves.
+    document
+        The contents of ``identification.json``.
+    """
+
+    recordings: tuple[Recording, ...]
     robot: RobotConfig
     result: Identification
     document: IdentificationDocument
 
 
 def identify_recording(
-    recording: Recording,
+    recordings: Recording | Sequence[Recording],
     robot: RobotConfig | None = None,
     options: Options | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> IdentificationOutcome:
-    """Identify a recording, whether it was read from a file or assembled from the stream.
+    """Identify recordings, read from files or assembled from the stream.
 
     Parameters
     ----------
-    recording
-        The recording.
+    recordings
+        One or several recordings of one robot.
     robot
-        Configuration to use; ``None``: the one inside the recording.
+        Configuration to use; ``None``: the one inside the first recording.
     options
-        Of the estimator.
+        Of the estimator; ``None``: the defaults.
     progress
-        Called with a stage and the share done.
+        Called with the name of a stage and the share done, 0 to 1.
 
     Raises
     ------
-    ConfigError, DataError
-        If configuration or data cannot support the request.
+    ConfigError
+        If the configuration cannot support the request.
+    DataError
+        If the data cannot support the request.
     """
-    robot = robot or recording.robot
-    experiments, notes = experiments_from_recording(recording, robot)
+    recordings = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
+    robot = robot or recordings[0].robot
+    experiments, notes = experiments_of(recordings, robot, name_files=len(recordings) > 1)
     result = identify_experiment(experiments, robot, options or Options(), progress)
-    return IdentificationOutcome(recording, robot, result, identification_document(result, recording, robot, notes))
+    return IdentificationOutcome(recordings, robot, result, identification_document(result, recordings, robot, notes))
+
+
+def experiments_of(
+    recordings: Sequence[Recording], robot: RobotConfig, *, name_files: bool
+) -> tuple[list[Experiment], list[str]]:
+    """Return the experiments of recordings, one recording after the other, and remarks on them.
+
+    Parameters
+    ----------
+    recordings
+        The recordings.
+    robot
+        Configuration to convert them with.
+    name_files
+        True to begin each remark with the name of its file.
+
+    Raises
+    ------
+    ConfigError
+        If a recording is of another robot.
+    DataError
+        If a recording holds no experiment that can be used.
+    """
+    experiments: list[Experiment] = []
+    notes: list[str] = []
+    for recording in recordings:
+        found, remarks = experiments_from_recording(recording, robot)
+        experiments += found
+        named = name_files and recording.path is not None
+        notes += [f"{recording.path.name}: {remark}" if named and recording.path else remark for remark in remarks]
+    return experiments, notes

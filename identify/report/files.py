@@ -15,7 +15,7 @@ def write_identification(outcome: IdentificationOutcome, out: Path) -> tuple[Pat
 
     document, report = out / "identification.json", out / "report.html"
     write_atomically(document, to_json(outcome.document))
-    write_atomically(report, identification_report(outcome.recording, outcome.robot, outcome.result, outcome.document))
+    write_atomically(report, identification_report(outcome.recordings, outcome.robot, outcome.result, outcome.document))
     return document, report
 
 

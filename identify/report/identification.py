@@ -1,5 +1,6 @@
 """The report of an identification: what was recorded, what came out, and how far to trust it."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ FAIR_PCT = 20.0
 
 
 def identification_report(
-    recording: Recording, robot: RobotConfig, result: Identification, document: IdentificationDocument
+    recordings: Sequence[Recording], robot: RobotConfig, result: Identification, document: IdentificationDocument
 ) -> str:
     """HTML page of an identification, complete in one file."""
     joints = [joint.name for joint in robot.joints]
@@ -27,7 +28,7 @@ def identification_report(
         "identification.html",
         document=document,
         robot=robot,
-        recorded=recorded(recording),
+        recorded=[recorded(recording) for recording in recordings],
         essential=_rows(document),
         others=[p for p in document.parameters if not p.essential],
         torques=torque_figure(result.t, result.tau_measured, result.tau_predicted, joints, _units(robot)),

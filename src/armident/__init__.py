@@ -1,1 +1,69 @@
-"""Records robot arms over CANopen and identifies, diagnoses and monitors their dynamic models."""
+"""Records robot arms over CANopen and identifies, diagnoses and monitors their dynamic models.
+
+>>> import armident
+>>> recording = armident.simulate_recording("tx40", "tx40_excitation", seed=1)
+>>> result = armident.identify(recording, method="idim-ls")
+>>> result.parameters["zz1r"].unit
+'kg m^2'
+"""
+
+import importlib
+import logging
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from armident.configs import ArmidentError as ArmidentError
+    from armident.configs import ConfigError as ConfigError
+    from armident.configs import DataError as DataError
+    from armident.configs import load_robot as load_robot
+    from armident.configs import load_session as load_session
+    from armident.daq.api import capture as capture
+    from armident.daq.api import import_recording as import_recording
+    from armident.daq.recording import Recording as Recording
+    from armident.daq.recording import read_recording as read_recording
+    from armident.identify.api import ChangeTest as ChangeTest
+    from armident.identify.api import Design as Design
+    from armident.identify.api import Diagnosis as Diagnosis
+    from armident.identify.api import Effect as Effect
+    from armident.identify.api import Identification as Identification
+    from armident.identify.api import RobotModel as RobotModel
+    from armident.identify.api import compare as compare
+    from armident.identify.api import design_trajectory as design_trajectory
+    from armident.identify.api import diagnose as diagnose
+    from armident.identify.api import effects as effects
+    from armident.identify.api import identify as identify
+    from armident.virtual_robot.api import simulate_recording as simulate_recording
+
+_HOMES = {
+    "armident.configs": ("ArmidentError", "ConfigError", "DataError", "load_robot", "load_session"),
+    "armident.daq.api": ("capture", "import_recording"),
+    "armident.daq.recording": ("Recording", "read_recording"),
+    "armident.identify.api": (
+        "ChangeTest", "Design", "Diagnosis", "Effect", "Identification", "RobotModel", "compare", "design_trajectory",
+        "diagnose", "effects",
+    ),
+    "armident.virtual_robot.api": ("simulate_recording",),
+}  # fmt: skip
+"""Names of the public API by the module that defines them; a name is imported when it is first used."""
+_MODULES = {name: module for module, names in _HOMES.items() for name in names}
+__all__ = sorted([*_MODULES, "identify"])
+
+# A program that imports armident chooses the output of the log; by default there is none.
+logging.getLogger(__name__).addHandler(logging.NullHandler())
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used (PEP 562), so that ``import armident`` is quick."""
+    if name == "identify":
+        # The package of this name is callable.
+        return importlib.import_module("armident.identify")
+    if name not in _MODULES:
+        raise AttributeError(f"module 'armident' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_MODULES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names, for completion."""
+    return [name for name in globals() if name.startswith("__")] + __all__

@@ -65,7 +65,7 @@ def test_document_and_page_hold_what_the_tests_say(method: Method) -> None:
     assert len(document["diagnostics"]["joints"]) == 6
     assert (document["diagnostics"]["endogeneity"] is None) == (method == "idim-ls")
     assert (document["torque_delay_samples"] is None) == (method == "idim-ls")
-    page = identification_report(outcome.recording, outcome.robot, outcome.result, outcome.document)
+    page = identification_report(outcome.recordings, outcome.robot, outcome.result, outcome.document)
     assert "What tests say" in page
     assert ("Durbin" in page) == (method != "idim-ls")
 
@@ -82,7 +82,7 @@ def test_a_physical_arm_is_found_on_request() -> None:
     assert physical is not None
     assert len(physical["parameters"]) == 87
     assert physical["compatible"]
-    page = identification_report(outcome.recording, outcome.robot, outcome.result, outcome.document)
+    page = identification_report(outcome.recordings, outcome.robot, outcome.result, outcome.document)
     assert "nearest physically consistent arm" in page
 
 

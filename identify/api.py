@@ -1,0 +1,1002 @@
+"""Identification, diagnosis, comparison and trajectory design, as ``import armident`` offers them."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike, NDArray
+
+from armident.configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.daq.recording import Recording, read_recording
+from armident.identify.document import (
+    DiagnosisDocument,
+    IdentificationDocument,
+    Parameter,
+    load_document,
+    reference,
+    to_json,
+    write_atomically,
+)
+from armident.identify.effects.effect import Effect as Effect
+from armident.identify.effects.registry import catalogue
+from armident.identify.effects.terms import arm_model
+from armident.identify.experiment import Experiment
+from armident.identify.identification.api import experiments_of, identify_recording
+from armident.identify.identification.options import (
+    ControllerName,
+    DerivativesName,
+    Method,
+    NoiseModelName,
+    Options,
+)
+from armident.identify.identification.result import Identification as Estimation
+from armident.identify.monitoring.change_test import ParameterChangeTest
+from armident.identify.monitoring.change_test import compare as test_parameter_change
+from armident.identify.regression.equations import MAX_AR_ORDER
+from armident.identify.report.files import robot_yaml
+from armident.identify.robot.controller import DiscreteController
+from armident.identify.signals.differentiate import NvrRule
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from armident.identify.diagnosis.diagnose import Diagnosis as DiagnosisResult
+    from armident.identify.excitation.design import Design as DesignResult
+    from armident.identify.robot.simulation import Simulation
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+Robot = RobotConfig | str | Path
+Recorded = Recording | str | Path
+
+
+class Table(Sequence[Mapping[str, Any]]):
+    """Rows with named columns that print, show themselves in a notebook and convert to pandas.
+
+    Parameters
+    ----------
+    columns
+        Names of the columns.
+    rows
+        One tuple of values per row, as long as ``columns``.
+    title
+        Heading, may be empty.
+    """
+
+    def __init__(self, columns: Sequence[str], rows: Sequence[Sequence[Any]], title: str = "") -> None:
+        self.columns = tuple(columns)
+        self.rows = [tuple(row) for row in rows]
+        self.title = title
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, key: Any) -> Any:
+        """Return row ``key`` as a mapping if it is a number, else the column of that name as a list."""
+        if isinstance(key, str):
+            column = self.columns.index(key)
+            return [row[column] for row in self.rows]
+        if isinstance(key, slice):
+            return [dict(zip(self.columns, row, strict=True)) for row in self.rows[key]]
+        return dict(zip(self.columns, self.rows[key], strict=True))
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return the table as a pandas DataFrame, indexed by its first column.
+
+        Raises
+        ------
+        ConfigError
+            If pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise ConfigError("a table as DataFrame needs the package pandas (pip install pandas)") from error
+        return pandas.DataFrame(self.rows, columns=list(self.columns)).set_index(self.columns[0])
+
+    def __str__(self) -> str:
+        cells = [self.columns, *(tuple(_text(value) for value in row) for row in self.rows)]
+        widths = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
+        numbers = [any(isinstance(row[k], float) for row in self.rows) for k in range(len(self.columns))]
+        lines = [
+            "  ".join(
+                text.rjust(width) if number else text.ljust(width)
+                for text, width, number in zip(row, widths, numbers, strict=True)
+            ).rstrip()
+            for row in cells
+        ]
+        return "\n".join([self.title, *lines] if self.title else lines)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
+        body = "".join(
+            "<tr>" + "".join(f"<td>{escape(_text(value))}</td>" for value in row) + "</tr>" for row in self.rows
+        )
+        caption = f"<caption>{escape(self.title)}</caption>" if self.title else ""
+        return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+class ParameterTable(Table):
+    """Estimated base parameters: a table that is also indexed by the name of a parameter.
+
+    Parameters
+    ----------
+    parameters
+        The parameters, in the order of ``theta``.
+    title
+        Heading.
+    """
+
+    def __init__(self, parameters: Sequence[Parameter], title: str = "") -> None:
+        columns = ("name", "value", "std", "relative_std_pct", "unit", "essential", "formula")
+        super().__init__(columns, [[getattr(p, column) for column in columns] for p in parameters], title)
+        self._by_name = {p.name: p for p in parameters}
+
+    def __getitem__(self, key: Any) -> Any:
+        """Return the parameter of that name, else a column or a row as `Table` does."""
+        if isinstance(key, str) and key in self._by_name:
+            return self._by_name[key]
+        if isinstance(key, str) and key not in self.columns:
+            known = ", ".join(self._by_name)
+            raise KeyError(f"{key!r} is no base parameter and no column; parameters: {known}")
+        return super().__getitem__(key)
+
+
+@dataclass(frozen=True, repr=False)
+class Identification:
+    """The dynamic model of a robot identified from recordings; SI units, joint side.
+
+    Parameters
+    ----------
+    document
+        Everything that ``identification.json`` holds.
+    robot
+        Configuration that the model is of.
+    recordings
+        The recordings it was identified from.
+    result
+        The estimate with its curves: residuals, measured and predicted torques.
+    """
+
+    document: IdentificationDocument
+    robot: RobotConfig
+    recordings: tuple[Recording, ...]
+    result: Estimation
+
+    @property
+    def parameters(self) -> ParameterTable:
+        """Table of the base parameters (b,): ``parameters["zz1r"].value``, ``parameters.to_pandas()``."""
+        return ParameterTable(self.document.parameters, f"{self.document.robot}: {self.document.method}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the base parameters, (b,)."""
+        return self.result.names
+
+    @property
+    def theta(self) -> Array:
+        """Values of the base parameters, (b,), each in its unit."""
+        return self.result.theta
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations of the base parameters, (b,), each in its unit."""
+        return self.result.std
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance matrix of the base parameters, (b, b)."""
+        return self.result.covariance
+
+    @property
+    def relative_error_pct(self) -> float:
+        """Norm of the torque residual relative to that of the torque, percent."""
+        return self.document.relative_error_pct
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Remarks on data and result, one sentence each."""
+        return tuple(self.document.warnings)
+
+    def report(self, path: str | Path) -> Path:
+        """Write the report, one HTML file that needs nothing else.
+
+        Parameters
+        ----------
+        path
+            The file to write; its folder is made.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
+        from armident.identify.report.identification import identification_report
+
+        file = Path(path)
+        write_atomically(file, identification_report(self.recordings, self.robot, self.result, self.document))
+        return file
+
+    def save(self, folder: str | Path) -> tuple[Path, Path]:
+        """Write ``identification.json`` and ``report.html``.
+
+        Parameters
+        ----------
+        folder
+            Where to write them; made if it does not exist.
+
+        Returns
+        -------
+        tuple of Path
+            The document and the report.
+        """
+        document = Path(folder) / "identification.json"
+        write_atomically(document, to_json(self.document))
+        return document, self.report(Path(folder) / "report.html")
+
+    def __repr__(self) -> str:
+        return f"{self._summary()}\n{self._essential()}"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(self._summary())}</p>{self._essential()._repr_html_()}"
+
+    def _summary(self) -> str:
+        document = self.document
+        essential = sum(p.essential for p in document.parameters)
+        state = "converged" if document.converged else f"not converged ({document.stop_reason})"
+        return (
+            f"{document.robot}, {document.method}: torque error {document.relative_error_pct:.2f} %, "
+            f"{essential} of {len(document.parameters)} base parameters essential, {state}"
+        )
+
+    def _essential(self) -> Table:
+        rows = [(p.name, p.value, p.std, p.relative_std_pct, p.unit) for p in self.document.parameters if p.essential]
+        return Table(("name", "value", "std", "std %", "unit"), rows)
+
+
+def identify(
+    recordings: Recorded | Sequence[Recorded],
+    robot: Robot | None = None,
+    *,
+    method: Method = "idim-piv",
+    derivatives: DerivativesName | None = None,
+    controller: ControllerName = "crc",
+    nvr: float | NvrRule | None = None,
+    noise_model: NoiseModelName = "black-box",
+    max_ar_order: int = MAX_AR_ORDER,
+    bandwidth_hz: float | None = None,
+    decimation: int | Literal["noise"] | None = None,
+    weighted: bool = True,
+    physical: bool = False,
+    progress: Progress | None = None,
+) -> Identification:
+    """Identify the dynamic model of a robot from one or several recordings.
+
+    Parameters
+    ----------
+    recordings
+        A recording, the path of one, or a sequence of them; all of one robot at one sampling rate.
+    robot
+        Configuration to use, or the path or shipped name of one; by default the one inside the first recording.
+    method
+        ``idim-piv`` (thesis section 6.2), ``idim-iv`` (2.3.3), ``idim-ls`` (2.3.1), ``didim``, ``clie``, ``cloe`` or
+        ``sep-pem``.
+    derivatives
+        ``irwsm``, ``irwsm2`` or ``bandpass``; by default IRWSM of order 1 (thesis chapter 5).
+    controller
+        ``crc`` (impulse response by correlation analysis), ``parametric`` (cascade or PID by refined instrumental
+        variables) or ``known`` (gains of the configuration).
+    nvr
+        Noise-variance ratio of IRWSM, or the rule that finds it: ``automatic``, ``cross-validation``, ``likelihood``,
+        ``tracking-error``.
+    noise_model
+        Noise model of IDIM-PIV: ``black-box`` (thesis 6.27) or ``grey-box`` (6.28).
+    max_ar_order
+        Highest order of the autoregressive noise models.
+    bandwidth_hz
+        Closed-loop bandwidth, Hz; by default from the configuration, else from the data.
+    decimation
+        Keep one sample of so many, or ``noise``: of as many as the noise is correlated over (thesis 6.2.3); by default
+        from the bandwidth.
+    weighted
+        True to weight each joint of IDIM-LS by its noise (thesis 2.23).
+    physical
+        True to compute the nearest physically consistent parameters, too.
+    progress
+        Called with the name of a stage and the share done, 0 to 1.
+
+    Returns
+    -------
+    Identification
+        Parameters with standard deviations and covariance, errors, diagnostics.
+
+    Raises
+    ------
+    ConfigError
+        If an option is wrong or a file does not exist.
+    DataError
+        If the data cannot support the request.
+
+    Examples
+    --------
+    >>> import armident
+    >>> recording = armident.simulate_recording("tx40", "tx40_excitation", seed=1)
+    >>> result = armident.identify(recording, method="idim-ls")
+    >>> result.theta.shape, result.covariance.shape
+    ((61,), (61, 61))
+    """
+    options = Options(
+        method=method,
+        derivatives=derivatives,
+        controller=controller,
+        decimation=decimation,
+        nvr=nvr,
+        bandwidth_hz=bandwidth_hz,
+        noise_model=noise_model,
+        max_ar_order=max_ar_order,
+        weighted=weighted,
+        physical=physical,
+    )
+    read = _read(recordings)
+    config = _robot(robot, read)
+    outcome = identify_recording(read, config, options, progress)
+    return Identification(outcome.document, config, read, outcome.result)
+
+
+@dataclass(frozen=True, repr=False)
+class Diagnosis:
+    """Disagreement of a model with recordings, and the effects that explain it.
+
+    Parameters
+    ----------
+    document
+        Everything that ``diagnosis.json`` holds.
+    robot
+        The configuration with the effects found added to it; `identify` and `simulate_recording` accept it.
+    configured
+        The configuration that was judged.
+    result
+        The findings with their curves.
+    """
+
+    document: DiagnosisDocument
+    robot: RobotConfig
+    configured: RobotConfig
+    result: "DiagnosisResult"
+
+    @property
+    def verdict(self) -> str:
+        """``no_gap``, ``explained``, ``partly_explained`` or ``unexplained``."""
+        return self.document.verdict
+
+    @property
+    def findings(self) -> Table:
+        """Table of the effects found, in the order found; gaps are torque errors in percent on held-out data."""
+        rows = [
+            (
+                finding.effect,
+                finding.joint if finding.other is None else f"{finding.joint}, {finding.other}",
+                ", ".join(f"{name} {value:.4g}" for name, value in finding.parameters.items()),
+                finding.confidence,
+                finding.gap_before,
+                finding.gap_after,
+            )
+            for finding in self.document.findings
+        ]
+        columns = ("effect", "joint", "parameters", "confidence", "gap_before", "gap_after")
+        return Table(columns, rows, f"{self.document.robot}: {self.verdict}")
+
+    @property
+    def gap_pct(self) -> tuple[float, float]:
+        """Torque error on held-out data of the model as configured, and with the findings, percent."""
+        gap = self.document.gap.validation
+        return gap.before.all, gap.after.all
+
+    def report(self, path: str | Path) -> Path:
+        """Write the report, one HTML file that needs nothing else.
+
+        Parameters
+        ----------
+        path
+            The file to write; its folder is made.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
+        from armident.identify.report.diagnosis import diagnosis_report
+
+        file = Path(path)
+        write_atomically(file, diagnosis_report(self.result, self.document))
+        return file
+
+    def save(self, folder: str | Path) -> DiagnosisDocument:
+        """Write ``diagnosis.json``, ``report.html`` and, where effects were found, the new model ``model.yaml``.
+
+        Parameters
+        ----------
+        folder
+            Where to write them; made if it does not exist.
+
+        Returns
+        -------
+        DiagnosisDocument
+            The document as written, with the path of the model.
+        """
+        place, document = Path(folder), self.document
+        if self.robot.effects != self.configured.effects:
+            model = place / "model.yaml"
+            write_atomically(model, robot_yaml(self.robot))
+            document = document.model_copy(update={"model": str(model)})
+        write_atomically(place / "diagnosis.json", to_json(document))
+        from armident.identify.report.diagnosis import diagnosis_report
+
+        write_atomically(place / "report.html", diagnosis_report(self.result, document))
+        return document
+
+    def __repr__(self) -> str:
+        return f"{self._summary()}\n{self.findings}" if self.document.findings else self._summary()
+
+    def _repr_html_(self) -> str:
+        table = self.findings._repr_html_() if self.document.findings else ""
+        return f"<p>{escape(self._summary())}</p>{table}"
+
+    def _summary(self) -> str:
+        before, after = self.gap_pct
+        return (
+            f"{self.document.robot}: {self.verdict}; torque error on held-out data {before:.2f} % before, "
+            f"{after:.2f} % after"
+        )
+
+
+def diagnose(
+    recordings: Recorded | Sequence[Recorded],
+    robot: Robot | None = None,
+    *,
+    validate: Recorded | None = None,
+    baseline: Identification | IdentificationDocument | str | Path | None = None,
+    false_alarm_rate: float = 0.01,
+    material: float = 0.01,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Find the effects that a model lacks: where it disagrees with the data, which effect is missing, what is left.
+
+    Parameters
+    ----------
+    recordings
+        A recording, the path of one, or a sequence of them; the models are fitted to these.
+    robot
+        Configuration in question, or the path or shipped name of one; by default the one inside the first recording.
+    validate
+        A recording to judge by; by default the last part of the data is held out.
+    baseline
+        An identification of the healthy robot; changes of its parameters are judged too.
+    false_alarm_rate
+        Probability that a diagnosis of a faultless model finds something.
+    material
+        Share of the power of a joint's residual from which on an effect is a finding.
+    progress
+        Called with the name of a stage and the share done, 0 to 1.
+
+    Returns
+    -------
+    Diagnosis
+        Verdict, findings, gaps before and after, and the configuration with the findings added.
+
+    Raises
+    ------
+    ConfigError
+        If a file does not exist or a configuration is wrong.
+    DataError
+        If the recordings cannot support a diagnosis, or the baseline is of another robot.
+
+    Examples
+    --------
+    >>> import armident
+    >>> worn = armident.simulate_recording("tx40", "tx40_excitation", scenario="tx40_worn_joint2", seed=1)
+    >>> found = armident.diagnose(worn)
+    >>> found.findings[0]["effect"], found.findings[0]["joint"]
+    ('asymmetric_viscous_friction', 'joint_2')
+    """
+    from armident.identify.diagnosis.diagnose import diagnose as run
+    from armident.identify.diagnosis.state import Settings
+
+    read = _read(recordings)
+    config = _robot(robot, read)
+    numbers = None if baseline is None else _document(baseline)
+    if numbers is not None and numbers.robot != config.name:
+        name = baseline if isinstance(baseline, str | Path) else "baseline"
+        raise DataError(f"{name}: the numbers of robot {numbers.robot!r}, the recording is of {config.name!r}")
+    training, notes = experiments_of(read, config, name_files=True)
+    held_out: list[Experiment] = []
+    if validate is not None:
+        read = (*read, *_read(validate))
+        held_out, more = experiments_of(read[-1:], config, name_files=True)
+        notes += more
+    settings = Settings(false_alarms=false_alarm_rate, material=material)
+    references = [reference(recording) for recording in read]
+    found = run(training, held_out, config, references, numbers, list(dict.fromkeys(notes)), progress, settings)
+    return Diagnosis(found.document, found.robot, config, found)
+
+
+@dataclass(frozen=True, repr=False)
+class ChangeTest:
+    """Test for a change of the parameters between two identifications of one robot.
+
+    Parameters
+    ----------
+    result
+        Differences, standard deviations and p-values of parameters and groups.
+    """
+
+    result: ParameterChangeTest
+
+    @property
+    def changed(self) -> bool:
+        """True if the parameters have changed, at the false-alarm rate asked for."""
+        return self.result.drifted
+
+    @property
+    def p_value(self) -> float:
+        """Probability of so large a difference of all parameters together without a change."""
+        return self.result.p_joint
+
+    @property
+    def parameters(self) -> Table:
+        """Table of the parameters: value before and after, standard deviation of the difference, p-value (Holm)."""
+        result = self.result
+        rows = [
+            (p.name, float(before), p.value, float(std), float(p_value), p.unit)
+            for p, before, std, p_value in zip(
+                result.parameters, result.before, result.std, result.p_values, strict=True
+            )
+        ]
+        return Table(("name", "before", "after", "std_of_difference", "p_value", "unit"), rows, result.words)
+
+    def __bool__(self) -> bool:
+        return self.changed
+
+    def __repr__(self) -> str:
+        return self.result.words
+
+    def _repr_html_(self) -> str:
+        return self.parameters._repr_html_()
+
+
+def compare(
+    baseline: Identification | IdentificationDocument | str | Path,
+    now: Identification | IdentificationDocument | str | Path,
+    *,
+    false_alarm_rate: float = 1e-4,
+) -> ChangeTest:
+    """Test if the parameters of a robot have changed since a baseline.
+
+    Parameters
+    ----------
+    baseline, now
+        Two identifications of one robot with the same model, or the paths of their ``identification.json``.
+    false_alarm_rate
+        Probability of the answer "changed" without a change.
+
+    Returns
+    -------
+    ChangeTest
+        True in a condition if the parameters have changed.
+
+    Raises
+    ------
+    DataError
+        If the two are of different robots or models, or too imprecise for an answer.
+
+    Examples
+    --------
+    >>> import armident
+    >>> runs = [armident.simulate_recording("tx40", "tx40_excitation", seed=seed) for seed in (1, 2)]
+    >>> first, second = (armident.identify(run, method="idim-iv") for run in runs)
+    >>> bool(armident.compare(first, second))
+    False
+    """
+    return ChangeTest(test_parameter_change(_document(baseline), _document(now), false_alarm_rate))
+
+
+@dataclass(frozen=True, repr=False)
+class Design:
+    """A reference trajectory and the precision to expect from a recording of it.
+
+    Parameters
+    ----------
+    robot
+        The robot it is for.
+    result
+        Trajectory, condition number, predicted standard deviations and torques.
+    """
+
+    robot: RobotConfig
+    result: "DesignResult"
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The reference trajectory, within the limits of the robot."""
+        return self.result.trajectory
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the filtered, weighted base regressor along the trajectory."""
+        return self.result.condition
+
+    @property
+    def std(self) -> Array | None:
+        """Predicted standard deviations of the base parameters, (b,); ``None`` where the torque noise is unknown."""
+        return self.result.std
+
+    def save(self, path: str | Path) -> Path:
+        """Write the trajectory as a YAML file that ``capture`` and ``robot`` play.
+
+        Parameters
+        ----------
+        path
+            The file to write.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
+        content = self.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+        write_atomically(Path(path), yaml.safe_dump(content, sort_keys=False))
+        return Path(path)
+
+    def __repr__(self) -> str:
+        return f"{self.robot.name}: {self.trajectory.duration:.2f} s, condition number {self.condition:.0f}"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>"
+
+
+def design_trajectory(
+    robot: Robot,
+    duration: float = 7.5,
+    *,
+    seed: int = 0,
+    evaluations: int = 2000,
+    shape: Literal["moves", "fourier"] = "moves",
+    harmonics: int | None = None,
+    known: Identification | IdentificationDocument | str | Path | None = None,
+    effect: str | None = None,
+    joint: str | None = None,
+    against: str | None = None,
+    progress: Progress | None = None,
+) -> Design:
+    """Design an exciting trajectory within the limits of a robot (thesis section 2.3.5).
+
+    Parameters
+    ----------
+    robot
+        Configuration with joint limits, or the path or shipped name of one.
+    duration
+        Length, s.
+    seed
+        Seed of the random search; the same seed gives the same trajectory.
+    evaluations
+        Number of candidates to try.
+    shape
+        ``moves`` (point to point, trapezoidal velocities) or ``fourier`` (finite Fourier series).
+    harmonics
+        Number of harmonics of a Fourier series.
+    known
+        An earlier identification: torques stay within their limits, and the noise weights the joints.
+    effect
+        Name of an effect that the trajectory is to show; by default the base parameters count.
+    joint
+        Joint at which the effect is to show; by default any.
+    against
+        Another effect from which it is to be distinguished.
+    progress
+        Called with the name of a stage and the share done, 0 to 1.
+
+    Returns
+    -------
+    Design
+        The trajectory, its condition number and the predicted standard deviations.
+
+    Raises
+    ------
+    ConfigError
+        If the robot cannot make a single move in that time, or an option is wrong.
+
+    Examples
+    --------
+    >>> import armident
+    >>> design = armident.design_trajectory("emps", duration=5.0, evaluations=50)
+    >>> round(design.trajectory.duration, 2)
+    5.0
+    """
+    from armident.identify.excitation.design import design_trajectory as run
+    from armident.identify.excitation.design import with_objective
+    from armident.identify.excitation.previous_estimate import prior_from
+
+    config = _robot(robot, ())
+    earlier = None if known is None else prior_from(_document(known), config, "known")
+    theta = None if earlier is None else earlier.theta
+    found = run(
+        config,
+        duration,
+        seed,
+        noise=None if earlier is None else earlier.noise,
+        evaluations=evaluations,
+        theta=theta,
+        aim=with_objective(config, effect, joint, against, theta),
+        shape=shape,
+        harmonics=harmonics,
+        progress=None if progress is None else lambda share: progress("search", share),
+    )
+    return Design(config, found)
+
+
+class RobotModel:
+    """The dynamic model of a robot configuration: regressor, inverse and forward dynamics, closed loop.
+
+    All quantities are in SI units on the joint side. Parameters ``theta`` are base parameters (b,) in the order of
+    ``names``, or standard parameters (p,) in that of ``standard_names`` (thesis equations 2.3 to 2.9).
+
+    Parameters
+    ----------
+    robot
+        Configuration, or the path or shipped name of one; its effects are terms of the model.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such configuration, or it is wrong.
+
+    Examples
+    --------
+    >>> import armident, numpy as np
+    >>> model = armident.RobotModel("tx40")
+    >>> q = np.zeros((1, model.n))
+    >>> model.regressor(q, q, q).shape
+    (1, 6, 61)
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = _robot(robot, ())
+        self._arm = arm_model(self.robot)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self._arm.n
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the base parameters, (b,)."""
+        return self._arm.base.names
+
+    @property
+    def standard_names(self) -> tuple[str, ...]:
+        """Names of the standard parameters, (p,)."""
+        return self._arm.names
+
+    def regressor(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, dt: float | None = None) -> Array:
+        """Return the regressor of the base parameters (thesis equation 2.8), (N, n, b).
+
+        Parameters
+        ----------
+        q, qd, qdd
+            Positions, velocities and accelerations, (N, n) each; rad or m and their derivatives.
+        dt
+            Sampling period, s; needed where the configuration has effects.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, or ``dt`` is missing.
+        """
+        return self._arm.base_regressor(q, qd, qdd, dt=dt)
+
+    def inverse_dynamics(
+        self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, dt: float | None = None
+    ) -> Array:
+        """Return the joint torques along a motion, (N, n), N m or N.
+
+        Parameters
+        ----------
+        theta
+            Base parameters (b,) or standard parameters (p,).
+        q, qd, qdd
+            Positions, velocities and accelerations, (N, n) each; rad or m and their derivatives.
+        dt
+            Sampling period, s; needed where the configuration has effects.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, or ``dt`` is missing.
+        """
+        torque = self._arm.inverse_dynamics(theta, q, qd, qdd)
+        if self._arm.e == 0:
+            return torque
+        if dt is None:
+            raise ValueError("the effects of the configuration need the sampling period dt")
+        values = np.asarray(theta, dtype=np.float64)
+        known = self._arm.anchored(values)
+        further: Array = known.term_regressor(known.motion(q, qd, qdd, dt)) @ values[values.size - self._arm.e :]
+        return torque + further
+
+    def mass_matrix(self, theta: ArrayLike, q: ArrayLike) -> Array:
+        """Return the mass matrices, rotors and couplings included, (N, n, n).
+
+        Parameters
+        ----------
+        theta
+            Base parameters (b,) or standard parameters (p,).
+        q
+            Positions (N, n), rad or m.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit.
+        """
+        return self._arm.mass_matrix(theta, q)
+
+    def forward_dynamics(self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, tau: ArrayLike) -> Array:
+        """Return the joint accelerations under given torques (thesis equation 2.9), (N, n).
+
+        Parameters
+        ----------
+        theta
+            Base parameters (b,) or standard parameters (p,).
+        q, qd
+            Positions and velocities, (N, n) each.
+        tau
+            Joint torques (N, n), N m or N.
+
+        Raises
+        ------
+        ConfigError
+            If the configuration has effects: they need a whole motion, see `simulate`.
+        ArmidentError
+            If a mass matrix is not positive definite: these parameters are not physical.
+        """
+        if self._arm.e:
+            raise ConfigError(f"{self.robot.name}: forward dynamics leave effects out; use simulate for a whole motion")
+        return self._arm.forward_dynamics(theta, q, qd, tau)
+
+    def simulate(
+        self,
+        theta: ArrayLike,
+        trajectory: Trajectory | str | Path | ArrayLike,
+        *,
+        dt: float,
+        controller: DiscreteController | None = None,
+    ) -> "Simulation":
+        """Simulate the closed loop along a reference (thesis section B.3).
+
+        Parameters
+        ----------
+        theta
+            Base parameters (b,) or standard parameters (p,).
+        trajectory
+            Reference: a trajectory, the path or shipped name of one, or positions (N, n), rad or m.
+        dt
+            Sampling period of loop and controller, s.
+        controller
+            By default that of the configuration, or else a stiff PD controller for its bandwidth.
+
+        Returns
+        -------
+        Simulation
+            ``q``, ``qd``, ``qdd``, ``tau``, (N, n) each, and ``diverged_at``.
+
+        Raises
+        ------
+        ConfigError
+            If the configuration has neither a controller nor a bandwidth.
+        """
+        from armident.identify.controller.nominal import known_controller, nominal_controller
+        from armident.identify.robot.relaxation import simulate_with_terms
+
+        if isinstance(trajectory, str | Path):
+            trajectory = load_trajectory(trajectory)
+        positions = trajectory.sample(dt) if isinstance(trajectory, Trajectory) else np.asarray(trajectory, np.float64)
+        values = np.asarray(theta, dtype=np.float64)
+        if controller is None:
+            if self.robot.controller is not None:
+                controller = known_controller(self.robot, dt)
+            elif self.robot.bandwidth_hz is not None:
+                controller = nominal_controller(self._arm, values, positions, dt, self.robot.bandwidth_hz)
+            else:
+                raise ConfigError(f"{self.robot.name}: simulate needs a controller; the configuration has none")
+        return simulate_with_terms(self._arm, values, controller, positions, dt)
+
+    def __repr__(self) -> str:
+        effects_ = f", {self._arm.e} of effects" if self._arm.e else ""
+        return f"RobotModel({self.robot.name}: {self.n} joints, {len(self.names)} base parameters{effects_})"
+
+
+class EffectTable(Table):
+    """The effects of the catalogue: a table that is also indexed by the name of an effect."""
+
+    def __init__(self, found: Mapping[str, Effect]) -> None:
+        columns = ("name", "title", "scope", "parameters", "required_motion", "reference")
+        rows = [
+            (
+                effect.name,
+                effect.title,
+                effect.scope,
+                ", ".join([p.name for p in effect.linear] + [s.name for s in effect.shapes]),
+                effect.needs,
+                effect.reference,
+            )
+            for effect in found.values()
+        ]
+        super().__init__(columns, rows)
+        self._by_name = dict(found)
+
+    def __getitem__(self, key: Any) -> Any:
+        """Return the effect of that name, else a column or a row as `Table` does."""
+        if isinstance(key, str) and key in self._by_name:
+            return self._by_name[key]
+        if isinstance(key, str) and key not in self.columns:
+            raise KeyError(f"{key!r} is no effect and no column; effects: {', '.join(self._by_name)}")
+        return super().__getitem__(key)
+
+    def effects(self) -> Iterator[Effect]:
+        """Iterate over the effects, in the order of the table."""
+        return iter(self._by_name.values())
+
+
+def effects() -> EffectTable:
+    """Return the effects that a model can have and a diagnosis looks for.
+
+    Effects of other packages (entry points of group ``armident.effects``) are among them.
+
+    Raises
+    ------
+    ConfigError
+        If the entry point of another package cannot be loaded.
+
+    Examples
+    --------
+    >>> import armident
+    >>> armident.effects()["stribeck_friction"].scope
+    'joint'
+    """
+    return EffectTable(catalogue())
+
+
+def _read(recordings: Recorded | Sequence[Recorded]) -> tuple[Recording, ...]:
+    given = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
+    if not given:
+        raise ConfigError("no recording was given")
+    return tuple(one if isinstance(one, Recording) else read_recording(Path(one)) for one in given)
+
+
+def _robot(robot: Robot | None, recordings: Sequence[Recording]) -> RobotConfig:
+    if robot is None:
+        return recordings[0].robot
+    return robot if isinstance(robot, RobotConfig) else load_robot(robot)
+
+
+def _document(given: Identification | IdentificationDocument | str | Path) -> IdentificationDocument:
+    if isinstance(given, Identification):
+        return given.document
+    if isinstance(given, IdentificationDocument):
+        return given
+    path = Path(given)
+    return load_document(path / "identification.json" if path.is_dir() else path, IdentificationDocument)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

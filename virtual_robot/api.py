@@ -1,0 +1,63 @@
+"""The virtual arm without a bus, as ``import armident`` offers it."""
+
+from pathlib import Path
+
+from armident.configs import RobotConfig, Scenario, Trajectory, load_robot, load_scenario, load_trajectory
+from armident.daq.recording import Recording
+
+
+def simulate_recording(
+    robot: RobotConfig | str | Path,
+    trajectory: Trajectory | str | Path,
+    *,
+    scenario: Scenario | str | Path | None = None,
+    seed: int = 0,
+    noise: float = 1.0,
+    period: float | None = None,
+    velocity_feedback: bool | None = None,
+) -> Recording:
+    """Simulate the recording that a capture of the virtual arm would make along a trajectory.
+
+    The arm's physics come from Pinocchio, which the identification does not use.
+
+    Parameters
+    ----------
+    robot
+        Configuration of a robot that has a virtual arm (TX40, EMPS), or the path or shipped name of one.
+    trajectory
+        Reference positions, or the path or shipped name of a trajectory file.
+    scenario
+        Effects injected into the arm, or the path or shipped name of a scenario file; by default none.
+    seed
+        Seed of the noise.
+    noise
+        Amplitude of the noise relative to that of the real robot; 0 for none.
+    period
+        Sampling period, s; by default the control period of the drives.
+    velocity_feedback
+        True if the velocity loop of the drives is fed with the velocity, False for the derivative of the position
+        error; by default as the robot's configuration says.
+
+    Returns
+    -------
+    Recording
+        As `armident.read_recording` returns it.
+
+    Raises
+    ------
+    ConfigError
+        If the trajectory leaves the limits of the robot, or the robot has no virtual arm.
+
+    Examples
+    --------
+    >>> import armident
+    >>> recording = armident.simulate_recording("tx40", "tx40_excitation")
+    >>> recording.sample_rate_hz
+    5000.0
+    """
+    from armident.virtual_robot.offline import simulate_recording as simulate
+
+    config = robot if isinstance(robot, RobotConfig) else load_robot(robot)
+    reference = trajectory if isinstance(trajectory, Trajectory) else load_trajectory(trajectory)
+    hidden = scenario if isinstance(scenario, Scenario) or scenario is None else load_scenario(scenario)
+    return simulate(config, reference, seed, noise, hidden, period, velocity_feedback=velocity_feedback)
