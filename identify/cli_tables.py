@@ -158,9 +158,9 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
         for f in document.findings:
             rivals = f.evidence.get("ambiguous_with", [])
             unsure = f"; could also be {', '.join(rivals)}" if rivals else ""
-            console.print(f"{f.joint}: {f.evidence['says']}{unsure}", highlight=False)
+            console.print(f"{f.joint}: {f.evidence['description']}{unsure}", highlight=False)
     if document.considered:
-        named = ", ".join(f.doubt for f in document.considered)
+        named = ", ".join(f.rejection for f in document.considered)
         console.print(f"considered, and not convincing: {named}", highlight=False, soft_wrap=True)
     for u in document.unexplained:
         console.print(

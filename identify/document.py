@@ -1,17 +1,20 @@
-"""The result documents, ``identification.json`` and ``diagnosis.json``: schema, reading and writing."""
+"""The result documents, ``identification.json`` and ``diagnosis.json``: schema, reading and writing.
+
+`DiagnosisDocument` reads version 1 of ``diagnosis.json`` too and converts it to version 2.
+"""
 
 import json
 import math
 import os
 import platform
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from armident import configs
 from armident.configs import ConfigError, DataError, RobotConfig
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
     from armident.identify.identification.result import Identification
 
 LIBRARIES = ("armident", "numpy", "scipy", "numba")
+"""Distributions whose versions a document records."""
+
 T = TypeVar("T", bound=BaseModel)
 
 
@@ -31,7 +36,7 @@ class Document(BaseModel):
 
 
 class RecordingReference(Document):
-    """Which recording the numbers come from; ``samples`` counts rows (one per SYNC)."""
+    """Recording that was used; ``samples`` counts rows (one per SYNC)."""
 
     path: str | None
     sha256: str
@@ -42,7 +47,7 @@ class RecordingReference(Document):
 class Parameter(Document):
     """One estimated parameter, SI; ``relative_std_pct`` is null where the value is zero.
 
-    ``formula`` is the parameter in standard ones, where several act as one: ``my5 - mz6``.
+    ``formula`` gives the standard parameters that a base parameter groups, for example ``my5 - mz6``.
     """
 
     name: str
@@ -55,7 +60,7 @@ class Parameter(Document):
 
 
 class Whiteness(Document):
-    """Autocorrelation of a joint's residual: the share of ``lags`` outside two standard deviations."""
+    """Residual autocorrelation of a joint: fraction of the ``lags`` outside two standard deviations (white: 0.05)."""
 
     joint: str
     lags: int
@@ -63,7 +68,7 @@ class Whiteness(Document):
 
 
 class Comparison(Document):
-    """The estimate of a simpler method from the same data, beside the result."""
+    """Estimate of a simpler method from the same data, for comparison."""
 
     method: str
     parameters: list[Parameter]
@@ -71,10 +76,10 @@ class Comparison(Document):
 
 
 class IdentificationDocument(Document):
-    """``identification.json``: what was identified, from what, how, and how well.
+    """``identification.json``: estimated parameters, their covariance, the data, the method and its diagnostics.
 
-    ``torque_delay_samples`` has, per joint, by how many samples the torque runs ahead of the position (0.5 if the drive
-    reports the torque it holds), and the standard deviation.
+    ``torque_delay_samples`` has two numbers per joint: the number of samples by which the torque leads the position
+    (0.5 if the drive reports the torque that it holds until the next sample), and its standard deviation.
     """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
@@ -99,10 +104,11 @@ class IdentificationDocument(Document):
     diagnostics: dict[str, Any] | None = None
     physical: dict[str, Any] | None = None
     torque_delay_samples: dict[str, list[float]] | None = None
+    further_recordings: list[RecordingReference] | None = None
 
 
 class Alternative(Document):
-    """A competitor of a finding; ``score`` is its gain in held-out log-likelihood."""
+    """Another effect in place of a finding; ``score`` is its gain in log-likelihood (training and held-out data)."""
 
     effect: str
     joint: str
@@ -113,7 +119,7 @@ Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
 
 
 class Finding(Document):
-    """One missing effect; gaps are relative torque errors in percent on held-out data."""
+    """One effect that the model lacks; gaps are relative torque errors in percent on held-out data."""
 
     effect: str
     joint: str
@@ -127,15 +133,15 @@ class Finding(Document):
     evidence: dict[str, Any]
 
     @property
-    def doubt(self) -> str:
-        """Its name and place, and what without a name explains more, for a list of those that did not convince."""
-        better = self.evidence.get("better_without_name", [])
+    def rejection(self) -> str:
+        """Effect, joint and the reason for the rejection, for the list of rejected effects."""
+        better = self.evidence.get("better_unnamed_dependences", [])
         reason = f" (the {' and the '.join(better)} explains more)" if better else ""
         return f"{self.effect.replace('_', ' ')} of {self.joint}{reason}"
 
 
 class Unexplained(Document):
-    """What no effect of the catalogue explains, and what it varies with."""
+    """Part of a joint's residual that no effect of the catalogue explains, and the variable that it depends on."""
 
     joint: str
     share_of_residual: float
@@ -143,25 +149,25 @@ class Unexplained(Document):
     hint: str
 
 
-class Invisible(Document):
-    """An effect of the catalogue that these recordings cannot show at a joint, whatever its size."""
+class NotVisible(Document):
+    """Effect that these recordings cannot show at a joint, whatever its size; ``required_motion`` would show it."""
 
     effect: str
     joint: str
     reason: str
-    needs: str
+    required_motion: str
 
 
-class Hideable(Document):
-    """An effect that could be in the arm without showing in these recordings, up to a size.
+class DetectionLimit(Document):
+    """Smallest size at which an effect at a joint would be detected with a probability of 0.9.
 
-    ``below`` holds, for each parameter by itself, the size from which on nine diagnoses of ten would have found it.
+    ``limits`` holds the size of each linear parameter with the others at zero, ``units`` their units.
     """
 
     effect: str
     joint: str
     other: str | None = None
-    below: dict[str, float]
+    limits: dict[str, float]
     units: dict[str, str]
 
 
@@ -174,26 +180,26 @@ class Gap(Document):
 
 
 class BeforeAfter(Document):
-    """A gap of the model as configured, and with what was found added."""
+    """Gap of the model as configured, and of the model with the findings added."""
 
     before: Gap
     after: Gap
 
 
 class Gaps(Document):
-    """The gap on the data the models were fitted to, and on data they have not seen."""
+    """Gap on the training data and on the held-out data."""
 
     train: BeforeAfter
     validation: BeforeAfter
 
 
 class DiagnosisDocument(Document):
-    """``diagnosis.json``: where model and data disagree, what is missing, and what stays unexplained.
+    """``diagnosis.json``: effects that the model lacks, their share of the torque error, and the unexplained rest.
 
-    ``considered`` are effects that passed the tests and did not convince in the end; they are not in the model.
+    ``considered`` are effects that passed the tests but have a confidence below 0.5; they are not in the model.
     """
 
-    schema_: Literal["armident/diagnosis/1"] = Field("armident/diagnosis/1", alias="schema")
+    schema_: Literal["armident/diagnosis/2"] = Field("armident/diagnosis/2", alias="schema")
     robot: str
     recordings: list[RecordingReference]
     verdict: Verdict
@@ -206,10 +212,72 @@ class DiagnosisDocument(Document):
     timing_s: dict[str, float]
     versions: dict[str, str]
     warnings: list[str]
-    not_visible: list[Invisible] = []
-    could_hide: list[Hideable] = []
+    not_visible: list[NotVisible] = []
+    detection_limits: list[DetectionLimit] = []
     simulated: dict[str, dict[str, float]] | None = None
     considered: list[Finding] = []
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_version_1(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and data.get("schema") == DIAGNOSIS_1:
+            return diagnosis_from_version_1(data)
+        return data
+
+
+DIAGNOSIS_1 = "armident/diagnosis/1"
+"""Former schema of ``diagnosis.json``, see ``configs/json_schemas/diagnosis-1.schema.json``."""
+
+EVIDENCE_1 = {
+    "says": "description",
+    "gap_foretold": "gap_without_derivative_noise",
+    "confidence_with_equals": "confidence_with_ambiguous",
+    "better_without_name": "better_unnamed_dependences",
+    "equally_good": "equally_likely",
+}
+"""Keys of ``evidence`` in version 1 and their names in version 2."""
+
+
+def diagnosis_from_version_1(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert a diagnosis document from version 1 to version 2; only names change.
+
+    Parameters
+    ----------
+    data
+        Content of a ``diagnosis.json`` with the schema ``armident/diagnosis/1``.
+
+    Returns
+    -------
+    dict
+        The same content with the names of ``armident/diagnosis/2``. ``data`` is not changed.
+    """
+
+    def renamed(entry: Any, names: Mapping[str, str]) -> Any:
+        return {names.get(k, k): v for k, v in entry.items()} if isinstance(entry, Mapping) else entry
+
+    def each(entries: Any, change: Callable[[Any], Any]) -> Any:
+        return [change(entry) for entry in entries] if isinstance(entries, list) else entries
+
+    def finding(entry: Any) -> Any:
+        if not isinstance(entry, Mapping) or "evidence" not in entry:
+            return entry
+        return {**entry, "evidence": renamed(entry["evidence"], EVIDENCE_1)}
+
+    def unexplained(entry: Any) -> Any:
+        bursts = isinstance(entry, Mapping) and entry.get("varies_with") == "time, in bursts"
+        return {**entry, "varies_with": "transients"} if bursts else entry
+
+    changes: dict[str, Callable[[Any], Any]] = {
+        "findings": lambda v: each(v, finding),
+        "considered": lambda v: each(v, finding),
+        "unexplained": lambda v: each(v, unexplained),
+        "not_visible": lambda v: each(v, lambda e: renamed(e, {"needs": "required_motion"})),
+        "could_hide": lambda v: each(v, lambda e: renamed(e, {"below": "limits"})),
+        "simulated": lambda v: renamed(v, {"torque_foretold": "torque_without_derivative_noise"}),
+        "schema": lambda _: "armident/diagnosis/2",
+    }
+    names = {"could_hide": "detection_limits"}
+    return {names.get(key, key): changes[key](value) if key in changes else value for key, value in data.items()}
 
 
 SCHEMA_FILES: dict[str, type[Document]] = {
@@ -219,9 +287,21 @@ SCHEMA_FILES: dict[str, type[Document]] = {
 
 
 def identification_document(
-    result: "Identification", recording: Recording, robot: RobotConfig, notes: Sequence[str] = ()
+    result: "Identification", recordings: Sequence[Recording], robot: RobotConfig, notes: Sequence[str] = ()
 ) -> IdentificationDocument:
-    """The document of an identification; ``notes`` of the conversion come before the estimator's warnings."""
+    """Return the document of an identification.
+
+    Parameters
+    ----------
+    result
+        Estimates of the base parameters with covariance, residual statistics and timing.
+    recording
+        Recording that they come from.
+    robot
+        Its configuration.
+    notes
+        Messages of the conversion; they precede the estimator's warnings.
+    """
     joints = [joint.name for joint in robot.joints]
     essential = np.asarray(result.essential, dtype=bool)
     parameters = [
@@ -244,7 +324,7 @@ def identification_document(
         )
     return IdentificationDocument(
         robot=robot.name,
-        recording=reference(recording),
+        recording=reference(recordings[0]),
         method=result.method,
         options=plain(result.options),
         parameters=parameters,
@@ -271,11 +351,22 @@ def identification_document(
             name: [float(samples), float(std)]
             for name, samples, std in zip(joints, result.delay.samples, result.delay.std, strict=True)
         },
+        further_recordings=[reference(recording) for recording in recordings[1:]] or None,
     )
 
 
 def parameter(name: str, value: float, std: float, unit: str, essential: bool, formula: str | None = None) -> Parameter:
-    """One parameter with its relative standard deviation in percent."""
+    """Return one parameter with its relative standard deviation in percent, null where that is not finite.
+
+    Parameters
+    ----------
+    name, value, std, unit
+        As in the document, SI.
+    essential
+        True for an essential parameter.
+    formula
+        Standard parameters that it groups.
+    """
     relative = 100.0 * float(std) / abs(float(value)) if value != 0.0 else None
     if relative is not None and not math.isfinite(relative):
         relative = None
@@ -291,7 +382,7 @@ def parameter(name: str, value: float, std: float, unit: str, essential: bool, f
 
 
 def reference(recording: Recording) -> RecordingReference:
-    """How a document refers to a recording."""
+    """Return the reference to a recording as documents hold it."""
     return RecordingReference(
         path=None if recording.path is None else str(recording.path),
         sha256=recording.sha256,
@@ -301,7 +392,7 @@ def reference(recording: Recording) -> RecordingReference:
 
 
 def versions() -> dict[str, str]:
-    """Versions of whatever the numbers depend on."""
+    """Return the versions of Python and of the libraries that determine the numbers."""
     found = {"python": platform.python_version()}
     for library in LIBRARIES:
         try:
@@ -312,7 +403,7 @@ def versions() -> dict[str, str]:
 
 
 def plain(value: Any) -> Any:
-    """The same in what JSON knows: lists, dicts, numbers, text; numbers that are not finite become null."""
+    """Convert to JSON types: lists, dicts, numbers, text; numbers that are not finite become null."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if hasattr(value, "__dataclass_fields__"):
@@ -331,17 +422,26 @@ def plain(value: Any) -> Any:
 
 
 def to_json(document: Document) -> str:
-    """JSON text of a document, keys in the order of the schema."""
+    """Return the JSON text of a document, keys in the order of the schema."""
     return document.model_dump_json(by_alias=True, indent=1) + "\n"
 
 
 def from_json(text: str, kind: type[T], where: str) -> T:
-    """A document from its JSON text.
+    """Return the document of a JSON text; older versions are converted.
+
+    Parameters
+    ----------
+    text
+        JSON.
+    kind
+        Class of the document.
+    where
+        Source of the text, for messages.
 
     Raises
     ------
     DataError
-        Naming ``where``, the key and what was expected.
+        If the text is no such document; the message names ``where``, the key and what was expected.
     """
     try:
         return kind.model_validate(json.loads(text))
@@ -354,7 +454,14 @@ def from_json(text: str, kind: type[T], where: str) -> T:
 
 
 def load_document(path: Path, kind: type[T]) -> T:
-    """A document from a file.
+    """Read a document from a file; older versions are converted.
+
+    Parameters
+    ----------
+    path
+        JSON file.
+    kind
+        Class of the document.
 
     Raises
     ------
@@ -373,7 +480,7 @@ def load_document(path: Path, kind: type[T]) -> T:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write a file so that a reader sees all of it or none of it; missing folders are made."""
+    """Write a file so that a reader sees all of it or none of it; missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -381,7 +488,7 @@ def write_atomically(path: Path, text: str) -> None:
             stream.write(text)
             stream.flush()
             os.fsync(stream.fileno())
-        # mkstemp makes the file private; a result is as readable as any other file of its folder.
+        # mkstemp restricts the file to its owner; results are readable like any other file.
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException:
@@ -390,7 +497,7 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def schema_text(kind: type[Document]) -> str:
-    """JSON Schema of a document as it stands in ``configs/``."""
+    """Return the JSON Schema of a document as it stands in ``configs/json_schemas``."""
     return json.dumps(kind.model_json_schema(by_alias=True), indent=2) + "\n"
 
 

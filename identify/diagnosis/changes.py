@@ -12,9 +12,9 @@ from armident.identify.diagnosis.trial import CLOSE
 from armident.identify.effects.registry import catalogue
 
 STRUCTURAL = {
-    "drive_gain_error": "another torque per ampere than in the baseline",
-    "gravity_direction": "gravity comes from another direction than in the baseline",
-    "rotor_inertia": "another inertia at the motor than in the baseline",
+    "drive_gain_error": "torque constant changed since the baseline",
+    "gravity_direction": "gravity direction changed since the baseline",
+    "rotor_inertia": "motor inertia changed since the baseline",
 }
 """Effects that a model can also lack, which parameters of an arm take over in part: another number against a baseline,
 of either sign; and how to say so."""

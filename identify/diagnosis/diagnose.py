@@ -1,4 +1,4 @@
-"""The diagnosis: is there a gap, where, what fills it, does it close on unseen data, and what is left."""
+"""Diagnosis of a model: lack of fit, missing effects, held-out validation, unexplained residual dependences."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from armident.identify.diagnosis.findings import (
     outdated,
     undetectable,
 )
-from armident.identify.diagnosis.hiding import hideable
+from armident.identify.diagnosis.hiding import detection_limits
 from armident.identify.diagnosis.numbers import stale_numbers
 from armident.identify.diagnosis.regression import relative_errors
 from armident.identify.diagnosis.search import Search
@@ -44,33 +44,34 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 SHARE_OF_ALARMS = 0.1
-"""Of the rate of false alarms, for a mistake of wiring that no other gap speaks for."""
+"""Share of the false-alarm rate for a wiring error without any other finding."""
 NOTABLY = 0.2
-"""Drop of the logarithm of the held-out errors' power, summed over the joints, that makes a mistake of wiring likelier
-than effects that are no more to believe in: a wrong sign of a wrist looks much like a missing rotor."""
+"""Decrease of the log power of the held-out errors, summed over the joints, from which a wiring error is preferred to
+an equal number of effects: a wrong sign of a wrist resembles a missing rotor inertia."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, and the curves that show it.
+    """Result of a diagnosis, with the curves of its report.
 
     Parameters
     ----------
     document
         ``diagnosis.json`` without the path of the model.
     robot
-        The configuration with the findings added.
+        Configuration with the findings added.
     t, measured, before, after
-        Held-out instants (M,), s, and torques (M, n): measured, and of the model without and with the findings.
+        Held-out instants (M,), s, and torques (M, n), N m or N: measured, and of the model without and with the
+        findings.
     lacking
-        The same of the model with all findings but one, for each finding of the document; ``None`` for one that is not
-        a part of the model (wiring, numbers).
+        Torques (M, n) of the model with all findings but one, for each finding of the document; ``None`` for a finding
+        that is not a part of the model (wiring, parameter changes).
     q, qd
-        Held-out joint positions and velocities (M, n).
+        Held-out joint positions and velocities (M, n), rad and rad/s, or m and m/s.
     where
-        What the residual of the model as configured depends on, and what is left of that.
+        Dependences of the residual of the model as configured.
     left
-        The same of the model with the findings.
+        Dependences of the residual of the model with the findings.
     simulated
         Errors of the simulated closed loop before and after.
     """
@@ -99,26 +100,31 @@ def diagnose(
     progress: Progress | None = None,
     settings: Settings | None = None,
 ) -> Diagnosis:
-    """Find the effects a model lacks, one after the other, until none passes.
+    """Find the effects that a model lacks by stepwise selection.
 
     Parameters
     ----------
     training
         Experiments to fit.
     validation
-        Experiments to judge by; without them the last part of the training experiments is held out.
+        Held-out experiments; without them the last part of the training experiments is held out.
     robot
-        The model in question.
+        Configuration of the model to diagnose.
     recordings
-        References to where the experiments come from, for the document.
+        References to the recordings of the experiments, for the document.
     baseline
-        Numbers to judge too: which of them no longer hold.
+        Identification whose parameters are tested for change.
     notes
-        Of the conversion, for the document's warnings.
+        Messages of the conversion, for the document's warnings.
     progress
-        Called with a stage and the share done.
+        Called with a stage and the share done, 0 to 1.
     settings
         Error rates.
+
+    Returns
+    -------
+    Diagnosis
+        Document, configuration with the findings, and curves.
 
     Raises
     ------
@@ -133,7 +139,7 @@ def diagnose(
 
 
 class _Steps:
-    """Turns the steps of a search, whose number nobody knows, into shares of the whole."""
+    """Reports the progress of a search with an unknown number of steps."""
 
     def __init__(self, progress: Progress | None) -> None:
         self._progress = progress or (lambda stage, share: None)
@@ -156,7 +162,7 @@ class _Steps:
     def _note(self) -> None:
         now = time.perf_counter()
         if self._stage:
-            kind = "search" if self._stage.startswith(("adding", "taking", "exchang")) else self._stage
+            kind = "search" if self._stage.startswith(("adding", "removing", "exchang")) else self._stage
             self.spent[kind] = self.spent.get(kind, 0.0) + now - self._since
         self._since = now
 
@@ -175,10 +181,10 @@ def _diagnose(
     wiring = find_wiring([*training, *validation], robot)
     found = _searched(training, validation, robot, wiring if wiring and wiring.certain else None, steps, settings)
     if wiring is not None and not wiring.certain:
-        # Where nothing else can be to blame, the recordings alone must say it; elsewhere they say it of many things.
+        # Without any other gap the wiring test alone must be significant at a stricter level.
         alone = found.open == 0 and wiring.p_values[0] <= SHARE_OF_ALARMS * settings.false_alarms
         other = _searched(training, validation, robot, wiring, steps, settings) if alone or found.open else None
-        # The mistake itself is one thing more to believe in.
+        # The wiring error itself counts as one finding.
         room = 0 if alone else found.open - 1
         if other is not None and other.open <= room and other.misfit < found.misfit - NOTABLY * (other.open == room):
             found = other
@@ -189,12 +195,12 @@ def _diagnose(
     findings = [*([] if wiring is None else miswired(wiring, robot)), *outcome.findings]
     lacking = [*(None for _ in findings[len(outcome.findings) :]), *(_beside(final, s) for s in outcome.lacking)]
     if baseline is not None:
-        steps("numbers")
+        steps("changed parameters")
         findings += outdated(stale_numbers(final.fit, final.workshop, baseline, settings.false_alarms))
     steps("simulation")
     simulated = simulated_errors(first, final)
-    steps("what could hide")
-    could_hide = hideable(final, settings)
+    steps("detection limits")
+    limits = detection_limits(final, settings)
     document = DiagnosisDocument(
         robot=robot.name,
         recordings=list(recordings),
@@ -215,7 +221,7 @@ def _diagnose(
         versions=versions(),
         warnings=[*notes, *study.warnings],
         not_visible=undetectable(first),
-        could_hide=could_hide,
+        detection_limits=limits,
         simulated=simulated.document(),
     )
     held = final.study.held
@@ -272,11 +278,11 @@ def _searched(
     steps("base fit")
     search = Search(study, settings, steps)
     first = search.start()
-    steps("where")
+    steps("residual dependences")
     seen = survey(first.fit, first.workshop, settings.false_alarms)
     places = where(first.fit, first.workshop, seen=seen)
     outcome = convincing(search, first, search.run(), seen)
-    steps("what is left")
+    steps("unexplained dependences")
     left = beyond_noise(outcome.state.fit, outcome.left, settings.false_alarms)
     return _Found(study, first, outcome, tuple(places), tuple(left))
 

@@ -70,7 +70,7 @@ def convincing(search: Search, first: State, final: State, seen: Survey) -> Outc
             been.add(places_of(final))
             continue
         considered.append(findings[worst])
-        search.progress(f"taking out {findings[worst].effect}")
+        search.progress(f"removing {findings[worst].effect}")
         final = _without(search, first, final, worst, been)
         been.add(places_of(final))
     order = sorted(range(len(findings)), key=lambda k: _left_open(findings[k]))
@@ -82,7 +82,7 @@ def convincing(search: Search, first: State, final: State, seen: Survey) -> Outc
 
 
 def _confidence(finding: Finding) -> float:
-    return float(finding.evidence["confidence_with_equals"])
+    return float(finding.evidence["confidence_with_ambiguous"])
 
 
 def _left_open(finding: Finding) -> float:
@@ -97,7 +97,7 @@ def _instead_of(
     told: list[Disagreement] = []
     for finding in taken_out:
         at = {finding.joint, finding.other or finding.joint}
-        if not finding.evidence["better_without_name"] or at & {d.joint for d in (*left, *told)}:
+        if not finding.evidence["better_unnamed_dependences"] or at & {d.joint for d in (*left, *told)}:
             continue
         numbers = {final.study.joints.index(joint) for joint in at}
         found = strangers(final.fit, final.workshop, numbers, search.settings.false_alarms)

@@ -1,4 +1,4 @@
-"""Which experiment would say more: what the next recording must contain, in words and as a command."""
+"""Recommended next experiment: required contents of the recording, in words and as a command."""
 
 from collections.abc import Sequence
 
@@ -15,16 +15,16 @@ CONTAINS = {
     "repeats": "the same motion again after an hour of work",
     "independent": "moves of each of the joints alone, of both together, and of both against each other",
 }
-"""What the entries of the catalogue ask for, in the words of whoever programs the robot."""
+"""Motion that each ``excitation`` keyword of an effect requires."""
 
 
 def recommended_experiment(effect: Effect, joint: str, rivals: Sequence[Effect] = ()) -> str:
-    """The experiment that makes a finding surer, or tells it from its nearest rivals.
+    """Return the experiment that raises the confidence of a finding or separates it from its nearest alternative.
 
     Parameters
     ----------
     effect, joint
-        What was found, and the joint's name.
+        Effect found, and the joint's name.
     rivals
         Effects that explain the recording nearly as well, best first.
     """
@@ -35,11 +35,11 @@ def recommended_experiment(effect: Effect, joint: str, rivals: Sequence[Effect] 
     if not others:
         if effect.rewires:
             return f"Check the wiring and the configuration of {joint}, then record the same motion again."
-        return f"To be surer of {effect.title} at {joint}, record {contents}: {_command(effect, joint)}"
+        return f"To confirm {effect.title} at {joint}, record {contents}: {_command(effect, joint)}"
     rival = others[0]
-    text = f"To tell {effect.title} from {rival.title} at {joint}, record {contents}"
+    text = f"To separate {effect.title} from {rival.title} at {joint}, record {contents}"
     if effect.rewires or rival.rewires:
-        return f"{text}, after a check of the wiring."
+        return f"{text}, after checking the wiring."
     return f"{text}: {_command(effect, joint)} --against {rival.name}"
 
 

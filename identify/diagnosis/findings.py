@@ -1,4 +1,4 @@
-"""What a search found, as the document says it: sizes, certainty, rivals, and what could not be seen."""
+"""Findings of a search as entries of the document: parameters, confidence, alternatives, undetectable effects."""
 
 from collections.abc import Collection, Sequence
 
@@ -22,7 +22,7 @@ from armident.identify.diagnosis.study import ALIKE
 from armident.identify.diagnosis.trial import CLOSE, Trial, judge
 from armident.identify.diagnosis.where import Disagreement, strangers
 from armident.identify.diagnosis.wiring_check import WiringFinding
-from armident.identify.document import Alternative, Finding, Gap, Invisible
+from armident.identify.document import Alternative, Finding, Gap, NotVisible
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import catalogue, known
@@ -121,20 +121,20 @@ def _finding(
         gap_after=float(relative_errors(final.fit, held=True)[1][joint]),
         evidence={
             "title": effect.title,
-            "says": effect.says,
+            "description": effect.says,
             "reference": effect.reference,
             "score": None if mine is None else mine.score,
             "p_value": None if mine is None else mine.p_value,
             "tests": rest.tests,
             "share_of_residual": share,
-            "gap_foretold": foretold_gap if np.isfinite(foretold_gap) else None,
+            "gap_without_derivative_noise": foretold_gap if np.isfinite(foretold_gap) else None,
             "std": std,
             "units": _units(effect, study.robot.joints[joint].type == "prismatic"),
-            "confidence_with_equals": among * explained,
+            "confidence_with_ambiguous": among * explained,
             "ambiguous_with": [
                 t.candidate.effect.name for t in serious if mine and _instead(t, final) > mine.score - CLOSE
             ],
-            "better_without_name": [words for words, score in nameless.items() if mine and score > mine.score],
+            "better_unnamed_dependences": [words for words, score in nameless.items() if mine and score > mine.score],
         },
     )
 
@@ -178,10 +178,10 @@ def miswired(wiring: WiringFinding, robot: RobotConfig) -> list[Finding]:
                 gap_after=100 * float(np.sqrt(wiring.unexplained_after[motor])),
                 evidence={
                     "title": effect.title,
-                    "says": words,
+                    "description": words,
                     "reference": effect.reference,
                     "p_value": p_value,
-                    "equally_good": list(rivals),
+                    "equally_likely": list(rivals),
                 },
             )
         )
@@ -219,23 +219,23 @@ def noise_floor(final: State, left: Sequence[Disagreement]) -> Gap:
     return Gap(all=overall, by_joint=dict(zip(study.joints, (float(v) for v in floor), strict=True)))
 
 
-def undetectable(state: State) -> list[Invisible]:
+def undetectable(state: State) -> list[NotVisible]:
     """Effects of the catalogue that this motion cannot show at some joint, with the reason."""
     study = state.study
     motion = state.workshop.motion(study.train[0], "measured")
-    found: list[Invisible] = []
+    found: list[NotVisible] = []
     for effect in catalogue().values():
         if effect.rewires or effect.scope == "pair":
             continue
         for place in places(effect, study.robot.n):
             reason = None if effect.visible is None else effect.visible(motion, place)
             if effect.numbers is not None:
-                reason = "it changes numbers of the model, not its structure: it shows against a baseline only"
+                reason = "it changes parameters of the model, not its structure: it is visible against a baseline only"
             elif (effect.name, place.joint, place.other) in state.hidden:
-                reason = "the motion does not excite it, or the model contains it"
+                reason = "the motion does not excite it, or the model already contains it"
             if reason is not None:
                 joint = study.joints[place.joint]
-                found.append(Invisible(effect=effect.name, joint=joint, reason=reason, needs=effect.needs))
+                found.append(NotVisible(effect=effect.name, joint=joint, reason=reason, required_motion=effect.needs))
     return found
 
 
@@ -253,8 +253,8 @@ def outdated(numbers: Sequence[NumbersFinding]) -> list[Finding]:
             gap_before=n.gap_before,
             gap_after=n.gap_after,
             evidence={
-                "title": known(n.effect).title if n.effect in catalogue() else "numbers that have changed",
-                "says": n.words,
+                "title": known(n.effect).title if n.effect in catalogue() else "parameters that have changed",
+                "description": n.words,
                 "p_value": n.p_value,
                 "std": n.std,
                 "ambiguous_with": list(n.ambiguous_with),

@@ -1,8 +1,8 @@
-"""What a model changes of another's errors at simulated motion, where measured motion brings noise.
+"""Torque error with the contribution of an effect taken at the simulated motion, without derivative noise.
 
-A link on a spring or a late torque takes one derivative more than the rigid model: at measured signals it brings noise
-that the effect does not have, and the errors of the right model may be larger than those of the wrong one. What it
-changes of the predicted torque is known without that noise where the motion is simulated.
+An elastic joint or a torque delay takes one derivative more than the rigid model. At measured signals that derivative
+adds noise, so that the correct model may have larger errors than the wrong one. At the simulated motion the
+contribution of the effect is free of that noise.
 """
 
 from dataclasses import dataclass, replace

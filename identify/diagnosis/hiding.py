@@ -1,4 +1,4 @@
-"""How much of an effect these recordings could hide: the smallest size that a diagnosis would nearly always find."""
+"""Detection limits: smallest size of each effect that a diagnosis of these recordings would find."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,30 +8,30 @@ from armident.identify.diagnosis.candidates import Candidate, Columns, Shapes, c
 from armident.identify.diagnosis.state import HELD_OUT_LEVEL, Settings, State
 from armident.identify.diagnosis.trial import deviations, inflation_along, joints_reached
 from armident.identify.diagnosis.whitening import rows_of_joints, whitened
-from armident.identify.document import Hideable
+from armident.identify.document import DetectionLimit
 
 Array = NDArray[np.float64]
 
 POWER = 0.9
-"""Chance with which an effect of the size that is told would have been found."""
+"""Probability of detection at the detection limit."""
 
 
-def hideable(state: State, settings: Settings) -> list[Hideable]:
-    """Sizes up to which effects that are not in the model could be in the arm without showing.
+def detection_limits(state: State, settings: Settings) -> list[DetectionLimit]:
+    """Return the detection limits of the effects that are not in the model.
 
-    Each linear parameter by itself, at the nonlinear ones that fit best. It must be so large that training and held-out
-    data each speak for it, at the levels of a search, with a chance of nine in ten, and that it takes the share of the
-    held-out error away that a finding must.
+    Each linear parameter is treated by itself, at the nonlinear parameters that fit best. At the limit, training and
+    held-out tests are both significant at the levels of the search with probability `POWER`, and the held-out error
+    falls by the share that a finding requires.
 
     Parameters
     ----------
     state
-        The model with all that was found.
+        Model with all findings.
     settings
         Error rates of the search.
     """
     shapes = {trial.candidate.key: trial.shapes for trial in (*state.others, *state.trials[::-1])}
-    found: list[Hideable] = []
+    found: list[DetectionLimit] = []
     for candidate in candidates(state.workshop):
         if candidate.key in state.hidden or candidate.effect.sudden:
             continue
@@ -75,14 +75,14 @@ def _smallest(state: State, candidate: Candidate, shapes: Shapes, settings: Sett
     return sizes
 
 
-def _told(state: State, candidate: Candidate, sizes: Array) -> Hideable:
+def _told(state: State, candidate: Candidate, sizes: Array) -> DetectionLimit:
     joints, place = state.study.joints, candidate.place
     kind = int(state.study.robot.joints[place.joint].type == "prismatic")
     named = [(p, float(v)) for p, v in zip(candidate.effect.linear, sizes, strict=True) if np.isfinite(v)]
-    return Hideable(
+    return DetectionLimit(
         effect=candidate.effect.name,
         joint=joints[place.joint],
         other=None if place.other is None else joints[place.other],
-        below={p.name: float(f"{v:.2g}") for p, v in named},
+        limits={p.name: float(f"{v:.2g}") for p, v in named},
         units={p.name: p.unit[kind] for p, _ in named},
     )

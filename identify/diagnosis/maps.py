@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Kind = Literal[
     "velocity", "position", "position and direction", "motor angle", "load", "load and direction", "torque",
     "acceleration", "time", "time and direction", "velocity of another joint", "torque of another joint",
-    "frequency", "motion", "time, in bursts",
+    "frequency", "motion", "transients",
 ]  # fmt: skip
 """Variables; those with a direction count for the positive one, and with the other sign for the negative one. The last
 are no maps: a frequency that does not move with the motion, whatever moves with it in a way nobody can tell, and

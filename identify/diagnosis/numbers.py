@@ -19,9 +19,10 @@ from armident.identify.diagnosis.baseline import Change, Comparison, cautious, c
 from armident.identify.diagnosis.candidates import Workshop
 from armident.identify.diagnosis.changes import STRUCTURAL, changes, p_value, ranked
 from armident.identify.diagnosis.regression import Fit, relative_errors
-from armident.identify.diagnosis.trial import CLOSE, newey_west
+from armident.identify.diagnosis.trial import CLOSE, variance_of_sum
 from armident.identify.document import IdentificationDocument
 from armident.identify.effects.effect import Effect
+from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]
 
@@ -127,12 +128,8 @@ def _changed_names(comparison: Comparison, changes: Sequence[Change], alpha: flo
     rest = comparison.difference - stack @ comparison.solved(changes)[0]
     std = np.sqrt(np.diag(comparison.covariance))
     p = 2 * stats.norm.sf(np.abs(rest) / std)
-    found = []
-    for rank, k in enumerate(np.argsort(p)):
-        if p[k] * (p.size - rank) > alpha:
-            break
-        found.append((int(k), float(rest[k]), float(std[k])))
-    return found
+    adjusted = holm(p)
+    return [(int(k), float(rest[k]), float(std[k])) for k in np.argsort(p) if adjusted[k] <= alpha]
 
 
 def _closes(comparison: Comparison, before: Sequence[Change], after: Sequence[Change], alpha: float) -> bool:
@@ -151,7 +148,7 @@ def _held_out(comparison: Comparison, before: Array, after: Array) -> float:
     if size == 0.0:
         return 0.0
     residual = held.y - held.x @ before
-    inflation = max(1.0, newey_west(change * (residual - change)) / size)
+    inflation = max(1.0, variance_of_sum(change * (residual - change)) / size)
     through = change @ held.x[:, comparison.known]
     spread = float(through @ comparison.covariance0 @ through)
     return float(change @ residual) / float(np.sqrt(size * inflation + spread))
@@ -256,6 +253,6 @@ def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list
             confidence=1.0 - p,
             ambiguous_with=(),
             alternatives=(),
-            words=f"numbers differ from the baseline and no effect of the catalogue explains it: {told}",
+            words=f"parameters differ from the baseline, and no effect of the catalogue explains it: {told}",
         )
     ]

@@ -258,7 +258,7 @@ class Search:
                 break
             value += float(rest.values[0])
             if not trial.candidate.effect.allows(np.array([value]), rest.std, {}):
-                raise DataError(f"{trial.candidate.effect.name}: the recording cannot be put right")
+                raise DataError(f"{trial.candidate.effect.name}: the recording cannot be corrected for it")
             robot = valued(robot, trial.candidate.effect.linear[0].name, value)
             if abs(float(rest.values[0])) < SETTLED * abs(value):
                 break
@@ -276,7 +276,7 @@ class Search:
                 return state
             worst = stanza_number(state.study.robot, max(doubtful)[1])
             robot = without(state.study.robot, worst)
-            self.progress(f"taking out {state.study.robot.effects[worst].effect}")
+            self.progress(f"removing {state.study.robot.effects[worst].effect}")
             state = self.state(robot, state)
 
     def _exchanged(self, state: State, own: int) -> State:

@@ -1,4 +1,4 @@
-"""The simulated closed loop against the measured one, with the model as configured and with what was found."""
+"""Errors of the simulated closed loop, with the model as configured and with the findings."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,8 +18,9 @@ Array = NDArray[np.float64]
 class SimulatedErrors:
     """Errors of simulated velocities and torques on the held-out data, percent of the measured ones, (n,) each.
 
-    ``torque_foretold`` is the error at measured motion less what the findings change of the torque at simulated motion,
-    see `armident.identify.diagnosis.foretold`. Not a number where a loop diverges, or that cannot be said.
+    ``torque_without_derivative_noise`` is the error of the model as configured at the measured motion, less the torque
+    that the findings add at the simulated motion: see `armident.identify.diagnosis.foretold`. NaN where a simulated
+    loop diverges or the difference is undefined.
     """
 
     joints: tuple[str, ...]
@@ -27,11 +28,17 @@ class SimulatedErrors:
     velocity_after: Array
     torque_before: Array
     torque_after: Array
-    torque_foretold: Array
+    torque_without_derivative_noise: Array
 
     def document(self) -> dict[str, Any] | None:
-        """As it stands in ``diagnosis.json``."""
-        names = ("velocity_before", "velocity_after", "torque_before", "torque_after", "torque_foretold")
+        """Return the entry ``simulated`` of ``diagnosis.json``."""
+        names = (
+            "velocity_before",
+            "velocity_after",
+            "torque_before",
+            "torque_after",
+            "torque_without_derivative_noise",
+        )
         told = {name: getattr(self, name) for name in names if np.isfinite(getattr(self, name)).all()}
         return {name: dict(zip(self.joints, map(float, values), strict=True)) for name, values in told.items()} or None
 

@@ -107,13 +107,13 @@ class Disagreement:
     @property
     def of_noise(self) -> bool:
         """Whether the band of the curve is what noise reaches, instead of the curve's own uncertainty."""
-        return self.kind in ("frequency", "motion", "time, in bursts")
+        return self.kind in ("frequency", "motion", "transients")
 
     @property
     def hint(self) -> str:
         """What to look for, for whoever stands at the machine."""
         height = np.abs(self.curve.value)
-        if self.kind in ("motion", "time, in bursts"):
+        if self.kind in ("motion", "transients"):
             height = height / np.maximum(self.curve.band, 1e-300)
         at = self.curve.x[int(np.argmax(height))]
         return hint_of(self.kind, self.joint, self.other, f"{at:.3g} {self.unit}")
@@ -238,7 +238,7 @@ def _moving(joint: str, excess: Excess) -> Disagreement:
 
 
 def _bursting(joint: str, own: Bursts) -> Disagreement:
-    kind: Kind = "time, in bursts"
+    kind: Kind = "transients"
     return Disagreement(
         joint, kind, None, unit_of(kind, ""), own.share, own.p_value, Curve(own.t, own.amplitude, own.noise)
     )

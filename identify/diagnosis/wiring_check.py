@@ -338,5 +338,5 @@ def _words(stanza: Stanza, robot: RobotConfig) -> str:
         return f"{signals}{plural} the drives of {stanza.joint} and {stanza.other} are exchanged"
     words = f"{signals} of the drive of {stanza.joint} {verb} read with the wrong sign"
     if " and " in signals:
-        words += ": the joint turns the other way round than its configuration says"
+        words += ": the joint turns opposite to its configured direction"
     return words

@@ -171,7 +171,7 @@ def _at_measured_motion(case: Case, document: Document, healthy: Document) -> Po
             float(healthy["gap"]["validation"]["before"]["rms"][place]) ** 2,
         )
     after = power(validation["after"])
-    foretold = (document.get("simulated") or {}).get("torque_foretold")
+    foretold = (document.get("simulated") or {}).get("torque_without_derivative_noise")
     if foretold is not None:
         torques = _torques(document, "after")
         after = min(after, sum((foretold[j] * torques[j]) ** 2 for j in _joints(case, foretold)))
@@ -225,6 +225,6 @@ def _called_invisible(part: InjectedEffect, truth: dict[str, float], document: D
     """Whether the diagnosis says that an effect cannot show, or could hide with parameters of this size."""
     if any(matches(part, entry) for entry in document["not_visible"]):
         return True
-    limits = [entry["below"] for entry in document.get("could_hide", []) if matches(part, entry)]
+    limits = [entry["limits"] for entry in document.get("detection_limits", []) if matches(part, entry)]
     sizes = [[abs(value) < below[name] for name, value in truth.items() if name in below] for below in limits]
     return any(bool(compared) and all(compared) for compared in sizes)

@@ -40,7 +40,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
     return render(
         "diagnosis.html",
         document=document,
-        could_hide=_could_hide(document),
+        detection_limits=_detection_limits(document),
         verdict=VERDICTS[document.verdict],
         findings=[
             {
@@ -49,7 +49,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
                 "where": finding.joint if finding.other is None else f"{finding.joint} and {finding.other}",
                 "sure": certainty(finding),
                 "closed": closed_share(finding, document),
-                "noisy": (finding.evidence.get("gap_foretold") or np.inf) < NOISELESS * finding.gap_after,
+                "noisy": (finding.evidence.get("gap_without_derivative_noise") or np.inf) < NOISELESS * finding.gap_after,
                 "rows": _rows(finding),
                 "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking),
             }
@@ -63,15 +63,15 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
     )
 
 
-def _could_hide(document: DiagnosisDocument) -> list[dict[str, str]]:
+def _detection_limits(document: DiagnosisDocument) -> list[dict[str, str]]:
     """Rows of the table of what could hide: effect, place, and the sizes from which on it would have been found."""
     return [
         {
             "effect": h.effect.replace("_", " "),
             "joint": h.joint if h.other is None else f"{h.joint} and {h.other}",
-            "below": ", ".join(f"{name} {value:g} {h.units[name]}".rstrip() for name, value in h.below.items()),
+            "below": ", ".join(f"{name} {value:g} {h.units[name]}".rstrip() for name, value in h.limits.items()),
         }
-        for h in document.could_hide
+        for h in document.detection_limits
     ]
 
 
@@ -91,7 +91,7 @@ def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:
     At measured motion, or with what it changes at simulated motion, where that leaves less: noise that derivatives of
     measured positions bring is no fault of the model.
     """
-    foretold = finding.evidence.get("gap_foretold")
+    foretold = finding.evidence.get("gap_without_derivative_noise")
     after = finding.gap_after if foretold is None else min(finding.gap_after, foretold)
     floor = min(document.noise_floor.by_joint[finding.joint], after)
     gap = finding.gap_before**2 - floor**2
@@ -248,7 +248,7 @@ def _curve_figure(d: Disagreement, unit: str) -> str:
     """Shape of what is left, in the unit of the joint's torque."""
     with figure(1, 1, 2.3) as (_, axes, picture):
         _curve(axes[0, 0], d, unit)
-        over = {"motion": "frequency; shaded: noise", "time, in bursts": "time, from moment to moment; shaded: noise"}
+        over = {"motion": "frequency; shaded: noise", "transients": "time, from moment to moment; shaded: noise"}
         axes[0, 0].set_title(f"{d.joint}: what remains, over {over.get(d.kind, d.varies_with)}")
         axes[0, 0].axhline(0, color=MUTED, linewidth=0.6)
     return picture[0]

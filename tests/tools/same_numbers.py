@@ -30,6 +30,13 @@ from typing import Any
 KEYS = {
     "gap_foretold": "gap_without_derivative_noise",
     "could_hide": "detection_limits",
+    "torque_foretold": "torque_without_derivative_noise",
+    "says": "description",
+    "confidence_with_equals": "confidence_with_ambiguous",
+    "better_without_name": "better_unnamed_dependences",
+    "equally_good": "equally_likely",
+    "needs": "required_motion",
+    "below": "limits",
 }
 """Renamed keys of documents, old to new, wherever they stand."""
 
@@ -46,7 +53,8 @@ SKIPPED_AT_TOP = {"model"}
 """The same for keys of the first level: a path, too."""
 
 PROSE = {
-    "warnings", "hint", "says", "title", "reference", "reason", "needs", "recommended_experiment", "stop_reason",
+    "warnings", "hint", "description", "title", "reference", "reason", "required_motion", "recommended_experiment",
+    "stop_reason", "equally_likely",
 }  # fmt: skip
 """Keys of sentences for people: their wording may change, the numbers in them may not."""
 

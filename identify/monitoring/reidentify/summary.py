@@ -79,7 +79,7 @@ def found(diagnosis: DiagnosisDocument) -> list[str]:
     for finding in diagnosis.findings:
         values = ", ".join(f"{name} {value:.4g}" for name, value in finding.parameters.items())
         where = finding.joint if finding.other is None else f"{finding.joint} and {finding.other}"
-        words = finding.evidence.get("says")
+        words = finding.evidence.get("description")
         said = words if isinstance(words, str) else f"{finding.effect.replace('_', ' ')} ({values})"
         lines.append(
             f"{where}: {said}; confidence {100 * finding.confidence:.0f} %, torque error "

@@ -72,9 +72,9 @@ def test_what_could_hide_does_up_to_the_size_that_is_told_and_no_further() -> No
     robot = load_robot("emps")
     told = diagnosed(recorded(robot, 1, trajectory="emps_1", repeats=1), robot).document
     assert told.verdict == "no_gap"
-    (spring,) = [h for h in told.could_hide if h.effect == "joint_spring"]
+    (spring,) = [h for h in told.detection_limits if h.effect == "joint_spring"]
     for share, found in ((0.2, []), (2.0, ["joint_spring"])):
-        stiffness = share * spring.below["ks"]
+        stiffness = share * spring.limits["ks"]
         hidden = HiddenEffect(effect="joint_spring", joint="joint_1", parameters={"stiffness": stiffness})
         document = diagnosed(recorded(robot, 2, hidden, trajectory="emps_1", repeats=1), robot).document
         assert [f.effect for f in document.findings] == found, share

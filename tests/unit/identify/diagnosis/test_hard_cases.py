@@ -68,8 +68,10 @@ def test_a_link_that_swings_beyond_the_bandwidth_is_found_where_measured_positio
     errors = told["gap"]["validation"]
     assert errors["after"]["all"] > errors["before"]["all"]  # what makes it hard
     # Without the noise of the derivatives it is nearer, and that is what is said of it.
-    assert found["evidence"]["gap_foretold"] < 0.97 * found["gap_before"]
-    assert told["simulated"]["torque_foretold"]["joint_1"] == pytest.approx(found["evidence"]["gap_foretold"])
+    assert found["evidence"]["gap_without_derivative_noise"] < 0.97 * found["gap_before"]
+    assert told["simulated"]["torque_without_derivative_noise"]["joint_1"] == pytest.approx(
+        found["evidence"]["gap_without_derivative_noise"]
+    )
 
 
 @pytest.mark.parametrize("run", [2, 5])
@@ -103,7 +105,7 @@ def test_a_coupling_has_to_account_for_both_of_its_joints(strength: str, tmp_pat
     assert "joint_4" in {rest["joint"] for rest in told["unexplained"]}
     assert told["verdict"] == "unexplained"
     (other,) = (found for found in told["considered"] if found["effect"] == "coupling_friction")
-    assert "torque of joint_3 at joint_4" in other["evidence"]["better_without_name"]
+    assert "torque of joint_3 at joint_4" in other["evidence"]["better_unnamed_dependences"]
 
 
 @pytest.mark.parametrize(
@@ -115,7 +117,7 @@ def test_friction_for_moments_at_random_times_is_no_noise(case: str, tmp_path: P
     assert hidden == {}
     assert told["verdict"] == "unexplained"
     (rest,) = told["unexplained"]
-    assert rest["varies_with"] == "time, in bursts"
+    assert rest["varies_with"] == "transients"
     assert rest["joint"] == case.split()[2]
 
 

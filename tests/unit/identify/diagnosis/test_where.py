@@ -103,7 +103,7 @@ def test_every_map_has_its_own_name_and_a_hint() -> None:
     found, workshop = healthy()
     every = list(maps(found.study, [workshop.motion(s, "simulated") for s in found.study.train]))
     assert len({m.key for m in every}) == len(every)
-    assert {m.kind for m in every} | {"frequency", "motion", "time, in bursts"} == set(HINTS)
+    assert {m.kind for m in every} | {"frequency", "motion", "transients"} == set(HINTS)
     text = hint_of("torque of another joint", "joint_3", "joint_2", "1 N m")
     assert text.startswith("The torque of joint_3 follows that of joint_2: look for")
 

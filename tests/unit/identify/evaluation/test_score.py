@@ -101,24 +101,24 @@ def test_nothing_found_is_missed_unless_the_motion_cannot_show_it() -> None:
     assert not score(case(SPRING, baseline=True), silent, HEALTHY).invisible
 
 
-def test_what_a_diagnosis_says_could_hide_is_no_miss_up_to_the_size_that_it_says() -> None:
+def test_an_effect_below_its_detection_limit_is_no_miss() -> None:
     silent = record(before=8.1, after=8.1, verdict="no_gap")
     silent["truth"] = [{"ks": 3.0}]
     for below, excused in ((3.1, True), (2.9, False)):
-        entry = {"effect": "joint_spring", "joint": "joint_2", "other": None, "below": {"ks": below}}
-        silent["document"]["could_hide"] = [entry]
+        entry = {"effect": "joint_spring", "joint": "joint_2", "other": None, "limits": {"ks": below}}
+        silent["document"]["detection_limits"] = [entry]
         assert score(case(SPRING), silent, HEALTHY).invisible is excused
-    entry["joint"], entry["below"] = "joint_3", {"ks": 10.0}
+    entry["joint"], entry["limits"] = "joint_3", {"ks": 10.0}
     assert not score(case(SPRING), silent, HEALTHY).invisible
     silent["truth"], entry["joint"] = [{}], "joint_2"
     assert not score(case(SPRING), silent, HEALTHY).invisible
     # Another name in its place is wrong, whatever could hide.
     other = record(finding("cogging_torque", "joint_2"), truth=[{"ks": 3.0}])
-    other["document"]["could_hide"] = [entry]
+    other["document"]["detection_limits"] = [entry]
     assert not score(case(SPRING), other, HEALTHY).invisible
     # One of a pair is found, the other could hide.
     half = record(finding("coupling_friction", "joint_4", "joint_5"), truth=[{"ks": 3.0}, {}])
-    half["document"]["could_hide"] = [entry]
+    half["document"]["detection_limits"] = [entry]
     assert score(case(SPRING, SHAFT, kind="pair"), half, HEALTHY).invisible
 
 
@@ -150,11 +150,11 @@ def test_what_findings_change_counts_without_the_noise_of_measured_derivatives()
     """An elastic joint: measured motion differentiated four times makes the right model's error larger."""
     found = record(finding("joint_spring", "joint_2"), before=10.0, after=11.0)["document"]
     assert (closed_share(case(SPRING), found, HEALTHY["document"]) or 0.0) < 0.0
-    found["simulated"] = {"torque_foretold": {f"joint_{k}": 8.0 for k in range(1, 7)}}
+    found["simulated"] = {"torque_without_derivative_noise": {f"joint_{k}": 8.0 for k in range(1, 7)}}
     assert closed_share(case(SPRING), found, HEALTHY["document"]) == pytest.approx(1.0)
     # Where it is measured motion that leaves less, that counts.
     found["gap"] = record(before=10.0, after=82.0**0.5)["document"]["gap"]
-    found["simulated"]["torque_foretold"]["joint_2"] = 9.5
+    found["simulated"]["torque_without_derivative_noise"]["joint_2"] = 9.5
     assert closed_share(case(SPRING), found, HEALTHY["document"]) == pytest.approx(0.5)
 
 

@@ -54,7 +54,9 @@ def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: D
     told = diagnosis.document.simulated
     assert told is not None
     assert "Simulated closed loop" in diagnosis_report(diagnosis, diagnosis.document)
-    partly = diagnosis.document.model_copy(update={"simulated": {"torque_foretold": told["torque_foretold"]}})
+    partly = diagnosis.document.model_copy(
+        update={"simulated": {"torque_without_derivative_noise": told["torque_without_derivative_noise"]}}
+    )
     page = diagnosis_report(diagnosis, partly)
     assert "Simulated closed loop" not in page
     assert "Where model and data disagree" in page
