@@ -248,14 +248,30 @@ def _signal_notes(experiments: list[Experiment], robot: RobotConfig) -> list[str
 
 
 def _rate_notes(recording: Recording) -> list[str]:
-    samples = recording.samples
+    """Notes on a SYNC rate that differs from the nominal one by the receive times.
+
+    A SYNC producer that was held up moves its time grid by whole periods and counts them (``sync_skipped_periods``).
+    This delay is no error of a clock. It matters on a physical bus, where the arm goes on moving meanwhile; a virtual
+    arm advances by one period per SYNC.
+    """
+    samples, nominal = recording.samples, recording.sample_rate_hz
     elapsed = float(samples.t_ns[-1] - samples.t_ns[0]) * 1e-9
     if elapsed <= 0:
         return []
-    rate = float(samples.sync[-1] - samples.sync[0]) / elapsed
-    if abs(rate / recording.sample_rate_hz - 1.0) > RATE_TOLERANCE:
-        return [
-            f"received at {rate:.1f} samples/s, configured are {recording.sample_rate_hz:.1f}: "
+    span = float(samples.sync[-1] - samples.sync[0]) / nominal
+    skipped = recording.counters.get("sync_skipped_periods", 0) / nominal
+    held_up = min(max(elapsed - span, 0.0), skipped)
+    notes = []
+    if abs(span / (elapsed - held_up) - 1.0) > RATE_TOLERANCE:
+        notes.append(
+            f"received at {span * nominal / elapsed:.1f} samples/s, configured are {nominal:.1f}: "
             "SYNC or the receiving clock is off"
-        ]
-    return []
+        )
+    session = recording.session
+    virtual = session is not None and all(bus.bitrate is None for bus in session.all_buses)
+    if held_up > RATE_TOLERANCE * span and not virtual:
+        notes.append(
+            f"SYNC stood still for {held_up:.2f} s in all: the capturing machine was too busy, "
+            "and samples around these times are not evenly spaced"
+        )
+    return notes

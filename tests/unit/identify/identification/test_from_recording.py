@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from armident.configs import DataError, RobotConfig, load_robot
+from armident.configs import DataError, RobotConfig, load_robot, load_session
 from armident.daq.recording import Field, Mark, Recording, Stream
 from armident.identify.identification.from_recording import MAX_MISSING_SHARE, experiments_from_recording
 
@@ -180,3 +181,35 @@ def test_counters_that_disagree_with_the_rows_are_refused(tx40: RobotConfig) -> 
     recording = replace(recording_of(tx40), counters={"samples.rows": 10_001})
     with pytest.raises(DataError, match="10001 samples of 'samples', it holds 10000"):
         experiments_from_recording(recording, tx40)
+
+
+def _received(recording: Recording, t_ns: NDArray[np.int64]) -> Recording:
+    samples = replace(recording.samples, t_ns=t_ns)
+    return replace(recording, streams={**recording.streams, "samples": samples})
+
+
+def test_a_wrong_clock_is_noted_whatever_sync_was_skipped(tx40: RobotConfig) -> None:
+    recording = recording_of(tx40)
+    slow = _received(recording, np.rint(recording.samples.t_ns * 1.02).astype(np.int64))
+    for counters in ({}, {"sync_skipped_periods": 50}):
+        _, notes = experiments_from_recording(replace(slow, counters=counters), tx40)
+        assert any(note.startswith("received at 4902.0 samples/s, configured are 5000.0") for note in notes)
+    fast = _received(recording, np.rint(recording.samples.t_ns * 0.98).astype(np.int64))
+    _, notes = experiments_from_recording(replace(fast, counters={"sync_skipped_periods": 500}), tx40)
+    assert any("the receiving clock is off" in note for note in notes)
+
+
+def test_sync_that_stood_still_is_no_wrong_clock_and_does_not_matter_on_a_virtual_bus(tx40: RobotConfig) -> None:
+    recording = recording_of(tx40)
+    times = recording.samples.t_ns + np.where(recording.samples.sync > 4000, 100_000_000, 0)
+    held_up = replace(_received(recording, times), counters={"sync_skipped_periods": 500})
+    session = load_session("tx40_cell.yaml")
+    assert session.bus.bitrate is None
+    _, notes = experiments_from_recording(replace(held_up, session=session), tx40)
+    assert not [note for note in notes if "clock" in note or "SYNC" in note]
+    physical = session.model_copy(update={"bus": session.bus.model_copy(update={"bitrate": 1_000_000})})
+    _, notes = experiments_from_recording(replace(held_up, session=physical), tx40)
+    assert [note for note in notes if "clock" in note or "SYNC" in note] == [
+        "SYNC stood still for 0.10 s in all: the capturing machine was too busy, "
+        "and samples around these times are not evenly spaced"
+    ]
