@@ -1,1 +1,1 @@
-"""The effects a rigid model with symmetric friction can lack, and the terms they add to it."""
+"""Catalogue of effects beyond a rigid model with symmetric friction, and the model terms that they add."""

@@ -1,4 +1,4 @@
-"""Effects of drives and encoders: what they report is not what they do."""
+"""Effects of drives and encoders: reported signals differ from the true ones."""
 
 from collections.abc import Sequence
 
@@ -29,17 +29,17 @@ def _gain_numbers(motion: Motion, place: Place) -> Array:
 
 
 def _saturation(motion: Motion, place: Place) -> Array:
-    """The first term of any odd curve beyond the straight line: the share lost grows with the square of the torque."""
+    """Return the cubic term of an odd torque curve: the share lost grows with the square of the torque."""
     torque = motion.motor_torque[:, place.joint]
-    # By the limit of the joint, so that the parameter is the same in every motion.
+    # Normalised by the torque limit, so that the parameter does not depend on the motion.
     loss = torque * (torque / motor_limit(motion.model.robot, place.joint)) ** 2
     return motion.of_motor(place.joint, loss)
 
 
 def _unsaturated(recorded: Array, at: Recorded, loss: float) -> Array:
-    """Torques (N,) that currents give whose torque would be the recorded: ``i / sqrt(1 + 2 loss (i / limit)^2)``.
+    """Return the true torques (N,) of recorded ones: ``i / sqrt(1 + 2 loss (i / limit)^2)``.
 
-    Sample by sample, as what a controller makes of the noise of its encoder is bent with the rest.
+    Sample by sample: the saturation acts on the noise that the controller adds, too.
     """
     given: Array = recorded / np.sqrt(1.0 + 2.0 * max(loss, 0.0) * (recorded / at.limit) ** 2)
     return given
@@ -54,14 +54,14 @@ def _bandwidth(motion: Motion, place: Place) -> Array:
 
 
 def _earlier(recorded: Array, at: Recorded, delay: float) -> Array:
-    """Recorded torques (N,) at the time that they belong to."""
+    """Return the recorded torques (N,) shifted to the instants at which they acted."""
     t = at.dt * np.arange(recorded.size)
     early: Array = np.interp(t + delay, t, recorded)
     return early
 
 
 def _lagging(recorded: Array, at: Recorded, lag: float) -> Array:
-    """What a motor makes of the commands (N,) that are recorded: ``1 / (1 + lag s)``, from rest (Tustin)."""
+    """Return the torques (N,) of recorded commands after a first-order lag ``1 / (1 + lag s)``, from rest (Tustin)."""
     if lag <= 0.0:
         return recorded
     ratio = 2.0 * lag / at.dt
@@ -71,12 +71,12 @@ def _lagging(recorded: Array, at: Recorded, lag: float) -> Array:
 
 
 def _within_a_sample(values: Array, dt: float) -> bool:
-    """Whether a torque of one instant may as well be that of the next: drives differ in what they latch when."""
+    """Return True for delays below a sampling period: drives differ in the instant at which they latch signals."""
     return bool(np.all(np.abs(values) < dt))
 
 
 def _eccentricity(motion: Motion, place: Place, *, harmonic: float) -> Array:
-    """Measured positions are ``q + c cos(h q) + s sin(h q)``: the real ones move by as much less."""
+    """Return columns for measured positions ``q + c cos(h q) + s sin(h q)``, linearised in ``c`` and ``s``."""
     j = place.joint
     angle, w, a = harmonic * motion.q[:, j], harmonic * motion.qd[:, j], harmonic * motion.qdd[:, j]
     c, s = np.cos(angle), np.sin(angle)
@@ -85,7 +85,7 @@ def _eccentricity(motion: Motion, place: Place, *, harmonic: float) -> Array:
 
 
 def rounds(motion: Motion, joint: int) -> Sequence[float]:
-    """Once and twice per turn of the joint and of its motor; of a prismatic axis wave numbers of its travel."""
+    """Return harmonics: one and two per turn of joint and motor; for a prismatic axis wave numbers, rad/m."""
     if motion.model.robot.joints[joint].type == "prismatic":
         resolution = np.pi / float(motion.span[joint])
         return [float(resolution * k) for k in (*np.arange(2.0, 16.0, 0.5), *range(16, 81))]
@@ -97,7 +97,7 @@ EFFECTS = (
     Effect(
         name="drive_gain_error",
         title="a wrong torque constant",
-        says="a drive gives another torque per ampere than configured: wrong data, weak magnets, a changed drive",
+        says="the torque per ampere of a drive differs from its configuration: wrong data, weak magnets, a new drive",
         reference="Gautier, Briot 2014, IEEE Trans. Automatic Control 59(10), Global identification of drive gains",
         linear=(Linear("gain_error", ("", ""), bounds=(-0.6, 1.5)),),
         columns=_gain,
@@ -112,7 +112,7 @@ EFFECTS = (
         name="drive_gain_saturation",
         title="a torque constant that falls with current",
         says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost "
-        "at the joint's torque limit as far as it grows with the square of the torque",
+        "at the torque limit of the joint, and grows with the square of the torque",
         reference="Leonhard 2001, Control of Electrical Drives, chapter 5",
         linear=(Linear("gain_loss", ("", ""), sign=1),),
         columns=_saturation,
@@ -124,7 +124,7 @@ EFFECTS = (
     ),
     Effect(
         name="time_delay",
-        title="torques that are recorded late",
+        title="a delay of the recorded torque",
         says="the reported torque belongs to a position that was reported earlier: a filter or a queue in the drive",
         reference="Brunot 2017, section 2.3.1",
         linear=(Linear("delay", ("s", "s"), sign=1),),
@@ -138,9 +138,9 @@ EFFECTS = (
     ),
     Effect(
         name="actuator_bandwidth",
-        title="torque that lags behind the command",
-        says="the reported torque is a command that the motor follows late: a slow current loop; positions that are "
-        "reported late look the same",
+        title="a slow current loop",
+        says="the reported torque is a command that the motor follows with a first-order lag: a slow current loop; a "
+        "delay of the reported position has the same effect",
         reference="Leonhard 2001, Control of Electrical Drives, chapter 7",
         linear=(Linear("lag", ("s", "s"), sign=1),),
         columns=_bandwidth,
@@ -153,8 +153,8 @@ EFFECTS = (
     ),
     Effect(
         name="encoder_eccentricity",
-        title="an encoder that runs out of true",
-        says="the measured position has an error that repeats with the turn: an encoder disc mounted off centre",
+        title="an eccentric encoder",
+        says="the measured position has an error that is periodic in the angle: an encoder disc mounted off centre",
         reference="Armstrong 1998, Mechanism and Machine Theory; de Silva 2007, Sensors and Actuators, chapter 5",
         linear=(Linear("ecc", ("rad", "m")), Linear("ecs", ("rad", "m"))),
         shapes=(Shape("harmonic", ("per rad of the joint", "rad/m"), rounds, continuous=(False, True)),),

@@ -1,4 +1,4 @@
-"""What an entry of the catalogue is."""
+"""Entry of the catalogue: `Effect`, its linear parameters (`Linear`) and nonlinear ones (`Shape`)."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -15,33 +15,33 @@ from armident.identify.robot.motion import Motion
 Array = NDArray[np.float64]
 
 Scope = Literal["joint", "motor", "pair", "arm"]
-"""Where an effect sits: in one joint, in one motor (which a coupled transmission joins to several joints), between two
-joints, or in the arm as a whole (its stanza then names the first joint, a payload the last one)."""
+"""Location of an effect: one joint, one motor (a coupled transmission acts on several joints), a pair of joints, or the
+whole arm (its entry in the configuration then names the first joint, that of a payload the last one)."""
 
 DOUBT = 2.0
-"""Standard deviations by which a parameter must have the wrong sign to be against physics."""
+"""Standard deviations by which a parameter must violate its sign or bounds to be rejected."""
 
 
 @dataclass(frozen=True)
 class Linear:
-    """A parameter that the torque is proportional to.
+    """Linear parameter of an effect: the torque is proportional to it.
 
     Parameters
     ----------
     name
-        In the robot configuration; in results the number of the joint is appended.
+        Name in the robot configuration; results append the number of the joint.
     unit
-        Of a revolute joint; and of a prismatic one.
+        Units at a revolute and at a prismatic joint.
     sign
-        +1 or -1 where physics knows it, 0 where both are possible.
+        +1 or -1 where physics determines the sign, 0 otherwise.
     bounds
-        Values beyond which the effect would be something else.
+        Lowest and highest plausible value.
     through
-        The nonlinear parameter without which (where it is zero) there is no such parameter, if there is one. A search
-        tries the effect without it.
+        Nonlinear parameter that this one requires: it is absent where that one is zero. The search first tries the
+        effect without it.
     replaces
-        The rigid parameter of the joint whose part it takes over then: the search gives it to an effect where it takes
-        over all of that, and data kept back are nearer with it.
+        Rigid parameter of the joint that this one absorbs. The search adds it where it absorbs all of that parameter
+        and reduces the held-out error.
     """
 
     name: str
@@ -54,24 +54,24 @@ class Linear:
 
 @dataclass(frozen=True)
 class Shape:
-    """A parameter that the torque depends on in another way: found by search, then refined.
+    """Nonlinear parameter of an effect: found by a grid search, then refined.
 
     Parameters
     ----------
     name, unit
-        In the robot configuration; the unit of a revolute and of a prismatic joint.
+        Name in the robot configuration; units at a revolute and at a prismatic joint.
     grid
-        Values worth trying on a motion of a joint, increasing, in the unit of the parameter.
+        ``(motion, joint)`` to the increasing values to try, in the unit of the parameter.
     continuous
-        Whether values between those of the grid make sense, for a revolute and for a prismatic joint; a harmonic of a
-        turn is a whole number, and nobody has said where on its travel a screw turns round.
+        For a revolute and for a prismatic joint: True if values between those of the grid are meaningful. A harmonic of
+        a turn is an integer; the pitch of a prismatic axis is unknown.
     default
-        What a robot configuration means that does not give it; ``None``: it must.
+        Value where the configuration gives none; ``None``: the configuration must give one.
     closer
-        Values to try beside those of the grid once the simulated loop has the effect in it: what a rigid arm's motion
-        does not excite says nothing there.
+        Additional values to try once the simulated loop contains the effect: the motion of a rigid arm does not excite
+        them.
     movable
-        Whether it is moved with the others once the effect is found, although the search takes it from its grid.
+        True if it is refined with the others, although the search takes it from its grid.
     """
 
     name: str
@@ -85,69 +85,71 @@ class Shape:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What is known of a motor whose torque was recorded: the sampling period, s, and its largest torque, N m or N."""
+    """Recorded torque of a motor: sampling period, s, and largest torque, N m or N."""
 
     dt: float
     limit: float
 
 
 def motor_limit(robot: RobotConfig, motor: int) -> float:
-    """Largest torque of a motor at its shaft, N m or N."""
+    """Return the largest torque of a motor at its shaft, N m or N."""
     return float(robot.joints[motor].limits.torque / np.abs(robot.transmission_matrix[motor]).max())
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect: the torque it adds to what the drives report is ``columns(motion, joint, **shapes) @ linear``.
+    """One effect: its torque in the reported joint torques is ``columns(motion, place, **shapes) @ linear``.
 
     Parameters
     ----------
     name
-        In ``diagnosis.json`` and in the ``effects`` of a robot configuration.
+        Name in ``diagnosis.json`` and in the ``effects`` of a robot configuration.
     title, says
-        A name and an explanation in plain language, for a plant engineer.
+        Short name and description for a plant engineer.
     reference
-        Where the form comes from.
+        Source of the functional form.
     linear
         Linear parameters, one per column.
     columns
-        ``(motion, place, **shapes)`` to an array (N, k) of the torques (N m or N) of joint ``place.joint``, or
-        (N, n, k) of all joints, per unit of the linear parameters.
+        ``(motion, place, **shapes)`` to the torques per unit of the linear parameters, N m or N: an array (N, k) for
+        joint ``place.joint``, or (N, n, k) for all joints.
     needs
-        What a recording must contain for the effect to be visible, in words.
+        Motion or data that make the effect visible, in words.
     shapes
         Nonlinear parameters.
     scope
         See `Scope`.
     visible
-        Why the effect cannot show in a motion whatever its size, or ``None``; the motion is the model's own.
+        ``(motion, place)`` to the reason why the motion cannot show the effect whatever its size, or ``None``. The
+        motion is the simulated one.
     numbers
-        Change of the base parameters (b, k) per unit of the linear ones, where the effect is nothing but other numbers
-        in the same model: it shows against a baseline only, and ``columns`` follow from it.
+        Jacobian (b, k) of the base parameters with respect to the linear ones, for an effect that only changes
+        parameters of the same model. It is visible against a baseline only; ``columns`` follow from the Jacobian.
     together
-        Whether several of one effect on one joint are one finding (the harmonics of a periodic torque).
+        True if several instances at one joint make one finding (harmonics of a periodic torque).
     excitation
-        What a trajectory that is to show the effect must have plenty of; see `armident.identify.excitation.design`.
+        Keywords of the motion that excites the effect, see `armident.identify.excitation.design`.
     rewires
-        Whether the effect is an exchange of signals instead of a torque:
-        `armident.identify.effects.wiring` undoes it in the recording, and there are no columns.
+        True if the effect permutes signals or changes their signs instead of adding a torque.
+        `armident.identify.effects.wiring` corrects the recording, and there are no columns.
     predicts
-        Whether the columns depend on the torques that the model predicts, and so on its parameters.
+        True if the columns depend on the predicted torque, and so on the model's parameters.
     share
-        Whether its linear parameter is a share of these torques: fits are repeated until it is one of those that the
-        model with the effect predicts.
+        True if its linear parameter scales the predicted torque. The fit is then iterated until parameter and torque
+        agree.
     undo
-        ``(recorded, at, value)`` to the torque (N,) that a motor really had where the recording says otherwise, for the
-        one linear parameter. The columns are what the first order of it makes of the model's torques, which at measured
-        signals hold more noise than effect; a recording put right holds none that it did not have.
+        ``(recorded, at, value)`` to the true torque (N,) of a motor, for the one linear parameter. The columns are its
+        first-order expansion, whose noise at measured signals exceeds the effect; the corrected recording has no
+        added noise.
     sudden
-        Whether it makes the arm leap, at instants that no simulation meets to the sample: columns at measured signals
-        are their own instruments then, and have to explain more than feedback lets a term without merit explain.
+        True if the arm's motion has jumps at instants that a simulation does not reproduce to the sample. The columns
+        at measured signals are then their own instruments, and a higher threshold accounts for the feedback bias.
     physical
-        Whether physics allows linear parameters (k,) at given nonlinear ones, where signs and bounds do not say it all.
+        ``(values, shapes)`` to True if linear parameters (k,) are physically possible at given nonlinear ones, beyond
+        signs and bounds.
     negligible
-        Whether linear parameters (k,) are a convention of sampling instead of a fault, at the sampling period of the
-        recording in s; ``None``: never.
+        ``(values, dt)`` to True if linear parameters (k,) are within the sampling convention at the sampling period
+        ``dt``, s; ``None``: never.
     """
 
     name: str
@@ -172,9 +174,9 @@ class Effect:
     negligible: Callable[[Array, float], bool] | None = None
 
     def allows(self, values: Array, std: Array, shapes: Mapping[str, float]) -> bool:
-        """Whether linear parameters (k,) at given nonlinear ones have signs and sizes that physics allows.
+        """Return True if linear parameters (k,) with standard deviations (k,) are physically possible.
 
-        Signs and sizes are wrong if they are wrong beyond doubt: of several parameters some may be nothing but noise.
+        Signs and bounds may be violated by `DOUBT` standard deviations: single parameters may be zero.
         """
         if self.physical is not None and not self.physical(values, shapes):
             return False
@@ -185,24 +187,24 @@ class Effect:
 
     @property
     def essence(self) -> "Effect":
-        """The effect without the parameters that it may be without."""
+        """The effect without its optional linear parameters."""
         kept = [k for k, linear in enumerate(self.linear) if linear.through is None]
         if len(kept) == len(self.linear):
             return self
         return replace(self, linear=tuple(self.linear[k] for k in kept), columns=partial(_some, self.columns, kept))
 
     def refinable(self, robot: RobotConfig, place: "Place") -> tuple[bool, ...]:
-        """Which of the nonlinear parameters may lie between the values of their grids at a place."""
+        """Return, for each nonlinear parameter, True if it may lie between the values of its grid at a place."""
         prismatic = robot.joints[place.joint].type == "prismatic"
         return tuple(shape.continuous[prismatic] for shape in self.shapes)
 
     def movable(self, robot: RobotConfig, place: "Place", shapes: Mapping[str, float]) -> list[str]:
-        """Names of the nonlinear parameters to be moved once it is found: none at zero, which no factor moves."""
+        """Return the names of the nonlinear parameters to refine; those at zero stay, as refinement is by factors."""
         between = zip(self.shapes, self.refinable(robot, place), strict=True)
         return [s.name for s, may in between if (may or s.movable) and shapes[s.name] != 0.0]
 
     def torque(self, motion: Motion, place: "Place", shapes: Mapping[str, float]) -> Array:
-        """Columns of all joints, shape (N, n, k)."""
+        """Return the columns of all joints, shape (N, n, k)."""
         columns = self.columns(motion, place, **shapes)
         if columns.ndim == 3:
             return columns
@@ -212,13 +214,13 @@ class Effect:
 
 
 def _some(columns: Callable[..., Array], kept: Sequence[int], motion: Motion, place: "Place", **shapes: float) -> Array:
-    """Some of the columns of an effect."""
+    """Return some of the columns of an effect."""
     return columns(motion, place, **shapes)[..., kept]
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where in an arm an effect sits; joints count from 0, ``other`` is the second one of a pair."""
+    """Location of an effect in an arm: joint index from 0; ``other`` is the second joint of a pair."""
 
     joint: int
     other: int | None = None

@@ -1,4 +1,4 @@
-"""Friction that is more than ``fv qd + fc sign(qd)``."""
+"""Friction effects beyond viscous and Coulomb friction, ``fv qd + fc sign(qd)``."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,12 +14,12 @@ Array = NDArray[np.float64]
 
 TORQUE = ("N m", "N")
 LATE = 0.1
-"""Share of a joint's speed limit from which on friction may grow faster than speed: lubricants do not churn at rest."""
+"""Lowest knee, over the speed limit, at which nonlinear viscous friction may be negative (shear thickening)."""
 VISCOUS = ("N m s/rad", "N s/m")
 
 
 def speeds(motion: Motion, joint: int) -> Sequence[float]:
-    """Characteristic speeds from a hundredth of the joint's top speed to a third of it."""
+    """Return characteristic speeds from a hundredth of the joint's top speed to a third of it, rad/s or m/s."""
     top = float(motion.top_speed[joint])
     return [float(v) for v in top * np.geomspace(0.01, 0.35, 8)]
 
@@ -36,40 +36,40 @@ def _asymmetric_coulomb(motion: Motion, place: Place, *, velocity: float = 0.0) 
 
 
 def films(motion: Motion, joint: int) -> Sequence[float]:
-    """Speeds from that of the model's smoothed sign to a twentieth of the joint's top speed."""
+    """Return speeds from that of the model's smoothed sign to a twentieth of the joint's top speed, rad/s or m/s."""
     least, most = 1 / motion.model.smoothing, 0.05 * float(motion.top_speed[joint])
     return [float(v) for v in np.geomspace(least, most, 5)] if most > least else [least]
 
 
 def _stribeck(motion: Motion, place: Place, *, velocity: float, displacement: float = 0.0) -> Array:
     j = place.joint
-    # So slow that the model's smoothed sign is only on its way, while a bristle has long been bent.
+    # At speeds where the smoothed sign has not saturated yet, the bristle already has.
     side = dahl(motion.q[:, j], displacement) if displacement > 0.0 else motion.sign[:, j]
-    # The bristle carries the model's dry friction, too: what of it the smoothed sign has no part in any more.
+    # The second column moves the model's Coulomb friction from the smoothed sign to the bristle.
     return np.stack([np.exp(-((motion.qd[:, j] / velocity) ** 2)) * side, side - motion.sign[:, j]], axis=1)
 
 
 def bristles(motion: Motion, joint: int) -> Sequence[float]:
-    """Displacements from three millionths of the joint's range of motion to a hundred times that."""
+    """Return displacements from three millionths of the joint's range of motion to a hundred times that, rad or m."""
     return [float(d) for d in motion.span[joint] * np.geomspace(3e-6, 3e-4, 4)]
 
 
 def _nonlinear_viscous(motion: Motion, place: Place, *, knee: float) -> Array:
     j = place.joint
-    # Measured in the joint's own speeds, so that the parameter is a torque whatever the knee.
+    # Normalised by the speed limit, so that the parameter is a torque for any knee.
     share = motion.qd[:, j] / motion.model.robot.joints[j].limits.velocity
     curved: Array = np.arcsinh(share / knee) / np.arcsinh(1.0 / knee)
     return curved[:, None]
 
 
 def knees(motion: Motion, joint: int) -> Sequence[float]:
-    """From a hundredth of the joint's top speed to a third of it, as shares of its speed limit."""
+    """Return knees from a hundredth of the joint's top speed to a third of it, as shares of its speed limit."""
     limit = motion.model.robot.joints[joint].limits.velocity
     return [speed / limit for speed in speeds(motion, joint)]
 
 
 def _rises_from_rest(values: Array, shapes: Mapping[str, float]) -> bool:
-    """A negative one falls steeply from standstill where its knee is early: extra friction at low speed."""
+    """Refuse a negative value with a low knee: that shape is extra friction at low speed (Stribeck)."""
     return bool(shapes["knee"] >= LATE or values[0] >= 0.0)
 
 
@@ -85,9 +85,9 @@ def _presliding(motion: Motion, place: Place, *, displacement: float) -> Array:
 
 @compiled
 def dahl(q: Array, displacement: float) -> Array:
-    """Dahl's friction over its level along positions ``q`` (N,), exactly between samples.
+    """Return Dahl's friction over its level along positions ``q`` (N,), integrated exactly between samples.
 
-    ``dz/dq = (1 - z sign(qd)) / displacement``: after a reversal it approaches its level as an exponential of the way.
+    ``dz/dq = (1 - z sign(qd)) / displacement``: after a reversal it approaches its level exponentially in the distance.
     """
     z = np.empty(q.size)
     state = 0.0
@@ -107,7 +107,7 @@ def _position_dependent(motion: Motion, place: Place, *, period: float) -> Array
 
 
 def turns(motion: Motion, joint: int) -> Sequence[float]:
-    """Periods in the joint's position: whole fractions of a turn, or of the travel of a prismatic axis."""
+    """Return periods in the joint's position: integer fractions of a turn, or of the travel of a prismatic axis."""
     if motion.model.robot.joints[joint].type == "revolute":
         return [2 * np.pi / k for k in (4, 3, 2, 1)]
     low, high = motion.model.robot.joints[joint].limits.position
@@ -115,14 +115,14 @@ def turns(motion: Motion, joint: int) -> Sequence[float]:
 
 
 def _drift(motion: Motion, place: Place, *, time_constant: float) -> Array:
-    """Friction goes from half a change below to half a change above the model's, as a warming body does."""
+    """Return columns of an exponential change of friction, from half the change below to half of it above the mean."""
     j, whole = place.joint, max(motion.duration, motion.dt * motion.samples)
     progress = np.expm1(-motion.t / time_constant) / np.expm1(-whole / time_constant) - 0.5
     return np.stack([motion.sign[:, j] * progress, motion.qd[:, j] * progress], axis=1)
 
 
 def warming(motion: Motion, joint: int) -> Sequence[float]:
-    """Time constants from a tenth of the recordings to three times all of them: hardly another curve than a line."""
+    """Return time constants from a tenth of the recorded time to three times it, s; longer ones are linear in time."""
     whole = max(motion.duration, motion.dt * motion.samples)
     return [whole * share for share in (0.1, 0.3, 1.0, 3.0)]
 
@@ -142,8 +142,8 @@ def _coupling(motion: Motion, place: Place) -> Array:
 EFFECTS = (
     Effect(
         name="asymmetric_viscous_friction",
-        title="viscous friction that differs between the directions",
-        says="friction grows with speed more in one direction than in the other: a worn or one-sidedly loaded gear",
+        title="direction-dependent viscous friction",
+        says="viscous friction is higher in one direction than in the other: a worn or one-sidedly loaded gear",
         reference="Janot, Gautier, Brunot 2019, Data set and reference models of EMPS",
         linear=(Linear("fva", VISCOUS),),
         columns=_asymmetric_viscous,
@@ -151,9 +151,9 @@ EFFECTS = (
     ),
     Effect(
         name="asymmetric_coulomb_friction",
-        title="dry friction that differs between the directions",
-        says="dry friction differs between the two directions of motion, beyond a constant offset, and builds up with "
-        "the speed",
+        title="direction-dependent Coulomb friction",
+        says="Coulomb friction differs between the two directions of motion; the difference vanishes at standstill, "
+        "unlike a constant offset",
         reference="Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)",
         linear=(Linear("fca", TORQUE),),
         shapes=(Shape("velocity", ("rad/s", "m/s"), films, default=0.0),),
@@ -163,8 +163,8 @@ EFFECTS = (
     ),
     Effect(
         name="stribeck_friction",
-        title="extra friction at low speed",
-        says="extra friction at low speed that fades as the joint speeds up: poor or squeezed-out lubricant",
+        title="Stribeck friction",
+        says="additional friction at low speed that decreases with the speed: poor or squeezed-out lubricant",
         reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
         linear=(Linear("fst", TORQUE, sign=1), Linear("fsb", TORQUE, through="displacement", replaces="fc")),
         shapes=(
@@ -177,8 +177,8 @@ EFFECTS = (
     ),
     Effect(
         name="nonlinear_viscous_friction",
-        title="friction curved in speed",
-        says="friction does not grow in proportion to speed: the lubricant thins or churns",
+        title="nonlinear viscous friction",
+        says="friction is not proportional to speed: shear thinning or churning of the lubricant",
         reference="Ree, Ree, Eyring 1958, Ind. Eng. Chem. 50(7)",
         linear=(Linear("fvn", TORQUE),),
         shapes=(Shape("knee", ("", ""), knees),),
@@ -189,8 +189,8 @@ EFFECTS = (
     ),
     Effect(
         name="load_dependent_friction",
-        title="friction in proportion to the load",
-        says="dry friction grows with the torque that the gear transmits",
+        title="load-dependent friction",
+        says="Coulomb friction grows with the torque that the gear transmits",
         reference="Hamon, Gautier, Garrec 2010, IROS, Dynamic identification with load-dependent dry friction",
         linear=(Linear("fcl", ("", ""), sign=1),),
         shapes=(ROTOR,),
@@ -201,8 +201,8 @@ EFFECTS = (
     ),
     Effect(
         name="presliding_friction",
-        title="dry friction that yields before it slides",
-        says="at a reversal dry friction builds up over a small way instead of at once: elastic contacts or seals",
+        title="presliding friction",
+        says="after a reversal Coulomb friction builds up over a small displacement: elastic contacts or seals",
         reference="Dahl 1968, A solid friction model; Canudas de Wit et al. 1995, IEEE TAC 40(3)",
         linear=(Linear("fcd", TORQUE, sign=-1),),
         shapes=(
@@ -218,8 +218,8 @@ EFFECTS = (
     ),
     Effect(
         name="position_dependent_friction",
-        title="friction that varies with the joint's position",
-        says="dry friction differs from one position of the joint to another: a bent shaft, a tight spot, uneven wear",
+        title="position-dependent friction",
+        says="Coulomb friction varies with the position of the joint: a bent shaft, a tight spot, uneven wear",
         reference="Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators",
         linear=(Linear("fpc", TORQUE), Linear("fps", TORQUE)),
         shapes=(Shape("period", ("rad", "m"), turns, continuous=(False, True)),),
@@ -230,8 +230,8 @@ EFFECTS = (
     ),
     Effect(
         name="friction_drift",
-        title="friction that changes while it is recorded",
-        says="friction at the end of the recording is not what it was at its beginning: the gear warms up",
+        title="friction drift",
+        says="friction changes between the beginning and the end of the recording: the gear warms up",
         reference="Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators",
         linear=(Linear("fcdr", TORQUE), Linear("fvdr", VISCOUS)),
         shapes=(Shape("time_constant", ("s", "s"), warming),),
@@ -241,8 +241,8 @@ EFFECTS = (
     ),
     Effect(
         name="coupling_friction",
-        title="friction and inertia shared by two joints",
-        says="two joints share a shaft or gear: what one does costs the other friction and inertia",
+        title="coupling of two joints",
+        says="two joints share a shaft or gear, whose friction and inertia act on both",
         reference="Brunot 2017, equation B.1",
         linear=(
             Linear("iac", ("kg m^2", "kg"), sign=1),

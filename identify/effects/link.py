@@ -1,4 +1,4 @@
-"""Effects of links, springs and mounting."""
+"""Effects of links, springs, payload and mounting."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ def _spring(motion: Motion, place: Place) -> Array:
 
 
 def across(gravity: Array) -> Array:
-    """Two unit vectors at right angles to gravity and to each other, shape (2, 3): x, then y, of an upright arm."""
+    """Return two orthonormal vectors perpendicular to gravity, shape (2, 3): the x and y axes of an upright arm."""
     down = gravity / np.linalg.norm(gravity)
     start = np.eye(3)[int(np.argmin(np.abs(down)))]
     first = start - (start @ down) * down
@@ -24,7 +24,7 @@ def across(gravity: Array) -> Array:
 
 
 def _gravity(motion: Motion, place: Place) -> Array:
-    """The torque is linear in gravity, so a tilt adds the torque of a gravity along the axes across it."""
+    """Return columns of a tilt: the torque is linear in gravity, so they are those of gravity along `across`."""
     model, size = motion.model, float(np.linalg.norm(motion.model.chain.gravity))
     still = np.zeros_like(motion.q)
     theta = motion.standard
@@ -51,7 +51,7 @@ def _payload_numbers(motion: Motion, place: Place) -> Array:
 
 def _rotor(motion: Motion, place: Place) -> Array:
     ratios = motion.model.robot.transmission_matrix[place.joint]
-    # Of the motor, but given at its own joint: the ratio of that joint taken out twice.
+    # The motor's inertia, referred to its own joint: divided by that joint's ratio squared.
     own = ratios[int(np.argmax(np.abs(ratios)))]
     return motion.of_motor(place.joint, motion.qdd @ ratios / own**2)
 
@@ -63,7 +63,7 @@ def _offset_numbers(motion: Motion, place: Place) -> Array:
 
 
 def by_numbers(motion: Motion, change: Array) -> Array:
-    """Columns (N, n, k) of a change (b, k) of the base parameters."""
+    """Return the columns (N, n, k) of a change (b, k) of the base parameters."""
     columns: Array = motion.model.rigid_regressor(motion.q, motion.qd, motion.qdd, sharp_sign=motion.sharp) @ change
     return columns
 
@@ -71,8 +71,8 @@ def by_numbers(motion: Motion, change: Array) -> Array:
 EFFECTS = (
     Effect(
         name="joint_spring",
-        title="a spring on the joint",
-        says="a torque in proportion to the joint's position: a spring, a gravity compensator, a stiff cable harness",
+        title="a spring at the joint",
+        says="a torque proportional to the joint's position: a spring, a gravity compensator, a stiff cable harness",
         reference="Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 9",
         linear=(Linear("ks", ("N m/rad", "N/m")),),
         columns=_spring,
@@ -81,7 +81,7 @@ EFFECTS = (
     ),
     Effect(
         name="payload",
-        title="something mounted on the flange",
+        title="a payload on the flange",
         says="the last link is heavier than in the baseline: a gripper or a workpiece is mounted",
         reference="Gaz, De Luca 2017, IROS, Payload estimation based on identified coefficients of robot dynamics",
         linear=tuple(
@@ -98,8 +98,8 @@ EFFECTS = (
     ),
     Effect(
         name="rotor_inertia",
-        title="a rotor that the model does not know",
-        says="a motor has more inertia than the links explain: a rotor, a brake or a coupling left out of the model",
+        title="an unmodelled rotor inertia",
+        says="a motor has more inertia than the links explain: a rotor, a brake or a coupling is missing in the model",
         reference="Brunot 2017, equation 2.13",
         linear=(Linear("iax", ("kg m^2", "kg"), sign=1),),
         columns=_rotor,
@@ -109,8 +109,8 @@ EFFECTS = (
     ),
     Effect(
         name="gravity_direction",
-        title="the base stands askew",
-        says="the arm feels gravity from another direction than its configuration says: the base is tilted, or hangs",
+        title="a tilted base",
+        says="the direction of gravity differs from the configuration: the base is tilted or hangs",
         reference="Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 12",
         linear=(Linear("tilt_x", ("rad", "rad")), Linear("tilt_y", ("rad", "rad"))),
         columns=_gravity,
@@ -122,8 +122,8 @@ EFFECTS = (
     ),
     Effect(
         name="torque_offset",
-        title="a constant torque",
-        says="a constant torque that the baseline did not have: a drifting current sensor, a brake that drags",
+        title="a torque offset",
+        says="a constant torque that the baseline does not have: a drifting current sensor, a dragging brake",
         reference="Brunot 2017, equation 2.12",
         linear=(Linear("offx", ("N m", "N")),),
         columns=lambda motion, place: by_numbers(motion, _offset_numbers(motion, place)),

@@ -1,4 +1,4 @@
-"""``armident effects``: what a model can have, in a table or as JSON."""
+"""Command ``armident effects``: the effects of the catalogue as a table or as JSON."""
 
 import json
 import sys
@@ -14,28 +14,41 @@ ALWAYS: tuple[tuple[str, str, str], ...] = (
     ("rotor inertia", "ia<joint> (kg m^2, kg)", "where `joints[].rotor_inertia` is true"),
     ("coupling of two joints", "ia<name>, fv<name>, fc<name>", "for every entry of `couplings`"),
 )
-"""Terms that have their own place in a robot configuration: name, parameters, when."""
+"""Terms with a key of their own in the robot configuration: name, parameters, condition."""
+
+FORMER_KEYS = {"says": "description", "shapes": "nonlinear_parameters", "needs": "required_motion"}
+"""Keys of ``armident effects --json`` up to version 0.1 and their new names; both are printed for one release."""
 
 
 def described(effect: Effect) -> dict[str, Any]:
-    """An effect as plain data."""
-    return {
+    """Return the entry of ``armident effects --json`` of an effect."""
+    entry = {
         "name": effect.name,
         "title": effect.title,
-        "says": effect.says,
+        "description": effect.says,
         "scope": effect.scope,
         "parameters": [
-            {"name": p.name, "unit": list(p.unit), "sign": p.sign, "through": p.through, "replaces": p.replaces or None}
+            {"name": p.name, "unit": list(p.unit), "sign": p.sign, "requires": p.through, "absorbs": p.replaces or None}
             for p in effect.linear
         ],
-        "shapes": [{"name": s.name, "unit": list(s.unit), "continuous": list(s.continuous)} for s in effect.shapes],
-        "needs": effect.needs,
+        "nonlinear_parameters": [
+            {"name": s.name, "unit": list(s.unit), "continuous": list(s.continuous)} for s in effect.shapes
+        ],
+        "required_motion": effect.needs,
         "reference": effect.reference,
     }
+    return entry | {old: entry[new] for old, new in FORMER_KEYS.items()}
 
 
 def effects_command(name: str | None, *, as_json: bool) -> None:
-    """Carry out ``armident effects``.
+    """Print the effects of the catalogue.
+
+    Parameters
+    ----------
+    name
+        Name of one effect; ``None``: all.
+    as_json
+        Print JSON instead of a table.
 
     Raises
     ------
@@ -53,13 +66,13 @@ def effects_command(name: str | None, *, as_json: bool) -> None:
     from rich.table import Table
 
     table = Table(title="effects", title_justify="left")
-    for heading in ("effect", "is", "parameters", "at"):
+    for heading in ("effect", "title", "parameters", "scope"):
         table.add_column(heading, overflow="fold")
     for effect in chosen:
         table.add_row(effect.name, effect.title, ", ".join(_parameters(effect)), effect.scope)
     console = Console()
     console.print(table)
-    print("terms with a place of their own in the robot configuration:")
+    print("terms with a key of their own in the robot configuration:")
     for title, parameters, when in ALWAYS:
         print(f"  {title}: {parameters}; {when}")
 
@@ -70,13 +83,13 @@ def _one(effect: Effect) -> None:
         print(f"  {parameter}")
     for linear in effect.linear:
         if linear.through is not None:
-            print(f"{linear.name} is there only with {linear.through}, in the place of {linear.replaces} of the joint;")
-            print(f"  a stanza with `without: [{linear.name}]` leaves {linear.replaces} as it is")
-    print(f"needs: {effect.needs}\nsource: {effect.reference}")
+            print(f"{linear.name} requires {linear.through} and absorbs {linear.replaces} of the joint;")
+            print(f"  `without: [{linear.name}]` in the configuration keeps {linear.replaces}")
+    print(f"required motion: {effect.needs}\nsource: {effect.reference}")
     names = [shape.name for shape in effect.shapes] + [parameter.name for parameter in effect.linear]
     values = [f"{parameter}: ..." for parameter in names]
     other = ", other: joint_2" if effect.scope == "pair" else ""
-    print(f"stanza: {{effect: {effect.name}, joint: joint_1{other}, parameters: {{{', '.join(values)}}}}}")
+    print(f"configuration: {{effect: {effect.name}, joint: joint_1{other}, parameters: {{{', '.join(values)}}}}}")
 
 
 def _parameters(effect: Effect) -> list[str]:

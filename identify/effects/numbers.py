@@ -1,4 +1,4 @@
-"""Changes of numbers that every model has: they show against a baseline only."""
+"""Changes of parameters that every model has: visible against a baseline only."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,8 @@ def _friction(motion: Motion, place: Place) -> Array:
 EFFECTS = (
     Effect(
         name="friction_change",
-        title="friction that is not what it was",
-        says="viscous or dry friction of a joint differs from the baseline: cold or aged grease, a worn gear",
+        title="a change of friction",
+        says="viscous or Coulomb friction of a joint differs from the baseline: cold or aged grease, a worn gear",
         reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
         linear=(Linear("fvx", VISCOUS), Linear("fcx", TORQUE)),
         columns=lambda motion, place: by_numbers(motion, _friction(motion, place)),

@@ -1,4 +1,4 @@
-"""Recordings as they would be without what a robot's effects say of them: wiring, late torques."""
+"""Correction of recordings for effects on signals: wiring, delayed or saturated torques."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,22 +14,29 @@ from armident.identify.experiment import Experiment
 
 
 def of_recording(stanza: Stanza) -> bool:
-    """Whether a stanza is put right in the recordings instead of being a term of the model.
+    """Return True if an effect entry corrects the recordings instead of being a term of the model.
 
-    Mistakes of wiring always are. A torque that is recorded late is where the stanza says how late; where it does not,
-    that is a parameter of the model, to be estimated with the rest.
+    Wiring errors always do. A torque correction (delay, lag, saturation) does if the entry gives its value; otherwise
+    the value is a parameter of the model and estimated with the rest.
     """
     effect = known(stanza.effect)
     return effect.rewires or (effect.undo is not None and bool(stanza.parameters.get(effect.linear[0].name)))
 
 
 def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Experiment]:
-    """The experiments without what the stanzas of a robot say of recordings.
+    """Return the experiments corrected for the effects on signals of a robot's configuration.
+
+    Parameters
+    ----------
+    experiments
+        As recorded.
+    robot
+        Configuration with the effect entries.
 
     Raises
     ------
     ConfigError
-        If a stanza of wiring does not say which signal, or which other joint.
+        If the entry of a wiring error does not name the signal or the other joint.
     """
     experiments = rewired(experiments, robot)
     names = [joint.name for joint in robot.joints]

@@ -1,4 +1,4 @@
-"""All effects there are: ours, and those that other packages bring along."""
+"""Registry of all effects: those of this package and those of plug-ins."""
 
 from functools import cache
 from importlib.metadata import entry_points
@@ -8,17 +8,17 @@ from armident.identify.effects import drive, friction, link, numbers, transmissi
 from armident.identify.effects.effect import Effect
 
 ENTRY_POINTS = "armident.effects"
-"""Group of the entry points by which a package adds effects: each names an `Effect`, or a sequence of them."""
+"""Entry-point group of plug-ins: each entry names an `Effect` or a sequence of them."""
 
 
 @cache
 def catalogue() -> dict[str, Effect]:
-    """All effects by name, ours first.
+    """Return all effects by name, those of this package first.
 
     Raises
     ------
     ConfigError
-        If an entry point cannot be loaded, is not an effect, or takes a name that is taken.
+        If an entry point cannot be loaded, is not an effect, or repeats a name.
     """
     modules = (friction, link, transmission, drive, numbers, wiring)
     ours = [effect for module in modules for effect in module.EFFECTS]
@@ -33,18 +33,23 @@ def catalogue() -> dict[str, Effect]:
             if not isinstance(effect, Effect):
                 raise ConfigError(f"{where}: expected an Effect, got {type(effect).__name__}")
             if effect.name in found:
-                raise ConfigError(f"{where}: there is an effect {effect.name!r} already")
+                raise ConfigError(f"{where}: an effect {effect.name!r} exists already")
             found[effect.name] = effect
     return found
 
 
 def known(name: str) -> Effect:
-    """Look an effect up.
+    """Return the effect of a name.
+
+    Parameters
+    ----------
+    name
+        Name in the catalogue.
 
     Raises
     ------
     ConfigError
-        Naming the effects there are.
+        If there is no such effect; the message lists all.
     """
     effects = catalogue()
     if name not in effects:

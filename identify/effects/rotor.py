@@ -1,4 +1,4 @@
-"""What of a joint's inertia the gear does not hand on: the rotor, where a rigid motion cannot tell it from the link."""
+"""Rotor inertia as a nonlinear parameter, for joints where a rigid motion cannot separate it from the link."""
 
 from collections.abc import Sequence
 
@@ -8,17 +8,17 @@ from armident.identify.effects.effect import Shape
 from armident.identify.robot.motion import Motion
 
 SHARES = (0.0, 0.25, 0.5, 0.75)
-"""Of the least inertia that a joint has along a motion."""
+"""Rotor inertias to try, over the least inertia of the joint along the motion."""
 
 APART = 0.05
-"""Share of the load's size that must not go with the acceleration for the rotor to make a difference but of scale."""
+"""Least share of the load that is not proportional to the acceleration; below it the rotor only scales the effect."""
 
 
 def rotors(motion: Motion, joint: int) -> Sequence[float]:
-    """Rotor inertias beyond the model's own: none where it is identified, else shares of what passes for the link's.
+    """Return the rotor inertias to try, kg m^2 or kg: zero where the model has one, else shares of the link's inertia.
 
-    In the base parameters of joints with a constant axis, and of models without rotors, the rotor is part of the link;
-    load and elastic or loose gears feel the difference, unless all the load there is goes with the acceleration.
+    The base parameters of joints with a constant axis, and of models without rotors, contain the rotor in the link. It
+    matters for load-dependent friction, elasticity and backlash, unless all load is proportional to the acceleration.
     """
     if f"ia{joint + 1}" in motion.model.base.names:
         return (0.0,)
@@ -31,4 +31,4 @@ def rotors(motion: Motion, joint: int) -> Sequence[float]:
 
 
 ROTOR = Shape("rotor", ("kg m^2", "kg"), rotors, continuous=(False, False), default=0.0, movable=True)
-"""Shape of effects that depend on what the gear hands on."""
+"""Nonlinear parameter of effects that depend on the torque that the gear transmits."""

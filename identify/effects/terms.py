@@ -1,4 +1,4 @@
-"""The effects that a robot configuration names, as terms of its model."""
+"""Effects of a robot configuration as terms of its model."""
 
 from dataclasses import dataclass
 
@@ -18,18 +18,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Term:
-    """One stanza of a robot's ``effects``.
+    """One entry of a robot's ``effects`` as a model term.
 
     Parameters
     ----------
     effect, place, shapes
-        The entry of the catalogue, where it sits, and its nonlinear parameters.
+        Effect of the catalogue, its location, and its nonlinear parameters.
     kept
-        Numbers of the effect's linear parameters that the term has, (k,).
+        Indices of the effect's linear parameters that the term has, (k,).
     names, units
-        Of these, as they stand in results.
+        Names and units of these in results.
     values
-        Of them in the configuration, zero where it gives none, (k,).
+        Their values in the configuration, zero where it gives none, (k,).
     """
 
     effect: Effect
@@ -41,13 +41,13 @@ class Term:
     values: Array
 
     def columns(self, motion: Motion) -> Array:
-        """Torques of all joints per unit of the linear parameters, (N, n, k)."""
+        """Return the torques of all joints per unit of the linear parameters, (N, n, k)."""
         every = self.effect.torque(motion, self.place, self.shapes)
         return every if len(self.kept) == every.shape[2] else every[:, :, list(self.kept)]
 
     @property
     def linear(self) -> tuple[Linear, ...]:
-        """Its linear parameters."""
+        """Linear parameters of the term."""
         return tuple(self.effect.linear[k] for k in self.kept)
 
     @property
@@ -61,7 +61,7 @@ class Term:
         return self.effect.share
 
     def of_effect(self, values: Array) -> Array:
-        """Values (k,) of its linear parameters among all of the effect's, the others zero."""
+        """Return the values (k,) of its linear parameters among all of the effect's, the others zero."""
         every = np.zeros(len(self.effect.linear))
         every[list(self.kept)] = values
         return every
@@ -89,12 +89,17 @@ def effect_terms(model: ArmModel) -> tuple[Term, ...]:
 
 
 def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
-    """Terms of a robot's effects, in their order; what is put right in the recordings is none.
+    """Return the terms of a robot's effects in their order, without those that correct the recordings.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
 
     Raises
     ------
     ConfigError
-        If an effect is unknown, lacks a parameter or has one too many, or stands at a joint where it cannot be.
+        If an effect is unknown, lacks a parameter, has an unknown one, or cannot be at the joint.
     """
     terms: list[Term] = []
     taken: dict[str, int] = {}
@@ -128,7 +133,18 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
 
 
 def place_of(stanza: Stanza, effect: Effect, robot: RobotConfig, where: str) -> Place:
-    """Where a stanza puts its effect.
+    """Return the location of an effect entry.
+
+    Parameters
+    ----------
+    stanza
+        Entry of the ``effects`` of the configuration.
+    effect
+        Its effect.
+    robot
+        The configuration.
+    where
+        Key of the entry, for messages.
 
     Raises
     ------
@@ -149,7 +165,19 @@ def place_of(stanza: Stanza, effect: Effect, robot: RobotConfig, where: str) -> 
 def stanza_of(
     effect: Effect, place: Place, robot: RobotConfig, parameters: dict[str, float], without: tuple[str, ...] = ()
 ) -> Stanza:
-    """The stanza of an effect at a place."""
+    """Return the configuration entry of an effect.
+
+    Parameters
+    ----------
+    effect, place
+        Effect and location.
+    robot
+        Configuration, for the names of the joints.
+    parameters
+        Values of its parameters.
+    without
+        Linear parameters that it leaves out.
+    """
     other = None if place.other is None else robot.joints[place.other].name
     return Stanza(
         effect=effect.name, joint=robot.joints[place.joint].name, other=other, parameters=parameters, without=without
@@ -157,15 +185,15 @@ def stanza_of(
 
 
 def _kept(stanza: Stanza, effect: Effect, shapes: dict[str, float], where: str) -> tuple[int, ...]:
-    """Numbers of the linear parameters that a stanza does not leave out, and that its nonlinear ones do not."""
+    """Return the indices of the linear parameters that neither ``without`` nor a zero `Linear.through` removes."""
     names = [parameter.name for parameter in effect.linear]
     for name in stanza.without:
         if name not in names:
-            raise ConfigError(f"{where}: without: {name!r} is none of its linear parameters ({', '.join(names)})")
+            raise ConfigError(f"{where}: without: {name!r} is not one of its linear parameters ({', '.join(names)})")
     there = [p.through is None or shapes[p.through] != 0.0 for p in effect.linear]
     kept = tuple(k for k, name in enumerate(names) if name not in stanza.without and there[k])
     if not kept:
-        raise ConfigError(f"{where}: without: nothing is left of it")
+        raise ConfigError(f"{where}: without: removes all its parameters")
     return kept
 
 

@@ -1,4 +1,4 @@
-"""Effects between motor and joint: elasticity, play, ripple."""
+"""Effects between motor and joint: elasticity, backlash, cogging."""
 
 from collections.abc import Sequence
 
@@ -13,27 +13,27 @@ from armident.identify.robot.motion import Motion
 Array = NDArray[np.float64]
 
 DAMPINGS = (0.1, 0.7)
-"""Damping ratios of a link on its spring: of its own, and where the controlled motor, giving way, calms it."""
+"""Damping ratios of an elastic joint: of its own, and with damping by the controlled motor."""
 
 LEAST_DAMPING = 0.02
-"""Of a link on a spring of steel: seen where the motion has its oscillation in it."""
+"""Damping ratio of an elastic joint of steel; visible where the motion contains its oscillation."""
 
 LEAST_INERTIA = 0.1
-"""Inertia at a joint below which it is not believed, of the largest along the motion: a fit may make it negative."""
+"""Lower bound of the link inertia, over its maximum along the motion: a fit may make it negative."""
 
 
 def _cogging(motion: Motion, place: Place, *, harmonic: float) -> Array:
     angle = harmonic * motion.motor[:, place.joint]
     ripple = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     ratios = motion.model.robot.transmission_matrix[place.joint]
-    # At the motor's own joint, so that a coupled transmission hands the rest on in proportion.
+    # Referred to the motor's own joint; a coupled transmission passes the rest on in proportion.
     share: Array = ratios / ratios[int(np.argmax(np.abs(ratios)))]
     columns: Array = ripple[:, None, :] * share[:, None]
     return columns
 
 
 def harmonics(motion: Motion, joint: int) -> Sequence[float]:
-    """Harmonics of a motor turn; of a prismatic axis without a known pitch, wave numbers its travel can resolve."""
+    """Return harmonics of a motor turn; for a prismatic axis of unknown pitch wave numbers that its travel resolves."""
     if motion.model.robot.joints[joint].type == "revolute":
         return (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 18.0, 24.0)
     resolution = np.pi / float(motion.span[joint])
@@ -43,9 +43,10 @@ def harmonics(motion: Motion, joint: int) -> Sequence[float]:
 def _elasticity(
     motion: Motion, place: Place, *, frequency: float, damping: float = DAMPINGS[-1], rotor: float = 0.0
 ) -> Array:
-    """The link stands behind the motor by compliance times load, and swings there: slower where it has more inertia.
+    """Return the column of an elastic joint: the link lags by compliance times load, with second-order dynamics.
 
-    ``frequency`` is that of its mean inertia over the postures of the arm: the same spring in every motion.
+    ``frequency`` refers to the mean inertia over the postures of the arm, so that it stands for the same stiffness in
+    every motion.
     """
     j = place.joint
     inertia, share = inertias(motion, j, rotor), np.ones(motion.samples)
@@ -58,9 +59,9 @@ def _elasticity(
 
 @compiled
 def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> tuple[Array, Array, Array]:
-    """Way, speed and acceleration (N,) of ``share x'' + 2 damping w x' + w^2 x = w^2 pull``, at first at rest.
+    """Return position, velocity and acceleration (N,) of ``share x'' + 2 damping w x' + w^2 x = w^2 pull``, from rest.
 
-    By the trapezoidal rule (Newmark 1959): stable at any frequency.
+    Trapezoidal rule (Newmark 1959): stable at any frequency.
     """
     way, rate, acceleration = np.empty(pull.size), np.zeros(pull.size), np.zeros(pull.size)
     way[0] = pull[0]
@@ -74,19 +75,19 @@ def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> 
 
 
 def frequencies(motion: Motion, joint: int) -> Sequence[float]:
-    """Resonances up to a fifth of the sampling rate."""
+    """Return resonance frequencies up to a fifth of the sampling rate, Hz."""
     return [float(f) for f in np.geomspace(4.0, min(80.0, 0.2 / motion.dt), 7)]
 
 
 def _backlash(motion: Motion, place: Place, *, gap: float, rotor: float = 0.0) -> Array:
-    """Between the sides of the gap nothing drives the link: it coasts and falls on, until the teeth catch it."""
+    """Return the column of backlash: inside the gap the link moves freely, until the teeth are in contact again."""
     j = place.joint
     moves = crossing(falls(motion, j, rotor), gap, motion.dt)
     return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
 
 
 def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
-    """Acceleration (N,) of a link from its motor where no tooth touches, over position and time as they are."""
+    """Return the free acceleration (N,) of a link relative to its motor, without contact of the teeth."""
     inertia = inertias(motion, joint, rotor)
     if inertia.max() <= 0.0:
         return np.zeros(motion.samples)
@@ -95,7 +96,7 @@ def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
 
 
 def inertias(motion: Motion, joint: int, rotor: float) -> Array:
-    """Inertia (N,) of the link that a gear drives, kept from vanishing; nowhere above zero where the fit has none."""
+    """Return the inertia (N,) of the link that a gear drives, with a lower bound; zero where the fit has none."""
     inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
     believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())
     return believed
@@ -103,10 +104,10 @@ def inertias(motion: Motion, joint: int, rotor: float) -> Array:
 
 @compiled
 def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
-    """Way, speed and acceleration (N,) of a link against its motor under ``pull`` (N,), caught at half a gap.
+    """Return position, velocity and acceleration (N,) of a link relative to its motor under ``pull`` (N,) in a gap.
 
-    Leapfrog; impacts are plastic. Speeds and accelerations are differences of the way to either side, so that none of
-    it is lost and none is late.
+    Leapfrog integration with plastic impacts at half a gap to either side. Velocity and acceleration are central
+    differences of the position, so that they have no delay.
     """
     way, rate, acceleration = np.zeros(pull.size), np.zeros(pull.size), np.zeros(pull.size)
     way[0] = 0.5 * gap if pull[0] > 0.0 else -0.5 * gap
@@ -125,7 +126,7 @@ def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
 
 
 def gaps(motion: Motion, joint: int) -> Sequence[float]:
-    """Gaps that the link crosses in 5 to 100 ms under the usual load; one that is a quarter off misses the impacts."""
+    """Return gaps that the link crosses in 5 to 100 ms under the usual load; an error of 25 % misses the impacts."""
     usual = max(float(np.std(falls(motion, joint))), 1e-9)
     return [0.5 * usual * float(time) ** 2 for time in np.geomspace(0.005, 0.1, 25)]
 
@@ -133,8 +134,8 @@ def gaps(motion: Motion, joint: int) -> Sequence[float]:
 EFFECTS = (
     Effect(
         name="cogging_torque",
-        title="a torque ripple over the motor's turn",
-        says="a torque ripple that repeats with the motor angle: magnets of the motor, or an eccentric gear",
+        title="a torque ripple of the motor",
+        says="a torque ripple that is periodic in the motor angle: magnets of the motor, or an eccentric gear",
         reference="Petrovic et al. 2000, IEEE Trans. Power Electronics 15(6); Gandhi et al. 2002, ICRA",
         linear=(Linear("cgc", ("N m", "N")), Linear("cgs", ("N m", "N"))),
         shapes=(Shape("harmonic", ("per rad of the motor", "rad/m"), harmonics, continuous=(False, True)),),
@@ -147,7 +148,7 @@ EFFECTS = (
     Effect(
         name="joint_elasticity",
         title="an elastic joint",
-        says="the link swings behind its motor: an elastic gear, belt or coupling, or a bending link",
+        says="the link oscillates relative to its motor: an elastic gear, belt or coupling, or a bending link",
         reference="Spong 1987, J. Dyn. Sys. Meas. Control 109(4)",
         linear=(Linear("compliance", ("rad/(N m)", "m/N"), sign=1),),
         shapes=(
@@ -162,8 +163,8 @@ EFFECTS = (
     ),
     Effect(
         name="backlash",
-        title="play in the gear",
-        says="the motor turns a little before the link follows when the load changes sides: worn teeth, a loose key",
+        title="backlash of the gear",
+        says="after a sign change of the load the motor crosses a gap before the link follows: worn teeth, a loose key",
         reference="Nordin, Gutman 2002, Automatica 38(10)",
         linear=(Linear("behind", ("", ""), sign=1, bounds=(0.1, 1.5)),),
         shapes=(Shape("gap", ("rad", "m"), gaps), ROTOR),

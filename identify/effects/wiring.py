@@ -1,4 +1,4 @@
-"""Mistakes of wiring and naming: signals with the wrong sign, or of the wrong drive."""
+"""Wiring errors: signals with the wrong sign or of the wrong drive."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +14,7 @@ from armident.identify.robot.motion import Motion
 Array = NDArray[np.float64]
 
 SIGNALS = ("position", "torque")
-"""Parameters of the stanzas of this file: which signal is meant, by a value of 1."""
+"""Parameters of these effects: a value of 1 selects the signal."""
 
 
 def _none(motion: Motion, place: Place) -> Array:
@@ -36,7 +36,7 @@ EFFECTS = (
     Effect(
         name="joint_order",
         title="two drives exchanged",
-        says="the signals of two drives stand in each other's place: swapped node numbers or plugs",
+        says="the signals of two drives are exchanged: swapped node numbers or plugs",
         reference="CiA 301, node-ID; CiA 305",
         linear=(),
         columns=_none,
@@ -49,18 +49,25 @@ NAMES = tuple(effect.name for effect in EFFECTS)
 
 
 def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Experiment]:
-    """The experiments as they would be without the wiring mistakes that a robot's effects name.
+    """Return the experiments corrected for the wiring errors of a robot's configuration.
+
+    Parameters
+    ----------
+    experiments
+        As recorded.
+    robot
+        Configuration with the effect entries.
 
     Raises
     ------
     ConfigError
-        If a stanza does not say which signal, or which other joint.
+        If an entry does not name the signal or the other joint.
     """
     position, torque = exchanges(robot)
     if np.array_equal(position, np.eye(robot.n)) and np.array_equal(torque, np.eye(robot.n)):
         return list(experiments)
     ratios = robot.transmission_matrix
-    # Signals belong to the motors: exchanged there, and brought back to the joints.
+    # Signals are those of the motors: exchanged there, then converted back to the joints.
     of_position = np.linalg.solve(ratios, position @ ratios)
     of_torque = np.linalg.inv(ratios) @ torque.T @ ratios
     return [
@@ -75,10 +82,10 @@ def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Exper
 
 
 def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
-    """What undoes the mistakes that a robot's effects name in the motors' positions and torques, (n, n) each.
+    """Return the matrices (n, n) that correct the motors' positions and torques for the configured wiring errors.
 
-    Raw numbers are exchanged, counts and shares of the rated signal; what they are worth goes with the name. So these
-    are signed permutations, scaled where two drives differ in resolution, gain or rating.
+    Raw values (counts, shares of the rated signal) are exchanged, while the scaling belongs to the drive. So these are
+    signed permutations, scaled where two drives differ in resolution, gain or rating.
     """
     names = [joint.name for joint in robot.joints]
     worth = {"position": _per_count(robot), "torque": _per_share(robot)}
@@ -105,7 +112,7 @@ def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
 
 
 def _per_count(robot: RobotConfig) -> Array:
-    """Position of each motor per count (n,), rad or m; ones where positions come in SI."""
+    """Return the position of each motor per count (n,), rad or m; ones where positions come in SI."""
     if any(joint.drive.counts_per_unit is None for joint in robot.joints):
         return np.ones(robot.n)
     turn = np.array([2 * np.pi if joint.type == "revolute" else 1.0 for joint in robot.joints])
@@ -114,6 +121,6 @@ def _per_count(robot: RobotConfig) -> Array:
 
 
 def _per_share(robot: RobotConfig) -> Array:
-    """Torque of each motor at its rated signal (n,), N m or N."""
+    """Return the torque of each motor at its rated signal (n,), N m or N."""
     drives = [joint.drive for joint in robot.joints]
     return np.array([d.rated * (d.gain if d.signal != "torque" and d.gain else 1.0) for d in drives])
