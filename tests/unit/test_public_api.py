@@ -187,5 +187,5 @@ def test_the_examples_of_the_docstrings_run(module: str) -> None:
 def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     failed, tried = doctest.testfile(str(REPOSITORY / "README.md"), module_relative=False, optionflags=doctest.ELLIPSIS)
-    assert tried >= 8
+    assert tried >= 8  # the ten lines at the top
     assert failed == 0
