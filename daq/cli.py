@@ -1,11 +1,12 @@
-"""Root of the command line: finds the commands that the packages registered, and loads the one that is called.
+"""Root of the command line: finds the registered commands and loads the one that is called.
 
-A command is an entry point of group ``armident.commands`` naming a function with typer annotations. Its
-module must be light: what it works with is imported when the function runs.
+A command is an entry point of group ``armident.commands`` that names a function with typer annotations. Its module
+must import quickly: heavy imports belong into the function.
 """
 
 import functools
 import importlib.metadata
+import logging
 import os
 import sys
 import traceback
@@ -14,9 +15,13 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from armident.daq.logs import StderrHandler, log_to
+
 GROUP = "armident.commands"
 DEBUG_VARIABLE = "ARMIDENT_DEBUG"
+"""Environment variable that does what ``--debug`` does."""
 INTERRUPTED = 130
+"""Exit code after Ctrl-C: 128 plus SIGINT, as shells have it."""
 
 EPILOG = (
     "Exit codes: 0 done, 2 usage or configuration, 3 the data cannot support the request, "
@@ -25,7 +30,13 @@ EPILOG = (
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the command that ``arguments`` (default: those of the process) name, and exit with its status."""
+    """Run a command and exit with its status.
+
+    Parameters
+    ----------
+    arguments
+        The command and its arguments; default: those of the process.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     application(words)(args=words, prog_name="armident")
     raise SystemExit(0)
@@ -34,14 +45,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 def application(
     words: Sequence[str], entry_points: Iterable[importlib.metadata.EntryPoint] | None = None
 ) -> typer.Typer:
-    """Build the command line with the command that ``words`` call, or with all where they call none (help, completion).
+    """Return the command line with the command that is called, or with all if none is (help, completion).
 
     Parameters
     ----------
     words
         Arguments of the command line.
     entry_points
-        The registered commands; by default those of the installed packages.
+        The registered commands; default: those of the installed packages.
     """
     app = typer.Typer(
         no_args_is_help=True,
@@ -76,12 +87,14 @@ def _add(app: typer.Typer, entry: importlib.metadata.EntryPoint) -> None:
 
 
 def _reported(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a command so that what it raises becomes one line on stderr and the exit code that belongs to it."""
+    """Return a command whose log goes to stderr, and whose exceptions become one line on stderr and an exit code."""
 
     @functools.wraps(function)
     def command(*args: Any, **kwargs: Any) -> None:
+        level = logging.DEBUG if os.environ.get(DEBUG_VARIABLE) else logging.INFO
         try:
-            function(*args, **kwargs)
+            with log_to(StderrHandler("armident"), level):
+                function(*args, **kwargs)
         except (typer.Exit, typer.Abort, typer.BadParameter, BrokenPipeError):
             raise
         except KeyboardInterrupt:
@@ -113,9 +126,9 @@ def _show_version(wanted: bool) -> None:
 
 def _root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
     ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Log debug messages and the traceback of an error.")] = False,
 ) -> None:
     """Record robot arms over CANopen at 5 kHz and identify their dynamic models.
 

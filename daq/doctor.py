@@ -27,7 +27,7 @@ from armident.daq.capture.files import chunk_duration_ns
 from armident.daq.matching.streams import captured_streams
 from armident.daq.streaming.session import configuration, endpoints
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
-from armident.drivers.can.timestamps import has_hardware_stamps
+from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits
 from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 
@@ -119,7 +119,7 @@ def _interface(bus: Bus) -> Iterator[Check]:
         return
     timing = details.get("bittiming")
     rate = f" at {timing['bitrate']} bit/s" if isinstance(timing, dict) and "bitrate" in timing else ""
-    clock = "hardware" if has_hardware_stamps(name) else "software"
+    clock = "hardware" if has_hardware_timestamps(name) else "software"
     yield Check("bus", "ok", f"{name} is up{rate}, {clock} time stamps")
     yield _receive_buffer(bus)
 

@@ -1,7 +1,8 @@
-"""The capture daemon: starts the drives, moves them if asked to, and records every SYNC of it."""
+"""One capture from the configuration of the drives to the finished recording, and the command ``armident capture``."""
 
 import datetime
 import json
+import logging
 import signal
 import sys
 import threading
@@ -21,154 +22,158 @@ from armident.daq.capture.files import (
     open_series,
 )
 from armident.daq.capture.host_metadata import host_metadata
-from armident.daq.capture.journal import Line, Voice
+from armident.daq.capture.journal import JournalHandler
 from armident.daq.capture.plan import CapturePlan, load_plan
 from armident.daq.capture.publisher import Publisher
-from armident.daq.capture.recorder import Recorder
+from armident.daq.capture.recorder import Outputs, Recorder
 from armident.daq.capture.reload import Change, Reloader
 from armident.daq.capture.sink import Sink
 from armident.daq.capture.systemd import Notifier
+from armident.daq.logs import log_to
 from armident.daq.recording import Mark, QueuedSeries
 from armident.daq.streaming import Keys
 from armident.drivers.can.frames import FrameBus
 from armident.drivers.can.receiver import Receiver
-from armident.drivers.can.udp import NOTE, open_bus
-from armident.drivers.canopen.emcy_listener import Eavesdropper
+from armident.drivers.can.udp import UDP_WARNING, open_bus
+from armident.drivers.canopen.emcy_listener import EmcyListener
 
-__all__ = ["CapturePlan", "Captured", "capture", "load_plan", "run_capture"]
+__all__ = ["CapturePlan", "CaptureResult", "capture", "load_plan", "run_capture"]
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Captured:
-    """What a capture left: the finished files in order, its counters and marks, and what ended it early."""
+class CaptureResult:
+    """Result of a capture.
+
+    Parameters
+    ----------
+    paths
+        The finished files, in their order in time.
+    counters
+        All counters of the capture.
+    marks
+        Marks of the recording, such as begin and end of the experiment.
+    failure
+        Error of a bus or a drive that ended the capture early.
+    """
 
     paths: tuple[Path, ...]
     counters: dict[str, int]
     marks: tuple[Mark, ...]
-    trouble: ArmidentError | None
+    failure: ArmidentError | None
 
 
 def capture(
-    order: CapturePlan,
+    plan: CapturePlan,
     stop: threading.Event,
-    say: Callable[[str], None],
     save: threading.Event | None = None,
     reload: threading.Event | None = None,
-) -> Captured:
+) -> CaptureResult:
     """Run one capture from the first SDO to the finished file.
 
     Parameters
     ----------
-    order
-        What to capture.
+    plan
+        Session, robot, trajectory and options of the capture.
     stop
         Set it to end the capture; the file is finished all the same.
-    say
-        Takes lines that tell how it goes.
     save
-        Set it to have the last seconds written, where only events are.
+        Set it to have the last seconds written, where a trigger decides what is written.
     reload
-        Set it to have the configuration read again, where the order has a file.
+        Set it to have the configuration read again, where the plan was read from a file.
 
     Returns
     -------
-    Captured
-        With ``trouble`` if the bus or a drive failed on the way; the recording is finished then too.
+    CaptureResult
+        With ``failure`` if a bus or a drive failed during the capture; the recording is finished in that case, too.
 
     Raises
     ------
     ConfigError
-        If it could not start: bus, drives, mapping, disk, Zenoh. Nothing is left behind then.
+        If the capture could not start: bus, drives, mapping, disk, Zenoh. No file is left behind in that case.
     """
-    session, robot = order.session, order.robot
+    session, robot = plan.session, plan.robot
     now = datetime.datetime.now(datetime.UTC)
     name = f"{robot.name}-{capture_stamp(now)}"
     with ExitStack() as stack:
-        receiver = stack.enter_context(Receiver([_opener(bus, k, order) for k, bus in enumerate(session.all_buses)]))
-        # Nothing that drives report is missed while the rest is made ready.
-        eavesdropper = stack.enter_context(Eavesdropper(session)) if order.listen_only else None
+        receiver = stack.enter_context(Receiver([_opener(bus, k, plan) for k, bus in enumerate(session.all_buses)]))
+        # Opened first, so that no emergency message is missed while the rest is prepared.
+        listener = stack.enter_context(EmcyListener(session)) if plan.listen_only else None
         stamps = {
-            f"timestamps.{channel}": kind for channel, kind in zip(receiver.channels, receiver.stamps, strict=True)
+            f"timestamps.{channel}": kind
+            for channel, kind in zip(receiver.channels, receiver.timestamp_sources, strict=True)
         }
         metadata = host_metadata(now) | {"capture": name, "cell": session.cell} | stamps
         rate = 1.0 / session.sync_period
         notifier = stack.enter_context(closing(Notifier()))
-        writer = open_series(session, robot, order.streams, order.directory, name, metadata)
+        writer = open_series(session, robot, plan.streams, plan.directory, name, metadata)
         stack.callback(writer.__exit__, None, None, None)
-        tidiness = stack.enter_context(RecordingRetention(session.recording, order.directory, robot.name, say))
+        retention = stack.enter_context(RecordingRetention(session.recording, plan.directory, robot.name))
         try:
             if session.all_buses[0].interface == "udp_multicast":
-                say(NOTE)
+                log.info(UDP_WARNING)
             publisher = Publisher(session, Keys(session.cell, robot.name))
             stack.callback(publisher.close)
-            run = Recorder(
-                order,
-                receiver,
-                eavesdropper,
-                Sink(writer, publisher, order.streams, name),
-                publisher,
-                notifier,
-                stop,
-                save or threading.Event(),
-                say,
-            )
-            run.start(stack)
+            outputs = Outputs(Sink(writer, publisher, plan.streams, name), publisher, notifier)
+            recorder = Recorder(plan, receiver, listener, outputs, stop, save or threading.Event())
+            recorder.start(stack)
         except BaseException:
             writer.abort()
             raise
-        if order.config is not None:
-            changes = (run.health.change, run.change, publisher.change, _exchange_limits(writer, tidiness))
-            reloader = stack.enter_context(closing(Reloader(order.config, order, changes, say)))
-            _connect(run, reloader, reload or threading.Event(), notifier, session.cell)
-        run.sink.announce(robot, session, rate, metadata)
+        if plan.config is not None:
+            changes = (recorder.health.change, recorder.change, publisher.change, _change_limits(writer, retention))
+            reloader = stack.enter_context(closing(Reloader(plan.config, plan, changes)))
+            _connect(recorder, reloader, reload or threading.Event(), notifier, session.cell)
+        recorder.sink.announce(robot, session, rate, metadata)
         trigger = session.recording.trigger
         if trigger is None:
-            say(Line(f"recording to {writer.path}", event="capture_start", file=writer.path))
+            log.info("recording to %s", writer.path, extra={"event": "capture_start", "file": writer.path})
         else:
-            say(f"keeping the last {trigger.before_s:g} s; written on {', '.join(trigger.events)}")
+            log.info("keeping the last %g s; written on %s", trigger.before_s, ", ".join(trigger.events))
         notifier.ready(f"{session.cell}: recording")
-        trouble = run.record()
+        failure = recorder.record()
         notifier.stopping()
-        counters = run.counters()
-        run.sink.finish(counters)
+        counters = recorder.counters()
+        recorder.sink.finish(counters)
         if writer.problem is not None:
-            say(f"warning: {writer.lost_rows} rows not written: {writer.problem}")
-        return Captured(tuple(writer.paths), counters, tuple(run.sink.marks), trouble)
+            log.warning("%d rows not written: %s", writer.lost_rows, writer.problem)
+        return CaptureResult(tuple(writer.paths), counters, tuple(recorder.sink.marks), failure)
 
 
-def _exchange_limits(writer: QueuedSeries, tidiness: RecordingRetention) -> Change:
-    """Changes how often rows are written, when files are full, how long they are kept, and how much around an event."""
+def _change_limits(writer: QueuedSeries, retention: RecordingRetention) -> Change:
+    """Return the function that applies the ``recording`` options of a reloaded session."""
 
     def change(session: SessionConfig) -> None:
         writer.gather(chunk_duration_ns(session.recording))
         writer.limit(*limits(session.recording))
         if session.recording.trigger is not None:
             writer.keep(*kept_around(session.recording.trigger))
-        tidiness.options = session.recording
+        retention.options = session.recording
 
     return change
 
 
-def _connect(run: Recorder, reloader: Reloader, asked: threading.Event, notifier: Notifier, cell: str) -> None:
-    """Have a capture read its configuration again when it is asked to, by signal or by command."""
+def _connect(recorder: Recorder, reloader: Reloader, requested: threading.Event, notifier: Notifier, cell: str) -> None:
+    """Have a capture reload its configuration on request, by signal or by command."""
 
-    def ask() -> None:
+    def reload() -> None:
         notifier.reloading()
-        reloader.ask()
+        reloader.request()
         notifier.ready(f"{cell}: recording")
 
     def between() -> None:
-        if asked.is_set():
-            asked.clear()
-            ask()
+        if requested.is_set():
+            requested.clear()
+            reload()
         reloader.apply()
 
-    run.reload, run.between = ask, between
+    recorder.reload, recorder.between = reload, between
 
 
-def _opener(bus: Bus, number: int, order: CapturePlan) -> Callable[[], FrameBus]:
-    """Opens one bus for what the capture wants of it, and for what its controller reports."""
-    return lambda: open_bus(bus, filters=order.filters(number), errors=True, hardware=True)
+def _opener(bus: Bus, number: int, plan: CapturePlan) -> Callable[[], FrameBus]:
+    """Return a function that opens a bus for the frames of the capture and the error frames of its controller."""
+    return lambda: open_bus(bus, filters=plan.filters(number), errors=True, hardware=True)
 
 
 def run_capture(
@@ -179,36 +184,52 @@ def run_capture(
     as_json: bool,
     sniff_s: float | None = None,
 ) -> None:
-    """``armident capture``: runs until it is over, SIGINT or SIGTERM, and tells how it went.
+    """Run ``armident capture`` until its end, SIGINT or SIGTERM, and print the paths of the files.
+
+    Parameters
+    ----------
+    config
+        Session configuration.
+    out
+        Directory of recordings; default: that of the session.
+    duration
+        Time after which the capture ends, s.
+    listen_only
+        Send nothing to the buses.
+    as_json
+        Print paths and counters as JSON.
+    sniff_s
+        With ``listen_only``: time to discover the TPDOs of the drives, s.
 
     Raises
     ------
     ConfigError
-        If it could not start.
+        If the capture could not start.
     ArmidentError
-        If the bus or a drive failed on the way; the file is finished then too.
+        If a bus or a drive failed during the capture; the file is finished in that case, too.
     """
-    say = Voice({})
-    order = load_plan(config, out, duration, listen_only, sniff_s, say)
-    say.fields = {"cell": order.session.cell, "robot": order.robot.name}
-    stop, save, reload = threading.Event(), threading.Event(), threading.Event()
-    signal.signal(signal.SIGUSR1, lambda *_: save.set())
-    # A terminal that is closed says the same as a service manager that wants a reload.
-    hung_up = stop if sys.stdin is not None and sys.stdin.isatty() else reload
-    signal.signal(signal.SIGHUP, lambda *_: hung_up.set())
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    handler = JournalHandler()
+    with log_to(handler):
+        plan = load_plan(config, out, duration, listen_only, sniff_s)
+        handler.fields = {"cell": plan.session.cell, "robot": plan.robot.name}
+        stop, save, reload = threading.Event(), threading.Event(), threading.Event()
+        signal.signal(signal.SIGUSR1, lambda *_: save.set())
+        # SIGHUP of a terminal that is closed ends the capture; that of a service manager asks for a reload.
+        on_hangup = stop if sys.stdin is not None and sys.stdin.isatty() else reload
+        signal.signal(signal.SIGHUP, lambda *_: on_hangup.set())
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
 
-    done = capture(order, stop, say, save, reload)
-    rows, gaps = done.counters["samples.rows"], done.counters["samples.in_gaps"]
-    drops = done.counters["kernel_drops"]
-    text = f"recorded {rows} samples, {gaps} in gaps, {drops} frames dropped by the kernel"
-    say(Line(text, event="capture_end", rows=rows, rows_in_gaps=gaps, kernel_drops=drops))
+        result = capture(plan, stop, save, reload)
+        rows, gaps = result.counters["samples.rows"], result.counters["samples.in_gaps"]
+        drops = result.counters["kernel_drops"]
+        fields = {"event": "capture_end", "rows": rows, "rows_in_gaps": gaps, "kernel_drops": drops}
+        log.info("recorded %d samples, %d in gaps, %d frames dropped by the kernel", rows, gaps, drops, extra=fields)
     if as_json:
-        files = [str(path) for path in done.paths]
-        print(json.dumps({"recording": files[-1], "recordings": files, "counters": done.counters}))
+        files = [str(path) for path in result.paths]
+        print(json.dumps({"recording": files[-1], "recordings": files, "counters": result.counters}))
     else:
-        print(*done.paths, sep="\n")
+        print(*result.paths, sep="\n")
     sys.stdout.flush()
-    if done.trouble is not None:
-        raise done.trouble
+    if result.failure is not None:
+        raise result.failure

@@ -1,16 +1,17 @@
-"""What the kernel knows of its clock (adjtimex(2)): how far it is off, how sure that is, and whether it is set."""
+"""State of the system clock (adjtimex(2)): offset, error and synchronisation."""
 
 import ctypes
 import os
 from dataclasses import dataclass
 
 _TIME_ERROR = 5
+"""Returned by adjtimex(2) if the clock is not synchronised."""
 _UNSYNCHRONISED, _NANOSECONDS = 0x0040, 0x2000
-"""Bits of the status: nothing disciplines the clock; the offset is in ns instead of us."""
+"""Bits of ``status``: STA_UNSYNC, and STA_NANO (the offset is in ns instead of us)."""
 
 
 class _Timex(ctypes.Structure):
-    """The beginning of ``struct timex``, and room for the rest."""
+    """First members of ``struct timex``, padded to its size."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -30,11 +31,11 @@ class ClockState:
     Parameters
     ----------
     offset_us
-        What is still to be corrected, us.
+        Offset that is still to be corrected, us.
     error_us, largest_error_us
-        What whoever sets the clock estimates its error to be, and what it is at most, us.
+        Estimated and largest error, as the process that sets the clock states them, us.
     synchronised
-        Whether anybody sets it.
+        True if a process such as chrony or ntpd sets the clock.
     """
 
     offset_us: float
@@ -44,12 +45,12 @@ class ClockState:
 
 
 def clock_state() -> ClockState:
-    """Ask the kernel; nothing is changed.
+    """Return the state of the system clock; nothing is changed.
 
     Raises
     ------
     OSError
-        If the kernel does not tell.
+        If the kernel refuses the call.
     """
     timex = _Timex()
     state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))

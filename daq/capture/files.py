@@ -1,9 +1,9 @@
-"""Where a capture's files go, when a new one is begun, and which old ones make room."""
+"""Files of a capture: creation, rotation, and deletion of old recordings."""
 
 import datetime
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
@@ -22,9 +22,22 @@ def open_series(
     name: str,
     metadata: dict[str, str],
 ) -> QueuedSeries:
-    """Begin the files of a capture, or what keeps its last seconds until there is something to write.
+    """Return the writer of a capture's files, which a thread of its own writes.
 
-    A thread of its own writes them.
+    With a trigger it keeps the last seconds in memory, and writes a file at each event.
+
+    Parameters
+    ----------
+    session, robot
+        Configuration that the files hold.
+    streams
+        The captured streams.
+    directory
+        Directory of the files.
+    name
+        Name of the first file, without suffix.
+    metadata
+        Metadata of every file.
 
     Raises
     ------
@@ -37,10 +50,10 @@ def open_series(
     chunk_ns = chunk_duration_ns(options)
 
     def begin(path: Path, part: int) -> RecordingWriter:
-        facts = metadata | {"part": str(part)}
         rate = 1.0 / session.sync_period
-        # By itself a writer ends chunks only where much comes at once.
-        return RecordingWriter(path, robot, session, rate, layouts, facts, 2 * chunk_ns, options.look_hz)
+        # The series ends the chunks; the writer does so only where many rows come at once.
+        own = metadata | {"part": str(part)}
+        return RecordingWriter(path, robot, session, rate, layouts, own, 2 * chunk_ns, options.look_hz)
 
     max_bytes, max_ns = limits(options)
     if options.trigger is None:
@@ -54,24 +67,27 @@ def open_series(
 
 
 def chunk_duration_ns(options: RecordingOptions) -> int:
-    """Time that the rows of a chunk are gathered for, ns: what is still in the kernel is lost with them."""
+    """Return the time span of a chunk, ns.
+
+    A crash loses the current chunk and the frames in the kernel, together ``recording.chunk_ms``.
+    """
     return round(max(options.chunk_ms - 2.5 * options.drain_ms, options.chunk_ms / 4) * 1e6)
 
 
 def kept_around(trigger: Trigger) -> tuple[int, int]:
-    """Time to keep before and after a trigger, ns."""
+    """Return the times that are recorded before and after a trigger, ns."""
     return round(trigger.before_s * 1e9), round(trigger.after_s * 1e9)
 
 
 def limits(options: RecordingOptions) -> tuple[int | None, int | None]:
-    """Bytes and ns at which a file is full."""
+    """Return the size (bytes) and the time span (ns) at which the next file begins."""
     max_bytes = None if options.rotate_mb is None else round(options.rotate_mb * 1e6)
     max_ns = None if options.rotate_minutes is None else round(options.rotate_minutes * 60e9)
     return max_bytes, max_ns
 
 
 def free_space(directory: Path) -> int | None:
-    """Bytes that are free where a directory is or will be; ``None`` if it cannot be told."""
+    """Return the free bytes on the disk of a directory that may not exist yet; ``None`` if unknown."""
     try:
         there = next(path for path in (directory.absolute(), *directory.absolute().parents) if os.path.exists(path))
         return shutil.disk_usage(there).free
@@ -80,29 +96,29 @@ def free_space(directory: Path) -> int | None:
 
 
 def capture_stamp(now: datetime.datetime) -> str:
-    """The time in the names of recordings, to the millisecond, in UTC."""
+    """Return the time (UTC, to the millisecond) as it stands in the names of recordings."""
     return f"{now:%Y%m%dT%H%M%S}-{now.microsecond // 1000:03d}Z"
 
 
 class RecordingRetention:
-    """Deletes old recordings of a robot meanwhile, if the options say so; use it in a ``with`` block.
+    """Deletes old recordings of a robot during a capture; use it in a ``with`` block.
 
     Parameters
     ----------
     options
-        How long recordings are kept, and how much space is left; may be exchanged at any time.
-    directory, robot
-        Whose recordings.
-    say
-        Takes lines.
+        ``keep_days`` and ``min_free_gb``; may be exchanged at any time.
+    directory
+        Directory of the recordings.
+    robot
+        Name of the robot.
     """
 
-    def __init__(self, options: RecordingOptions, directory: Path, robot: str, say: Callable[[str], None]) -> None:
+    def __init__(self, options: RecordingOptions, directory: Path, robot: str) -> None:
         self.options = options
         self._directory, self._robot = directory, robot
-        self._janitor = RetentionThread(self._look, say)
+        self._thread = RetentionThread(self._prune)
 
-    def _look(self) -> list[Path]:
+    def _prune(self) -> list[Path]:
         options = self.options
         if options.keep_days is None and options.min_free_gb is None:
             return []
@@ -110,9 +126,9 @@ class RecordingRetention:
         return prune(self._directory, self._robot, datetime.datetime.now(datetime.UTC), options.keep_days, least)
 
     def __enter__(self) -> Self:
-        """Begin to look."""
+        """Return the object; its thread runs already."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop looking."""
-        self._janitor.close()
+        """End the thread."""
+        self._thread.close()

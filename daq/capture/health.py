@@ -1,5 +1,6 @@
-"""How a capture does, once a second: on Zenoh, for Prometheus, and in words where the disk refuses."""
+"""Health of a capture, once a second: a Zenoh message, Prometheus metrics, and warnings about the disk."""
 
+import logging
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -17,7 +18,9 @@ from armident.daq.matching.assembler import Assembler
 from armident.drivers.can.receiver import Receiver
 
 SLOW_DISK_S = 1.0
-"""Rows of so long that wait for the disk are worth a line."""
+"""The disk is slow when rows of this time wait for it, s."""
+
+log = logging.getLogger(__name__)
 
 
 class Health:
@@ -25,58 +28,59 @@ class Health:
 
     Parameters
     ----------
-    order
-        What is captured.
-    assembler, receiver, jitters, sink, publisher
-        What is reported on, and where to.
-    say
-        Takes lines.
+    plan
+        Plan of the capture.
+    assembler, receiver, jitters
+        Sources of the counters.
+    sink
+        Gives the state of the files.
+    publisher
+        Takes the messages.
     """
 
     def __init__(
         self,
-        order: CapturePlan,
+        plan: CapturePlan,
         assembler: Assembler,
         receiver: Receiver,
         jitters: list[SyncJitter],
         sink: Sink,
         publisher: Publisher,
-        say: Callable[[str], None],
     ) -> None:
-        self._order, self._assembler, self._receiver, self._jitters = order, assembler, receiver, jitters
-        self._sink, self._publisher, self._say = sink, publisher, say
+        self._plan, self._assembler, self._receiver, self._jitters = plan, assembler, receiver, jitters
+        self._sink, self._publisher = sink, publisher
         self._metrics: Metrics | None = None
-        self._served = order.session.metrics
+        self._options = plan.session.metrics
         self.temperatures: Callable[[], dict[str, float]] = dict
-        """Gives the temperature of each joint's drive, degrees Celsius, where it is known."""
+        """Returns the temperature of each joint's drive (degrees Celsius) where it is known."""
         self._frames_before = self._lost_rows = 0
         self._writing, self._slow = True, False
 
     def serve(self, stack: ExitStack) -> None:
-        """Serve metrics where the session asks for it, until the stack unwinds."""
+        """Serve metrics if the session configures a port, until the stack unwinds."""
         stack.callback(self._exchange, None)
-        self._exchange(self._opened(self._served))
+        self._exchange(self._opened(self._options))
 
     def change(self, session: SessionConfig) -> None:
-        """Serve metrics where a changed session asks for it.
+        """Apply the ``metrics`` options of a reloaded session.
 
         Raises
         ------
         ConfigError
-            If the port cannot be had; they are served where they were then.
+            If the port cannot be opened; the metrics stay at the former port in that case.
         """
-        if session.metrics != self._served:
+        if session.metrics != self._options:
             fresh = self._opened(session.metrics)
-            # Closing waits for the server's thread.
+            # Not here: closing the former server waits for its thread.
             threading.Thread(target=self._exchange, args=(fresh,), name="metrics", daemon=True).start()
-            self._served = session.metrics
+            self._options = session.metrics
 
     def _opened(self, options: MetricsOptions) -> Metrics | None:
         if options.port is None:
             return None
-        labels = {"cell": self._order.session.cell, "robot": self._order.robot.name}
+        labels = {"cell": self._plan.session.cell, "robot": self._plan.robot.name}
         metrics = Metrics(options.address, options.port, labels)
-        self._say(f"metrics on http://{options.address}:{metrics.port}/metrics")
+        log.info("metrics on http://%s:%d/metrics", options.address, metrics.port)
         return metrics
 
     def _exchange(self, fresh: Metrics | None) -> None:
@@ -85,11 +89,19 @@ class Health:
             old.close()
 
     def report(self, seconds: float, events: dict[str, int]) -> None:
-        """Say how the last ``seconds`` were; ``events`` are counts since the start."""
+        """Publish the state of the capture.
+
+        Parameters
+        ----------
+        seconds
+            Time since the last report, s.
+        events
+            Counts of events since the start.
+        """
         counters = self._assembler.counters
         rate = (counters["frames"] - self._frames_before) / seconds
         self._frames_before = counters["frames"]
-        self._tell_of_disk()
+        self._check_disk()
         health: dict[str, Value] = {
             "file": None if self._sink.path is None else self._sink.path.name,
             "rows_not_written": self._sink.lost_rows,
@@ -104,7 +116,7 @@ class Health:
             "buses_down": sum(self._receiver.down),
             "answers_owed": self._assembler.owed,
             "queue_depth": self._publisher.depth,
-            "disk_free_bytes": free_space(self._order.directory),
+            "disk_free_bytes": free_space(self._plan.directory),
             "blocks_dropped": self._publisher.dropped,
             "events_dropped": self._publisher.events_dropped,
             **_clock(),
@@ -119,25 +131,25 @@ class Health:
             metrics.update(health)
         self._publisher.status({"state": "recording", "sync": self._assembler.last_sync})
 
-    def _tell_of_disk(self) -> None:
-        """Say it when the disk begins to refuse rows, and when it takes them again."""
+    def _check_disk(self) -> None:
+        """Log when the disk refuses rows or is slow, and when that is over."""
         lost, before = self._sink.lost_rows, self._lost_rows
         self._lost_rows = lost
         if lost > before and self._writing:
-            self._say(f"warning: rows are not being written, streaming goes on: {self._sink.problem}")
+            log.warning("rows are not being written, streaming goes on: %s", self._sink.problem)
         elif lost == before and not self._writing:
-            self._say(f"writing again; {lost} rows were not written")
+            log.info("writing again; %d rows were not written", lost)
         self._writing = lost == before
-        waits_s = self._sink.waiting_rows * self._order.session.sync_period
+        waits_s = self._sink.waiting_rows * self._plan.session.sync_period
         if waits_s > SLOW_DISK_S and not self._slow:
-            self._say(f"warning: the disk is slow: {waits_s:.1f} s of rows wait for it")
+            log.warning("the disk is slow: %.1f s of rows wait for it", waits_s)
         elif self._slow and waits_s <= SLOW_DISK_S:
-            self._say("the disk has caught up")
+            log.info("the disk has caught up")
         self._slow = waits_s > SLOW_DISK_S
 
 
 def _clock() -> dict[str, Value]:
-    """The state of the system clock, which stamps the frames where their hardware does not."""
+    """Return the state of the system clock, which stamps the frames where the hardware does not."""
     try:
         state = clock_state()
     except OSError:

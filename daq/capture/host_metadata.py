@@ -1,4 +1,4 @@
-"""Facts about the machine and the program that a recording keeps."""
+"""Metadata of machine and program that a recording holds."""
 
 import datetime
 import platform
@@ -11,8 +11,14 @@ _GIT_TIMEOUT_S = 2.0
 
 
 def host_metadata(now: datetime.datetime) -> dict[str, str]:
-    """Host, kernel, clock, program version and git revision, as far as they can be told."""
-    facts = {
+    """Return host, kernel, clock source, program version and git revision, as far as they are known.
+
+    Parameters
+    ----------
+    now
+        Start of the recording.
+    """
+    metadata = {
         "started_utc": now.astimezone(datetime.UTC).isoformat(timespec="microseconds"),
         "host": platform.node(),
         "kernel": platform.release(),
@@ -20,19 +26,19 @@ def host_metadata(now: datetime.datetime) -> dict[str, str]:
         "python": platform.python_version(),
     }
     try:
-        facts["armident"] = version("armident")
+        metadata["armident"] = version("armident")
     except PackageNotFoundError:
-        facts["armident"] = "unpackaged"
+        metadata["armident"] = "unpackaged"
     revision = git_revision(Path(__file__).resolve().parent)
     if revision is not None:
-        facts["git_revision"] = revision
+        metadata["git_revision"] = revision
     if _CLOCK.is_file():
-        facts["clocksource"] = _CLOCK.read_text().strip()
-    return facts
+        metadata["clocksource"] = _CLOCK.read_text().strip()
+    return metadata
 
 
 def git_revision(folder: Path) -> str | None:
-    """Revision of the working tree that ``folder`` is in, with ``+`` if it was changed; ``None`` if it is in none."""
+    """Return the git revision of a folder, with ``+`` if files were changed; ``None`` outside of a working tree."""
     try:
         head = _git(folder, "rev-parse", "HEAD")
         changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", ".")

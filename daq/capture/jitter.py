@@ -1,4 +1,4 @@
-"""How even the SYNCs of a bus come: the difference of their distances from the period, by the frames' time stamps."""
+"""Jitter of SYNC: deviation of the intervals between its time stamps from the period."""
 
 from typing import Any
 
@@ -8,19 +8,20 @@ from numpy.typing import NDArray
 BIN_NS = 1_000
 """Width of a bin of the histogram, ns."""
 BINS = 50_000
-"""Bins of the histogram; the last one also holds everything larger."""
+"""Number of bins; the last one also counts all larger deviations."""
 PERCENTILES = (50.0, 99.0, 99.9)
+"""Reported percentiles of the absolute deviation, %."""
 
 
 class SyncJitter:
-    """Statistics over all SYNCs of one bus since the start.
+    """Statistics of the jitter over all SYNCs of one bus.
 
     Parameters
     ----------
     period_ns
         SYNC period, ns.
     overflow
-        Of the SYNC counter, by which SYNCs that are missing are told.
+        Overflow of the SYNC counter (CiA 301, 1019h), by which missing SYNCs are detected.
     sync_id
         COB-ID of SYNC.
     """
@@ -33,7 +34,13 @@ class SyncJitter:
         self._max = 0
 
     def take(self, frames: NDArray[Any]) -> None:
-        """Take the frames of a bus in the order they came."""
+        """Add frames of the bus.
+
+        Parameters
+        ----------
+        frames
+            Frames (N,) in the order of reception; all but SYNC are ignored.
+        """
         sync = frames[frames["can_id"] == self._sync_id]
         if sync.size == 0:
             return
@@ -44,7 +51,7 @@ class SyncJitter:
         self._last = int(t_ns[-1]), int(counter[-1])
         elapsed = np.diff(t_ns)
         steps = np.where(counter[1:] >= 0, np.diff(counter) % self._overflow, 1)
-        # Where a SYNC is repeated, or a whole turn of the counter is missing, there is no distance to compare.
+        # A repeated SYNC, or a loss of a whole turn of the counter, gives no interval.
         near = (steps > 0) & (elapsed < self._overflow * self._period)
         error = (elapsed - steps * self._period)[near].astype(np.float64)
         if error.size == 0:
@@ -54,12 +61,12 @@ class SyncJitter:
         self._squares += float(np.square(error).sum())
         size = np.abs(error).astype(np.int64)
         self._max = max(self._max, int(size.max()))
-        # As far as there are any: the whole histogram is far larger than what a batch changes of it.
+        # Only as far as the largest deviation: a batch changes few bins of the histogram.
         counts = np.bincount(np.minimum(size // BIN_NS, BINS - 1))
         self._histogram[: counts.size] += counts
 
     def statistics(self) -> dict[str, float]:
-        """Deviation from the period, us: ``std``, ``p50``, ``p99``, ``p99.9``, ``max``; nothing before two SYNCs."""
+        """Return ``std``, ``p50``, ``p99``, ``p99.9`` and ``max`` of the deviation, us; empty before two SYNCs."""
         if self._count == 0:
             return {}
         mean = self._sum / self._count
@@ -71,8 +78,8 @@ class SyncJitter:
         return found | {"max": self._max / 1000}
 
 
-def worst(jitters: "list[SyncJitter]") -> dict[str, float]:
-    """The largest of each statistic over several buses, us."""
-    all_of_them = [jitter.statistics() for jitter in jitters]
-    names = next((list(found) for found in all_of_them if found), [])
-    return {name: max(found[name] for found in all_of_them if found) for name in names}
+def worst(jitters: list[SyncJitter]) -> dict[str, float]:
+    """Return the largest of each statistic over several buses, us."""
+    statistics = [found for jitter in jitters if (found := jitter.statistics())]
+    names = list(statistics[0]) if statistics else []
+    return {name: max(found[name] for found in statistics) for name in names}

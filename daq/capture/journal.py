@@ -1,8 +1,9 @@
-"""What a service says: lines on stderr, or entries with fields in the journal of systemd where that listens.
+"""A logging handler for the journal of systemd, with a field per attribute of a record.
 
-The journal's own protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL): one datagram of fields per entry.
+It uses the native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL): one datagram of fields per entry.
 """
 
+import logging
 import os
 import socket
 import struct
@@ -10,65 +11,59 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from armident.daq.logs import StderrHandler
+
 SOCKET = Path("/run/systemd/journal/socket")
 _LONGEST = 8000
-"""Most bytes of a field."""
-_PRIORITY = {"warning": 4, "error": 3}
-_INFORMATION = 6
+"""Largest size of a field, bytes: an entry has to fit into one datagram."""
+_PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
+"""Levels of syslog(3), by the lowest level of logging."""
+_STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName"}
+"""Attributes that every record has; all others come from ``extra``."""
 
 
-class Line(str):
-    """A line with what it is about: ``Line("no heartbeat", event="heartbeat_lost", axis="joint_2", sync=17)``.
+class JournalHandler(StderrHandler):
+    """Sends records to the journal where stderr is a stream of it, and writes lines to stderr elsewhere.
 
-    Whoever takes text takes it as text; the journal gets ``ARMIDENT_EVENT``, ``ARMIDENT_AXIS`` and so on besides.
-    """
-
-    __slots__ = ("fields",)
-    fields: Mapping[str, object]
-
-    def __new__(cls, text: str, **fields: object) -> "Line":
-        """A text and what it is about."""
-        line = super().__new__(cls, text)
-        line.fields = fields
-        return line
-
-
-class Voice:
-    """Says lines on stderr, or to the journal where that is what stderr is.
+    ``log.info("no heartbeat", extra={"event": "heartbeat_lost", "axis": "joint_2"})`` becomes an entry with the fields
+    ``ARMIDENT_EVENT`` and ``ARMIDENT_AXIS``.
 
     Parameters
     ----------
     fields
-        Of every entry: cell and robot.
-    place
-        Where the journal listens.
+        Fields of every entry, such as cell and robot; may be exchanged at any time.
+    address
+        Socket of the journal.
     """
 
-    def __init__(self, fields: Mapping[str, object], place: Path = SOCKET) -> None:
-        self.fields = dict(fields)
-        self._place = str(place)
+    def __init__(self, fields: Mapping[str, object] | None = None, address: Path = SOCKET) -> None:
+        super().__init__()
+        self.fields: Mapping[str, object] = fields or {}
+        self._address = str(address)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) if in_journal() else None
 
-    def __call__(self, text: str) -> None:
-        """Say a line."""
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send one record."""
         if self._socket is not None:
             try:
-                # A journal that is full would hold up the capture: then the line goes the other way.
-                self._socket.sendto(entry(text, self.fields), socket.MSG_DONTWAIT, self._place)
+                # Waiting for a journal whose buffer is full would delay the capture: the line goes to stderr then.
+                datagram = entry(record, self.format(record), self.fields)
+                self._socket.sendto(datagram, socket.MSG_DONTWAIT, self._address)
                 return
             except OSError:
                 pass
-        print(text, file=sys.stderr, flush=True)
+        super().emit(record)
 
     def close(self) -> None:
-        """Say no more to the journal."""
+        """Close the socket; records that still come go to stderr."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+        super().close()
 
 
 def in_journal() -> bool:
-    """Whether stderr is a stream of the journal (systemd.exec(5), ``$JOURNAL_STREAM``)."""
+    """Return whether stderr is a stream of the journal (systemd.exec(5), ``$JOURNAL_STREAM``)."""
     device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
     if not (device.isdigit() and inode.isdigit()):
         return False
@@ -79,13 +74,22 @@ def in_journal() -> bool:
     return (found.st_dev, found.st_ino) == (int(device), int(inode))
 
 
-def entry(text: str, fields: Mapping[str, object]) -> bytes:
-    """The datagram of one entry."""
-    level = text.partition(":")[0]
-    own = text.fields if isinstance(text, Line) else {}
+def entry(record: logging.LogRecord, message: str, fields: Mapping[str, object]) -> bytes:
+    """Return the datagram of one entry.
+
+    Parameters
+    ----------
+    record
+        The record; its ``extra`` attributes become fields, except those that are ``None``.
+    message
+        The formatted record.
+    fields
+        More fields; those of the record take precedence.
+    """
+    own = {key: value for key, value in vars(record).items() if key not in _STANDARD}
     entries: dict[str, object] = {
-        "MESSAGE": text,
-        "PRIORITY": _PRIORITY.get(level, _INFORMATION),
+        "MESSAGE": message,
+        "PRIORITY": next(priority for level, priority in _PRIORITIES if record.levelno >= level),
         "SYSLOG_IDENTIFIER": "armident",
     }
     entries |= {f"ARMIDENT_{key.upper()}": value for key, value in {**fields, **own}.items() if value is not None}

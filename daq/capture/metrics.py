@@ -1,4 +1,4 @@
-"""Metrics of a capture for Prometheus: off by default, on loopback."""
+"""Metrics of a capture for Prometheus; off by default, and on the loopback interface."""
 
 from collections.abc import Iterator
 from types import TracebackType
@@ -15,35 +15,35 @@ Value = int | float | str | None
 COUNTERS = {
     "frames": "CAN frames received",
     "rows": "Complete rows recorded",
-    "rows_in_gaps": "Rows that stand in the gap list",
-    "rows_not_written": "Rows that the disk did not take",
+    "rows_in_gaps": "Rows that are in the gap list",
+    "rows_not_written": "Rows that could not be written to disk",
     "kernel_drops": "Frames that the kernel dropped because the receive buffer was full",
-    "blocks_dropped": "Blocks that Zenoh listeners did not get because the queue was full",
-    "events_dropped": "Events that Zenoh listeners did not get because they were held up",
+    "blocks_dropped": "Blocks that were not sent on Zenoh because the queue was full",
+    "events_dropped": "Events that were not sent on Zenoh because the queue was full",
     "emcy": "Emergency messages of drives",
-    "heartbeat_lost": "Heartbeats of drives that stayed away",
-    "rebooted": "Drives that booted again",
+    "heartbeat_lost": "Lost heartbeats of drives",
+    "rebooted": "Unexpected reboots of drives",
     "bus_down": "Buses that went down",
-    "bus_off": "Controllers that went off their bus",
+    "bus_off": "CAN controllers that went bus-off",
     "error_frames": "Error frames of the controllers",
 }
-"""What only grows while a capture runs; everything else that health says is a gauge."""
+"""Values of the health message that are counters, with their help texts; all others are gauges."""
 
 
 class Metrics:
-    """Serves what the last health message said.
+    """Serves the last health message over HTTP.
 
     Parameters
     ----------
     address, port
-        Where; loopback unless the session says otherwise.
+        Address and port of the server; port 0 takes a free one.
     labels
-        Of every metric: cell and robot.
+        Labels of every metric: cell and robot.
 
     Raises
     ------
     ConfigError
-        If the port cannot be had.
+        If the port cannot be opened.
     """
 
     def __init__(self, address: str, port: int, labels: dict[str, str]) -> None:
@@ -58,15 +58,15 @@ class Metrics:
 
     @property
     def port(self) -> int:
-        """Where they are served."""
+        """Port of the server."""
         return int(self._server.server_port)
 
     def update(self, health: dict[str, Value]) -> None:
-        """Take a health message."""
+        """Replace the served health message."""
         self._collected.health = dict(health)
 
     def close(self) -> None:
-        """Serve no more."""
+        """Stop the server."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -84,7 +84,7 @@ class _Collected(Collector):
         self._labels = labels
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics, made when they are asked for."""
+        """Yield the metrics of the last health message."""
         names, values = list(self._labels), list(self._labels.values())
         info = InfoMetricFamily("armident_capture", "Cell and robot that are recorded", labels=names)
         info.add_metric(values, {})

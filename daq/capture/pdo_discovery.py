@@ -1,12 +1,12 @@
-"""Finds out by listening alone what the drives of a session send: which TPDOs, how often, and what is in them.
+"""Discovery of the TPDOs that drives send, by listening alone.
 
-Frames that come in step with SYNC, once every so many of them and always with the same length, are TPDOs of the drives
-whose EDS gives them their COB-ID. What they hold no frame says; it is what the session says if that has this
-length and interval, or else what the EDS has mapped by default if that has. Anything else is refused.
+Frames that come on every n-th SYNC, always with the same length, are TPDOs of the drives whose EDS gives them their
+COB-ID. Frames do not tell their contents. The mapping is that of the session if its length and interval agree, else
+the default of the EDS if its length agrees. Anything else is refused.
 """
 
+import logging
 import time
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -24,17 +24,32 @@ from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.objects import COB_SYNC, OBJECTS, TpdoLayout
 
 SYNC_WAIT_S = 10.0
-"""How long a bus may be silent before we give up."""
+"""Longest wait for the first SYNC of a bus, s."""
 FEWEST_FRAMES = 3
+"""Fewest frames from which an interval is computed."""
 IN_STEP = 0.95
 """Share of a TPDO's frames that must come at its interval; a busy machine may delay the others past the next SYNC."""
 PERIOD_TOLERANCE = 0.05
-"""Relative difference allowed between the SYNC period heard and the session's."""
+"""Largest relative difference between the measured SYNC period and that of the session."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What one identifier did: ``every`` how many SYNCs it came (``None``: not in step), and its lengths."""
+class IdentifierStatistics:
+    """Statistics of the frames of one identifier.
+
+    Parameters
+    ----------
+    can_id
+        The identifier.
+    frames
+        Number of frames.
+    every
+        Interval in SYNCs; ``None`` if the frames do not follow SYNC.
+    lengths
+        Lengths that occurred, bytes.
+    """
 
     can_id: int
     frames: int
@@ -48,63 +63,88 @@ class Heard:
 
 
 @dataclass(frozen=True)
-class Survey:
-    """What was heard on one bus: the SYNC period (us) and every identifier that PDOs may have."""
+class BusStatistics:
+    """Statistics of the frames of one bus.
+
+    Parameters
+    ----------
+    channel
+        Name of the bus.
+    period_us
+        Median SYNC period, us.
+    identifiers
+        Statistics of every received identifier of the range of PDOs (180h to 57Fh).
+    """
 
     channel: str
     period_us: float
-    heard: dict[int, Heard]
+    identifiers: dict[int, IdentifierStatistics]
 
 
-def survey(channel: str, frames: Frames) -> Survey:
-    """What the frames of one bus are, SYNC by SYNC.
+def bus_statistics(channel: str, frames: Frames) -> BusStatistics:
+    """Return the statistics of the frames of one bus.
+
+    Parameters
+    ----------
+    channel
+        Name of the bus.
+    frames
+        Its frames (N,) in the order of reception.
 
     Raises
     ------
     ConfigError
-        If there are too few SYNCs among them to tell.
+        If there are fewer than `FEWEST_FRAMES` SYNCs among them.
     """
     is_sync = frames["can_id"] == COB_SYNC
     if np.count_nonzero(is_sync) < FEWEST_FRAMES:
-        raise ConfigError(f"bus {channel}: no SYNC heard; without SYNC nothing can be told from listening")
+        raise ConfigError(f"bus {channel}: no SYNC received; TPDOs are discovered by their interval in SYNCs")
     period_us = float(np.median(np.diff(frames["t_ns"][is_sync]))) / 1000
     number = np.cumsum(is_sync)
-    heard = {}
+    identifiers = {}
     for can_id in np.unique(frames["can_id"]):
         if 0x180 <= can_id < 0x580:
             mine = frames["can_id"] == can_id
             lengths = tuple(int(n) for n in np.unique(frames["length"][mine]))
-            heard[int(can_id)] = Heard(int(can_id), int(mine.sum()), _interval(number[mine]), lengths)
-    return Survey(channel, period_us, heard)
+            interval = _interval(number[mine])
+            identifiers[int(can_id)] = IdentifierStatistics(int(can_id), int(mine.sum()), interval, lengths)
+    return BusStatistics(channel, period_us, identifiers)
 
 
 def _interval(number: NDArray[np.int64]) -> int | None:
-    """Every how many SYNCs frames came, given the number of the SYNC before each; ``None`` if they are not in step."""
+    """Return the interval of frames in SYNCs, given the number of the SYNC before each; ``None`` if it varies."""
     if number.size < FEWEST_FRAMES:
         return None
     steps = np.diff(number)
     every = int(np.median(steps))
-    # A frame that came late makes one long and one short step.
+    # A delayed frame makes one long and one short step.
     if not 1 <= every <= 240 or np.mean(steps == every) < 2 * IN_STEP - 1:
         return None
     return every
 
 
-def sniffed(session: SessionConfig, surveys: list[Survey], say: Callable[[str], None]) -> SessionConfig:
-    """The session with the streams that the drives turn out to send.
+def with_sent_streams(session: SessionConfig, buses: list[BusStatistics]) -> SessionConfig:
+    """Return the session with the streams that the drives send.
+
+    Parameters
+    ----------
+    session
+        The session.
+    buses
+        Statistics of each of its buses.
 
     Raises
     ------
     ConfigError
-        If SYNC has another period, drives differ, or it cannot be told what a TPDO holds.
+        If SYNC has another period, drives send different TPDOs, or the mapping of a TPDO is unknown.
     """
-    for heard in surveys:
-        if abs(heard.period_us / session.sync.period_us - 1) > PERIOD_TOLERANCE:
+    for bus in buses:
+        if abs(bus.period_us / session.sync.period_us - 1) > PERIOD_TOLERANCE:
             raise ConfigError(
-                f"bus {heard.channel}: SYNC comes every {heard.period_us:.0f} us, "
+                f"bus {bus.channel}: SYNC comes every {bus.period_us:.0f} us, "
                 f"the session says sync.period_us {session.sync.period_us}"
             )
-    by_channel = {s.channel: s for s in surveys}
+    by_channel = {bus.channel: bus for bus in buses}
     streams: dict[str, Stream] = {}
     for tpdo in range(1, 5):
         found = [_stream(session, drive, tpdo, by_channel[session.bus_of(drive).channel]) for drive in session.drives]
@@ -124,43 +164,56 @@ def sniffed(session: SessionConfig, surveys: list[Survey], say: Callable[[str], 
             name = "samples" if first.every == 1 and "samples" not in streams else f"tpdo{tpdo}"
         streams[name] = first
         how = "as the session says" if session.streams.get(name) == first else "as the EDS says"
-        say(f"TPDO{tpdo} is {name}: {', '.join(first.objects)} on every {max(first.every, first.pack)}. SYNC, {how}")
+        objects, every = ", ".join(first.objects), max(first.every, first.pack)
+        log.info("TPDO%d is %s: %s on every %d. SYNC, %s", tpdo, name, objects, every, how)
     if "samples" not in streams or streams["samples"].every != 1:
         raise ConfigError("no TPDO comes on every SYNC: there is nothing to record as samples")
     return session.model_copy(update={"streams": streams})
 
 
-def _stream(session: SessionConfig, drive: DriveNode, tpdo: int, bus: Survey) -> Stream | None:
-    """What one TPDO of a drive is; ``None`` if it does not come, or not in step with SYNC."""
+def _stream(session: SessionConfig, drive: DriveNode, tpdo: int, bus: BusStatistics) -> Stream | None:
+    """Return the stream of a drive's TPDO; ``None`` if it is not received, or does not follow SYNC."""
     cob_id, objects = default_mapping(drive, tpdo)
-    heard = bus.heard.get(cob_id)
-    if heard is None or heard.every is None:
+    sent = bus.identifiers.get(cob_id)
+    if sent is None or sent.every is None:
         return None
-    who = f"bus {bus.channel}: node {drive.node_id} ({drive.joint}), TPDO{tpdo} {heard}"
-    if len(heard.lengths) > 1:
-        raise ConfigError(f"{who}: its length changes, so its mapping cannot be told")
-    (length,) = heard.lengths
+    who = f"bus {bus.channel}: node {drive.node_id} ({drive.joint}), TPDO{tpdo} {sent}"
+    if len(sent.lengths) > 1:
+        raise ConfigError(f"{who}: its length changes, so its mapping is unknown")
+    (length,) = sent.lengths
     fd = session.bus_of(drive).fd
     for stream in session.streams.values():
         layout = TpdoLayout.of(stream.objects, "streams", stream.pack, fd)
-        same = fd_length(layout.frame_size) == length and max(stream.every, stream.pack) == heard.every
+        same = fd_length(layout.frame_size) == length and max(stream.every, stream.pack) == sent.every
         if stream.tpdo == tpdo and same:
             return stream
     if isinstance(objects, str):
-        raise ConfigError(f"{who}: the session does not say this, and {objects}")
+        raise ConfigError(f"{who}: no stream of the session agrees, and {objects}")
     size = TpdoLayout.of(objects, "EDS", 1, fd).size
     if fd_length(size) != length:
         raise ConfigError(
             f"{who}: {drive.eds.name} maps {size} bytes by default ({', '.join(objects) or 'nothing'}) and the session "
-            "has no stream of this length and interval; say in streams what the TPDO holds"
+            "has no stream of this length and interval; add the objects of the TPDO to streams"
         )
-    if session.sync.counter % heard.every:
+    if session.sync.counter % sent.every:
         raise ConfigError(f"{who}: its interval does not divide sync.counter {session.sync.counter}")
-    return Stream.model_validate({"tpdo": tpdo, "every": heard.every, "objects": objects})
+    return Stream.model_validate({"tpdo": tpdo, "every": sent.every, "objects": objects})
 
 
 def default_mapping(drive: DriveNode, tpdo: int) -> tuple[int, tuple[str, ...] | str]:
-    """COB-ID and objects of a TPDO by the defaults of the drive's EDS; in place of objects, why they cannot be told.
+    """Return COB-ID and objects of a TPDO by the defaults of the drive's EDS.
+
+    Parameters
+    ----------
+    drive
+        Node and EDS of the drive.
+    tpdo
+        Number of the TPDO, 1 to 4.
+
+    Returns
+    -------
+    tuple
+        COB-ID, and the names of the objects; instead of names a message if one of the objects is unknown.
 
     Raises
     ------
@@ -178,7 +231,7 @@ def default_mapping(drive: DriveNode, tpdo: int) -> tuple[int, tuple[str, ...] |
     names = {entry.entry: name for name, entry in OBJECTS.items()}
     unknown = [f"{entry:08X}h" for entry in entries if entry not in names]
     if unknown:
-        return cob_id, f"{drive.eds.name} maps {', '.join(unknown)}, which no stream can hold"
+        return cob_id, f"{drive.eds.name} maps {', '.join(unknown)}, which streams do not support"
     return cob_id, tuple(names[entry] for entry in entries)
 
 
@@ -187,13 +240,20 @@ def _default(known: Any, index: int, subindex: int) -> int | None:
     return None if variable is None or variable.default is None else int(variable.default)
 
 
-def listen(buses: tuple[Bus, ...], seconds: float) -> list[Frames]:
-    """The frames of each bus in the ``seconds`` after all have had a SYNC; nothing is sent.
+def receive_frames(buses: tuple[Bus, ...], seconds: float) -> list[Frames]:
+    """Return the frames of each bus in a time that begins when all have had a SYNC; nothing is sent.
+
+    Parameters
+    ----------
+    buses
+        The buses.
+    seconds
+        Length of the time, s.
 
     Raises
     ------
     ConfigError
-        If there is no such bus, or one has no SYNC.
+        If a bus does not exist, or has no SYNC within `SYNC_WAIT_S`.
     """
     parts: list[list[Frames]] = [[] for _ in buses]
     openers = [lambda bus=bus: open_bus(bus) for bus in buses]
@@ -208,20 +268,27 @@ def listen(buses: tuple[Bus, ...], seconds: float) -> list[Frames]:
             if all(has_sync) and since == float("inf"):
                 since = time.monotonic()
             if not all(has_sync) and time.monotonic() - begin > SYNC_WAIT_S:
-                silent = ", ".join(bus.channel for bus, heard in zip(buses, has_sync, strict=True) if not heard)
-                raise ConfigError(f"bus {silent}: no SYNC within {SYNC_WAIT_S:g} s; listening alone cannot start any")
+                silent = ", ".join(bus.channel for bus, has in zip(buses, has_sync, strict=True) if not has)
+                raise ConfigError(f"bus {silent}: no SYNC within {SYNC_WAIT_S:g} s; start its SYNC producer")
     return [np.concatenate(part) if part else np.zeros(0, FD_FRAME) for part in parts]
 
 
-def discover_pdos(session: SessionConfig, seconds: float, say: Callable[[str], None]) -> SessionConfig:
-    """Listen for so long, and return the session with the streams that were heard.
+def discover_pdos(session: SessionConfig, seconds: float) -> SessionConfig:
+    """Return the session with the streams that its drives send; nothing is sent to them.
+
+    Parameters
+    ----------
+    session
+        The session; its drives send already.
+    seconds
+        Time to listen, s.
 
     Raises
     ------
     ConfigError
-        If it cannot be told what the drives send.
+        If the drives send TPDOs whose mapping is unknown.
     """
-    say(f"listening for {seconds:g} s on {', '.join(bus.channel for bus in session.all_buses)}")
-    heard = listen(session.all_buses, seconds)
-    surveys = [survey(bus.channel, frames) for bus, frames in zip(session.all_buses, heard, strict=True)]
-    return sniffed(session, surveys, say)
+    log.info("listening for %g s on %s", seconds, ", ".join(bus.channel for bus in session.all_buses))
+    received = receive_frames(session.all_buses, seconds)
+    buses = [bus_statistics(bus.channel, frames) for bus, frames in zip(session.all_buses, received, strict=True)]
+    return with_sent_streams(session, buses)

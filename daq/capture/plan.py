@@ -1,6 +1,5 @@
-"""What a capture is to do, loaded and checked before anything is touched."""
+"""Plan of a capture, loaded and checked before a bus or a file is opened."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +21,25 @@ from armident.drivers.canopen.objects import COB_SDO_REQUEST, COB_SYNC
 
 @dataclass(frozen=True)
 class CapturePlan:
-    """What is to be captured."""
+    """Everything that a capture needs to know.
+
+    Parameters
+    ----------
+    session, robot
+        Configuration of cell and robot.
+    streams
+        The captured streams.
+    trajectory
+        Trajectory that the arm follows, if it moves.
+    directory
+        Directory of the recordings.
+    duration
+        Time after which the capture ends, s; default: with the trajectory, or when it is stopped.
+    listen_only
+        Send nothing to the buses.
+    config
+        File of the session, if it may be reloaded.
+    """
 
     session: SessionConfig
     robot: RobotConfig
@@ -32,11 +49,10 @@ class CapturePlan:
     duration: float | None = None
     listen_only: bool = False
     config: str | Path | None = None
-    """The file of the session, where it may be read again."""
 
     @property
-    def producing(self) -> bool:
-        """Whether we send SYNC."""
+    def produces_sync(self) -> bool:
+        """Whether the capture sends SYNC."""
         return self.session.sync.role == "producer" and not self.listen_only
 
     @property
@@ -45,15 +61,21 @@ class CapturePlan:
         return bus_numbers(self.session, self.robot)
 
     @property
-    def overheard(self) -> tuple[int, ...]:
-        """Nodes of the joints' drives, in the robot's order; none where they are configured by others."""
+    def sdo_nodes(self) -> tuple[int, ...]:
+        """Nodes whose SDO requests the capture reads, in the robot's order; none if it only listens."""
         return () if self.listen_only else node_ids(self.session, self.robot)
 
     def filters(self, bus: int) -> list[Filter]:
-        """What the capture wants to see of a bus: SYNC, the TPDOs of its drives, and what others write to these."""
+        """Return the filters of a bus: SYNC, the TPDOs of its drives, and SDO requests to them.
+
+        Parameters
+        ----------
+        bus
+            Number of the bus, in the order of the session.
+        """
         wanted = [
             COB_SYNC,
-            *(COB_SDO_REQUEST + n for n, b in zip(self.overheard, self.bus_of, strict=False) if b == bus),
+            *(COB_SDO_REQUEST + n for n, b in zip(self.sdo_nodes, self.bus_of, strict=False) if b == bus),
         ]
         for stream in self.streams:
             wanted += [cob for cob, b in zip(stream.bus.cob_ids, self.bus_of, strict=True) if b == bus]
@@ -66,14 +88,26 @@ def load_plan(
     duration: float | None,
     listen_only: bool,
     sniff_s: float | None = None,
-    say: Callable[[str], None] = print,
 ) -> CapturePlan:
-    """Load and check everything a capture needs; with ``sniff_s`` listen for so long for what the drives send.
+    """Return the checked plan of a capture.
+
+    Parameters
+    ----------
+    config
+        Session configuration.
+    out
+        Directory of the recordings; default: that of the session.
+    duration
+        Time after which the capture ends, s.
+    listen_only
+        Send nothing to the buses.
+    sniff_s
+        With ``listen_only``: time to discover the TPDOs of the drives, s.
 
     Raises
     ------
     ConfigError
-        For whatever is wrong with the configuration, the trajectory's limits, or the load of the buses.
+        If the configuration is invalid, the trajectory exceeds the limits of the robot, or a bus is overloaded.
     """
     session = load_session(config)
     robot = load_robot(session.robot)
@@ -81,7 +115,7 @@ def load_plan(
     if sniff_s is not None:
         if not listen_only:
             raise ConfigError("--sniff: only with --listen-only; otherwise drives are configured as the session says")
-        session = discover_pdos(session, sniff_s, say)
+        session = discover_pdos(session, sniff_s)
     trajectory = None
     if session.setpoints is not None and not listen_only:
         if session.sync.role != "producer":

@@ -1,4 +1,4 @@
-"""Publishes a capture on Zenoh from a thread of its own; whoever listens can never slow the capture."""
+"""Publisher of a capture on Zenoh, in a thread of its own: slow subscribers never delay the capture."""
 
 import json
 import threading
@@ -14,19 +14,23 @@ from armident.daq.capture.remote_commands import Commands
 from armident.daq.streaming import Block, Keys, encode_block, open_session
 
 _EVENTS_KEPT = 64
+"""Events that late subscribers can query."""
 _MOST_EVENTS = 4096
-"""Events that may wait."""
+"""Largest number of waiting events."""
 _HEARTBEAT_S = 0.2
+"""Interval at which sequence numbers are repeated, so that subscribers detect a miss, s."""
 _LINGER_S = 0.5
+"""Time for subscribers to query missed samples at the end, s."""
 _LONGEST_CLOSE_S = 5.0
+"""Longest wait for the queue at the end, s."""
 
 
 class Publisher:
-    """Blocks, events, health and status of a capture.
+    """Publishes blocks, events, health and status of a capture.
 
-    Blocks wait in a queue of ``session.zenoh.queue_blocks``; when it is full they are dropped and counted: the file is
-    the truth. Their sequence numbers show listeners what they miss; the last ``cache_blocks`` can be asked for again.
-    Events are dropped only where thousands wait, because a listener holds them up. Of health and status the last waits.
+    Blocks wait in a queue of ``session.zenoh.queue_blocks``. If it is full they are dropped and counted; the file is
+    complete all the same. Subscribers detect missing blocks by sequence numbers, and can query the last
+    ``cache_blocks``. Events are dropped only if thousands wait. Of health and status only the latest waits.
 
     Parameters
     ----------
@@ -63,16 +67,16 @@ class Publisher:
 
     @property
     def depth(self) -> int:
-        """Blocks waiting."""
+        """Number of waiting blocks."""
         return self._waiting
 
     def change(self, session: SessionConfig) -> None:
-        """Take over what may change of a session: the length of the queue, and whether commands are obeyed."""
+        """Apply the ``zenoh`` options of a reloaded session: length of the queue, and permission of commands."""
         self._limit = session.zenoh.queue_blocks
         self.commands.allowed = session.zenoh.commands
 
     def offer(self, block: Block) -> None:
-        """Queue a block, or drop it where the queue is full; never waits for a listener."""
+        """Queue a block, or drop it if the queue is full; never blocks."""
         with self._ready:
             self.offered += 1
             if self._waiting >= self._limit:
@@ -83,7 +87,7 @@ class Publisher:
             self._ready.notify()
 
     def event(self, data: bytes) -> None:
-        """Queue an event; never waits for a listener."""
+        """Queue an encoded event, or drop it if the queue is full; never blocks."""
         with self._ready:
             if self._events_waiting >= _MOST_EVENTS:
                 self.events_dropped += 1
@@ -93,15 +97,15 @@ class Publisher:
             self._ready.notify()
 
     def health(self, content: Mapping[str, Any]) -> None:
-        """Queue a health message, in the place of one that still waits."""
+        """Queue a health message; it replaces one that still waits."""
         self._put(self._keys.health, json.dumps(content).encode())
 
     def status(self, content: Mapping[str, Any]) -> None:
-        """Queue a status message, in the place of one that still waits."""
+        """Queue a status message; it replaces one that still waits."""
         self._put(self._keys.status, json.dumps({"component": "capture", **content}).encode())
 
     def close(self) -> None:
-        """Send what waits, give listeners a moment to ask for what they missed, and leave."""
+        """Send the queue, wait a moment for queries of missed samples, and close the Zenoh session."""
         with self._ready:
             self._closing = True
             self._ready.notify()

@@ -1,11 +1,13 @@
-"""One capture while it runs: drains the bus, has rows written and published, and watches drives, disk and commands."""
+"""Main loop of a capture: reads the buses, writes and publishes rows, supervises drives, disk and commands."""
 
+import logging
 import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,103 +24,138 @@ from armident.daq.capture.systemd import Notifier
 from armident.daq.matching.assembler import LATE_S, Assembler
 from armident.drivers.can.frames import BusDown
 from armident.drivers.can.receiver import Receiver
-from armident.drivers.can.scheduling import ahead
-from armident.drivers.canopen.emcy_listener import Eavesdropper
+from armident.drivers.can.scheduling import raised_priority
+from armident.drivers.canopen.emcy_listener import EmcyListener
 from armident.drivers.canopen.kernel_sync import KernelSync
 from armident.drivers.canopen.master import DriveEvent, DriveMaster
 from armident.drivers.canopen.sync_producer import SyncProducer
 from armident.drivers.canopen.temperature import TemperaturePoll
 
 HEALTH_S = 1.0
+"""Interval of health reports, s."""
 REST_S = 0.01
-"""Time between two looks at the buses when the capture comes to its end."""
+"""Interval of reads of the buses at the end of a capture, s."""
 TELL_BEHIND_S = 0.5
-"""Drives that are farther behind than this at the end are worth a line."""
+"""Lag of the drives at the end of a capture from which on it is logged, s."""
 QUICK_STOP_S = 0.3
-"""How long an arm of which nothing is heard after a quick stop keeps its drives enabled."""
+"""Time for which the drives stay enabled after a quick stop when no position is received, s."""
 STARVED_S = 20.0
-"""How long the end waits for drives that are all behind, though nothing at all has come; the watchdog waits longer."""
+"""Time without any frame after which the end no longer waits for drives that all lag, s; less than the watchdog's."""
 BRAKING_S = 5.0
-"""How long it keeps them that is seen to move."""
+"""Time for which the drives stay enabled after a quick stop while the arm still moves, s."""
 AHEAD = 10
-"""Steps of niceness by which whoever drains the buses comes before the threads that write and publish."""
+"""Steps of niceness by which the thread that reads the buses precedes those that write and publish."""
 OUTAGE_S = 5.0
-"""A capture ends when no bus has worked for this long."""
+"""Time without a working bus after which a capture ends, s."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Destinations of a capture.
+
+    Parameters
+    ----------
+    sink
+        Takes the matched rows.
+    publisher
+        Takes health and status, and gives the commands of others.
+    notifier
+        Takes the progress for the watchdog of systemd.
+    """
+
+    sink: Sink
+    publisher: Publisher
+    notifier: Notifier
 
 
 class Recorder:
-    """The state of one capture while it runs."""
+    """The main loop of one capture.
+
+    Parameters
+    ----------
+    plan
+        Plan of the capture.
+    receiver
+        Frames of the buses.
+    listener
+        Emergency messages where the capture only listens; a drive master is created otherwise.
+    outputs
+        Destinations of rows and messages.
+    stop
+        Ends the capture when it is set.
+    save
+        Triggers a recording when it is set.
+    """
 
     def __init__(
         self,
-        order: CapturePlan,
+        plan: CapturePlan,
         receiver: Receiver,
-        eavesdropper: Eavesdropper | None,
-        sink: Sink,
-        publisher: Publisher,
-        notifier: Notifier,
+        listener: EmcyListener | None,
+        outputs: Outputs,
         stop: threading.Event,
         save: threading.Event,
-        say: Callable[[str], None],
     ) -> None:
-        self.sink = sink
-        self._order, self._receiver, self._publisher, self._stop, self._say = order, receiver, publisher, stop, say
-        self._notifier = notifier
-        session = order.session
+        self.sink = sink = outputs.sink
+        self._plan, self._receiver, self._publisher, self._stop = plan, receiver, outputs.publisher, stop
+        self._notifier = outputs.notifier
+        session = plan.session
         period_ns, overflow = session.sync.period_us * 1000, session.sync.counter
         self._assembler = Assembler(
-            [stream.bus for stream in order.streams],
-            [joint.name for joint in order.robot.joints],
+            [stream.bus for stream in plan.streams],
+            [joint.name for joint in plan.robot.joints],
             period_ns,
             overflow,
-            1 if order.producing else None,
-            bus_of=order.bus_of,
-            nodes=order.overheard,
+            1 if plan.produces_sync else None,
+            bus_of=plan.bus_of,
+            nodes=plan.sdo_nodes,
         )
         self._assembler.warm_up(receiver.warm_up())
         self._jitters = [SyncJitter(period_ns, overflow) for _ in receiver.channels]
-        self._happenings = EventHandler(order, self._assembler, sink, say)
-        self.health = Health(order, self._assembler, receiver, self._jitters, sink, publisher, say)
+        self._events = EventHandler(plan, self._assembler, sink)
+        self.health = Health(plan, self._assembler, receiver, self._jitters, sink, outputs.publisher)
         self._producer: SyncProducer | KernelSync | None = None
         self._master: DriveMaster | None = None
-        self._reports: DriveMaster | Eavesdropper | None = eavesdropper
+        self._reports: DriveMaster | EmcyListener | None = listener
         self._temperatures: TemperaturePoll | None = None
         self._motion: SetpointSchedule | None = None
         self._span: tuple[int, int] | None = None
         self._save = save
         self.between: Callable[[], None] = lambda: None
-        """Called between two looks at the bus."""
+        """Called between two reads of the buses."""
         self.reload: Callable[[], None] = lambda: None
-        """Called when somebody asks for the configuration to be read again."""
-        self._heard: deque[DriveEvent] = deque()
-        self._fed = -math.inf
-        self._refused: float | None = None
-        self._suspect: dict[str, tuple[int, int]] = {}
-        self._unseen = 0
+        """Called when a command requests a reload of the configuration."""
+        self._drive_events: deque[DriveEvent] = deque()
+        self._watchdog_fed = -math.inf
+        self._outage_since: float | None = None
+        self._unverified: dict[str, tuple[int, int]] = {}
+        self._syncs_unseen = 0
         self._drain_s = session.recording.drain_ms * 1e-3
 
     def start(self, stack: ExitStack) -> None:
-        """Configure and enable the drives, and start SYNC; whatever was started is stopped when the stack unwinds."""
-        order, session = self._order, self._order.session
+        """Configure and enable the drives, and start SYNC; the stack stops them when it unwinds."""
+        plan, session = self._plan, self._plan.session
         self.health.serve(stack)
-        if order.listen_only:
+        if plan.listen_only:
             return
-        self._master = self._reports = stack.enter_context(DriveMaster(session, order.robot))
-        self._say(f"configuring {len(session.drives)} drives on {', '.join(self._receiver.channels)}")
+        self._master = self._reports = stack.enter_context(DriveMaster(session, plan.robot))
+        log.info("configuring %d drives on %s", len(session.drives), ", ".join(self._receiver.channels))
         self._master.configure()
-        # Whoever else produces SYNC also moves the arm.
         now = time.time_ns()
-        for joint in order.robot.joints:
+        for joint in plan.robot.joints:
             self._assembler.suspect(joint.name, now, now)
-        self._master.start(enable=order.producing)
+        # Another producer of SYNC also moves the arm, and enables the drives.
+        self._master.start(enable=plan.produces_sync)
         self._temperatures = stack.enter_context(TemperaturePoll(self._master.drives))
         self.health.temperatures = self._temperatures.celsius
-        if order.trajectory is not None:
+        if plan.trajectory is not None:
             by_joint = dict(zip((d.joint for d in session.drives), self._master.positions(), strict=True))
-            actual = np.array([by_joint[joint.name] for joint in order.robot.joints], dtype=np.int64)
-            self._motion = plan_setpoints(session, order.robot, order.trajectory, actual)
-            self._happenings.moving = True
-        if order.producing:
+            actual = np.array([by_joint[joint.name] for joint in plan.robot.joints], dtype=np.int64)
+            self._motion = plan_setpoints(session, plan.robot, plan.trajectory, actual)
+            self._events.moving = True
+        if plan.produces_sync:
             timing = session.sync.period_us, session.sync.counter
             if session.sync.source == "kernel":
                 self._producer = KernelSync(session.all_buses[0], *timing)
@@ -129,29 +166,29 @@ class Recorder:
             stack.callback(self._producer.stop)
 
     def change(self, session: SessionConfig) -> None:
-        """Take over how often the buses are looked at, and what writes a recording."""
+        """Apply the read interval and the triggers of a reloaded session."""
         self._drain_s = session.recording.drain_ms * 1e-3
-        self._happenings.change(session)
+        self._events.change(session)
 
     def record(self) -> ArmidentError | None:
-        """Drain, match, write and publish until it is over; what ended it early, if something did."""
-        trouble: ArmidentError | None = None
-        with ahead(AHEAD):
+        """Run the capture to its end; return the error that ended it early, or ``None``."""
+        failure: ArmidentError | None = None
+        with raised_priority(AHEAD):
             try:
-                self._play()
+                self._start_motion()
                 self._loop()
             except ArmidentError as error:
-                trouble = error
-            self._come_to_rest(trouble is not None or self._stop.is_set() or self._cut_short())
-            self._mark_end(trouble)
-        return trouble
+                failure = error
+            self._stop_arm(failure is not None or self._stop.is_set() or self._is_interrupted())
+            self._mark_end(failure)
+        return failure
 
     def counters(self) -> dict[str, int]:
-        """All counts of the capture."""
-        counters = self._assembler.counters | self._happenings.counts
+        """Return all counters of the capture."""
+        counters = self._assembler.counters | self._events.counts
         counters["kernel_drops"] = self._receiver.dropped
         counters["error_frames"] = self._receiver.error_frames
-        counters["sync_unseen"] = self._unseen
+        counters["sync_unseen"] = self._syncs_unseen
         for name, value in worst(self._jitters).items():
             counters[f"sync_jitter_{name.replace('.', '_')}_us"] = round(value)
         if isinstance(self._producer, SyncProducer):
@@ -166,130 +203,130 @@ class Recorder:
             }
         return counters
 
-    def _play(self) -> None:
+    def _start_motion(self) -> None:
         if isinstance(self._producer, SyncProducer) and self._motion is not None:
             self._span = self._motion.span(self._producer.play(self._motion.plan))
             self.sink.mark("experiment_start", self._span[0])
             self.sink.mark("experiment_end", self._span[1])
-            self._say(f"moving: {len(self._motion.plan.rows) * self._motion.plan.every * self._period:.1f} s")
+            log.info("moving: %.1f s", len(self._motion.plan.rows) * self._motion.plan.every * self._period)
 
     @property
     def _period(self) -> float:
-        return self._order.session.sync_period
+        return self._plan.session.sync_period
 
-    def _last_wanted(self) -> float:
-        """Number of the SYNC after which the capture is over by itself."""
+    def _last_sync_wanted(self) -> float:
+        """Return the number of the SYNC after which the capture ends by itself."""
         wanted = float("inf")
-        if self._order.duration is not None:
-            wanted = round(self._order.duration / self._period) - 1
+        if self._plan.duration is not None:
+            wanted = round(self._plan.duration / self._period) - 1
         if self._producer is not None and self._motion is not None and self._span is not None:
             plan = self._motion.plan
             wanted = min(wanted, self._span[1] + (len(plan.rows) - 1 - self._motion.last) * plan.every)
         return wanted
 
-    def _cut_short(self) -> bool:
-        """Whether the capture ends in the middle of the motion."""
+    def _is_interrupted(self) -> bool:
+        """Return whether the capture ends before the motion does."""
         return self._motion is not None and self._span is not None and self._assembler.last_sync < self._span[1]
 
     def _loop(self) -> None:
-        last = self._last_wanted()
+        last = self._last_sync_wanted()
         if isinstance(self._producer, SyncProducer) and self._motion is None and math.isfinite(last):
-            # Who counts SYNCs here may be late; drives that are behind would be so by ever more. Not where an arm
-            # moves: enabled drives, and who guards them, take silence for the death of their master.
-            self._producer.end_after(round(last) + 1)
+            # The producer counts the SYNCs itself: this loop may be late, and drives that lag would lag ever more.
+            # Not for a moving arm: to enabled drives and to the guard, a missing SYNC is a failure of the master.
+            self._producer.stop_after(round(last) + 1)
         due = reported = time.monotonic()
-        deadline = None if self._order.duration is None else due + self._order.duration
+        deadline = None if self._plan.duration is None else due + self._plan.duration
         while not self._stop.is_set() and self._assembler.last_sync < last:
             due = max(due + self._drain_s, time.monotonic())
             time.sleep(max(0.0, due - time.monotonic()))
             sent = self._producer.sent if self._producer is not None else None
             self._drain()
-            self._watch()
+            self._supervise()
             if sent is not None and sent > last:
-                # There are no more, even if the kernel dropped the last ones on their way back.
+                # All SYNCs were sent, even if the kernel dropped the last ones on their way back.
                 break
             now = time.monotonic()
             if now - reported >= HEALTH_S:
-                self._happenings.look_for_other_mappings()
-                self.health.report(now - reported, self._happenings.counts)
+                self._events.check_mappings()
+                self.health.report(now - reported, self._events.counts)
                 reported = now
             if deadline is not None and now > deadline and self._assembler.last_sync < 0:
                 names = ", ".join(self._receiver.channels)
-                raise ArmidentError(f"bus {names}: no SYNC within {self._order.duration:g} s")
+                raise ArmidentError(f"bus {names}: no SYNC within {self._plan.duration:g} s")
 
     def _drain(self) -> int:
         total = 0
-        self._pass_on_suspicions()
+        self._update_unverified()
         for bus, frames, dropped in self._receiver.drain():
             if dropped and self._master is not None:
-                # Whether a mapping was changed meanwhile cannot be seen in these frames.
-                self._master.listen()
-                self._pass_on_suspicions()
+                # A write to a mapping may be among the dropped frames.
+                self._master.collect_reports()
+                self._update_unverified()
             sent = self._producer.sent if self._producer is not None else None
             self._jitters[bus].take(frames)
             self.sink.take(self._assembler.push(frames, sent, dropped, bus))
             self._mark_start()
             total += frames.size
-        # Our own SYNCs come back to us: without any, the bus is dead or we are. A foreign SYNC may rest.
-        if (total or self._producer is None) and time.monotonic() - self._fed >= HEALTH_S:
-            self._fed = time.monotonic()
+        # Own SYNCs are received as well: without any, the bus or this process has failed. A foreign SYNC may pause.
+        if (total or self._producer is None) and time.monotonic() - self._watchdog_fed >= HEALTH_S:
+            self._watchdog_fed = time.monotonic()
             self._notifier.progress(f"SYNC {self._assembler.last_sync}")
         return total
 
-    def _pass_on_suspicions(self) -> None:
-        """Tell the assembler whose TPDOs are not to be trusted, where the master says something new."""
-        if self._master is None or self._master.suspect is self._suspect:
+    def _update_unverified(self) -> None:
+        """Pass the drives whose mapping is unverified from the master to the assembler."""
+        if self._master is None or self._master.unverified_mapping is self._unverified:
             return
-        before, self._suspect = self._suspect, self._master.suspect
-        for joint, span in self._suspect.items():
+        before, self._unverified = self._unverified, self._master.unverified_mapping
+        for joint, span in self._unverified.items():
             if before.get(joint) != span:
                 self._assembler.suspect(joint, *span)
 
-    def _watch(self) -> None:
-        """Look after buses, SYNC and drives; what fails while we move the arm ends the capture."""
-        for happened in self._receiver.events():
-            self._happenings.of_bus(happened)
-        if not self._order.producing:
-            self._happenings.look_for_sync(time.monotonic())
-        self._obey()
+    def _supervise(self) -> None:
+        """Check buses, SYNC and drives; a failure while the arm moves ends the capture."""
+        for event in self._receiver.events():
+            self._events.on_bus_event(event)
+        if not self._plan.produces_sync:
+            self._events.check_sync(time.monotonic())
+        self._handle_requests()
         try:
             if self._producer is not None:
                 self._producer.check()
-            self._hear_drives()
+            self._handle_drive_events()
             if self._receiver.all_down_s:
                 raise BusDown(f"bus {', '.join(self._receiver.channels)}: the interface went down and stays down")
-            self._refused = None
+            self._outage_since = None
         except BusDown:
             now = time.monotonic()
-            self._refused = now if self._refused is None else self._refused
-            if self._happenings.moving or now - self._refused > OUTAGE_S:
+            self._outage_since = now if self._outage_since is None else self._outage_since
+            if self._events.moving or now - self._outage_since > OUTAGE_S:
                 raise
 
-    def _hear_drives(self) -> None:
-        """Take what drives have reported, each once, though one of them may end the capture."""
+    def _handle_drive_events(self) -> None:
+        """Handle the events of drives, each once, even if one of them ends the capture."""
         if self._reports is not None:
-            self._heard += self._reports.supervise()
-        while self._heard:
-            self._happenings.of_drive(self._heard.popleft())
+            self._drive_events += self._reports.supervise()
+        while self._drive_events:
+            self._events.on_drive_event(self._drive_events.popleft())
 
-    def _obey(self) -> None:
-        """Do what was asked over Zenoh or by SIGUSR1."""
-        asked = self._publisher.commands.pending()
+    def _handle_requests(self) -> None:
+        """Carry out commands from Zenoh and SIGUSR1."""
+        commands = self._publisher.commands.pending()
         if self._save.is_set():
             self._save.clear()
-            asked.append(Command("save", "SIGUSR1"))
+            commands.append(Command("save", "SIGUSR1"))
         self.between()
-        for command in asked:
+        for command in commands:
             if command.name == "reload":
                 self.reload()
                 continue
             if command.name == "stop":
-                self._say("stopped by a command")
+                log.info("stopped by a command")
                 self._stop.set()
                 continue
             text = command.text if command.name == "mark" else f"save: {command.text}".rstrip(": ")
             self.sink.mark("note", max(self._assembler.last_sync, 0), text)
-            if command.name == "save" and "command" in self._happenings.triggers:
+            if command.name == "save" and "command" in self._events.triggers:
                 self.sink.trigger()
 
     def _mark_start(self) -> None:
@@ -297,8 +334,8 @@ class Recorder:
             self._span = self.sink.first_sync, -1
             self.sink.mark("experiment_start", self.sink.first_sync)
 
-    def _come_to_rest(self, early: bool) -> None:
-        """Stop the arm, then SYNC, take the last answers and disable the drives; never raises."""
+    def _stop_arm(self, early: bool) -> None:
+        """Stop the arm, then SYNC, receive the last answers and disable the drives; never raises."""
         if self._temperatures is not None:
             self._temperatures.stop()
         with suppress(ArmidentError):
@@ -309,71 +346,71 @@ class Recorder:
             self._producer.stop()
         with suppress(ArmidentError):
             self._await_answers()
-        self._happenings.moving = False
-        for happened in self._receiver.events(last=True):
-            self._happenings.of_bus(happened)
+        self._events.moving = False
+        for event in self._receiver.events(last=True):
+            self._events.on_bus_event(event)
         with suppress(ArmidentError):
-            self._hear_drives()
+            self._handle_drive_events()
         if self._master is not None:
             self._master.stop()
-        self.sink.take(self._assembler.finish(self._sent_in_all()))
-        self._happenings.look_for_other_mappings()
+        self.sink.take(self._assembler.finish(self._total_syncs()))
+        self._events.check_mappings()
 
-    def _sent_in_all(self) -> int | None:
-        """How many SYNCs there were: ours; of another master at most, where the kernel dropped the last frames."""
+    def _total_syncs(self) -> int | None:
+        """Return the number of SYNCs; of another master an upper bound, if the kernel dropped the last frames."""
         if self._producer is not None:
             return self._producer.sent
         dropped = self._receiver.dropped_behind
-        self._unseen = self._assembler.unseen(dropped, time.time_ns())
-        if self._unseen:
-            self._happenings.of_the_end(sum(dropped), self._unseen)
-        return self._assembler.last_sync + 1 + self._unseen
+        self._syncs_unseen = self._assembler.unseen(dropped, time.time_ns())
+        if self._syncs_unseen:
+            self._events.on_frames_dropped_at_end(sum(dropped), self._syncs_unseen)
+        return self._assembler.last_sync + 1 + self._syncs_unseen
 
     def _await_standstill(self) -> None:
-        """Go on recording until the arm is seen to rest; not for long where nothing is seen of it."""
-        standstill = StandstillDetector(self._order.session, self._order.robot)
-        begin = heard = time.monotonic()
+        """Record until the arm stands still, at most `BRAKING_S`, or `QUICK_STOP_S` without positions."""
+        standstill = StandstillDetector(self._plan.session, self._plan.robot)
+        begin = last_s = time.monotonic()
         seen = self.sink.last_sync
-        # What drives that are behind tell of earlier says nothing.
+        # Positions of drives that lag are from before the quick stop.
         since = (self._producer.sent if self._producer is not None else None) or 0
-        while time.monotonic() < min(heard + QUICK_STOP_S, begin + BRAKING_S):
+        while time.monotonic() < min(last_s + QUICK_STOP_S, begin + BRAKING_S):
             time.sleep(REST_S)
             self._drain()
             if self.sink.last_sync > seen and "position" in self.sink.last_raw:
-                seen, heard = self.sink.last_sync, time.monotonic()
-                if seen >= since and standstill.look(seen, self.sink.last_raw["position"]):
+                seen, last_s = self.sink.last_sync, time.monotonic()
+                if seen >= since and standstill.update(seen, self.sink.last_raw["position"]):
                     return
-        self._say("the arm was not seen to come to rest; its drives are disabled all the same")
+        log.info("the arm was not seen to come to rest; its drives are disabled all the same")
 
     def _await_answers(self) -> None:
-        """Go on recording until no drive owes an answer, or none has come for ``LATE_S``.
+        """Record until no drive owes an answer, or none has come for ``LATE_S``.
 
-        Where all owe some they are behind together, on a host that is too busy for them: they get ``STARVED_S``, unless
-        a heartbeat is missing or no bus works.
+        If all owe answers they lag together, on a host that is too busy: the limit is ``STARVED_S`` then, unless a
+        heartbeat is missing or no bus works.
         """
-        told = False
-        heard, lost = time.monotonic(), self._happenings.counts["heartbeat_lost"]
+        reported = False
+        last_s, lost = time.monotonic(), self._events.counts["heartbeat_lost"]
         while True:
             if self._drain():
-                heard = time.monotonic()
-            owed, silent = self._assembler.owed, time.monotonic() - heard
+                last_s = time.monotonic()
+            owed, silent = self._assembler.owed, time.monotonic() - last_s
             if owed <= 0 or silent > STARVED_S:
                 return
             if silent > LATE_S:
-                self._hear_drives()
-                alive = self._happenings.counts["heartbeat_lost"] == lost and not self._receiver.all_down_s
+                self._handle_drive_events()
+                alive = self._events.counts["heartbeat_lost"] == lost and not self._receiver.all_down_s
                 if not (alive and self._assembler.owed_by_all):
                     return
-            if not told and owed * self._period > TELL_BEHIND_S:
-                self._say(f"the drives are {owed * self._period:.1f} s behind: waiting for their answers")
-                told = True
+            if not reported and owed * self._period > TELL_BEHIND_S:
+                log.info("the drives are %.1f s behind: waiting for their answers", owed * self._period)
+                reported = True
             time.sleep(REST_S)
 
-    def _mark_end(self, trouble: ArmidentError | None) -> None:
+    def _mark_end(self, failure: ArmidentError | None) -> None:
         if self._span is None:
             return
         if self._motion is None:
             self.sink.mark("experiment_end", self.sink.last_sync)
         elif self._span[0] <= self.sink.last_sync < self._span[1]:
-            why = str(trouble) if trouble is not None else "stopped"
+            why = str(failure) if failure is not None else "stopped"
             self.sink.move_mark("experiment_end", self.sink.last_sync, f"before its end: {why}")

@@ -1,9 +1,10 @@
-"""A changed configuration for a capture that goes on: what can change does, at once; what cannot is refused in a line.
+"""Reload of the configuration during a capture.
 
-The new configuration is read and checked in a thread of its own; the capture takes it over between two looks at the
-bus, so that no sample waits for it.
+A thread of its own reads and checks the new configuration; the capture applies it between two reads of the buses, so
+that no sample is delayed. A change of any key outside of `CHANGEABLE` is refused with one log record.
 """
 
+import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -11,7 +12,6 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from armident.configs import ArmidentError, ConfigError, SessionConfig, load_robot, load_session
-from armident.daq.capture.journal import Line
 from armident.daq.capture.plan import CapturePlan
 
 CHANGEABLE = (
@@ -28,43 +28,41 @@ CHANGEABLE = (
     "metrics.address",
     "identification",
 )
-"""Keys of a session that may change while it is captured; ``identification`` is the worker's."""
+"""Keys of a session that may change during its capture; ``identification`` belongs to the worker."""
 
 Change = Callable[[SessionConfig], None]
+"""Applies a changed session to one part of the capture; may raise ConfigError."""
+
+log = logging.getLogger(__name__)
 
 
 class Reloader:
-    """Reads the configuration again when it is asked to.
+    """Reads the configuration again on request.
 
     Parameters
     ----------
     config
-        The file of the session.
-    order
-        What is being captured.
+        File of the session.
+    plan
+        Plan of the running capture.
     changes
-        Take a session over, one part of the capture each, in this order. They are called where :meth:`apply` is; one
-        that raises ConfigError keeps those behind it from changing.
-    say
-        Takes lines.
+        Called by :meth:`apply`, in this order. The first that raises ConfigError ends the sequence.
     """
 
-    def __init__(
-        self, config: str | Path, order: CapturePlan, changes: Sequence[Change], say: Callable[[str], None]
-    ) -> None:
-        self._config, self._order, self._changes, self._say = config, order, changes, say
-        self._session = order.session
-        self._asked: SimpleQueue[bool] = SimpleQueue()
+    def __init__(self, config: str | Path, plan: CapturePlan, changes: Sequence[Change]) -> None:
+        self._config, self._plan, self._changes = config, plan, changes
+        self._session = plan.session
+        self._requests: SimpleQueue[bool] = SimpleQueue()
         self._ready: SimpleQueue[SessionConfig] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="reload", daemon=True)
         self._thread.start()
 
-    def ask(self) -> None:
-        """Have the configuration read again; may be called from anywhere, a signal's handler included."""
-        self._asked.put(True)
+    def request(self) -> None:
+        """Have the configuration read again; may be called from any thread and from a signal handler."""
+        self._requests.put(True)
 
     def apply(self) -> None:
-        """Take over what was read meanwhile; called between two looks at the bus."""
+        """Apply the configuration if one was read meanwhile; called between two reads of the buses."""
         try:
             session = self._ready.get_nowait()
         except Empty:
@@ -78,42 +76,42 @@ class Reloader:
             return
         self._session = session
         what = ", ".join(changed) if changed else "nothing has changed"
-        self._say(Line(f"reloaded {self._config}: {what}", event="reloaded"))
+        log.info("reloaded %s: %s", self._config, what, extra={"event": "reloaded"})
 
     def close(self) -> None:
-        """Listen no more."""
-        self._asked.put(False)
+        """End the thread."""
+        self._requests.put(False)
         self._thread.join()
 
     def _run(self) -> None:
-        while self._asked.get():
+        while self._requests.get():
             try:
                 self._ready.put(self._checked())
             except ArmidentError as error:
                 self._refuse(str(error))
 
     def _checked(self) -> SessionConfig:
-        """The session as it is in the file now.
+        """Return the session as it is in the file now.
 
         Raises
         ------
         ConfigError
-            If it cannot be read, or something has changed that cannot while it is captured.
+            If it cannot be read, or a key has changed that may not change during a capture.
         """
         session = load_session(self._config)
         fixed = [key for key in differences(self._session, session) if not key.startswith(CHANGEABLE)]
         if fixed:
             raise ConfigError(f"{self._config}: {', '.join(fixed)}: cannot change while it is captured")
-        if load_robot(session.robot) != self._order.robot:
+        if load_robot(session.robot) != self._plan.robot:
             raise ConfigError(f"{session.robot}: the robot cannot change while it is captured")
         return session
 
     def _refuse(self, why: str) -> None:
-        self._say(Line(f"warning: not reloaded, the capture goes on as before: {why}", event="reload_refused"))
+        log.warning("not reloaded, the capture goes on as before: %s", why, extra={"event": "reload_refused"})
 
 
 def differences(one: SessionConfig, other: SessionConfig) -> Iterator[str]:
-    """Keys of two sessions whose values differ, as ``recording.rotate_mb``."""
+    """Yield the keys whose values differ between two sessions, as ``recording.rotate_mb``."""
     yield from _differing(one.model_dump(by_alias=True), other.model_dump(by_alias=True), "")
 
 

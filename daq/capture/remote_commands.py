@@ -13,31 +13,40 @@ from armident.daq.streaming import Keys, open_session
 CommandName = Literal["save", "mark", "reload", "stop"]
 COMMANDS: tuple[CommandName, ...] = get_args(CommandName)
 _LONGEST_TEXT = 500
+"""Largest length of a command's text, bytes."""
 _MOST_WAITING = 32
-"""Commands that may wait for the capture to look at them, which it does some fifty times a second."""
+"""Largest number of waiting commands; the capture takes them at every read of the buses, some 50 times a second."""
 ANSWER_S = 5.0
-"""How long an answer is waited for, s."""
+"""Longest wait for an answer, s."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """What is asked of a capture."""
+    """A command to a capture.
+
+    Parameters
+    ----------
+    name
+        ``save``, ``mark``, ``reload`` or ``stop``.
+    text
+        Text of a mark, or of the note that a save leaves.
+    """
 
     name: CommandName
     text: str = ""
 
 
 class Commands:
-    """Receives commands for a capture; refuses them all where the session does not allow them.
+    """Receives the commands for a capture.
 
     Parameters
     ----------
     zenoh_session
-        The capture's own.
+        Zenoh session of the capture.
     keys
-        The key expressions of the robot.
+        Key expressions of the robot.
     allowed
-        ``zenoh.commands`` of the session.
+        Accept commands (``zenoh.commands`` of the session).
     """
 
     def __init__(self, zenoh_session: zenoh.Session, keys: Keys, allowed: bool) -> None:
@@ -46,7 +55,7 @@ class Commands:
         self._queryable = zenoh_session.declare_queryable(keys.command("*"), self._answer)
 
     def pending(self) -> list[Command]:
-        """What was asked since the last call."""
+        """Return the commands since the last call."""
         found = []
         while not self._waiting.empty():
             found.append(self._waiting.get())
@@ -56,7 +65,7 @@ class Commands:
         with query:
             name = str(query.key_expr).rsplit("/", 1)[-1]
             known = next((command for command in COMMANDS if command == name), None)
-            # Nothing is made of what a query carries before it is known to be wanted.
+            # The payload is decoded only after these checks: it may have any size.
             size = 0 if query.payload is None else len(query.payload)
             if not self.allowed:
                 query.reply_err("commands are not enabled: zenoh.commands in the session configuration")
@@ -73,16 +82,27 @@ class Commands:
 
 
 def send_command(session: SessionConfig, robot: str, command: Command, answer_s: float = ANSWER_S) -> None:
-    """Ask a running capture for something.
+    """Send a command to a running capture and wait until it is accepted.
+
+    Parameters
+    ----------
+    session
+        Session of the capture.
+    robot
+        Name of the robot.
+    command
+        The command.
+    answer_s
+        Longest wait for the capture, and for its answer, s.
 
     Raises
     ------
     ConfigError
         If no capture of the cell answers.
     DataError
-        If it refuses; says why.
+        If the capture refuses; the message gives the reason.
     ArmidentError
-        If Zenoh fails on the way.
+        If Zenoh fails.
     """
     with open_session(session, "observer") as zenoh_session:
         key = Keys(session.cell, robot).command(command.name)
@@ -102,7 +122,7 @@ def send_command(session: SessionConfig, robot: str, command: Command, answer_s:
 
 
 def _wait_for_capture(querier: zenoh.Querier, seconds: float) -> None:
-    """Until a capture is known to be there, or the time is over: peers find each other within a moment."""
+    """Wait until the querier has found a capture, or the time is over."""
     until = time.monotonic() + seconds
     while not querier.matching_status and time.monotonic() < until:
         time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""What a capture makes the arm do: from where it is to the start of the trajectory, the trajectory, and rest."""
+"""Set points of a capture (approach to the start, trajectory, rest), and detection of standstill."""
 
 from dataclasses import dataclass
 
@@ -13,30 +13,33 @@ from armident.drivers.canopen.objects import rpdo_cob
 from armident.drivers.canopen.sync_producer import SetpointPlan
 
 APPROACH_SHARE = 0.5
-"""Largest share of the joints' velocity and acceleration limits used on the way to the start."""
+"""Share of the joints' velocity and acceleration limits that the approach to the start uses."""
 SHORTEST_APPROACH_S = 0.5
+"""Shortest duration of the approach, s."""
 REST_SPAN_S = 0.05
-"""How long an arm must not have moved before it counts as standing."""
+"""Time without motion after which an arm stands still, s."""
 REST_STEP_S = 0.01
-"""Motion is looked for between positions that are at least so far apart."""
+"""Shortest time between two compared positions, s."""
 SLOW_SHARE = 0.002
-"""Share of a joint's velocity limit up to which it counts as standing."""
+"""Share of a joint's velocity limit up to which it stands still."""
 SHAKE_COUNTS = 2.0
-"""Encoder counts by which the position of a standing motor may differ between two looks."""
+"""Encoder counts by which two positions of a motor at standstill may differ."""
 _ALREADY_THERE = 1e-4
 """A joint closer to the start than this (rad or m) needs no approach."""
 
 
 class StandstillDetector:
-    """Sees in the newest positions whether an arm has come to rest.
+    """Detects from the newest positions that an arm has come to rest.
 
-    At rest is an arm none of whose joints was faster, on average over any 10 ms of the last 50 ms, than 0.2 % of its
-    velocity limit: one that swings back does not rest where it turns round. Two encoder counts are no motion.
+    An arm stands still if no joint was faster than 0.2 % of its velocity limit, on average over any 10 ms of the last
+    50 ms. The turning point of an oscillation is thus no standstill. Two encoder counts are no motion.
 
     Parameters
     ----------
-    session, robot
-        Period, scales and limits.
+    session
+        Gives the SYNC period.
+    robot
+        Gives transmission, scales and limits.
 
     Raises
     ------
@@ -53,10 +56,15 @@ class StandstillDetector:
         self._last: tuple[int, NDArray[np.float64]] | None = None
         self._since = 0
 
-    def look(self, sync: int, counts: NDArray[np.integer]) -> bool:
-        """Whether the arm rests, where SYNC ``sync`` found its motors at ``counts``, (n,).
+    def update(self, sync: int, counts: NDArray[np.integer]) -> bool:
+        """Take positions and return whether the arm stands still; ``False`` during the first 50 ms.
 
-        Knows it only from positions that are 50 ms apart; the same SYNC again says nothing new.
+        Parameters
+        ----------
+        sync
+            Number of the SYNC of the positions.
+        counts
+            Motor positions (n,), counts.
         """
         now = self._per_count @ counts
         if self._last is None:
@@ -71,16 +79,29 @@ class StandstillDetector:
 
 @dataclass(frozen=True)
 class SetpointSchedule:
-    """Set points of a capture; row ``first`` is the start of the experiment, row ``last`` its end."""
+    """Set points of a capture.
+
+    Parameters
+    ----------
+    plan
+        The set points.
+    first, last
+        Rows of the start and of the end of the experiment.
+    """
 
     plan: SetpointPlan
     first: int
     last: int
 
     def span(self, played_from: int) -> tuple[int, int]:
-        """SYNC numbers of start and end of the experiment, with row 0 the target at SYNC ``played_from``.
+        """Return the SYNC numbers of start and end of the experiment.
 
-        The demand reaches a row one interpolation after it becomes the target (60C2h).
+        The demand reaches a row one interpolation period (60C2h) after the row has become the target.
+
+        Parameters
+        ----------
+        played_from
+            Number of the SYNC at which row 0 becomes the target.
         """
         every = self.plan.every
         return played_from + (self.first + 1) * every, played_from + (self.last + 1) * every
@@ -89,18 +110,18 @@ class SetpointSchedule:
 def plan_setpoints(
     session: SessionConfig, robot: RobotConfig, trajectory: Trajectory, actual_counts: NDArray[np.int64]
 ) -> SetpointSchedule:
-    """Set points from the actual motor positions on.
+    """Return the set points of a trajectory, with an approach from the actual position and rest at both ends.
 
     Parameters
     ----------
     session
-        With ``setpoints``.
+        Session with ``setpoints``.
     robot
         The robot.
     trajectory
-        Checked against the robot's limits.
+        Trajectory within the robot's limits.
     actual_counts
-        Motor positions (6064h), (n,) counts.
+        Motor positions (6064h), (n,), counts.
     """
     assert session.setpoints is not None
     options = session.setpoints
@@ -124,11 +145,21 @@ def plan_setpoints(
 def approach(
     actual: NDArray[np.float64], start: NDArray[np.float64], robot: RobotConfig, period: float
 ) -> NDArray[np.float64]:
-    """Joint positions (N, n) of a smooth move from ``actual`` to ``start`` under half the limits."""
+    """Return the joint positions (N, n) of a smooth move within `APPROACH_SHARE` of the limits.
+
+    Parameters
+    ----------
+    actual, start
+        Joint positions (n,) at both ends, rad or m.
+    robot
+        Gives the limits.
+    period
+        Time between two rows, s.
+    """
     way = np.abs(start - actual)
     velocity = np.array([joint.limits.velocity for joint in robot.joints]) * APPROACH_SHARE
     acceleration = np.array([joint.limits.acceleration for joint in robot.joints]) * APPROACH_SHARE
-    # Peaks of a unit move in unit time: speed 1 / (1 - a), acceleration pi / 2 of speed per ramp.
+    # Peaks of a unit move in unit time with ramps of share a: speed 1 / (1 - a), acceleration pi / 2 speed / a.
     speed = 1.0 / (1.0 - RAMP_SHARE)
     peak = np.pi / 2 * speed / RAMP_SHARE
     duration = max(

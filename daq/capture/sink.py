@@ -1,4 +1,4 @@
-"""Where captured rows go: the recording, and Zenoh."""
+"""Output of captured rows: the recording, and Zenoh."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -18,22 +18,22 @@ from armident.daq.streaming import Block, encode_event
 from armident.daq.streaming.codec import end_content, start_content
 
 PIECE_NS = 200_000_000
-"""So much recorded time is written and published at once, however much became certain together."""
+"""Longest recorded time that is written and published at once, ns."""
 
 
 class Sink:
-    """Writes batches to the recording, offers them to Zenoh, and places marks at their SYNC.
+    """Writes batches to the recording, publishes them on Zenoh, and places marks at their SYNC.
 
     Parameters
     ----------
     writer
-        The files of the recording.
+        Files of the recording.
     publisher
-        Where blocks are offered.
+        Publisher of the blocks and events.
     streams
-        The session's streams.
+        Captured streams.
     capture
-        Name of this capture, the same in all its events.
+        Name of the capture in all of its events.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Sink:
         self.first_sync: int | None = None
         self.last_sync = -1
         self.last_raw: dict[str, NDArray[Any]] = {}
-        """What the newest samples said, by object, each (n,)."""
+        """Newest values of the samples by object, each (n,), in units of the drive."""
         self.last_ns = 0
         self._writer, self._publisher = writer, publisher
         self._streams, self._capture = tuple(streams), capture
@@ -57,48 +57,74 @@ class Sink:
 
     @property
     def path(self) -> Path | None:
-        """The file being written, if one is."""
+        """Path of the current file; ``None`` if none is open."""
         return self._writer.path
 
     @property
     def lost_rows(self) -> int:
-        """Rows that the disk did not take."""
+        """Number of rows that could not be written."""
         return self._writer.lost_rows
 
     @property
     def waiting_rows(self) -> int:
-        """Rows that wait for the disk."""
+        """Number of rows that wait for the disk."""
         return self._writer.waiting_rows
 
     @property
     def problem(self) -> str | None:
-        """What went wrong with writing last, in words."""
+        """Message of the last error in writing."""
         return self._writer.problem
 
     def announce(
         self, robot: RobotConfig, session: SessionConfig, sample_rate_hz: float, metadata: dict[str, str]
     ) -> None:
-        """Say on Zenoh what is about to come."""
+        """Publish the start of the capture.
+
+        Parameters
+        ----------
+        robot, session
+            Configuration of the capture.
+        sample_rate_hz
+            Sampling rate, Hz.
+        metadata
+            Metadata of the recording.
+        """
         layouts = [stream.layout for stream in self._streams]
         content = start_content(self._capture, robot, session, sample_rate_hz, layouts, metadata)
         self._publisher.event(encode_event("experiment_start", content))
 
     def mark(self, kind: MarkKind, sync: int, text: str = "") -> None:
-        """Place a mark at a SYNC, now or when that SYNC has come."""
+        """Place a mark, at once or when its SYNC has been received.
+
+        Parameters
+        ----------
+        kind
+            Kind of the mark.
+        sync
+            Number of its SYNC.
+        text
+            Text of the mark.
+        """
         self._planned.append((kind, sync, text))
         self._place_marks(False)
 
     def trigger(self) -> None:
-        """Have what was just recorded, and what follows, written where only events are."""
+        """Write the seconds before and after the newest sample, if a trigger decides what is written."""
         self._writer.trigger(self.last_ns)
 
     def move_mark(self, kind: MarkKind, sync: int, text: str) -> None:
-        """Bring a mark forward that was planned for later."""
+        """Place a mark at another SYNC than planned. Parameters as in :meth:`mark`."""
         self._planned = [planned for planned in self._planned if planned[0] != kind]
         self.mark(kind, sync, text)
 
     def take(self, batch: Batch) -> None:
-        """Write and publish what became certain."""
+        """Write and publish matched rows.
+
+        Parameters
+        ----------
+        batch
+            Rows and gaps from the assembler.
+        """
         for piece in pieces(batch):
             self._take(piece)
 
@@ -108,7 +134,7 @@ class Sink:
             self._writer.turn(int(samples.t_ns[0]))
             self.last_ns = self.last_ns or int(samples.t_ns[0])
         if batch.gaps:
-            # Before the rows behind them: a file that ends in the middle says what is missing in what it has.
+            # Before the rows behind them: a file that is cut off has all gaps of its rows.
             self.gaps += batch.gaps
             self._writer.add_gaps(batch.gaps, self.last_ns)
         for stream in self._streams:
@@ -130,7 +156,13 @@ class Sink:
             self._publisher.event(encode_event("gaps", {"capture": self._capture, "gaps": found}))
 
     def finish(self, counters: dict[str, int]) -> None:
-        """Place the last marks, close the recording, and say on Zenoh what it holds."""
+        """Place the last marks, close the recording, and publish the end of the capture.
+
+        Parameters
+        ----------
+        counters
+            Counters of the capture; those of writer and publisher are added.
+        """
         self._place_marks(True)
         self._writer.flush()
         counters["writer.rows_lost"] = self._writer.lost_rows
@@ -157,10 +189,15 @@ class Sink:
 
 
 def pieces(batch: Batch) -> Iterator[Batch]:
-    """Cut what drives that were behind sent at once into pieces of ``PIECE_NS``, by the time of the samples.
+    """Yield a batch in pieces of at most `PIECE_NS`, by the time of its samples.
 
-    Rows of every stream are in the piece of their SYNC, a gap is in that of its first one: files end, and blocks have
-    the size, as if the answers had come in time.
+    A batch is long if drives lagged and answered all at once. The pieces give blocks the usual size, and let files end
+    at their limits. Rows of a stream are in the piece of their SYNC, a gap is in the piece of its first SYNC.
+
+    Parameters
+    ----------
+    batch
+        Rows and gaps.
     """
     samples = batch.rows["samples"]
     if samples.sync.size == 0 or samples.t_ns[-1] - samples.t_ns[0] < PIECE_NS:
@@ -181,5 +218,5 @@ def pieces(batch: Batch) -> Iterator[Batch]:
 
 
 def _mark(entries: list[tuple[str, Any]]) -> dict[str, Any]:
-    """The entries of a mark, its kind under a name that the event's own kind leaves free."""
+    """Return a mark as a dictionary; its kind is named ``mark``, since ``kind`` is that of the event."""
     return {("mark" if key == "kind" else key): value for key, value in entries}

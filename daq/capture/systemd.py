@@ -1,4 +1,4 @@
-"""What a service tells systemd (sd_notify(3)): that it is ready, that it makes progress, that it ends."""
+"""Notifications to systemd (sd_notify(3)): ready, progress for the watchdog, reloading, stopping."""
 
 import os
 import socket
@@ -6,10 +6,10 @@ import time
 
 
 class Notifier:
-    """Sends states to the service manager; nothing happens where there is none.
+    """Sends states to the service manager, if there is one (``$NOTIFY_SOCKET``).
 
-    The watchdog is fed by `progress`, which is called when samples were taken or the bus was seen silent, and not by a
-    timer: a capture that hangs is restarted.
+    `progress` feeds the watchdog. The main loop calls it when it has read the buses, no timer does: systemd restarts a
+    capture that hangs.
     """
 
     def __init__(self) -> None:
@@ -19,23 +19,29 @@ class Notifier:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) if self._address else None
 
     def ready(self, status: str) -> None:
-        """The capture records."""
+        """Report that the capture records.
+
+        Parameters
+        ----------
+        status
+            Status line for ``systemctl status``.
+        """
         self._send(f"READY=1\nSTATUS={status}")
 
     def progress(self, status: str) -> None:
-        """Work was done since the last call."""
+        """Feed the watchdog, and set the status line."""
         self._send(f"WATCHDOG=1\nSTATUS={status}")
 
     def reloading(self) -> None:
-        """The configuration is being read again; `ready` says when that is over."""
+        """Report that the configuration is being reloaded; `ready` reports the end."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def stopping(self) -> None:
-        """The end has begun; the file is being finished."""
+        """Report that the capture finishes its file and ends."""
         self._send("STOPPING=1")
 
     def close(self) -> None:
-        """Say no more."""
+        """Close the socket."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -45,5 +51,5 @@ class Notifier:
             try:
                 self._socket.sendto(state.encode(), self._address)
             except OSError:
-                # The manager is gone or full; a capture goes on without it.
+                # The manager has ended or its buffer is full: the capture goes on without it.
                 return

@@ -15,7 +15,7 @@ from armident.daq.guard.limits import FOLLOWING_S, limits_of
 from armident.daq.guard.monitor import Alarm, Watch
 from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown, FrameBus, Frames, frames
-from armident.drivers.can.scheduling import be_punctual
+from armident.drivers.can.scheduling import set_realtime_priority
 from armident.drivers.can.udp import open_bus
 from armident.drivers.canopen.objects import COB_SDO_REQUEST, CONTROLWORD, Control, rpdo_cob, stop_rpdo
 
@@ -165,7 +165,7 @@ def guard(config: str, following_s: float = FOLLOWING_S) -> None:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, stop)
         signal.signal(signal.SIGUSR1, leave)
-        be_punctual(_PRIORITY)
+        set_realtime_priority(_PRIORITY)
         print(f"guard: ready on {', '.join(bus.channel for bus in buses)}", flush=True)
         alarm = watcher.run()
     if alarm is not None:

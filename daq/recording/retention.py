@@ -2,6 +2,7 @@
 
 import datetime
 import fcntl
+import logging
 import re
 import shutil
 import threading
@@ -10,7 +11,9 @@ from pathlib import Path
 
 _NAME = re.compile(r"-(\d{8}T\d{6})-\d{3}Z(?:\.\d+)?\.mcap(?:\.damaged)?$")
 EVERY_S = 60.0
-"""How often it is looked, s."""
+"""Interval between two deletions of old recordings, s."""
+
+log = logging.getLogger(__name__)
 
 
 def prune(
@@ -80,40 +83,41 @@ def _is_being_written(path: Path) -> bool:
 
 
 class RetentionThread:
-    """Prunes from time to time in a thread of its own: deleting gigabytes may take longer than a capture can wait.
+    """Deletes old recordings at regular intervals in a thread of its own, so that no capture waits for the disk.
+
+    Every deleted file is logged, and every error once.
 
     Parameters
     ----------
-    look
-        Deletes what is to be deleted and returns it.
-    say
-        Takes a line for everything that was deleted, and for what could not be.
+    delete
+        Deletes old recordings and returns their paths.
+    every_s
+        Interval between two calls of it, s.
     """
 
-    def __init__(self, look: Callable[[], list[Path]], say: Callable[[str], None], every_s: float = EVERY_S) -> None:
+    def __init__(self, delete: Callable[[], list[Path]], every_s: float = EVERY_S) -> None:
         self.deleted = 0
-        self._look, self._say, self._every_s = look, say, every_s
+        self._delete, self._every_s = delete, every_s
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="janitor", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="retention", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Stop looking."""
+        """End the thread."""
         self._over.set()
         self._thread.join()
 
     def _run(self) -> None:
-        told: str | None = None
+        last: str | None = None
         while True:
             try:
-                for path in self._look():
+                for path in self._delete():
                     self.deleted += 1
-                    self._say(f"deleted {path} (retention)")
-                told = None
+                    log.info("deleted %s (retention)", path)
+                last = None
             except OSError as error:
-                problem = f"warning: retention: {error}"
-                if problem != told:
-                    self._say(problem)
-                told = problem
+                if str(error) != last:
+                    log.warning("retention: %s", error)
+                last = str(error)
             if self._over.wait(self._every_s):
                 return

@@ -104,13 +104,13 @@ def main() -> int:
         session = session_file(folder, "hour", ["vcan0"], False, False, 10**6 // RATE_HZ, demand=False)
         text = session.read_text().replace("recording: {}", "recording: {rotate_mb: 20, drain_ms: 1}")
         session.write_text(text)
-        order = replace(load_plan(session, folder / "out", None, True))
-        return watched(order, MadeUp(count, options.pace), count, folder)
+        plan = replace(load_plan(session, folder / "out", None, True))
+        return watched(plan, MadeUp(count, options.pace), count, folder)
     finally:
         shutil.rmtree(folder)
 
 
-def watched(order: armident.daq.capture.capture.CapturePlan, bus: MadeUp, count: int, folder: Path) -> int:
+def watched(plan: armident.daq.capture.capture.CapturePlan, bus: MadeUp, count: int, folder: Path) -> int:
     """Capture in this process while another thread looks at memory and makes room."""
 
     def open_bus(config: Bus, **_: object) -> MadeUp:
@@ -141,12 +141,12 @@ def watched(order: armident.daq.capture.capture.CapturePlan, bus: MadeUp, count:
     watcher.start()
     begin, cpu = time.monotonic(), time.process_time()
     try:
-        done = armident.daq.capture.capture.capture(order, stop, lambda line: None)
+        done = armident.daq.capture.capture.capture(plan, stop)
     finally:
         ended.set()
         watcher.join()
-    if done.trouble is not None:
-        raise ArmidentError(str(done.trouble))
+    if done.failure is not None:
+        raise ArmidentError(str(done.failure))
     wall, used = time.monotonic() - begin, time.process_time() - cpu
     rows = done.counters["samples.rows"]
     print(

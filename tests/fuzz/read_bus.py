@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from armident.configs import ArmidentError, ConfigError, load_session
 from armident.configs.schema.session import Temperature
-from armident.daq.capture.pdo_discovery import survey
+from armident.daq.capture.pdo_discovery import bus_statistics
 from armident.daq.matching.assembler import Assembler, TpdoStream
 from armident.drivers.can.error_frames import summarise
 from armident.drivers.can.frames import FRAME
@@ -50,7 +50,7 @@ def _check_frames(data: bytes, _: Path) -> bool:
     frames = np.frombuffer(data[: len(data) // FRAME.itemsize * FRAME.itemsize], FRAME).copy()
     summarise(frames)
     with suppress(ConfigError):
-        survey("can0", frames)
+        bus_statistics("can0", frames)
     for streams, first in ((STREAMS, 1), (STREAMS, None), (PACKED, 1)):
         assembler = Assembler(streams, JOINTS, PERIOD_NS, 240, first)
         batches = [assembler.push(frames[at : at + 37]) for at in range(0, len(frames), 37)]
@@ -196,7 +196,7 @@ def _check_sdo(data: bytes, _: Path) -> bool:
         try:
             found = sdo.read(index, sub, code)
         except ArmidentError as error:
-            if not str(error).startswith(sdo.who):
+            if not str(error).startswith(sdo.label):
                 raise AssertionError(f"an error that does not say who: {error}") from error
             taken = False
             continue

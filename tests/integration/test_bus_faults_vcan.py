@@ -45,7 +45,7 @@ def test_a_bus_that_is_back_is_read_again(vcan_buses: list[str], removed: bool) 
     """Down and up again with the same socket; removed and made again with a new one. The other bus goes on."""
     names = vcan_buses
     with Receiver([partial(RawSocket, name) for name in names]) as receiver:
-        socket = receiver._lines[1].bus
+        socket = receiver._buses[1].bus
         if removed:
             remove_vcan(names[1])
         else:
@@ -58,7 +58,7 @@ def test_a_bus_that_is_back_is_read_again(vcan_buses: list[str], removed: bool) 
         ensure_vcan(names[1])
         events_until(receiver, "bus_up")
         assert receiver.down == (False, False)
-        assert (receiver._lines[1].bus is socket) is not removed
+        assert (receiver._buses[1].bus is socket) is not removed
         with RawSocket(names[1], filters=()) as other:
             other.send(frame(0x124))
         assert [(k, batch["can_id"].tolist()) for k, batch, _ in receiver.drain()] == [(1, [0x124])]

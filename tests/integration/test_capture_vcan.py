@@ -258,8 +258,8 @@ def test_sync_goes_on_until_somebody_disables_the_drives_of_an_arm_that_moved(vc
     """Enabled drives, and who guards them, take silence for the death of their master."""
     there = {"to": [0.1, 0.0, 1.57, 0.0, 0.0, 0.0], "duration": 0.6}
     session = moving_session(tmp_path, vcan_bus, "ends_late", [there])
-    done = capture(load_plan(session, tmp_path / "out", None, False), Late(), lambda line: None)
-    assert done.trouble is None
+    done = capture(load_plan(session, tmp_path / "out", None, False), Late())
+    assert done.failure is None
     end = next(mark.sync for mark in done.marks if mark.kind == "experiment_end")
     settled = end + 0.1 / 0.002
     assert done.counters["sync_sent"] > settled + 100
@@ -270,8 +270,8 @@ def test_sync_goes_on_until_somebody_disables_the_drives_of_an_arm_that_moved(vc
 def test_a_capture_that_is_over_in_the_middle_of_a_motion_stops_the_arm(vcan_bus: str, tmp_path: Path) -> None:
     away = {"to": [1.5, 0.0, 1.57, 0.0, 0.0, 0.0], "duration": 4.0}
     session = moving_session(tmp_path, vcan_bus, "cut_short", [away])
-    done = capture(load_plan(session, tmp_path / "out", 2.5, False), threading.Event(), lambda line: None)
-    assert done.trouble is None
+    done = capture(load_plan(session, tmp_path / "out", 2.5, False), threading.Event())
+    assert done.failure is None
     end = next(mark for mark in done.marks if mark.kind == "experiment_end")
     assert "before its end" in end.text
     robot, recording = load_robot("tx40.yaml"), read_recording(done.paths[-1])

@@ -1,4 +1,4 @@
-"""Jitter of SYNC from the frames' time stamps."""
+"""Jitter of SYNC from the time stamps of its frames."""
 
 import numpy as np
 import pytest
@@ -34,14 +34,14 @@ def test_statistics_are_those_of_the_deviations_from_the_period(cuts: list[int])
         assert found[name] == pytest.approx(np.percentile(np.abs(error), percent) / 1000, abs=1.0)
 
 
-def test_a_missing_sync_is_no_jitter_and_neither_is_an_outage() -> None:
+def test_missing_syncs_and_an_outage_are_no_jitter() -> None:
     numbers = np.delete(np.arange(3000), np.r_[100, 500:510, 1000:1700])
     jitter = SyncJitter(PERIOD_NS, 240)
     jitter.take(syncs(10**18 + numbers * PERIOD_NS, numbers))
     assert jitter.statistics() == {"std": 0.0, "p50": 0.0, "p99": 0.0, "p99.9": 0.0, "max": 0.0}
 
 
-def test_the_worst_of_several_buses_is_told_and_nothing_where_there_was_no_sync() -> None:
+def test_the_largest_jitter_of_several_buses_is_reported_and_nothing_without_sync() -> None:
     even, uneven, silent = (SyncJitter(PERIOD_NS, 240) for _ in range(3))
     numbers = np.arange(100)
     even.take(syncs(numbers * PERIOD_NS, numbers))

@@ -1,5 +1,6 @@
-"""What a capture says reaches the journal with its fields, and stderr where there is no journal."""
+"""Log records reach the journal with their fields, and stderr if it is no journal."""
 
+import logging
 import os
 import socket
 import struct
@@ -11,23 +12,29 @@ from pathlib import Path
 import pytest
 
 from armident.daq.capture.clock import clock_state
-from armident.daq.capture.journal import Line, entry
+from armident.daq.capture.journal import entry
 
-SAY = """
+LOG = """
+import logging
 import sys
 from pathlib import Path
-from armident.daq.capture.journal import Line, Voice
-voice = Voice({"cell": "press_7", "robot": "tx40"}, Path(sys.argv[1]))
-voice("warning: the disk is full")
-voice(Line("node 2 (joint_2): EMCY 2310h", event="emcy", axis="joint_2", bus="can0", sync=17, code=0x2310))
-voice("two\\nlines")
-voice.close()
-voice("afterwards")
+from armident.daq.capture.journal import JournalHandler
+handler = JournalHandler({"cell": "press_7", "robot": "tx40"}, Path(sys.argv[1]))
+log = logging.getLogger("armident.test")
+log.setLevel("INFO")
+log.addHandler(handler)
+log.warning("the disk is %s", "full")
+fields = {"event": "emcy", "axis": "joint_2", "bus": "can0", "sync": 17, "code": 0x2310, "node": None}
+log.info("node 2 (joint_2): EMCY 2310h", extra=fields)
+log.info("two\\nlines")
+log.debug("not logged")
+handler.close()
+log.info("afterwards")
 """
 
 
 def parsed(datagram: bytes) -> dict[str, str]:
-    """Fields of an entry, as the journal reads them."""
+    """Return the fields of an entry, as the journal reads them."""
     fields, at = {}, 0
     while at < len(datagram):
         end = datagram.index(b"\n", at)
@@ -50,19 +57,19 @@ def journal(tmp_path: Path) -> Iterator[socket.socket]:
         yield listener
 
 
-def said(place: Path, stderr: Path, stream: str | None) -> str:
-    """What stands in ``stderr`` after a process has spoken; ``stream`` names the journal's, ``""`` that file itself."""
+def logged(address: Path, stderr: Path, stream: str | None) -> str:
+    """Return the stderr of a process that logs; ``stream`` is its ``JOURNAL_STREAM``, ``""`` for stderr itself."""
     with stderr.open("w") as file:
         found = os.fstat(file.fileno())
         environment = {key: value for key, value in os.environ.items() if key != "JOURNAL_STREAM"}
         if stream is not None:
             environment["JOURNAL_STREAM"] = stream or f"{found.st_dev}:{found.st_ino}"
-        subprocess.run([sys.executable, "-c", SAY, str(place)], stderr=file, env=environment, check=True, timeout=60)
+        subprocess.run([sys.executable, "-c", LOG, str(address)], stderr=file, env=environment, check=True, timeout=60)
     return stderr.read_text()
 
 
 def test_entries_reach_the_journal_with_their_fields(journal: socket.socket, tmp_path: Path) -> None:
-    assert said(tmp_path / "journal", tmp_path / "stderr", "") == "afterwards\n"
+    assert logged(tmp_path / "journal", tmp_path / "stderr", "") == "afterwards\n"
     disk, emcy, lines = (parsed(journal.recv(100_000)) for _ in range(3))
     common = {"SYSLOG_IDENTIFIER": "armident", "ARMIDENT_CELL": "press_7", "ARMIDENT_ROBOT": "tx40"}
     assert disk == {"MESSAGE": "warning: the disk is full", "PRIORITY": "4", **common}
@@ -80,26 +87,34 @@ def test_entries_reach_the_journal_with_their_fields(journal: socket.socket, tmp
 
 
 @pytest.mark.parametrize("stream", [None, "1:2", "nonsense"])
-def test_it_is_plain_text_where_stderr_is_no_journal(stream: str | None, tmp_path: Path) -> None:
-    text = said(tmp_path / "nobody", tmp_path / "stderr", stream)
+def test_records_are_plain_lines_if_stderr_is_no_journal(stream: str | None, tmp_path: Path) -> None:
+    text = logged(tmp_path / "nobody", tmp_path / "stderr", stream)
     assert text == "warning: the disk is full\nnode 2 (joint_2): EMCY 2310h\ntwo\nlines\nafterwards\n"
 
 
-def test_it_is_plain_text_where_the_journal_does_not_listen(tmp_path: Path) -> None:
-    assert "EMCY 2310h\n" in said(tmp_path / "nobody", tmp_path / "stderr", "")
+def test_records_are_plain_lines_if_the_journal_does_not_answer(tmp_path: Path) -> None:
+    assert "EMCY 2310h\n" in logged(tmp_path / "nobody", tmp_path / "stderr", "")
 
 
-def test_a_long_line_is_cut_so_that_it_goes_into_a_datagram() -> None:
-    assert len(entry("x" * 1_000_000, {})) < 10_000
+def test_a_long_message_is_cut_to_fit_into_a_datagram() -> None:
+    record = logging.makeLogRecord({"levelno": logging.INFO})
+    assert len(entry(record, "x" * 1_000_000, {})) < 10_000
 
 
-def test_a_line_is_a_text_for_everybody_else() -> None:
-    line = Line("no heartbeat", event="heartbeat_lost", sync=5)
-    assert line == "no heartbeat"
-    assert f"{line}!" == "no heartbeat!"
+@pytest.mark.parametrize(
+    ("level", "priority"),
+    [(logging.DEBUG, "7"), (logging.INFO, "6"), (logging.WARNING, "4"), (logging.ERROR, "3"), (logging.CRITICAL, "2")],
+)
+def test_levels_become_priorities_of_syslog(level: int, priority: str) -> None:
+    assert parsed(entry(logging.makeLogRecord({"levelno": level}), "text", {}))["PRIORITY"] == priority
 
 
-def test_the_kernel_tells_the_state_of_its_clock() -> None:
+def test_fields_of_a_record_precede_those_of_the_handler() -> None:
+    record = logging.makeLogRecord({"levelno": logging.INFO, "cell": "own"})
+    assert parsed(entry(record, "text", {"cell": "press_7"}))["ARMIDENT_CELL"] == "own"
+
+
+def test_the_kernel_gives_the_state_of_its_clock() -> None:
     state = clock_state()
     assert abs(state.offset_us) < 10e6
     assert state.error_us >= 0

@@ -1,4 +1,4 @@
-"""What Prometheus is told: the last health message, with its kind, unit and cell."""
+"""Metrics for Prometheus: values of the last health message, with kind and labels."""
 
 import socket
 import urllib.request
@@ -40,7 +40,7 @@ def test_health_is_served_as_counters_and_gauges_of_the_cell() -> None:
     assert after["armident_frames_total"] == ("counter", labels, 15)
 
 
-def test_a_port_that_is_taken_is_one_line() -> None:
+def test_an_occupied_port_is_a_configuration_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(ConfigError, match=rf"metrics: 127\.0\.0\.1:{port} cannot be listened on: Address already"):

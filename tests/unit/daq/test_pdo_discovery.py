@@ -1,17 +1,19 @@
-"""What can be told from listening alone, and what is refused."""
+"""Discovery of TPDOs by listening: what is discovered, and what is refused."""
+
+import logging
 
 import numpy as np
 import pytest
 
 from armident.configs import ConfigError, SessionConfig, load_session
-from armident.daq.capture.pdo_discovery import default_mapping, sniffed, survey
+from armident.daq.capture.pdo_discovery import bus_statistics, default_mapping, with_sent_streams
 from armident.drivers.can.frames import Frames, frames
 
 SYNCS = 500
 
 
-def heard(tpdos: dict[int, tuple[int, int]], period_us: int = 200, fd: bool = False, late: float = 0.0) -> Frames:
-    """SYNC, and identifiers that come with a length on every n-th; a share of them ``late``, after the next SYNC."""
+def bus_frames(tpdos: dict[int, tuple[int, int]], period_us: int = 200, fd: bool = False, late: float = 0.0) -> Frames:
+    """Return SYNCs and frames of identifiers with length and interval; a share ``late`` follows the next SYNC."""
     rng = np.random.default_rng(4)
     rows: list[tuple[float, int, int]] = []
     for k in range(SYNCS):
@@ -27,10 +29,8 @@ def heard(tpdos: dict[int, tuple[int, int]], period_us: int = 200, fd: bool = Fa
     return out
 
 
-def told(frames_heard: Frames, session: SessionConfig) -> tuple[SessionConfig, list[str]]:
-    lines: list[str] = []
-    found = sniffed(session, [survey(session.all_buses[0].channel, frames_heard)], lines.append)
-    return found, lines
+def discovered(received: Frames, session: SessionConfig) -> SessionConfig:
+    return with_sent_streams(session, [bus_statistics(session.all_buses[0].channel, received)])
 
 
 def six(length: int, every: int, base: int = 0x180) -> dict[int, tuple[int, int]]:
@@ -38,27 +38,28 @@ def six(length: int, every: int, base: int = 0x180) -> dict[int, tuple[int, int]
 
 
 @pytest.mark.parametrize("late", [0.0, 0.005])
-def test_what_the_session_says_is_verified(late: float) -> None:
-    """Set points on the bus and a few late answers disturb nothing."""
+def test_streams_of_the_session_are_verified(late: float, caplog: pytest.LogCaptureFixture) -> None:
+    """Set points on the bus and some late answers do not matter."""
     session = load_session("tx40_cell.yaml")
-    frames_heard = heard(six(8, 1) | six(4, 5, 0x280) | six(4, 5, 0x200), late=late)
-    found, lines = told(frames_heard, session)
-    assert found.streams == session.streams
-    assert lines == [
+    received = bus_frames(six(8, 1) | six(4, 5, 0x280) | six(4, 5, 0x200), late=late)
+    caplog.set_level(logging.INFO, "armident")
+    assert discovered(received, session).streams == session.streams
+    assert caplog.messages == [
         "TPDO1 is samples: position, current, status on every 1. SYNC, as the session says",
         "TPDO2 is demand: demand on every 5. SYNC, as the session says",
     ]
 
 
-def test_a_stream_that_nobody_sends_is_left_out() -> None:
-    found, _ = told(heard(six(8, 1)), load_session("tx40_cell.yaml"))
+def test_a_stream_that_no_drive_sends_is_left_out() -> None:
+    found = discovered(bus_frames(six(8, 1)), load_session("tx40_cell.yaml"))
     assert list(found.streams) == ["samples"]
 
 
-def test_packed_samples_are_told_by_length_and_interval() -> None:
+def test_packed_samples_are_discovered_by_length_and_interval(caplog: pytest.LogCaptureFixture) -> None:
     session = load_session("tx40_one_fd.yaml")
-    found, (line,) = told(heard(six(64, 10), fd=True), session)
-    assert found.streams == session.streams
+    caplog.set_level(logging.INFO, "armident")
+    assert discovered(bus_frames(six(64, 10), fd=True), session).streams == session.streams
+    (line,) = caplog.messages
     assert "position, current on every 10. SYNC" in line
 
 
@@ -72,21 +73,21 @@ def test_packed_samples_are_told_by_length_and_interval() -> None:
         ({}, 200, "no TPDO comes on every SYNC"),
     ],
 )
-def test_what_cannot_be_told_is_refused(tpdos: dict[int, tuple[int, int]], period_us: int, message: str) -> None:
+def test_unknown_mappings_are_refused(tpdos: dict[int, tuple[int, int]], period_us: int, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        told(heard(tpdos, period_us), load_session("tx40_cell.yaml"))
+        discovered(bus_frames(tpdos, period_us), load_session("tx40_cell.yaml"))
 
 
 def test_a_length_that_changes_is_refused() -> None:
-    frames_heard = heard(six(8, 1))
-    frames_heard["length"][np.flatnonzero(frames_heard["can_id"] == 0x183)[50:]] = 6
+    received = bus_frames(six(8, 1))
+    received["length"][np.flatnonzero(received["can_id"] == 0x183)[50:]] = 6
     with pytest.raises(ConfigError, match=r"node 3 \(joint_3\), TPDO1 183h with 6 or 8 bytes.*its length changes"):
-        told(frames_heard, load_session("tx40_cell.yaml"))
+        discovered(received, load_session("tx40_cell.yaml"))
 
 
-def test_a_bus_without_sync_tells_nothing() -> None:
-    with pytest.raises(ConfigError, match="no SYNC heard"):
-        survey("can0", heard({})[:2])
+def test_a_bus_without_sync_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no SYNC received"):
+        bus_statistics("can0", bus_frames({})[:2])
 
 
 def test_the_defaults_of_an_eds_are_names_of_streams() -> None:

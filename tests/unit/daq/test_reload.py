@@ -1,5 +1,6 @@
-"""A configuration is reloaded where that can be done without losing a sample; all else is refused in one line."""
+"""Reload of a configuration: applied if no sample is lost, else refused with one log record."""
 
+import logging
 import time
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,14 @@ from armident.configs.loading import HERE
 from armident.daq.capture.files import limits, open_series
 from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.reload import Reloader, differences
+from armident.daq.logs import LineFormatter
 from armident.daq.matching.streams import captured_streams
 from armident.daq.recording import read_recording
 from tests.unit.daq.test_recording import make_recording
 
 
 def cell(path: Path, **changes: Any) -> Path:
-    """The shipped session with changes of its first level, or of one below (``recording={...}``)."""
+    """Write the shipped session with changed keys of the first or second level (``recording={...}``)."""
     data = yaml.safe_load((HERE / "cells" / "tx40_cell.yaml").read_text())
     data["robot"] = str(HERE / "robots" / "tx40.yaml")
     data["setpoints"]["trajectory"] = str(HERE / "trajectories" / "tx40_excitation.yaml")
@@ -31,15 +33,16 @@ def cell(path: Path, **changes: Any) -> Path:
 
 
 class Capture:
-    """Something that is being captured, as far as a reload is concerned."""
+    """A running capture, as far as a reload is concerned."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, caplog: pytest.LogCaptureFixture, path: Path) -> None:
+        caplog.set_level(logging.INFO, "armident")
+        self._caplog = caplog
         session = load_session(path)
         robot = load_robot(session.robot)
-        self.order = CapturePlan(session, robot, captured_streams(session, robot), None, path.parent, config=path)
+        plan = CapturePlan(session, robot, captured_streams(session, robot), None, path.parent, config=path)
         self.taken: list[SessionConfig] = []
-        self.said: list[str] = []
-        self.reloader = Reloader(path, self.order, [self.take], self.said.append)
+        self.reloader = Reloader(path, plan, [self.take])
 
     def take(self, session: SessionConfig) -> None:
         if session.metrics.port == 1:
@@ -47,18 +50,18 @@ class Capture:
         self.taken.append(session)
 
     def reload(self) -> str:
-        """Ask, and go on as a capture does until something was said."""
-        before = len(self.said)
-        self.reloader.ask()
+        """Request a reload, and return the line that is logged."""
+        before = len(self._caplog.records)
+        self.reloader.request()
         until = time.monotonic() + 20
-        while len(self.said) == before and time.monotonic() < until:
+        while len(self._caplog.records) == before and time.monotonic() < until:
             self.reloader.apply()
             time.sleep(0.005)
-        return self.said[-1]
+        return LineFormatter().format(self._caplog.records[-1])
 
 
-def test_what_can_change_does(tmp_path: Path) -> None:
-    capture = Capture(cell(tmp_path / "cell.yaml"))
+def test_changeable_keys_are_applied(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    capture = Capture(caplog, cell(tmp_path / "cell.yaml"))
     cell(tmp_path / "cell.yaml", recording={"rotate_mb": 7.0, "keep_days": 3.0}, zenoh={"commands": True})
     assert capture.reload().endswith("cell.yaml: recording.keep_days, recording.rotate_mb, zenoh.commands")
     assert capture.taken[-1].recording.rotate_mb == 7.0
@@ -66,12 +69,14 @@ def test_what_can_change_does(tmp_path: Path) -> None:
     capture.reloader.close()
 
 
-def test_what_is_kept_around_an_event_changes_and_whether_only_events_are_written_does_not(tmp_path: Path) -> None:
+def test_options_of_a_trigger_can_change_and_its_presence_cannot(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
     path = tmp_path / "cell.yaml"
-    capture = Capture(cell(path, recording={"trigger": {"before_s": 5.0, "events": ["command"]}}))
+    capture = Capture(caplog, cell(path, recording={"trigger": {"before_s": 5.0, "events": ["command"]}}))
     cell(path, recording={"trigger": {"before_s": 8.0, "events": ["emcy"]}, "drain_ms": 10, "chunk_ms": 50})
-    said = capture.reload()
-    assert said.endswith(
+    line = capture.reload()
+    assert line.endswith(
         ": recording.chunk_ms, recording.drain_ms, recording.trigger.before_s, recording.trigger.events"
     )
     trigger = capture.taken[-1].recording.trigger
@@ -95,26 +100,26 @@ def test_what_is_kept_around_an_event_changes_and_whether_only_events_are_writte
         ({"metrics": {"port": 1}}, "metrics: 127.0.0.1:1 cannot be listened on"),
     ],
 )
-def test_what_cannot_change_is_refused_and_the_capture_goes_on(
-    changes: dict[str, Any], named: str, tmp_path: Path
+def test_other_keys_are_refused_and_the_capture_goes_on(
+    changes: dict[str, Any], named: str, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    capture = Capture(cell(tmp_path / "cell.yaml"))
+    capture = Capture(caplog, cell(tmp_path / "cell.yaml"))
     cell(tmp_path / "cell.yaml", **changes)
-    said = capture.reload()
-    assert said.startswith("warning: not reloaded, the capture goes on as before: ")
-    assert named in said
-    assert "\n" not in said
+    line = capture.reload()
+    assert line.startswith("warning: not reloaded, the capture goes on as before: ")
+    assert named in line
+    assert "\n" not in line
     assert capture.taken == []
-    # And it can still be reloaded, once the file is right again.
+    # A corrected file can still be reloaded.
     cell(tmp_path / "cell.yaml", recording={"rotate_minutes": 1.0})
     assert capture.reload().endswith("recording.rotate_minutes")
     capture.reloader.close()
 
 
-def test_a_robot_that_changed_is_refused(tmp_path: Path) -> None:
+def test_a_changed_robot_is_refused(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     robot = tmp_path / "robot.yaml"
     robot.write_text((HERE / "robots" / "tx40.yaml").read_text())
-    capture = Capture(cell(tmp_path / "cell.yaml", robot=str(robot)))
+    capture = Capture(caplog, cell(tmp_path / "cell.yaml", robot=str(robot)))
     robot.write_text(robot.read_text().replace("name: tx40", "name: tx41"))
     assert "the robot cannot change while it is captured" in capture.reload()
     capture.reloader.close()
@@ -126,7 +131,7 @@ def test_differences_are_named_by_their_keys() -> None:
     assert list(differences(session, session.model_copy(update={"sync": sync}))) == ["sync.period_us"]
 
 
-def test_no_row_is_lost_where_rotation_begins_in_the_middle(tmp_path: Path) -> None:
+def test_no_row_is_lost_if_rotation_is_switched_on_during_a_capture(tmp_path: Path) -> None:
     session = load_session("tx40_cell.yaml")
     robot = load_robot(session.robot)
     streams = captured_streams(session, robot)

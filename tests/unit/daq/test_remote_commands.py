@@ -1,4 +1,4 @@
-"""Commands over Zenoh: allowed ones arrive, all others are refused with a reason."""
+"""Commands over Zenoh: permitted ones arrive, others are refused with a reason."""
 
 import time
 import uuid
@@ -33,7 +33,7 @@ def test_commands_arrive_in_order_with_their_texts() -> None:
         assert commands.pending() == []
 
 
-def test_commands_that_a_capture_does_not_look_at_do_not_heap_up() -> None:
+def test_the_number_of_waiting_commands_is_limited() -> None:
     cell = session(True)
     with open_session(cell, "capture") as own:
         commands = Commands(own, Keys(cell.cell, "tx40"), True)
@@ -48,7 +48,7 @@ def test_commands_that_a_capture_does_not_look_at_do_not_heap_up() -> None:
         assert commands.pending() == []
 
 
-def test_a_capture_that_does_not_allow_them_refuses() -> None:
+def test_commands_are_refused_if_the_session_does_not_permit_them() -> None:
     cell = session(False)
     with open_session(cell, "capture") as own:
         commands = Commands(own, Keys(cell.cell, "tx40"), cell.zenoh.commands)
@@ -57,7 +57,7 @@ def test_a_capture_that_does_not_allow_them_refuses() -> None:
         assert commands.pending() == []
 
 
-def test_without_a_capture_nobody_answers() -> None:
+def test_a_command_without_a_capture_is_a_configuration_error() -> None:
     begin = time.monotonic()
     with pytest.raises(ConfigError, match=r"no capture of cell remote_.* answers"):
         send_command(session(True), "tx40", Command("stop"), answer_s=0.5)

@@ -2,6 +2,7 @@
 
 import datetime
 import fcntl
+import logging
 import resource
 import threading
 from collections.abc import Callable
@@ -204,8 +205,8 @@ def test_a_file_that_is_being_written_stays(tmp_path: Path) -> None:
     assert prune(tmp_path, "tx40", NOW, 30.0, None) == [first]
 
 
-def test_the_janitor_tells_what_it_deletes_and_a_problem_once() -> None:
-    said: list[str] = []
+def test_deleted_files_are_logged_and_an_error_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "armident")
     looked = threading.Semaphore(0)
     problem = OSError(5, "Input/output error")
     answers: list[list[Path] | OSError] = [[], problem, problem, [Path("a.mcap")]]
@@ -217,9 +218,12 @@ def test_the_janitor_tells_what_it_deletes_and_a_problem_once() -> None:
             raise answer
         return answer
 
-    janitor = RetentionThread(look, said.append, every_s=0.001)
+    thread = RetentionThread(look, every_s=0.001)
     for _ in range(6):
         assert looked.acquire(timeout=10)
-    janitor.close()
-    assert janitor.deleted == 1
-    assert said == ["deleted a.mcap (retention)", "warning: retention: [Errno 5] Input/output error"]
+    thread.close()
+    assert thread.deleted == 1
+    assert [(record.levelname, record.message) for record in caplog.records] == [
+        ("INFO", "deleted a.mcap (retention)"),
+        ("WARNING", "retention: [Errno 5] Input/output error"),
+    ]

@@ -1,4 +1,4 @@
-"""What drives that were behind send at once is written and published in pieces."""
+"""Rows that come at once, because drives lagged, are written and published in pieces."""
 
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ PERIOD_NS = 200_000
 
 
 def batch_of(first: int, count: int, missing: list[int]) -> Batch:
-    """Samples at every SYNC and demand at every tenth, but for SYNCs that are gaps of one joint."""
+    """Return samples at every SYNC and demand at every tenth, except at SYNCs that are gaps of one joint."""
     sync = np.setdiff1d(np.arange(first, first + count), missing)
     rows = {}
     for name, every in (("samples", 1), ("demand", 10)):

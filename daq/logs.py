@@ -1,0 +1,81 @@
+"""Log output of the commands: one line per record on stderr.
+
+Modules log to ``logging.getLogger(__name__)``. The logger ``armident`` has no output by itself, so that a program that
+imports armident chooses its own; the command line adds `StderrHandler`.
+"""
+
+import contextlib
+import logging
+import sys
+from collections.abc import Iterator
+
+LOGGER = logging.getLogger("armident")
+
+
+class LineFormatter(logging.Formatter):
+    """Formats a record as its message, and from WARNING on with its level in front: ``warning: the disk is slow``.
+
+    Parameters
+    ----------
+    program
+        Name in front of the level.
+    """
+
+    def __init__(self, program: str | None = None) -> None:
+        super().__init__()
+        self._program = "" if program is None else f"{program}: "
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line of a record."""
+        text = super().format(record)
+        if record.levelno < logging.WARNING:
+            return text
+        return f"{self._program}{record.levelname.lower()}: {text}"
+
+
+class StderrHandler(logging.Handler):
+    """Writes records as lines to what ``sys.stderr`` is at that time.
+
+    Parameters
+    ----------
+    program
+        Name in front of warnings and errors.
+    """
+
+    def __init__(self, program: str | None = None) -> None:
+        super().__init__()
+        self.setFormatter(LineFormatter(program))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one record."""
+        try:
+            print(self.format(record), file=sys.stderr, flush=True)
+        except Exception:
+            self.handleError(record)
+
+
+@contextlib.contextmanager
+def log_to(handler: logging.Handler, level: int | None = None) -> Iterator[None]:
+    """Send the records of armident to a handler while the block runs, in place of another `StderrHandler`.
+
+    Parameters
+    ----------
+    handler
+        Takes the records; closed at the end.
+    level
+        Lowest level that is logged; default: the level that is set already, else INFO.
+    """
+    replaced = [other for other in LOGGER.handlers if isinstance(other, StderrHandler)]
+    level_before = LOGGER.level
+    for other in replaced:
+        LOGGER.removeHandler(other)
+    LOGGER.addHandler(handler)
+    LOGGER.setLevel(level or level_before or logging.INFO)
+    try:
+        yield
+    finally:
+        LOGGER.setLevel(level_before)
+        LOGGER.removeHandler(handler)
+        handler.close()
+        for other in replaced:
+            LOGGER.addHandler(other)
