@@ -17,6 +17,7 @@ from scipy import stats
 from armident.identify.diagnosis.lines import lowest_frequency
 from armident.identify.diagnosis.regression import Fit
 from armident.identify.diagnosis.repeats import repeats
+from armident.identify.signals.periodogram import hann_window, periodogram
 
 Array = NDArray[np.float64]
 Pieces = tuple[Sequence[Array], Sequence[Array] | None]
@@ -160,8 +161,7 @@ class Spectrum:
         """Of pieces (N,) each, under a Hann window."""
         f, density, length = [], [], 0.0
         for piece in pieces:
-            window = np.hanning(piece.size)
-            of_piece = 2 * dt * np.abs(np.fft.rfft(window * piece)) ** 2 / float(window @ window)
+            of_piece = 2 * dt * periodogram(hann_window(piece.size) * piece)
             f.append(np.fft.rfftfreq(piece.size, dt)[1:])
             density.append(of_piece[1:])
             length += piece.size * dt

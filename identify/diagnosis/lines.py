@@ -9,6 +9,7 @@ from scipy import stats
 
 from armident.identify.diagnosis.stretch import Stretch
 from armident.identify.diagnosis.study import BAND, Study
+from armident.identify.signals.periodogram import hann_window, periodogram
 
 Array = NDArray[np.float64]
 
@@ -145,15 +146,15 @@ class _Spectrum:
 
     @classmethod
     def of(cls, e: Array, dt: float) -> "_Spectrum":
-        window = np.hanning(e.size)
-        windowed = window * (e - e.mean()) / np.sqrt(window @ window)
-        power = np.abs(np.fft.rfft(windowed, PADDING * e.size)) ** 2
+        window = hann_window(e.size)
+        windowed = window * (e - e.mean())
+        power = periodogram(windowed, PADDING)
         block = PADDING * BLOCK
         count = max(1, power.size // block)
         parts = np.array_split(np.arange(power.size), count)
         level = np.array([np.log(np.median(power[part]) / np.log(2)) for part in parts])
         background = np.exp(np.interp(np.arange(power.size), [part.mean() for part in parts], level))
-        to_power = 2.0 * float(window @ window) / float(window.sum()) ** 2
+        to_power = 2.0 / float(window.sum()) ** 2
         f = np.arange(power.size) / (PADDING * e.size * dt)
         return cls(f, power, np.maximum(background, 1e-300), to_power, windowed, dt)
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from armident.identify.diagnosis.candidates import Workshop
 from armident.identify.diagnosis.regression import Fit
 from armident.identify.diagnosis.state import State
-from armident.identify.diagnosis.trial import newey_west
+from armident.identify.diagnosis.trial import variance_of_sum
 from armident.identify.effects.terms import Term, effect_terms
 from armident.identify.regression.ar_noise import ArModel
 
@@ -82,5 +82,5 @@ def _deviations(fit: Fit, slopes: list[Array]) -> Array:
     for k in range(b - e, b + len(slopes)):
         influence = (z / scale) @ inverse[:, k] / scale[k]
         variances[k] += (inverse[k, k] - (alone[k, k] if k < b else 0.0)) / scale[k] ** 2
-        variances[k] = max(variances[k], newey_west(influence * fit.residual))
+        variances[k] = max(variances[k], variance_of_sum(influence * fit.residual))
     return variances**0.5

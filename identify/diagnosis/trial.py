@@ -11,6 +11,7 @@ from armident.identify.diagnosis.candidates import Candidate, Columns, Shapes, W
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, applied, noise_models
 from armident.identify.diagnosis.whitening import joints_of, rows_of_joints
 from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.hac import newey_west
 
 Array = NDArray[np.float64]
 
@@ -243,7 +244,12 @@ def _judged(
 
 def inflation_along(change: Array, residual: Array) -> float:
     """Variance of whitened residuals (R,) along a change of prediction, over that of white noise; at least 1."""
-    return max(1.0, newey_west(change * _without_leaps(residual)) / float(change @ change))
+    return max(1.0, variance_of_sum(change * _without_leaps(residual)) / float(change @ change))
+
+
+def variance_of_sum(products: Array) -> float:
+    """Variance of the sum of serially correlated terms (R,), their mean removed."""
+    return float(newey_west([products - products.mean()], NEWEY_WEST_LAGS))
 
 
 def deviations(fit: Fit, columns: Columns) -> Array | None:
@@ -379,12 +385,3 @@ def _without_leaps(residual: Array) -> Array:
     """
     deviation = MAD_TO_STD * float(np.median(np.abs(residual)))
     return np.clip(residual, -LEAP * deviation, LEAP * deviation)
-
-
-def newey_west(products: Array) -> float:
-    """Variance of a sum of serially correlated terms of mean zero, with Bartlett weights."""
-    centred = products - products.mean()
-    total = float(centred @ centred)
-    for lag in range(1, min(NEWEY_WEST_LAGS, centred.size - 1) + 1):
-        total += 2 * (1 - lag / (NEWEY_WEST_LAGS + 1)) * float(centred[lag:] @ centred[:-lag])
-    return max(total, 0.0)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.ar_noise import ArModel, lowest_aic
 from armident.identify.robot.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -35,8 +35,7 @@ def ar_models(errors: Sequence[Array], max_order: int) -> list[ArModel]:
         if r[0] <= 0:
             models.append(ArModel(np.empty(0), np.finfo(np.float64).tiny, -np.inf))
             continue
-        coefficients, order, variance, criterion = _best_order(r / total, total)
-        models.append(ArModel(coefficients[:order].copy(), variance, criterion))
+        models.append(lowest_aic(r / total, total))
     return models
 
 
@@ -105,29 +104,3 @@ def _acting(columns: Array) -> NDArray[np.bool_]:
 def _add_lagged_sums(x: Array, sums: Array) -> None:
     for lag in range(sums.size):
         sums[lag] += np.dot(x[lag:], x[: x.size - lag])
-
-
-@compiled
-def _best_order(r: Array, total: int) -> tuple[Array, int, float, float]:
-    """Levinson-Durbin recursion: coefficients, order, variance and criterion of the model with the lowest AIC."""
-    c, swapped, best = np.zeros(r.size), np.zeros(r.size), np.zeros(r.size)
-    variance = r[0]
-    best_order, best_variance, best_criterion = 0, variance, total * np.log(variance)
-    for order in range(1, r.size):
-        reflected = r[order]
-        for i in range(order - 1):
-            reflected += c[i] * r[order - 1 - i]
-        reflection = -reflected / variance
-        for i in range(order - 1):
-            swapped[i] = c[order - 2 - i]
-        for i in range(order - 1):
-            c[i] += reflection * swapped[i]
-        c[order - 1] = reflection
-        variance *= 1 - reflection**2
-        if variance <= 1e-14 * r[0]:
-            break
-        criterion = 2 * order + total * np.log(variance)
-        if criterion < best_criterion:
-            best_order, best_variance, best_criterion = order, variance, criterion
-            best[:order] = c[:order]
-    return best, best_order, best_variance, best_criterion

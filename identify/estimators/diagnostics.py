@@ -24,6 +24,7 @@ from armident.identify.regression.equations import (
     noise_models,
     weighted_rows,
 )
+from armident.identify.regression.hac import newey_west
 
 Array = NDArray[np.float64]
 
@@ -36,6 +37,9 @@ WEAK_F = 23.1
 
 LAGS = 20
 """Lags of the whiteness test beyond the order of the noise model."""
+
+LAGS_PER_ROOT_SAMPLE = 1.3
+"""Lags of the Newey-West variance of M samples over ``sqrt(M)`` (Lazarus, Lewis, Stock and Watson 2018)."""
 
 SAME = 1e-8
 """Share of the IV variance under which the two estimators of the endogeneity test are one and the same."""
@@ -516,14 +520,10 @@ def _by_instant(rows: Array, keep: Sequence[NDArray[np.bool_]], weights: Sequenc
 
 
 def _long_run_variance(scores: Sequence[Array]) -> Array:
-    """Variance of the sum of serially correlated scores (b,): Newey and West, ``1.3 sqrt(M)`` lags (Lazarus 2018)."""
+    """Variance of the sum of serially correlated scores (b,), ``LAGS_PER_ROOT_SAMPLE sqrt(M)`` lags."""
     total = sum(s.shape[0] for s in scores)
-    lags = min([math.ceil(1.3 * math.sqrt(total)), *(s.shape[0] - 1 for s in scores)])
-    variance = sum((np.sum(s**2, axis=0) for s in scores), np.zeros(scores[0].shape[1]))
-    for lag in range(1, lags + 1):
-        products = sum((np.sum(s[lag:] * s[:-lag], axis=0) for s in scores), np.zeros_like(variance))
-        variance += 2 * (1 - lag / (lags + 1)) * products
-    return variance
+    lags = min([math.ceil(LAGS_PER_ROOT_SAMPLE * math.sqrt(total)), *(s.shape[0] - 1 for s in scores)])
+    return newey_west(scores, lags)
 
 
 def _absorbed(sensitivities: Sequence[Array], covariance: Array, lags: int) -> Array:

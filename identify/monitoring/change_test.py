@@ -11,6 +11,7 @@ from scipy import stats
 
 from armident.configs import DataError
 from armident.identify.document import IdentificationDocument, Parameter
+from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]
 
@@ -194,7 +195,7 @@ def compare(
     places = _places(names)
     sums = [_chi_square(difference[rows], covariance[np.ix_(rows, rows)]) for rows in places.values()]
     single = 2 * stats.norm.sf(np.abs(difference) / std)
-    p = _holm(np.concatenate([single, [stats.chi2.sf(value, dof) for value, dof in sums]]))
+    p = holm(np.concatenate([single, [stats.chi2.sf(value, dof) for value, dof in sums]]))
     groups = tuple(
         Group(kind, place, tuple(names[k] for k in rows), *found, float(chance))
         for ((kind, place), rows), found, chance in zip(places.items(), sums, p[len(names) :], strict=True)
@@ -231,12 +232,3 @@ def _places(names: Sequence[str]) -> dict[tuple[Literal["friction", "masses"], s
             kind: Literal["friction", "masses"] = "friction" if match[1] in FRICTION else "masses"
             found.setdefault((kind, match[2]), []).append(k)
     return {key: rows for key, rows in found.items() if len(rows) > 1}
-
-
-def _holm(p: Array) -> Array:
-    """P-values that hold for all tests together, by Holm's step-down."""
-    order = np.argsort(p, kind="stable")
-    stepped = np.maximum.accumulate(p[order] * (p.size - np.arange(p.size)))
-    adjusted = np.empty_like(p)
-    adjusted[order] = np.minimum(stepped, 1.0)
-    return adjusted

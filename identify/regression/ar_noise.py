@@ -1,6 +1,6 @@
 """Autoregressive noise models, whitening and whiteness (thesis section 6.1.3)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,10 +95,20 @@ def fit_ar(
     r /= total
     if r[0] <= 0:
         return ArModel(np.empty(0), np.finfo(np.float64).tiny, -np.inf)
-    models = list(_levinson(r))
-    criteria = [2 * order + total * float(np.log(variance)) for order, (_, variance) in enumerate(models)]
-    best = int(np.argmin(criteria))
-    return ArModel(*models[best], criteria[best])
+    return lowest_aic(r, total)
+
+
+def lowest_aic(r: NDArray[np.float64], samples: int) -> ArModel:
+    """AR model of the order with the lowest Akaike criterion (6.24, 6.25).
+
+    Parameters
+    ----------
+    r
+        Autocovariances at lags 0..highest order, ``r[0] > 0``.
+    samples
+        Length of the residuals from which they come, of all experiments together.
+    """
+    return ArModel(*_lowest_aic(r, samples))
 
 
 def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
@@ -112,21 +122,43 @@ def fit_spectrum(power: NDArray[np.float64], order: int) -> ArModel:
         Order; less where a shorter model is exact.
     """
     r = np.fft.irfft(power)[: order + 1]
-    coefficients, variance = list(_levinson(r))[-1]
-    return ArModel(coefficients, variance, -np.inf)
+    coefficients, variances = levinson_durbin(r)
+    last = variances.size - 1
+    return ArModel(coefficients[last, :last].copy(), float(variances[last]), -np.inf)
 
 
-def _levinson(r: NDArray[np.float64]) -> Iterator[tuple[NDArray[np.float64], float]]:
-    """Coefficients and variance of the AR models of order 0, 1, ... with autocovariances r (6.21 to 6.23)."""
-    c, variance = np.zeros(0), float(r[0])
-    yield c, variance
-    for order in range(1, r.size):
-        reflection = -(r[order] + c @ r[order - 1 : 0 : -1]) / variance
-        c = np.append(c + reflection * c[::-1], reflection)
-        variance *= 1 - reflection**2
-        if variance <= 1e-14 * r[0]:
-            return
-        yield c, variance
+@compiled
+def levinson_durbin(r: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Solutions of the Yule-Walker equations of every order by the Levinson-Durbin recursion (6.21 to 6.23).
+
+    Parameters
+    ----------
+    r
+        Autocovariances at lags 0..L, ``r[0] > 0``.
+
+    Returns
+    -------
+    coefficients
+        Row l holds ``c_1 .. c_l`` of the model of order l, then zeros; shape (P + 1, L).
+    variances
+        Variances of the innovations, shape (P + 1,). P is L, or less where a model of order P + 1 would be exact.
+    """
+    highest = r.size - 1
+    coefficients, variances = np.zeros((highest + 1, highest)), np.zeros(highest + 1)
+    variances[0] = r[0]
+    for order in range(1, highest + 1):
+        c = coefficients[order - 1]
+        reflected = r[order]
+        for i in range(order - 1):
+            reflected += c[i] * r[order - 1 - i]
+        reflection = -reflected / variances[order - 1]
+        for i in range(order - 1):
+            coefficients[order, i] = c[i] + reflection * c[order - 2 - i]
+        coefficients[order, order - 1] = reflection
+        variances[order] = variances[order - 1] * (1 - reflection**2)
+        if variances[order] <= 1e-14 * r[0]:
+            return coefficients[:order], variances[:order]
+    return coefficients, variances
 
 
 def lagged_sums(x: NDArray[np.float64], max_lag: int, first: int = 0) -> NDArray[np.float64]:
@@ -144,6 +176,18 @@ def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whitenes
         for lag in range(min(lags, centred.size - 1) + 1):
             r[lag] += centred[lag:] @ centred[: centred.size - lag]
     return Whiteness(r[1:] / r[0] if r[0] > 0 else np.zeros(lags), 2 / float(np.sqrt(total)))
+
+
+@compiled
+def _lowest_aic(r: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float64], float, float]:
+    """Coefficients, variance and criterion of the model with the lowest AIC."""
+    coefficients, variances = levinson_durbin(r)
+    best, lowest = 0, np.inf
+    for order in range(variances.size):
+        criterion = 2 * order + samples * np.log(variances[order])
+        if criterion < lowest:
+            best, lowest = order, criterion
+    return coefficients[best, :best].copy(), variances[best], lowest
 
 
 @compiled

@@ -5,7 +5,7 @@ import pytest
 
 from armident.configs import DataError
 from armident.identify.document import IdentificationDocument, Parameter, RecordingReference
-from armident.identify.monitoring.change_test import FALSE_ALARMS, Inconclusive, _holm, compare
+from armident.identify.monitoring.change_test import FALSE_ALARMS, Inconclusive, compare
 
 NAMES = [f"p{k}" for k in range(30)]
 TRUTH = np.linspace(0.5, 20.0, 30)
@@ -109,11 +109,6 @@ def test_another_robot_or_model_is_refused() -> None:
         compare(identified(TRUTH), identified(TRUTH, robot="other"))
     with pytest.raises(DataError, match="other base parameters: p29, q"):
         compare(identified(TRUTH), identified(TRUTH, names=[*NAMES[:29], "q"]))
-
-
-def test_p_values_of_holm() -> None:
-    np.testing.assert_allclose(_holm(np.array([0.01, 0.04, 0.03])), [0.03, 0.06, 0.06])
-    np.testing.assert_allclose(_holm(np.array([0.5, 0.9])), [1.0, 1.0])
 
 
 def test_a_run_that_did_not_converge_is_not_called_unchanged() -> None:
