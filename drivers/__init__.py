@@ -1,1 +1,1 @@
-"""The bus: CANopen drives, the fast SocketCAN path, and what a bus can carry."""
+"""CAN buses and CANopen drives: fast SocketCAN reception, CiA 301 and CiA 402 services, bus load."""

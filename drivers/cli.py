@@ -1,4 +1,4 @@
-"""Commands of the bus."""
+"""Command ``armident bus-load``."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,16 +9,18 @@ import typer
 def bus_load(
     config: Annotated[Path, typer.Option("--config", help="Session configuration.")] = Path("tx40_cell.yaml"),
     bitrate: Annotated[
-        int | None, typer.Option("--bitrate", min=10_000, help="Bit rate in bit/s, instead of the configuration's.")
+        int | None, typer.Option("--bitrate", min=10_000, help="Bit rate, bit/s. [default: that of the session]")
     ] = None,
     data_bitrate: Annotated[
         int | None,
-        typer.Option("--data-bitrate", min=10_000, help="Data bit rate with --bitrate; makes classic buses CAN FD."),
+        typer.Option(
+            "--data-bitrate", min=10_000, help="Data bit rate of CAN FD, bit/s, with --bitrate; makes classic buses FD."
+        ),
     ] = None,
 ) -> None:
-    """Compute the load of every bus from a configuration, and refuse what cannot fit.
+    """Compute the load of every bus of a session, and refuse a load that does not fit.
 
-    What does not fit is answered with the nearest configurations that would: the least change first.
+    The error lists the nearest configurations that fit, the smallest change first.
 
     Example: armident bus-load --config tx40_cell.yaml --bitrate 1000000
     """
@@ -38,7 +40,7 @@ def bus_load(
         )
         unknown = [bus.channel for bus in buses if bus.fd and bus.data_bitrate is None]
         if unknown:
-            raise ConfigError(f"--bitrate: {', '.join(unknown)}: CAN FD, which needs --data-bitrate, too")
+            raise ConfigError(f"--bitrate: {', '.join(unknown)}: a CAN FD bus needs --data-bitrate, too")
         session = session.model_copy(update={"buses": buses})
     console = Console()
     for bus in session.all_buses:
@@ -61,5 +63,5 @@ def bus_load(
         console.print(table)
     if all(bus.bitrate is None for bus in session.all_buses):
         fd = " --data-bitrate 5000000" if session.all_buses[0].fd else ""
-        console.print(f"Virtual buses have no bit rate to fill (--bitrate 1000000{fd} shows physical ones).")
+        console.print(f"Virtual buses have no bit rate; for physical buses add --bitrate 1000000{fd}.")
     check_fits(session, str(config))

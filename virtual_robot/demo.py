@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import yaml
 
 from armident.configs import ArmidentError, ConfigError, SessionConfig, load_session
-from armident.drivers.vcan import ensure_vcan, have_socketcan, launcher_available, launcher_command
+from armident.drivers.vcan import ensure_vcan, have_socketcan, launcher_command, launcher_obstacle
 
 CELL = "tx40_cell.yaml"
 SCENARIO = "scenarios/tx40_worn_joint2.yaml"
@@ -115,7 +115,7 @@ def _session_for_this_machine(out: Path, keep_going: bool, quick: bool) -> Sessi
     if have_socketcan():
         ensure_vcan(session.bus.channel)
         return session
-    reason = "the guest has no SocketCAN" if os.environ.get(GUEST_VARIABLE) else launcher_available()
+    reason = "the guest has no SocketCAN" if os.environ.get(GUEST_VARIABLE) else launcher_obstacle()
     if reason is None:
         print("this kernel has no SocketCAN: running under a User-Mode Linux guest that has", flush=True)
         _start_over_in_guest(out, keep_going, quick)

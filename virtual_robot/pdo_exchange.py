@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from armident.drivers.can.frames import BIT_RATE_SWITCH, FD_FLAG, fd_length, frames
 from armident.drivers.canopen.objects import (
+    ARRAY_OFFSET,
     COB_SYNC,
     CONTROLWORD,
     CURRENT_ACTUAL,
@@ -17,7 +18,6 @@ from armident.drivers.canopen.objects import (
     RPDO_COMMUNICATION,
     STATUSWORD,
     TARGET_POSITION,
-    TO_ARRAY,
     TORQUE_ACTUAL,
     TPDO_COMMUNICATION,
     VELOCITY_ACTUAL,
@@ -166,8 +166,8 @@ class Exchange:
                 offset = 0
                 for index, subindex, size in mapped:
                     row, back = LIVE.get(index), 0
-                    if row is None and subindex and index + TO_ARRAY in LIVE:
-                        row, back = LIVE[index + TO_ARRAY], kind - subindex
+                    if row is None and subindex and index + ARRAY_OFFSET in LIVE:
+                        row, back = LIVE[index + ARRAY_OFFSET], kind - subindex
                     elif row is None:
                         row = CONSTANT + len(constants)
                         raw = drive.get_data(index, subindex)

@@ -26,9 +26,9 @@ SUPERVISION_SYNCS = 64
 """Following errors are checked every so many SYNC."""
 FOLLOWING_ERROR_LIMIT = 0.5
 """Following error at which a drive faults, rad or m at the joint."""
-LATENESS_SYNCS = 16
+DELAY_SYNCS = 16
 """How long a SYNC waited is measured at every so many, and at every one that found another before it."""
-LATENESS_BINS = 50_000
+DELAY_BINS = 50_000
 """Lateness is counted in bins of 1 us; the last one holds everything later."""
 EMCY_FOLLOWING_ERROR, EMCY_PDO_LENGTH = 0x8611, 0x8210
 MOTION_ERROR, COMMUNICATION_ERROR = 0x20, 0x10
@@ -40,9 +40,9 @@ class ServerReport:
     """How the drives kept up; ``lateness`` is how long a SYNC had waited in the kernel when its turn came."""
 
     syncs: int
-    lateness_p50_us: float
-    lateness_p99_us: float
-    lateness_max_us: float
+    delay_p50_us: float
+    delay_p99_us: float
+    delay_max_us: float
     backlog_max: int
     seconds: float
     cpu_share: float
@@ -54,11 +54,11 @@ class ServerReport:
         behind = (
             "never a SYNC behind"
             if self.backlog_max <= 1
-            else f"at worst {self.backlog_max - 1} SYNC behind ({self.lateness_max_us / 1000:.1f} ms)"
+            else f"at worst {self.backlog_max - 1} SYNC behind ({self.delay_max_us / 1000:.1f} ms)"
         )
         return (
-            f"{self.syncs} SYNC answered, late by {self.lateness_p50_us:.0f} us (p50), "
-            f"{self.lateness_p99_us:.0f} us (p99), {self.lateness_max_us:.0f} us (worst); {behind}; "
+            f"{self.syncs} SYNC answered, late by {self.delay_p50_us:.0f} us (p50), "
+            f"{self.delay_p99_us:.0f} us (p99), {self.delay_max_us:.0f} us (worst); {behind}; "
             f"{100 * self.cpu_share:.0f} % of one CPU; "
             f"{self.dropped} frames dropped by the kernel"
         )
@@ -91,18 +91,18 @@ class Server:
             fd = session.bus_of(node).fd
             self.drives.append(Drive(node.node_id, node.eds, j, robot.joints[j], motion, *told, fd))
         self._limit = _following_limit(robot)
-        self._histogram = np.zeros(LATENESS_BINS + 1, np.int64)
+        self._histogram = np.zeros(DELAY_BINS + 1, np.int64)
         self._latest = 0.0
         self._backlog = self._syncs = 0
         self._seconds = self._cpu = 0.0
-        self._lines: list[DriveBus] = []
+        self._buses: list[DriveBus] = []
         try:
             for bus in session.all_buses:
                 both = zip(self.drives, session.drives, strict=True)
                 here = [drive for drive, node in both if session.bus_of(node) == bus]
-                self._lines.append(DriveBus(bus, here, motion, session.sync_period))
+                self._buses.append(DriveBus(bus, here, motion, session.sync_period))
         except BaseException:
-            for line in self._lines:
+            for line in self._buses:
                 line.close()
             raise
 
@@ -115,22 +115,22 @@ class Server:
     def _catch_up(self) -> None:
         if self._dirty:
             self._dirty = self._status_dirty = False
-            for line in self._lines:
+            for line in self._buses:
                 line.exchange.rebuild()
         elif self._status_dirty:
             self._status_dirty = False
-            for line in self._lines:
+            for line in self._buses:
                 line.exchange.refresh_status()
 
     def __enter__(self) -> Self:
         """Boot the drives: boot-up message, pre-operational, heartbeat."""
-        for line in self._lines:
+        for line in self._buses:
             line.boot()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Take the drives off their buses."""
-        for line in self._lines:
+        for line in self._buses:
             line.close()
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> ServerReport:
@@ -146,8 +146,8 @@ class Server:
         def over() -> bool:
             return stopped() or (duration is not None and time.monotonic() - begin > duration)
 
-        if len(self._lines) == 1:
-            self._serve_one(self._lines[0], over)
+        if len(self._buses) == 1:
+            self._serve_one(self._buses[0], over)
         else:
             self._serve_several(over)
         self._seconds += time.monotonic() - begin
@@ -175,7 +175,7 @@ class Server:
                 if at + 1 == count or (backlog + 1) % ANSWERED_SYNCS == 0:
                     bus.send(outbox[:queued])
                     queued = 0
-                if backlog or self._syncs % LATENESS_SYNCS == 0:
+                if backlog or self._syncs % DELAY_SYNCS == 0:
                     self._note(time.time_ns() - int(stamps[at]))
                 exchange.act()
                 # Drives that are behind obey at the same SYNC as those that are not.
@@ -191,19 +191,19 @@ class Server:
     def _serve_several(self, over: Callable[[], bool]) -> None:
         """Answer SYNC k on every bus before the arm moves on to k + 1."""
         poll = select.poll()
-        for line in self._lines:
+        for line in self._buses:
             assert isinstance(line.bus, RawSocket)
             poll.register(line.bus.fileno(), select.POLLIN)
         half_turn_ns = round(self._session.sync_period * 1e9 * self._session.sync.counter / 2)
         since: float | None = None
         while not over():
-            due = [(line, line.next_sync()) for line in self._lines]
+            due = [(line, line.next_sync()) for line in self._buses]
             waiting = [(line, *sync) for line, sync in due if sync is not None]
             missing = any(sync is None and not line.down for line, sync in due)
             self._catch_up()
             if not waiting or (missing and (since is None or time.monotonic() - since < TOGETHER_S)):
                 since = (since or time.monotonic()) if waiting else None
-                for line in self._lines:
+                for line in self._buses:
                     line.flush()
                 poll.poll(1000 * (TOGETHER_S if waiting else RECEIVE_TIMEOUT))
                 continue
@@ -213,7 +213,7 @@ class Server:
                 # A bus that lacked a SYNC is ahead of the others: its next one waits for theirs.
                 if other == counter and abs(at - stamp) < half_turn_ns:
                     line.answer(counter or self._counter)
-            if self._syncs % LATENESS_SYNCS == 0:
+            if self._syncs % DELAY_SYNCS == 0:
                 self._note(time.time_ns() - stamp)
             self._advance()
 
@@ -230,7 +230,7 @@ class Server:
 
     def _note(self, late_ns: int) -> None:
         late = max(late_ns // 1000, 0)
-        self._histogram[min(late, LATENESS_BINS)] += 1
+        self._histogram[min(late, DELAY_BINS)] += 1
         self._latest = max(self._latest, float(late))
 
     def _supervise(self) -> None:
@@ -238,7 +238,7 @@ class Server:
         for drive in self.drives:
             if drive.state is DriveState.ENABLED and error[drive.index] > self._limit[drive.index]:
                 drive.fault(EMCY_FOLLOWING_ERROR, MOTION_ERROR)
-        for index in [index for line in self._lines for index in line.exchange.take_short()]:
+        for index in [index for line in self._buses for index in line.exchange.take_short()]:
             next(d for d in self.drives if d.index == index).emcy.send(EMCY_PDO_LENGTH, COMMUNICATION_ERROR)
 
     def report(self) -> ServerReport:
@@ -247,7 +247,7 @@ class Server:
         p50, p99 = (float(np.searchsorted(counts, share * counts[-1])) for share in (0.5, 0.99))
         return ServerReport(
             self._syncs, p50, p99, self._latest, self._backlog, self._seconds,
-            self._cpu / self._seconds if self._seconds else 0.0, sum(line.bus.dropped for line in self._lines),
+            self._cpu / self._seconds if self._seconds else 0.0, sum(line.bus.dropped for line in self._buses),
         )  # fmt: skip
 
 

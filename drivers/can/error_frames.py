@@ -1,4 +1,4 @@
-"""Error frames of a CAN controller in words (linux/can/error.h)."""
+"""Interpretation of the error frames of a CAN controller (linux/can/error.h)."""
 
 from typing import Any, Literal
 
@@ -8,9 +8,9 @@ BusState = Literal["bus_off", "restarted", "passive", "warning", "active"]
 
 TX_TIMEOUT, LOST_ARBITRATION, CONTROLLER, PROTOCOL = 0x001, 0x002, 0x004, 0x008
 TRANSCEIVER, NO_ACKNOWLEDGE, BUS_OFF, BUS_ERROR, RESTARTED = 0x010, 0x020, 0x040, 0x080, 0x100
-"""Classes of errors, bits of ``can_id``."""
+"""Error classes, bits of ``can_id``."""
 OVERFLOW, WARNING, PASSIVE, ACTIVE = 0x03, 0x0C, 0x30, 0x40
-"""Bits of data byte 1 of a controller error, receiving and transmitting."""
+"""Bits of data byte 1 of a controller error, of receiver and transmitter."""
 
 _CLASSES = {
     TX_TIMEOUT: "a frame could not be sent in time",
@@ -23,7 +23,20 @@ _CLASSES = {
 
 
 def describe(error: Any) -> tuple[BusState | None, str]:
-    """What one error frame reports: the state the controller enters, if any, and a text."""
+    """Interpret one error frame.
+
+    Parameters
+    ----------
+    error
+        An element of an array of ``FRAME``.
+
+    Returns
+    -------
+    state
+        State that the controller enters; ``None`` if the frame reports no change of state.
+    text
+        Description of the error.
+    """
     classes = int(error["can_id"]) & 0x1FFFFFFF
     detail = int(error["data"][1]) if classes & CONTROLLER else 0
     if classes & BUS_OFF:
@@ -43,13 +56,24 @@ def describe(error: Any) -> tuple[BusState | None, str]:
 
 
 def summarise(errors: Frames) -> list[tuple[BusState | None, str]]:
-    """Every change of state in order, and of other errors each kind once with its count."""
-    told: list[tuple[BusState | None, str]] = []
+    """Summarise error frames: every change of state in order, then each kind of other errors with its count.
+
+    Parameters
+    ----------
+    errors
+        Error frames, shape (N,).
+
+    Returns
+    -------
+    list
+        Pairs of state and text, as `describe` returns them.
+    """
+    changes: list[tuple[BusState | None, str]] = []
     counts: dict[str, int] = {}
     for error in errors:
         state, text = describe(error)
         if state is not None:
-            told.append((state, text))
+            changes.append((state, text))
         else:
             counts[text] = counts.get(text, 0) + 1
-    return told + [(None, text if n == 1 else f"{text} ({n} times)") for text, n in counts.items()]
+    return changes + [(None, text if n == 1 else f"{text} ({n} times)") for text, n in counts.items()]

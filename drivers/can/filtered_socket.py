@@ -1,4 +1,4 @@
-"""A few identifiers of a bus in a socket of their own: what is rare, and must not be lost when samples are."""
+"""Socket for a few identifiers of a bus: rare frames that must not be lost when the sample socket overflows."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -9,22 +9,23 @@ from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown, FrameBus, Fra
 from armident.drivers.can.udp import open_bus
 
 BATCH = 256
+"""Maximum number of frames per batch."""
 
 
-class SideSocket:
-    """Frames of some identifiers, read when it suits; a bus that was removed is opened again when it is back.
+class FilteredSocket:
+    """Socket that receives a few identifiers and reopens a bus whose interface was removed and is back.
 
     Parameters
     ----------
     bus
         The bus.
     cob_ids
-        What is received.
+        Identifiers to receive.
 
     Raises
     ------
     ConfigError
-        If there is no such bus.
+        If the bus does not exist.
     BusDown
         If the bus is down.
     """
@@ -40,7 +41,7 @@ class SideSocket:
         return open_bus(classic, filters=[(cob_id, STANDARD_ID_MASK) for cob_id in self._cob_ids])
 
     def read(self) -> Iterator[Frames]:
-        """What has come, in batches that are good until the next one; nothing while the bus is down or removed."""
+        """Yield received frames in batches that are valid until the next one; none while the bus is down or removed."""
         if self._gone:
             with suppress(ArmidentError):
                 fresh = self._open()
@@ -50,7 +51,7 @@ class SideSocket:
             while (got := self._bus.receive(self._batch)) > 0:
                 yield self._batch[:got]
         except BusDown:
-            # A socket whose interface was removed has lost it for good.
+            # A socket whose interface was removed cannot be used again.
             self._gone = not self._bus.bound
 
     def close(self) -> None:

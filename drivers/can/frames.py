@@ -1,4 +1,4 @@
-"""CAN frames in arrays: the one form in which they travel between the buses and the rest."""
+"""CAN frames in NumPy arrays, and the protocol of a bus that sends and receives them."""
 
 from typing import Any, Protocol, Self
 
@@ -13,16 +13,16 @@ FRAME = np.dtype(
         ("flags", "u1"), ("reserved", "u1", (2,)), ("data", "u1", (8,)),
     ], align=True,
 )  # fmt: skip
-"""A received frame: kernel time (ns, UTC), then the 16 bytes of the kernel's ``struct can_frame`` as they are."""
+"""Received frame: kernel time (ns, UTC), then the 16 bytes of the kernel's ``struct can_frame``."""
 
 FD_FRAME = np.dtype([(name, FRAME[name]) for name in (FRAME.names or ())[:-1]] + [("data", "u1", (64,))], align=True)
-"""The same of a bus with CAN FD: kernel time, then the 72 bytes of ``struct canfd_frame``."""
+"""Received frame of a bus with CAN FD: kernel time (ns, UTC), then the 72 bytes of ``struct canfd_frame``."""
 
 FD_FLAG, BIT_RATE_SWITCH = 0x04, 0x01
-"""Bits of ``flags``: a CAN FD frame, whose data go at the data bit rate (linux/can.h); a frame without is classic."""
+"""Bits of ``flags``: CAN FD frame, and data phase at the data bit rate (linux/can.h); a classic frame has neither."""
 
 FD_LENGTHS: tuple[int, ...] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-"""How many data bytes a CAN FD frame can have (ISO 11898-1)."""
+"""Possible numbers of data bytes of a CAN FD frame (ISO 11898-1)."""
 
 STANDARD_ID_MASK = 0x7FF
 """Bits of an 11-bit identifier."""
@@ -42,45 +42,63 @@ class BusDown(ArmidentError):
 
 
 class FrameBus(Protocol):
-    """What capture, drives and SYNC producer need of a bus."""
+    """Interface of a bus that moves frames in batches."""
 
     channel: str
     dropped: int
     fd: bool
 
     @property
-    def stamps(self) -> str:
-        """Whose clock stamps the frames: ``hardware`` or ``software``."""
+    def timestamp_source(self) -> str:
+        """Clock of the time stamps: ``hardware`` or ``software``."""
         ...
 
     @property
     def up(self) -> bool:
-        """Whether frames can come and go."""
+        """``True`` if the bus can send and receive."""
         ...
 
     @property
     def bound(self) -> bool:
-        """Whether the bus can still come back, when it is down."""
+        """``True`` if the socket becomes usable again when the bus is back up."""
         ...
 
     def receive(self, batch: Frames) -> int:
-        """Fill the beginning of ``batch`` with what has arrived; the number of frames, 0 if none."""
+        """Write received frames to the beginning of ``batch``; return their number, 0 if none.
+
+        Parameters
+        ----------
+        batch
+            Array of ``FRAME`` or ``FD_FRAME``, shape (N,), written in place.
+        """
         ...
 
     def poll(self, timeout: float) -> bool:
-        """Whether a frame arrived within ``timeout`` seconds."""
+        """Return True if a frame arrives within the timeout.
+
+        Parameters
+        ----------
+        timeout
+            Longest wait, s.
+        """
         ...
 
     def send(self, frames: Frames) -> int:
-        """Send all frames in order; the number of frames sent."""
+        """Send all frames in order; return their number.
+
+        Parameters
+        ----------
+        frames
+            Array of ``FRAME`` or ``FD_FRAME``, shape (N,).
+        """
         ...
 
     def drops(self) -> int:
-        """Frames that were dropped so far, those behind the last one received among them."""
+        """Number of frames dropped by the kernel so far, including those after the last received one."""
         ...
 
     def close(self) -> None:
-        """Release the bus; nothing happens the second time."""
+        """Release the bus; further calls have no effect."""
         ...
 
     def __enter__(self) -> Self:
@@ -93,17 +111,30 @@ class FrameBus(Protocol):
 
 
 def frames(n: int, fd: bool = False) -> Frames:
-    """An array of ``n`` empty frames; with ``fd`` with room for those of CAN FD."""
+    """Array of empty frames.
+
+    Parameters
+    ----------
+    n
+        Number of frames.
+    fd
+        ``True`` for ``FD_FRAME``, else ``FRAME``.
+    """
     return np.zeros(n, dtype=FD_FRAME if fd else FRAME)
 
 
 def fd_length(size: int) -> int:
-    """The length of the CAN FD frame that carries ``size`` bytes: the rest is padding.
+    """Number of data bytes of the smallest CAN FD frame that carries a payload; the rest is padding.
+
+    Parameters
+    ----------
+    size
+        Payload, bytes.
 
     Raises
     ------
     ValueError
-        If no frame carries as many.
+        If the payload exceeds the largest frame.
     """
     if size > FD_LENGTHS[-1]:
         raise ValueError(f"{size} bytes do not fit into the {FD_LENGTHS[-1]} of a CAN FD frame")
@@ -111,7 +142,15 @@ def fd_length(size: int) -> int:
 
 
 def frame(can_id: int, data: bytes = b"") -> Frames:
-    """An array with one classic frame to send."""
+    """Array with one classic frame to send, shape (1,).
+
+    Parameters
+    ----------
+    can_id
+        Identifier.
+    data
+        Data bytes, at most 8.
+    """
     one = frames(1)
     one["can_id"] = can_id
     one["length"] = len(data)

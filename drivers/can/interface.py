@@ -1,4 +1,4 @@
-"""A CAN interface of this machine: its state, and what an administrator has to do about it."""
+"""State of a CAN interface of this machine, and error messages with the administrator's command."""
 
 from pathlib import Path
 
@@ -8,12 +8,33 @@ from armident.drivers.can.mmsg import FD_MTU
 
 SYSFS = Path("/sys/class/net")
 _IFF_UP = 1
+_ARPHRD_CAN = 280
 
 
 def is_up(channel: str) -> bool:
-    """Whether the interface is administratively up."""
+    """Return True if the interface is administratively up.
+
+    Parameters
+    ----------
+    channel
+        Name of the interface.
+    """
     try:
         return bool(int((SYSFS / channel / "flags").read_text(), 16) & _IFF_UP)
+    except (OSError, ValueError):
+        return False
+
+
+def is_can(channel: str) -> bool:
+    """Return True if the interface exists and is a CAN interface (``ARPHRD_CAN``).
+
+    Parameters
+    ----------
+    channel
+        Name of the interface.
+    """
+    try:
+        return int((SYSFS / channel / "type").read_text()) == _ARPHRD_CAN
     except (OSError, ValueError):
         return False
 
@@ -21,10 +42,15 @@ def is_up(channel: str) -> bool:
 def check_fd(channel: str) -> None:
     """Refuse an interface that carries classic frames only.
 
+    Parameters
+    ----------
+    channel
+        Name of the interface.
+
     Raises
     ------
     ConfigError
-        With the command that would make it carry CAN FD.
+        If the interface has no CAN FD; contains the command that enables it.
     """
     try:
         mtu = int((SYSFS / channel / "mtu").read_text())
@@ -41,7 +67,15 @@ def check_fd(channel: str) -> None:
 
 
 def missing(channel: str, reason: str | None) -> ConfigError:
-    """The error of an interface that is not there or is no CAN interface."""
+    """Error for an interface that does not exist or is not a CAN interface.
+
+    Parameters
+    ----------
+    channel
+        Name of the interface.
+    reason
+        Text of the system's error.
+    """
     hint = f"sudo ip link add dev {channel} type vcan && " if channel.startswith("vcan") else ""
     return ConfigError(
         f"bus {channel}: no such CAN interface ({reason}); "
@@ -50,6 +84,14 @@ def missing(channel: str, reason: str | None) -> ConfigError:
 
 
 def down(channel: str, what: str) -> BusDown:
-    """The error of an interface that cannot be used now: it is down, went down or was removed."""
+    """Error for an interface that is down, went down or was removed.
+
+    Parameters
+    ----------
+    channel
+        Name of the interface.
+    what
+        Predicate of the message, such as ``is down``.
+    """
     command = f"sudo ip link set dev {channel} up"
     return BusDown(f"bus {channel}: the interface {what}; an administrator may run: {command}")

@@ -1,4 +1,4 @@
-"""The kernel's message headers for whole batches of CAN frames, laid out in arrays (linux/socket.h, 64 bits)."""
+"""Arrays of ``struct mmsghdr`` for batches of CAN frames (``recvmmsg``, ``sendmmsg``; linux/socket.h, 64 bits)."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ _MESSAGE = np.dtype(
     }
 )
 _IOVEC = np.dtype([("base", "<u8"), ("length", "<u8")])
-# The kernel puts the time stamp first, and the drop counter behind it once anything was dropped.
+# The kernel writes the time stamp first, followed by the drop counter once frames were dropped.
 STAMP_CONTROL = np.dtype(
     {
         "names": ["seconds", "nanoseconds", "drops"],
@@ -33,17 +33,32 @@ HARDWARE_CONTROL = np.dtype(
 )
 """Control messages of SO_TIMESTAMPING (software, unused, raw hardware time) and SO_RXQ_OVFL."""
 DROP_CONTROL_BYTES = 24
-"""What the drop counter adds to the control messages of a frame."""
+"""Size of the drop counter in the control messages of a frame, bytes."""
 
 CLASSIC_MTU, FD_MTU = FRAME.itemsize - 8, FD_FRAME.itemsize - 8
-"""Bytes of ``struct can_frame`` and ``struct canfd_frame``."""
+"""Sizes of ``struct can_frame`` and ``struct canfd_frame``, bytes."""
 
 
 class Messages:
-    """Preallocated ``struct mmsghdr`` for up to ``n`` frames, for the kernel to read from or write to.
+    """Preallocated ``struct mmsghdr`` for a batch of frames.
 
-    ``body`` (n, 16) uint8 are the ``struct can_frame``, with ``fd`` (n, 72) the ``struct canfd_frame``;
-    ``control`` (n,) the time stamps and drop counters.
+    Parameters
+    ----------
+    n
+        Maximum number of frames.
+    control
+        ``True`` with room for time stamps and drop counters.
+    fd
+        ``True`` for ``struct canfd_frame``.
+    hardware
+        ``True`` with room for hardware time stamps.
+
+    Attributes
+    ----------
+    body
+        Bytes of ``struct can_frame`` or ``struct canfd_frame``, uint8, shape (n, 16) or (n, 72).
+    control
+        Time stamps and drop counters, shape (n,).
     """
 
     def __init__(self, n: int, control: bool = True, fd: bool = False, hardware: bool = False) -> None:
@@ -63,7 +78,13 @@ class Messages:
         self.address: int = self.header.ctypes.data
 
     def load(self, frames: Frames) -> None:
-        """Take over frames to send; those of CAN FD go as such, the others as classic ones."""
+        """Copy frames to send; frames with ``FD_FLAG`` are sent as CAN FD, the others as classic frames.
+
+        Parameters
+        ----------
+        frames
+            Array of ``FRAME`` or ``FD_FRAME``, shape (N,), N <= n.
+        """
         octets = frame_bytes(frames)[:, 8:]
         width = min(octets.shape[1], self.body.shape[1])
         self.body[: frames.size, :width] = octets[:, :width]
@@ -72,7 +93,13 @@ class Messages:
             self.iovec["length"][: frames.size] = np.where(fd, FD_MTU, CLASSIC_MTU)
 
     def unload(self, batch: Frames) -> None:
-        """Write the bodies of received frames behind the times of ``batch``."""
+        """Copy the bodies of received frames into ``batch``.
+
+        Parameters
+        ----------
+        batch
+            Array of ``FRAME`` or ``FD_FRAME``, shape (N,), written in place except for the times.
+        """
         got = batch.size
         frame_bytes(batch)[:, 8:] = self.body[:got]
         if self.body.shape[1] == FD_MTU:
@@ -80,7 +107,18 @@ class Messages:
 
 
 def frame_bytes(batch: Frames) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
-    """Bytes of a contiguous array of frames, shape (N, 24) or (N, 80), as a view."""
+    """View of a contiguous array of frames as bytes, shape (N, 24) or (N, 80).
+
+    Parameters
+    ----------
+    batch
+        Array of ``FRAME`` or ``FD_FRAME``, shape (N,).
+
+    Raises
+    ------
+    ValueError
+        If the array is not contiguous.
+    """
     if not batch.flags.c_contiguous:
         raise ValueError("frames must lie contiguously in memory")
     return batch.view(np.uint8).reshape(batch.size, batch.dtype.itemsize)

@@ -1,4 +1,4 @@
-"""All buses of a session read by one thread: frames in batches, and what happens to the buses themselves."""
+"""Reception of all buses of a session in one thread: frames in batches, and events of the buses."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,63 +13,76 @@ from armident.drivers.can.error_frames import summarise
 from armident.drivers.can.frames import ERROR_FLAG, BusDown, FrameBus, Frames, frames
 
 BATCH = 4096
+"""Maximum number of frames per batch."""
 DRAINS = 16
-"""Batches taken in a row from each bus before anything else is looked at."""
-LOOK_AGAIN_S = 0.1
-"""How often a bus that is down is looked at."""
-TELL_ERRORS_S = 1.0
-"""Errors of one bus are told together this often; changes of its state at once."""
+"""Maximum number of batches per bus that one call of `Receiver.drain` reads."""
+RETRY_S = 0.1
+"""Interval at which a bus that is down is checked, s."""
+REPORT_ERRORS_S = 1.0
+"""Interval at which errors of one bus are reported, s; changes of its state are reported at once."""
 
 BusEventKind = Literal["bus_down", "bus_up", "bus_off", "bus_restarted", "bus_state", "bus_errors"]
 
 
 @dataclass(frozen=True)
 class BusEvent:
-    """Something that happened to a bus, not on it."""
+    """Event of a bus.
+
+    Parameters
+    ----------
+    kind
+        Kind of the event.
+    bus
+        Number of the bus.
+    text
+        Message that names the bus.
+    """
 
     kind: BusEventKind
     bus: int
     text: str
 
 
-class _Line:
-    """One bus: its socket, whether it is up, and errors not told yet."""
+class _BusState:
+    """One bus: its socket, its state and the errors that are not reported yet."""
 
     def __init__(self, open_bus: Callable[[], FrameBus]) -> None:
         self.open = open_bus
         self.bus = open_bus()
         self.batch = frames(BATCH, fd=self.bus.fd)
         self.down_since: float | None = None
-        self.looked = 0.0
+        self.checked = 0.0
         self.lost_before = 0
         self.errors: list[Frames] = []
         self.error_count = 0
-        self.told = 0.0
+        self.reported = 0.0
 
 
 class Receiver:
-    """Reads several buses, one after the other, each in whole batches.
+    """Reads several buses in turn, each in whole batches.
 
-    A bus that goes down is an event, and so is its return: its socket stays, or is opened anew where the interface
-    itself was removed. Error frames are taken out, counted, and told as events.
+    A bus that goes down or comes back is an event. Its socket is kept, or reopened if the interface was removed. Error
+    frames are removed from the batches, counted, and reported as events.
 
     Parameters
     ----------
     openers
-        Open one bus each.
+        Functions that open one bus each.
 
     Raises
     ------
-    ConfigError, BusDown
-        As the buses do when they are opened.
+    ConfigError
+        If a bus does not exist.
+    BusDown
+        If a bus is down.
     """
 
     def __init__(self, openers: Sequence[Callable[[], FrameBus]]) -> None:
         self._events: list[BusEvent] = []
-        self._lines: list[_Line] = []
+        self._buses: list[_BusState] = []
         try:
             for opener in openers:
-                self._lines.append(_Line(opener))
+                self._buses.append(_BusState(opener))
         except BaseException:
             self.close()
             raise
@@ -77,133 +90,146 @@ class Receiver:
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of the buses."""
-        return tuple(line.bus.channel for line in self._lines)
+        return tuple(entry.bus.channel for entry in self._buses)
 
     @property
-    def stamps(self) -> tuple[str, ...]:
-        """Whose clock stamps the frames of each bus."""
-        return tuple(line.bus.stamps for line in self._lines)
+    def timestamp_sources(self) -> tuple[str, ...]:
+        """Clock of each bus's time stamps: ``hardware`` or ``software``."""
+        return tuple(entry.bus.timestamp_source for entry in self._buses)
 
     @property
     def dropped(self) -> int:
-        """Frames that the kernel dropped, of all buses."""
-        return sum(line.lost_before + line.bus.drops() for line in self._lines)
+        """Number of frames dropped by the kernel, all buses."""
+        return sum(entry.lost_before + entry.bus.drops() for entry in self._buses)
 
     @property
     def dropped_behind(self) -> tuple[int, ...]:
-        """Frames of each bus that the kernel dropped behind the last one received."""
-        return tuple(line.bus.drops() - line.bus.dropped for line in self._lines)
+        """Number of frames of each bus that the kernel dropped after the last received one."""
+        return tuple(entry.bus.drops() - entry.bus.dropped for entry in self._buses)
 
     @property
     def error_frames(self) -> int:
-        """Error frames of all buses."""
-        return sum(line.error_count for line in self._lines)
+        """Number of error frames, all buses."""
+        return sum(entry.error_count for entry in self._buses)
 
     @property
     def down(self) -> tuple[bool, ...]:
-        """Whether each bus is down."""
-        return tuple(line.down_since is not None for line in self._lines)
+        """``True`` for each bus that is down."""
+        return tuple(entry.down_since is not None for entry in self._buses)
 
     @property
     def all_down_s(self) -> float:
-        """How long all buses have been down, s."""
-        since = [line.down_since for line in self._lines]
+        """Time for which all buses have been down, s; 0 if a bus is up."""
+        since = [entry.down_since for entry in self._buses]
         latest = max((t for t in since if t is not None), default=0.0)
         return 0.0 if None in since else time.monotonic() - latest
 
     def warm_up(self) -> Frames:
-        """A few empty frames as they will come, for whatever has to be compiled for them."""
-        return self._lines[0].batch[:2]
+        """Two empty frames of the received type, for the compilation of loops before the first frame."""
+        return self._buses[0].batch[:2]
 
     def drain(self) -> Iterator[tuple[int, Frames, bool]]:
-        """Bus, frames, and whether frames were lost before them, as long as there are any.
+        """Yield received frames until none are left.
 
-        The frames are good until the next ones are asked for.
+        Yields
+        ------
+        bus
+            Number of the bus.
+        frames
+            Frames, shape (N,), valid until the next iteration.
+        lost
+            ``True`` if the kernel dropped frames before these.
         """
-        # Bounded, so that buses faster than we are cannot keep a capture from ending.
+        # Bounded, so that a bus faster than this loop cannot keep a capture from ending.
         for _ in range(DRAINS):
             more = False
-            # All of them every time: one that had nothing a moment ago must not fall behind by more than a batch.
-            for k, line in enumerate(self._lines):
-                before = line.bus.dropped
-                got = self._receive(k, line)
+            # All buses in every round, so that none falls behind by more than a batch.
+            for k, entry in enumerate(self._buses):
+                before = entry.bus.dropped
+                got = self._receive(k, entry)
                 more |= got == BATCH
                 if got:
-                    batch = self._without_errors(line, line.batch[:got])
-                    yield k, batch, line.bus.dropped > before
+                    batch = self._without_errors(entry, entry.batch[:got])
+                    yield k, batch, entry.bus.dropped > before
             if not more:
                 return
 
     def events(self, *, last: bool = False) -> list[BusEvent]:
-        """What happened since the last call; errors are told once a second, and all that are left at the ``last``."""
-        now = time.monotonic()
-        for k, line in enumerate(self._lines):
-            if line.down_since is not None and now - line.looked >= LOOK_AGAIN_S:
-                line.looked = now
-                self._look(k, line)
-            if line.errors:
-                self._tell_errors(k, line, now, last)
-        told, self._events = self._events, []
-        return told
+        """Events since the last call; errors are reported once per second.
 
-    def _receive(self, k: int, line: _Line) -> int:
+        Parameters
+        ----------
+        last
+            ``True`` for the last call, which reports all remaining errors.
+        """
+        now = time.monotonic()
+        for k, entry in enumerate(self._buses):
+            if entry.down_since is not None and now - entry.checked >= RETRY_S:
+                entry.checked = now
+                self._check(k, entry)
+            if entry.errors:
+                self._report_errors(k, entry, now, last)
+        pending, self._events = self._events, []
+        return pending
+
+    def _receive(self, k: int, entry: _BusState) -> int:
         try:
-            got = line.bus.receive(line.batch)
-            if got and line.down_since is not None:
-                self._back(k, line)
+            got = entry.bus.receive(entry.batch)
+            if got and entry.down_since is not None:
+                self._back(k, entry)
             return got
         except BusDown as error:
-            if line.down_since is None:
-                line.down_since = line.looked = time.monotonic()
+            if entry.down_since is None:
+                entry.down_since = entry.checked = time.monotonic()
                 self._events.append(BusEvent("bus_down", k, str(error)))
-            # What had arrived before is still to be read.
+            # Frames that arrived before are still readable.
             with suppress(BusDown):
-                return line.bus.receive(line.batch)
+                return entry.bus.receive(entry.batch)
         return 0
 
-    def _look(self, k: int, line: _Line) -> None:
-        if line.bus.bound:
-            if not line.bus.up:
+    def _check(self, k: int, entry: _BusState) -> None:
+        if entry.bus.bound:
+            if not entry.bus.up:
                 return
         else:
             try:
-                fresh = line.open()
+                fresh = entry.open()
             except ArmidentError:
                 return
-            line.lost_before += line.bus.drops()
-            line.bus.close()
-            line.bus = fresh
-        self._back(k, line)
+            entry.lost_before += entry.bus.drops()
+            entry.bus.close()
+            entry.bus = fresh
+        self._back(k, entry)
 
-    def _back(self, k: int, line: _Line) -> None:
-        assert line.down_since is not None
-        seconds = time.monotonic() - line.down_since
-        line.down_since = None
-        self._events.append(BusEvent("bus_up", k, f"bus {line.bus.channel}: is back after {seconds:.1f} s"))
+    def _back(self, k: int, entry: _BusState) -> None:
+        assert entry.down_since is not None
+        seconds = time.monotonic() - entry.down_since
+        entry.down_since = None
+        self._events.append(BusEvent("bus_up", k, f"bus {entry.bus.channel}: is back after {seconds:.1f} s"))
 
-    def _without_errors(self, line: _Line, batch: Frames) -> Frames:
+    def _without_errors(self, entry: _BusState, batch: Frames) -> Frames:
         bad = (batch["can_id"] & np.uint32(ERROR_FLAG)) != 0
         if not bad.any():
             return batch
-        line.errors.append(batch[bad])
-        line.error_count += int(np.count_nonzero(bad))
+        entry.errors.append(batch[bad])
+        entry.error_count += int(np.count_nonzero(bad))
         good: Frames = batch[~bad]
         return good
 
-    def _tell_errors(self, k: int, line: _Line, now: float, last: bool) -> None:
-        found = summarise(np.concatenate(line.errors))
-        if not last and all(state is None for state, _ in found) and now - line.told < TELL_ERRORS_S:
+    def _report_errors(self, k: int, entry: _BusState, now: float, last: bool) -> None:
+        found = summarise(np.concatenate(entry.errors))
+        if not last and all(state is None for state, _ in found) and now - entry.reported < REPORT_ERRORS_S:
             return
-        line.errors, line.told = [], now
+        entry.errors, entry.reported = [], now
         kinds: dict[str, BusEventKind] = {"bus_off": "bus_off", "restarted": "bus_restarted"}
         for state, text in found:
             kind: BusEventKind = "bus_errors" if state is None else kinds.get(state, "bus_state")
-            self._events.append(BusEvent(kind, k, f"bus {line.bus.channel}: {text}"))
+            self._events.append(BusEvent(kind, k, f"bus {entry.bus.channel}: {text}"))
 
     def close(self) -> None:
         """Release all buses."""
-        for line in self._lines:
-            line.bus.close()
+        for entry in self._buses:
+            entry.bus.close()
 
     def __enter__(self) -> Self:
         """Use the receiver in a ``with`` block."""

@@ -1,4 +1,4 @@
-"""What a thread asks of the scheduler so that it is in time; without the right to it, it runs as everybody else."""
+"""Scheduling priority of threads; without the right to it a thread keeps its normal priority."""
 
 import ctypes
 import os
@@ -8,21 +8,21 @@ from contextlib import contextmanager, suppress
 
 PR_SET_TIMERSLACK = 29
 HIGHEST = -20
-"""Niceness that comes before all others."""
+"""Nice value of the highest priority."""
 
 
-def be_punctual(priority: int) -> bool:
-    """Ask for exact wake-ups and a real-time priority for this thread.
+def set_realtime_priority(priority: int) -> bool:
+    """Request exact timers and a real-time priority for the calling thread.
 
     Parameters
     ----------
     priority
-        Of ``SCHED_FIFO``, 1 to 99.
+        Priority of ``SCHED_FIFO``, 1 to 99.
 
     Returns
     -------
     bool
-        Whether the priority was granted.
+        ``True`` if the priority was granted.
     """
     ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
     try:
@@ -33,13 +33,13 @@ def be_punctual(priority: int) -> bool:
 
 
 @contextmanager
-def ahead(steps: int) -> Iterator[None]:
-    """Let this thread come before the others of its process, where a processor is short.
+def raised_priority(steps: int) -> Iterator[None]:
+    """Raise the priority of the calling thread in a ``with`` block.
 
     Parameters
     ----------
     steps
-        Of niceness; threads that are started meanwhile come before the others, too.
+        Steps of the nice value; threads that are started in the block inherit them.
     """
     thread = threading.get_native_id()
     before = os.getpriority(os.PRIO_PROCESS, thread)

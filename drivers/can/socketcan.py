@@ -1,7 +1,7 @@
-"""The fast path to a SocketCAN bus: whole batches of frames in one system call, in arrays.
+"""Fast access to a SocketCAN bus: batches of frames in one system call, in arrays.
 
-The kernel writes a batch straight into preallocated arrays (``recvmmsg``), stamps every frame in
-nanoseconds and counts what it had to drop; no Python object per frame exists.
+The kernel writes a batch into preallocated arrays (``recvmmsg``), stamps every frame in nanoseconds and counts dropped
+frames. There is no Python object per frame.
 """
 
 import ctypes
@@ -25,17 +25,17 @@ from armident.drivers.can.timestamps import (
     SO_TIMESTAMPNS,
     SOFTWARE,
     InterfaceClock,
-    has_hardware_stamps,
+    has_hardware_timestamps,
 )
 
 __all__ = ["ERROR_FLAG", "FRAME", "BusDown", "Messages", "RawSocket", "frame", "frames"]
 
 RECEIVE_BUFFER = 128 << 20
-"""Bytes of kernel buffer asked for, and given twice over: eight seconds of 36 000 frames/s at 900 bytes each. They are
-taken while nobody reads."""
+"""Requested size of the kernel's receive buffer, bytes; the kernel doubles it. It holds eight seconds of 36 000
+frames/s at 900 bytes each. Memory is used only while frames wait."""
 
 BATCH = 4096
-"""Most frames that one system call moves."""
+"""Maximum number of frames per system call."""
 
 RECEIVE_TIMEOUT = 0.05
 """Longest wait of a receive call that waits, s."""
@@ -60,34 +60,34 @@ _sendmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int
 
 
 class RawSocket:
-    """A raw socket on one CAN interface that moves batches of frames.
+    """Raw socket on one CAN interface that moves batches of frames.
 
     Parameters
     ----------
     channel
         Name of the interface, ``vcan0``.
     filters
-        What the kernel lets through; ``None``: everything, empty: nothing (a socket that only sends).
+        Frames to receive; ``None``: all, empty: none (a socket that only sends).
     errors
-        Whether error frames of the controller are received (``can_id & ERROR_FLAG``).
+        Receive error frames of the controller (``can_id & ERROR_FLAG``).
     own
-        Whether frames sent through this socket are received on it as well.
+        Receive frames that are sent through this socket.
     loopback
-        Whether other sockets of this machine see what is sent here.
+        Deliver sent frames to other sockets of this machine.
     receive_buffer
-        Bytes of kernel buffer to ask for; forced beyond the system's limit where we have the right.
+        Size of the kernel's receive buffer, bytes; beyond the system's limit with the right to it.
     fd
-        Whether frames of CAN FD are moved too; batches are then arrays of ``FD_FRAME``.
+        Move CAN FD frames too; batches are then arrays of ``FD_FRAME``.
     hardware
-        Whether frames get the interface's own time stamps where it has some, put into the machine's time.
+        Use the interface's time stamps, if it has any, converted to the machine's time.
 
     Raises
     ------
     ConfigError
-        If the kernel has no SocketCAN or no such interface, or it carries no CAN FD; says which command an
-        administrator has to run.
+        If the kernel has no SocketCAN, or the interface does not exist or has no CAN FD; contains the command for an
+        administrator.
     BusDown
-        If the interface is there but down.
+        If the interface is down.
     """
 
     def __init__(
@@ -104,11 +104,9 @@ class RawSocket:
     ) -> None:
         self.channel = channel
         self.fd = fd
-        self._clock = InterfaceClock() if hardware and has_hardware_stamps(channel) else None
+        self._clock = InterfaceClock() if hardware and has_hardware_timestamps(channel) else None
         self.dropped = 0
-        """Frames the kernel had to drop because the receive buffer was full, since the socket was opened.
-
-        As the last frame received says, which does not know of those dropped behind it."""
+        """Number of frames dropped by the kernel because the receive buffer was full, up to the last received frame."""
         try:
             self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except OSError as error:
@@ -161,23 +159,23 @@ class RawSocket:
             interface.check_fd(self.channel)
 
     @property
-    def stamps(self) -> str:
-        """Whose clock stamps the frames: ``hardware`` (the interface's) or ``software`` (the kernel's)."""
+    def timestamp_source(self) -> str:
+        """Clock of the time stamps: ``hardware`` (the interface's) or ``software`` (the kernel's)."""
         return "software" if self._clock is None else "hardware"
 
     @property
     def bound(self) -> bool:
-        """Whether the socket still has its interface; it has lost it for good when that was removed."""
+        """``True`` while the socket has its interface; after a removal of the interface the socket is unusable."""
         return bool(self._socket.getsockname()[0])
 
     @property
     def up(self) -> bool:
-        """Whether the interface is administratively up."""
+        """``True`` if the interface is administratively up."""
         return interface.is_up(self.channel)
 
     @property
     def receive_buffer(self) -> int:
-        """Bytes of kernel buffer really granted."""
+        """Size of the kernel's receive buffer as granted, bytes."""
         return self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
     def fileno(self) -> int:
@@ -185,14 +183,14 @@ class RawSocket:
         return self._socket.fileno()
 
     def receive(self, batch: Frames, wait: bool = False) -> int:
-        """Fill the beginning of ``batch`` with the frames that have arrived.
+        """Write received frames to the beginning of ``batch``.
 
         Parameters
         ----------
         batch
             Array of ``FRAME`` (``FD_FRAME`` with ``fd``), shape (N,), written in place.
         wait
-            Wait up to ``RECEIVE_TIMEOUT`` for the first of them, without a system call more.
+            Wait up to ``RECEIVE_TIMEOUT`` for the first frame, in the same system call.
 
         Returns
         -------
@@ -202,7 +200,7 @@ class RawSocket:
         Raises
         ------
         BusDown
-            If the interface went down or away.
+            If the interface went down or was removed.
         """
         if self._in is None:
             self._in = Messages(BATCH, fd=self.fd, hardware=self._clock is not None)
@@ -223,24 +221,29 @@ class RawSocket:
         messages.unload(filled)
         lengths = messages.header["controllen"][:got]
         if lengths[-1] > messages.control.itemsize - DROP_CONTROL_BYTES:
-            # The counter is 32 bits wide, ours is not.
+            # The kernel's counter is 32 bits wide.
             self.dropped += (int(control["drops"][-1]) - self.dropped) & 0xFFFFFFFF
         lengths[:] = messages.control.itemsize
         return int(got)
 
     def drops(self) -> int:
-        """Frames the kernel dropped until now, those behind the last one received among them."""
+        """Number of frames dropped by the kernel so far, including those after the last received one."""
         info = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 4 * (MEMINFO_DROPS + 1))
         (now,) = struct.unpack_from("I", info, 4 * MEMINFO_DROPS)
         return self.dropped + ((int(now) - self.dropped) & 0xFFFFFFFF)
 
     def poll(self, timeout: float) -> bool:
-        """Whether a frame arrived within ``timeout`` seconds.
+        """Return True if a frame arrives within the timeout.
+
+        Parameters
+        ----------
+        timeout
+            Longest wait, s.
 
         Raises
         ------
         BusDown
-            If the interface went down or away.
+            If the interface went down or was removed.
         """
         for _, event in self._poll.poll(max(0.0, timeout) * 1000):
             if event & (select.POLLERR | select.POLLHUP | select.POLLNVAL):
@@ -249,28 +252,28 @@ class RawSocket:
         return False
 
     def send(self, frames: Frames) -> int:
-        """Send frames in order, waiting for room in the transmit queue where it is full.
+        """Send frames in order and wait for space in the transmit queue.
 
         Parameters
         ----------
         frames
-            Array of ``FRAME`` or ``FD_FRAME``, shape (N,); ``t_ns`` is not looked at.
+            Array of ``FRAME`` or ``FD_FRAME``, shape (N,); ``t_ns`` is ignored.
 
         Returns
         -------
         int
-            Number of frames sent: all of them.
+            Number of frames sent: N.
 
         Raises
         ------
         BusDown
-            If the interface went down or away, or nothing could be sent for half a second
-            (a physical bus without another node acknowledges nothing).
+            If the interface went down or was removed, or if nothing could be sent for half a second (a physical bus
+            without another node acknowledges nothing).
         """
         if self._out is None:
             self._out = Messages(BATCH, control=False, fd=self.fd)
         messages, sent = self._out, 0
-        # The clock is read only when the queue is full: where system calls are dear, that is half the cost.
+        # The clock is read only when the queue is full: in a guest kernel its system call is half the cost.
         deadline: float | None = None
         while sent < frames.size:
             chunk = frames[sent : sent + BATCH]
@@ -296,7 +299,7 @@ class RawSocket:
         raise BusDown(f"bus {self.channel}: {OSError(code, errno.errorcode.get(code, str(code)))}")
 
     def close(self) -> None:
-        """Release the socket; nothing happens the second time."""
+        """Release the socket; further calls have no effect."""
         self._socket.close()
 
     def __enter__(self) -> Self:

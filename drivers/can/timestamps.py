@@ -1,4 +1,4 @@
-"""Time stamps of CAN interfaces: which ones an interface has, and its clock's time in that of the machine."""
+"""Hardware time stamps of CAN interfaces and their conversion to the machine's clock."""
 
 import array
 import fcntl
@@ -16,13 +16,19 @@ _SIOCETHTOOL, _ETHTOOL_GET_TS_INFO = 0x8946, 0x41
 _TS_INFO_BYTES = 44
 
 LARGEST_DRIFT = 1e-4
-"""Largest relative difference expected between the interface's clock and the machine's."""
+"""Largest expected relative difference in rate of the interface's clock and the machine's."""
 _CLOCK_STEP_NS = 50_000_000
-"""A frame that seems to have waited for longer than this says that one of the clocks was set."""
+"""Smallest change of the clocks' offset (ns) that is taken as a step of one of the clocks."""
 
 
-def has_hardware_stamps(channel: str) -> bool:
-    """Whether the interface stamps received frames by a clock of its own; ``False`` where it cannot be asked."""
+def has_hardware_timestamps(channel: str) -> bool:
+    """Return True if the interface stamps received frames with its own clock.
+
+    Parameters
+    ----------
+    channel
+        Name of the interface; the result is ``False`` if it does not support the query.
+    """
     request = array.array("B", struct.pack("=I", _ETHTOOL_GET_TS_INFO).ljust(_TS_INFO_BYTES, b"\0"))
     address, _ = request.buffer_info()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
@@ -35,11 +41,11 @@ def has_hardware_stamps(channel: str) -> bool:
 
 
 class InterfaceClock:
-    """The clock of one interface, read in the machine's time.
+    """Conversion of one interface's clock to the machine's clock.
 
-    A frame's software stamp is its hardware stamp, plus the offset of the clocks, plus its wait for the interrupt.
-    The wait is never negative, so the offset is the smallest difference, which may grow as fast as clocks drift. So
-    frames keep the even spacing of the hardware stamps and the common time base of the software ones.
+    The software stamp of a frame is its hardware stamp plus the offset of the clocks plus the interrupt latency. The
+    latency is never negative, so the offset is the smallest difference, which may grow at the rate of the clocks'
+    drift. Converted times keep the even spacing of the hardware stamps and the common time base of the software ones.
     """
 
     def __init__(self) -> None:
@@ -47,7 +53,20 @@ class InterfaceClock:
         self._least = 0
 
     def to_utc(self, software_ns: NDArray[np.int64], hardware_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Times (N,) of frames in the machine's time, ns; one without hardware stamp (0) keeps its software one."""
+        """Convert hardware stamps to the machine's time.
+
+        Parameters
+        ----------
+        software_ns
+            Software stamps, ns UTC, shape (N,).
+        hardware_ns
+            Hardware stamps, ns, shape (N,); 0: none.
+
+        Returns
+        -------
+        ndarray
+            Times, ns UTC, shape (N,); a frame without hardware stamp keeps its software stamp.
+        """
         times = software_ns.copy()
         stamped = hardware_ns != 0
         software, hardware = software_ns[stamped], hardware_ns[stamped]

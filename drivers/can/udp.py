@@ -1,6 +1,6 @@
-"""The bus where there is no SocketCAN: python-can's ``udp_multicast``, for low rates.
+"""Bus for machines without SocketCAN: python-can's ``udp_multicast``, for low rates.
 
-UDP may lose frames, above some thousand a second it does: fit for trying things out, never for measuring.
+UDP may lose frames, and does so above some thousand per second. It is suitable for trials, not for measurements.
 """
 
 import time
@@ -15,38 +15,39 @@ from armident.configs.schema.session import Bus
 from armident.drivers.can.frames import ERROR_FLAG, BusDown, Filter, FrameBus, Frames
 from armident.drivers.can.socketcan import RawSocket
 
-NOTE = "udp_multicast carries the bus over UDP and may lose frames: fit for low rates, not for measuring"
-"""What a program says in one line when it runs on this bus."""
+UDP_WARNING = "udp_multicast carries the bus over UDP and may lose frames: fit for low rates, not for measuring"
+"""Warning of programs that run on this bus."""
 
 EXTENDED_FLAG = 0x8000_0000
+"""Bit of ``can_id`` that marks a 29-bit identifier (linux/can.h)."""
 
 
 class UdpBus:
-    """A bus over UDP multicast with the interface of :class:`RawSocket`.
+    """Bus over UDP multicast with the interface of :class:`RawSocket`.
 
-    Frames sent through it come back to it as well, as multicast on one machine does.
+    It receives the frames that it sends itself.
 
     Parameters
     ----------
     channel
         Multicast address, ``239.74.163.2``.
     filters
-        What is let through; ``None``: everything, empty: nothing.
+        Frames to receive; ``None``: all, empty: none.
 
     Raises
     ------
     ConfigError
-        If the address is no multicast address or the network has no route for it.
+        If the address is not a multicast address or the network has no route for it.
     """
 
     fd = False
-    stamps = "software"
+    timestamp_source = "software"
     up = bound = True
 
     def __init__(self, channel: str, *, filters: Sequence[Filter] | None = None) -> None:
         self.channel = channel
         self.dropped = 0
-        """Always 0: UDP does not tell what it lost."""
+        """Always 0: UDP does not count lost frames."""
         self._filters = filters
         try:
             self._bus = can.Bus(channel, interface="udp_multicast")
@@ -56,7 +57,12 @@ class UdpBus:
         self._ahead: can.Message | None = None
 
     def receive(self, batch: Frames) -> int:
-        """Fill the beginning of ``batch`` with the frames that have arrived; never waits.
+        """Write received frames to the beginning of ``batch`` without waiting; return their number.
+
+        Parameters
+        ----------
+        batch
+            Array of ``FRAME``, shape (N,), written in place.
 
         Raises
         ------
@@ -81,7 +87,12 @@ class UdpBus:
         return n
 
     def poll(self, timeout: float) -> bool:
-        """Whether a frame arrived within ``timeout`` seconds.
+        """Return True if a frame arrives within the timeout.
+
+        Parameters
+        ----------
+        timeout
+            Longest wait, s.
 
         Raises
         ------
@@ -98,12 +109,17 @@ class UdpBus:
         return True
 
     def send(self, frames: Frames) -> int:
-        """Send all frames in order.
+        """Send all frames in order; return their number.
+
+        Parameters
+        ----------
+        frames
+            Array of ``FRAME``, shape (N,).
 
         Raises
         ------
         BusDown
-            If the network does not take them.
+            If the network refuses a frame.
         """
         for one in frames:
             can_id = int(one["can_id"])
@@ -135,7 +151,7 @@ class UdpBus:
         return self._filters is None or any(can_id & mask == wanted & mask for wanted, mask in self._filters)
 
     def close(self) -> None:
-        """Release the sockets; nothing happens the second time."""
+        """Release the sockets; further calls have no effect."""
         self._bus.shutdown()
 
     def __enter__(self) -> Self:
@@ -150,23 +166,25 @@ class UdpBus:
 def open_bus(
     bus: Bus, *, filters: Sequence[Filter] | None = None, errors: bool = False, hardware: bool = False
 ) -> FrameBus:
-    """Open the bus of a session for frames in batches.
+    """Open a bus of a session.
 
     Parameters
     ----------
     bus
-        The ``bus`` of the session.
+        The bus.
     filters
-        What is let through; ``None``: everything, empty: nothing.
-    errors, hardware
-        Whether to receive error frames, and to use hardware time stamps, where there are any.
+        Frames to receive; ``None``: all, empty: none.
+    errors
+        Receive error frames, if the bus has them.
+    hardware
+        Use hardware time stamps, if the interface has them.
 
     Raises
     ------
     ConfigError
-        If the bus is not there.
+        If the bus does not exist.
     BusDown
-        If it is there but down.
+        If the bus is down.
     """
     if bus.interface == "udp_multicast":
         return UdpBus(bus.channel, filters=filters)

@@ -1,7 +1,7 @@
-"""What CAN buses can carry: bits of classic and FD frames, the load of a session on each of its buses, what fits.
+"""Load of CAN buses: bits of classic and FD frames, load of a session by bus, and alternatives that fit.
 
-Classic frames after Davis, Burns, Bril and Lukkien (2007); CAN FD after ISO 11898-1:2015: arbitration at the nominal
-bit rate, all between the bit rate switch and the CRC delimiter at the data bit rate, fixed stuff bits in the CRC field.
+Classic frames: Davis, Burns, Bril and Lukkien (2007). CAN FD: ISO 11898-1:2015, with arbitration at the nominal bit
+rate, the part between bit rate switch and CRC delimiter at the data bit rate, and fixed stuff bits in the CRC field.
 """
 
 from collections.abc import Iterator
@@ -13,34 +13,51 @@ from armident.drivers.can.frames import fd_length
 from armident.drivers.canopen.objects import COB_SYNC, FD_PDO_BYTES, MAPPED_OBJECTS, SETPOINT, TpdoLayout
 
 CRC_15 = 0x4599
+"""Polynomial of the CRC of classic frames (ISO 11898-1)."""
 TAIL_BITS = 13
 """CRC delimiter, acknowledgement, end of frame and interframe space: never stuffed."""
 HEARTBEAT_BYTES = 1
+"""Data bytes of a heartbeat (CiA 301 section 7.2.8.3.2)."""
 FD_ARBITRATION_BITS = 17
 """Start of frame to the bit rate switch, 11-bit identifier, at the nominal bit rate."""
 FD_TAIL_BITS = 13
 """CRC delimiter, acknowledgement, end of frame and interframe space, at the nominal bit rate."""
 STUFF_EVERY = 4
-"""After its first bit, a stuffed field gets at most one stuff bit per so many bits."""
+"""Fewest bits per stuff bit in a stuffed field, after its first bit."""
 STANDARD_PERIODS_US = (100, 125, 200, 250, 400, 500, 800, 1000, 2000, 4000, 5000, 10_000, 20_000, 50_000, 100_000)
-"""SYNC periods that drives commonly offer."""
+"""SYNC periods that drives commonly offer, us."""
 DATA_BITRATES = (2_000_000, 5_000_000, 8_000_000)
-"""Data bit rates that CAN FD controllers commonly offer."""
+"""Data bit rates that CAN FD controllers commonly offer, bit/s."""
 
 
 def frame_bits(data_bytes: int) -> tuple[int, int]:
-    """Fewest and most bits of a classic frame with an 11-bit identifier, interframe space included.
+    """Minimum and maximum number of bits of a classic frame with an 11-bit identifier, interframe space included.
 
-    ``47 + 8 n`` without a stuff bit, ``55 + 10 n`` with the most there can be (Davis, Burns, Bril, Lukkien 2007).
+    ``47 + 8 n`` bits without stuff bits, ``55 + 10 n`` with all possible ones (Davis, Burns, Bril, Lukkien 2007).
+
+    Parameters
+    ----------
+    data_bytes
+        Number of data bytes n, 0 to 8.
     """
     return 47 + 8 * data_bytes, 55 + 10 * data_bytes
 
 
 def fd_frame_bits(data_bytes: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Bits of a CAN FD frame with 11-bit identifier at the nominal and at the data bit rate: fewest, then most.
+    """Minimum and maximum number of bits of a CAN FD frame with an 11-bit identifier (ISO 11898-1:2015).
 
-    Start of frame to the last data bit gets dynamic stuff bits (none to one in four); the stuff count and the CRC, of
+    Start of frame to the last data bit gets dynamic stuff bits (none to one in four). The stuff count and the CRC, of
     17 bits up to 16 bytes and 21 above, have 6 and 7 fixed ones.
+
+    Parameters
+    ----------
+    data_bytes
+        Number of data bytes of the frame, 0 to 64.
+
+    Returns
+    -------
+    fewest, most
+        Bits at the nominal and at the data bit rate.
     """
     crc, fixed = (17, 6) if data_bytes <= 16 else (21, 7)
     payload = 1 + 4 + 8 * data_bytes
@@ -51,7 +68,15 @@ def fd_frame_bits(data_bytes: int) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def exact_bits(identifier: int, data: bytes) -> int:
-    """Bits of a classic frame with known content, stuff bits and interframe space included (ISO 11898-1)."""
+    """Number of bits of a classic frame with known content, stuff bits and interframe space included (ISO 11898-1).
+
+    Parameters
+    ----------
+    identifier
+        11-bit identifier.
+    data
+        Data bytes, at most 8.
+    """
     fields = [(0, 1), (identifier, 11), (0, 3), (len(data), 4), *((byte, 8) for byte in data)]
     bits = [value >> k & 1 for value, width in fields for k in reversed(range(width))]
     crc = 0
@@ -70,7 +95,19 @@ def exact_bits(identifier: int, data: bytes) -> int:
 
 @dataclass(frozen=True)
 class Load:
-    """One kind of message on one bus: frames per second and its share of the bus, without and with all stuff bits."""
+    """Load of one kind of message on one bus.
+
+    Parameters
+    ----------
+    message
+        Name of the message.
+    frames_per_s
+        Frames per second.
+    typical, worst
+        Fraction of the bus time without and with all stuff bits.
+    bus
+        Channel of the bus.
+    """
 
     message: str
     frames_per_s: float
@@ -80,15 +117,30 @@ class Load:
 
 
 def loads(session: SessionConfig, period_us: int | None = None) -> list[Load]:
-    """Load of a session by bus and kind of message, for its own SYNC period or another one.
+    """Load of a session by bus and kind of message; ``nan`` on a bus without bit rate.
 
-    Shares are fractions of the time; ``nan`` on a bus without bit rate.
+    Parameters
+    ----------
+    session
+        Buses, drives, streams and set points.
+    period_us
+        SYNC period, us; ``None``: that of the session.
     """
     return [row for bus in session.all_buses for row in bus_loads(session, bus, period_us)]
 
 
 def bus_loads(session: SessionConfig, bus: Bus, period_us: int | None = None) -> list[Load]:
-    """The same of one bus."""
+    """Load of one bus by kind of message; ``nan`` on a bus without bit rate.
+
+    Parameters
+    ----------
+    session
+        Drives, streams and set points.
+    bus
+        A bus of the session.
+    period_us
+        SYNC period, us; ``None``: that of the session.
+    """
     period = (session.sync.period_us if period_us is None else period_us) * 1e-6
     bitrate, data_bitrate = bus.bitrate or float("nan"), bus.data_bitrate or float("nan")
     nodes = len(session.drives_on(bus))
@@ -117,17 +169,35 @@ def bus_loads(session: SessionConfig, bus: Bus, period_us: int | None = None) ->
 
 
 def worst_load(session: SessionConfig, bus: Bus, period_us: int | None = None) -> float:
-    """Worst-case load of one bus; ``nan`` without bit rate."""
+    """Worst-case load of one bus as a fraction of its time; ``nan`` without bit rate.
+
+    Parameters
+    ----------
+    session, bus, period_us
+        As in `bus_loads`.
+    """
     return sum(row.worst for row in bus_loads(session, bus, period_us))
 
 
 def fits(session: SessionConfig, period_us: int | None = None) -> bool:
-    """Whether every bus that has a bit rate carries the session even in the worst case."""
+    """Return True if every bus with a bit rate carries the session in the worst case.
+
+    Parameters
+    ----------
+    session, period_us
+        As in `loads`.
+    """
     return all(worst_load(session, bus, period_us) <= 1.0 for bus in session.all_buses if bus.bitrate is not None)
 
 
 def fitting_period(session: SessionConfig) -> int | None:
-    """The shortest usual SYNC period (us), not below the configured one, whose worst-case load fits all buses."""
+    """Shortest standard SYNC period (us), at least the configured one, whose worst-case load fits all buses.
+
+    Parameters
+    ----------
+    session
+        The session; the result is ``None`` if no standard period fits.
+    """
     for period in STANDARD_PERIODS_US:
         if period >= session.sync.period_us and fits(session, period):
             return period
@@ -135,12 +205,19 @@ def fitting_period(session: SessionConfig) -> int | None:
 
 
 def check_fits(session: SessionConfig, where: str = "session") -> None:
-    """Refuse a session that its buses cannot carry even in the worst case; a virtual bus has no bit rate.
+    """Refuse a session whose worst-case load exceeds a bus; a virtual bus has no bit rate and always fits.
+
+    Parameters
+    ----------
+    session
+        The session.
+    where
+        Name of the session in messages.
 
     Raises
     ------
     ConfigError
-        With the load, and the nearest configurations that would fit.
+        If the load exceeds a bus; contains the load and the nearest configurations that fit.
     """
     for bus in session.all_buses:
         if bus.bitrate is None or worst_load(session, bus) <= 1.0:
@@ -150,27 +227,42 @@ def check_fits(session: SessionConfig, where: str = "session") -> None:
         raise ConfigError(
             f"{where}: sync.period_us {session.sync.period_us} loads {bus.channel} at {speed} Mbit/s with "
             f"{100 * worst_load(session, bus):.0f} % in the worst case; "
-            + (found or "no usual SYNC period, no number of buses and no packing would fit")
+            + (found or "no standard SYNC period, no number of buses and no packing would fit")
         )
 
 
 @dataclass(frozen=True)
 class Option:
-    """One way to make a session fit: what would change, in words, and how much that is."""
+    """Change of a session that makes it fit its buses.
+
+    Parameters
+    ----------
+    text
+        Description of the change.
+    session
+        The changed session.
+    kinds
+        Number of kinds of change.
+    size
+        Factor of the largest change.
+    """
 
     text: str
     session: SessionConfig
     kinds: int
-    """How many kinds of change it takes: the fewer, the nearer."""
     size: float
-    """By what factor the largest of them changes something."""
 
 
 def alternatives(session: SessionConfig) -> list[Option]:
-    """Sessions that fit, the nearest first: fewest kinds of change, then the smallest one.
+    """Changes that make a session fit, nearest first: fewest kinds of change, then smallest change.
 
-    Of each combination of kinds (rate, buses, FD, packing) the smallest change is listed, and none that only adds
-    to another one.
+    Of each combination of kinds (rate, buses, FD, packing) only the smallest change is listed. A change that only adds
+    to another one is left out.
+
+    Parameters
+    ----------
+    session
+        The session.
     """
     found = sorted(_all_options(session), key=lambda option: (option.kinds, option.size))
     chosen: list[Option] = []
@@ -222,7 +314,7 @@ def _option(session: SessionConfig, changed: SessionConfig, fd_rate: int | None,
 
 
 def _with_fd(session: SessionConfig, data_bitrate: int) -> SessionConfig | None:
-    """The session with CAN FD on every bus; ``None`` where they have it at this rate or a faster one already."""
+    """Session with CAN FD on every bus; ``None`` if all buses have it at this rate or a faster one already."""
     if all(bus.fd and (bus.data_bitrate or 0) >= data_bitrate for bus in session.all_buses):
         return None
     buses = tuple(bus.model_copy(update={"fd": True, "data_bitrate": data_bitrate}) for bus in session.all_buses)
@@ -230,7 +322,7 @@ def _with_fd(session: SessionConfig, data_bitrate: int) -> SessionConfig | None:
 
 
 def _packs(session: SessionConfig) -> list[int]:
-    """Numbers of samples per TPDO that the frame and the SYNC counter allow, from the session's own on."""
+    """Numbers of samples per TPDO that frame and SYNC counter allow, at least the session's own."""
     stream = session.streams["samples"]
     if not all(bus.fd for bus in session.all_buses):
         return [stream.pack]
@@ -251,7 +343,7 @@ def _with_pack(session: SessionConfig, pack: int) -> SessionConfig | None:
 
 
 def _spread(session: SessionConfig, count: int) -> SessionConfig:
-    """The drives evenly on ``count`` buses like the first one."""
+    """Session with its drives distributed evenly over ``count`` buses like the first one."""
     if count == len(session.all_buses):
         return session
     first = session.all_buses[0]

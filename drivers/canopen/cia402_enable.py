@@ -1,4 +1,4 @@
-"""The way of one drive through the state machine of CiA 402 (part 2), over SDO."""
+"""Enabling of one drive through the state machine of CiA 402 (part 2), over SDO."""
 
 import time
 
@@ -12,6 +12,7 @@ ENABLE_TIMEOUT = 3.0
 """Longest wait for a drive to reach the next state of CiA 402, s."""
 
 POLL_INTERVAL = 0.005
+"""Interval at which the state is read, s."""
 
 TO_ENABLED: dict[DriveState, tuple[Control, DriveState]] = {
     DriveState.SWITCH_ON_DISABLED: (Control.SHUTDOWN, DriveState.READY),
@@ -23,26 +24,43 @@ TO_ENABLED: dict[DriveState, tuple[Control, DriveState]] = {
 """Command and next state on the way to operation enabled (CiA 402 part 2, state machine)."""
 
 
-def state_of(sdo: DriveSdo) -> DriveState | None:
-    """The state that the drive's statusword says."""
+def read_state(sdo: DriveSdo) -> DriveState | None:
+    """State of the drive from its statusword (6041h); ``None`` for a pattern that CiA 402 does not define.
+
+    Parameters
+    ----------
+    sdo
+        The drive.
+    """
     return od.drive_state(sdo.read(od.STATUSWORD, 0, "H"))
 
 
-def stand_still(sdo: DriveSdo) -> None:
-    """Command the mode, and the position where the drive stands, whatever was commanded before it is enabled."""
+def hold_position(sdo: DriveSdo) -> None:
+    """Command cyclic synchronous position mode and the present position as target.
+
+    Parameters
+    ----------
+    sdo
+        The drive, before it is enabled.
+    """
     sdo.write(od.MODE_OF_OPERATION, 0, od.CYCLIC_SYNCHRONOUS_POSITION, "b")
     sdo.write(od.TARGET_POSITION, 0, sdo.read(od.POSITION_ACTUAL, 0, "i"), "i")
 
 
 def enable_drive(sdo: DriveSdo) -> None:
-    """Take one drive through the CiA 402 state machine, from wherever it is to operation enabled.
+    """Bring one drive from any state of CiA 402 to operation enabled.
+
+    Parameters
+    ----------
+    sdo
+        The drive.
 
     Raises
     ------
     ArmidentError
-        If it stays in a state; names it.
+        If the drive stays in another state; names the state.
     """
-    state = state_of(sdo)
+    state = read_state(sdo)
     while state != DriveState.ENABLED:
         if state not in TO_ENABLED:
             state = _await_state(sdo, DriveState.ENABLED, *TO_ENABLED)
@@ -50,17 +68,17 @@ def enable_drive(sdo: DriveSdo) -> None:
         control, wanted = TO_ENABLED[state]
         if control == Control.FAULT_RESET:
             # The reset acts on the rising edge of its bit.
-            sdo.order(od.CONTROLWORD, 0, Control.DISABLE_VOLTAGE, "H")
-        sdo.order(od.CONTROLWORD, 0, control, "H")
+            sdo.command(od.CONTROLWORD, 0, Control.DISABLE_VOLTAGE, "H")
+        sdo.command(od.CONTROLWORD, 0, control, "H")
         state = _await_state(sdo, wanted)
 
 
 def _await_state(sdo: DriveSdo, *wanted: DriveState) -> DriveState:
     deadline = time.monotonic() + ENABLE_TIMEOUT
-    while (state := state_of(sdo)) not in wanted:
+    while (state := read_state(sdo)) not in wanted:
         if time.monotonic() > deadline:
             raise ArmidentError(
-                f"{sdo.who}: cannot be enabled: stays in state '{state or 'unknown'}'{_fault_cause(sdo)}, "
+                f"{sdo.label}: cannot be enabled: stays in state '{state or 'unknown'}'{_fault_cause(sdo)}, "
                 f"expected '{wanted[0]}' within {ENABLE_TIMEOUT:g} s"
             )
         time.sleep(POLL_INTERVAL)

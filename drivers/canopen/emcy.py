@@ -1,4 +1,4 @@
-"""Emergency messages (EMCY), and their error codes in words: CiA 301, CiA 402, and what a vendor adds."""
+"""Emergency messages (EMCY) and the texts of their error codes: CiA 301, CiA 402, and vendor-specific ones."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -87,7 +87,15 @@ EMCY_TEXTS: dict[int, str] = {
 
 
 def emcy_text(code: int, vendor: Mapping[int, str] | None = None) -> str:
-    """The text of an emergency error code: the vendor's, its own, or that of the narrowest group that has one."""
+    """Text of an emergency error code: the vendor's, else that of the code, else that of its narrowest group.
+
+    Parameters
+    ----------
+    code
+        Error code.
+    vendor
+        Vendor-specific texts by code.
+    """
     if vendor and code in vendor:
         return vendor[code]
     for mask in (0xFFFF, 0xFFF0, 0xFF00, 0xF000):
@@ -98,18 +106,18 @@ def emcy_text(code: int, vendor: Mapping[int, str] | None = None) -> str:
 
 @dataclass(frozen=True)
 class Emergency:
-    """An emergency message (CiA 301 section 7.2.7.1).
+    """Emergency message (CiA 301 section 7.2.7.1).
 
     Parameters
     ----------
     node
-        Who sent it.
+        Node id of the sender.
     t_ns
-        When it was received, ns, UTC.
+        Receive time, ns UTC.
     code, register
         Error code, and error register (1001h).
     manufacturer
-        Five bytes of which the vendor knows the meaning.
+        Five manufacturer-specific bytes.
     """
 
     node: int
@@ -119,13 +127,25 @@ class Emergency:
     manufacturer: bytes
 
     def text(self, vendor: Mapping[int, str] | None = None) -> str:
-        """The message in words."""
+        """Text of the message.
+
+        Parameters
+        ----------
+        vendor
+            Vendor-specific texts by error code.
+        """
         more = f", manufacturer {self.manufacturer.hex(' ')}" if any(self.manufacturer) else ""
         return f"EMCY {self.code:04X}h, {emcy_text(self.code, vendor)} (error register {self.register:02X}h{more})"
 
 
 def read_emergencies(batch: Frames) -> Iterator[Emergency]:
-    """The emergency messages among frames; bytes that a drive leaves out are zero, what has no code is none."""
+    """Yield the emergency messages of a batch; missing bytes are zero, and frames without error code are ignored.
+
+    Parameters
+    ----------
+    batch
+        Frames with EMCY identifiers, shape (N,).
+    """
     for one in batch[batch["length"] >= 2]:
         data = bytes(one["data"][: int(one["length"])]).ljust(8, b"\0")
         code = int.from_bytes(data[:2], "little")

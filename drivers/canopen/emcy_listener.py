@@ -1,38 +1,43 @@
-"""What drives report by themselves, for somebody who listens only: emergency messages."""
+"""Reception of emergency messages without sending anything (listen-only capture)."""
 
 from typing import Self
 
 from armident.configs.schema.session import SessionConfig
-from armident.drivers.can.filtered_socket import SideSocket
+from armident.drivers.can.filtered_socket import FilteredSocket
 from armident.drivers.canopen.emcy import read_emergencies
 from armident.drivers.canopen.master import DriveEvent
 from armident.drivers.canopen.objects import COB_EMCY
 
 
-class Eavesdropper:
-    """Hears the drives of a session and sends nothing; use it in a ``with`` block.
+class EmcyListener:
+    """Receives the emergency messages of a session's drives and sends nothing; use it in a ``with`` block.
+
+    Parameters
+    ----------
+    session
+        Buses and drives.
 
     Raises
     ------
     ConfigError
-        If there is no such bus.
+        If a bus does not exist.
     BusDown
         If a bus is down.
     """
 
     def __init__(self, session: SessionConfig) -> None:
         self._texts = session.emcy_texts
-        self._sockets: list[tuple[SideSocket, dict[int, str]]] = []
+        self._sockets: list[tuple[FilteredSocket, dict[int, str]]] = []
         try:
             for bus in session.all_buses:
                 joints = {drive.node_id: drive.joint for drive in session.drives_on(bus)}
-                self._sockets.append((SideSocket(bus, [COB_EMCY + node for node in joints]), joints))
+                self._sockets.append((FilteredSocket(bus, [COB_EMCY + node for node in joints]), joints))
         except BaseException:
             self.close()
             raise
 
     def supervise(self) -> list[DriveEvent]:
-        """What has been reported since the last call; never waits."""
+        """Events since the last call; never waits."""
         return [
             DriveEvent(
                 kind="emcy",
@@ -48,14 +53,14 @@ class Eavesdropper:
         ]
 
     def close(self) -> None:
-        """Leave the buses."""
+        """Release the sockets."""
         for socket, _ in self._sockets:
             socket.close()
 
     def __enter__(self) -> Self:
-        """Listen in a ``with`` block."""
+        """Use the listener in a ``with`` block."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the buses."""
+        """Release the sockets."""
         self.close()

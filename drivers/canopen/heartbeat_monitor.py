@@ -1,4 +1,4 @@
-"""Heartbeats (CiA 301, section 7.2.8.3.2) by the kernel's stamps: which drive has been silent, and for how long."""
+"""Monitoring of heartbeats (CiA 301, section 7.2.8.3.2) by the kernel's time stamps."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -6,39 +6,39 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from armident.configs.schema.session import Bus
-from armident.drivers.can.filtered_socket import SideSocket
+from armident.drivers.can.filtered_socket import FilteredSocket
 from armident.drivers.canopen.objects import COB_HEARTBEAT
 
 HELD_UP_S = 0.1
-"""Whoever looks less often than this was held up."""
+"""Interval of updates (s) above which the consumer is taken to have been held up."""
 
 
 class HeartbeatSocket:
-    """The heartbeats on one bus, boot-up messages among them, in a socket of their own.
+    """Socket for the heartbeats and boot-up messages on one bus.
 
     Parameters
     ----------
     bus
         The bus.
     nodes
-        The drives on it.
+        Node ids of its drives.
 
     Raises
     ------
     ConfigError
-        If there is no such bus.
+        If the bus does not exist.
     BusDown
         If the bus is down.
     """
 
     def __init__(self, bus: Bus, nodes: Sequence[int]) -> None:
-        self._socket = SideSocket(bus, [COB_HEARTBEAT + node for node in nodes])
+        self._socket = FilteredSocket(bus, [COB_HEARTBEAT + node for node in nodes])
 
     def read(self) -> list[tuple[int, float]]:
-        """Node and time (s, of the monotonic clock) of what has come; nothing while the bus is down or removed."""
+        """Node id and time (s, monotonic clock) of the received heartbeats; none while the bus is down or removed."""
         found: list[tuple[int, float]] = []
         for batch in self._socket.read():
-            # Stamps are wall clock time, which may be set: only their age at this moment is used.
+            # Stamps are wall-clock times, which may be stepped: only their age is used.
             ages = (time.time_ns() - batch["t_ns"]) * 1e-9
             came = time.monotonic() - np.maximum(ages, 0.0)
             found += zip((batch["can_id"] - COB_HEARTBEAT).tolist(), came.tolist(), strict=True)
@@ -50,30 +50,38 @@ class HeartbeatSocket:
 
 
 class HeartbeatMonitor:
-    """How long each drive has been silent, and was until its last heartbeat.
+    """Time without heartbeat of each drive.
 
-    A machine that was held up as a whole stamps late what came meanwhile, or has lost it. So where the consumer was
-    held up, the stretch of that time in which no drive at all was heard is nobody's silence, once for each silence.
+    A machine that was held up stamps frames late or loses them. If the consumer was held up, the longest pause of all
+    drives in that time does not count as silence of any drive. Each silence is shortened in this way only once.
 
     Parameters
     ----------
     drives
-        Who is waited for.
+        Names of the drives.
     now
-        From when on, s.
+        Start time, s, monotonic clock.
     """
 
     def __init__(self, drives: Iterable[str], now: float) -> None:
         self._last = dict.fromkeys(drives, now)
         self._ended = dict.fromkeys(self._last, 0.0)
         self._excused: set[str] = set()
-        self.looked = now
-        """When this was asked last, s."""
+        self.updated = now
+        """Time of the last update, s, monotonic clock."""
 
-    def look(self, heartbeats: Iterable[tuple[str, float]], now: float) -> None:
-        """Take the heartbeats (drive, time in s) that have come since the last look."""
+    def update(self, heartbeats: Iterable[tuple[str, float]], now: float) -> None:
+        """Process the heartbeats since the last update.
+
+        Parameters
+        ----------
+        heartbeats
+            Pairs of drive and time, s.
+        now
+            Present time, s.
+        """
         self._ended = dict.fromkeys(self._last, 0.0)
-        before, self.looked = self.looked, now
+        before, self.updated = self.updated, now
         ordered = sorted(heartbeats, key=lambda beat: beat[1])
         times = [before, *(min(max(at, before), now) for _, at in ordered), now]
         k = max(range(len(times) - 1), key=lambda i: times[i + 1] - times[i])
@@ -92,10 +100,22 @@ class HeartbeatMonitor:
             self._last[drive] = max(self._last[drive], at)
             self._excused.discard(drive)
 
-    def lasts(self, drive: str) -> float:
-        """How long the drive has been silent by the last look, s."""
-        return self.looked - self._last[drive]
+    def silence(self, drive: str) -> float:
+        """Time since the last heartbeat of a drive at the last update, s.
 
-    def ended(self, drive: str) -> float:
-        """The longest silence of the drive that ended with a heartbeat of the last look, s; 0: none did."""
+        Parameters
+        ----------
+        drive
+            Name of the drive.
+        """
+        return self.updated - self._last[drive]
+
+    def ended_silence(self, drive: str) -> float:
+        """Longest silence of a drive that ended with a heartbeat of the last update, s; 0 if there was none.
+
+        Parameters
+        ----------
+        drive
+            Name of the drive.
+        """
         return self._ended[drive]

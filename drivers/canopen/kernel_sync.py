@@ -1,4 +1,4 @@
-"""SYNC from the kernel: the broadcast manager (CAN_BCM) sends SYNC 1 to its counter's overflow over and over."""
+"""SYNC producer in the kernel: the broadcast manager (CAN_BCM) sends SYNC with all counter values cyclically."""
 
 import socket
 import struct
@@ -18,7 +18,15 @@ _FRAME = "=IBBBB8s"
 
 
 def setup_message(period_us: int, counter: int) -> bytes:
-    """What tells the kernel to send SYNC with a counter of 1 to ``counter`` every ``period_us``."""
+    """Message that makes the kernel send SYNC with counter 1 to its overflow, cyclically.
+
+    Parameters
+    ----------
+    period_us
+        SYNC period, us.
+    counter
+        Overflow of the SYNC counter (1019h).
+    """
     head = struct.pack(
         _HEAD, TX_SETUP, SETTIMER | STARTTIMER, 0, 0, 0, *divmod(period_us, 1_000_000), COB_SYNC, counter
     )
@@ -26,20 +34,24 @@ def setup_message(period_us: int, counter: int) -> bytes:
 
 
 class KernelSync:
-    """Has the kernel send SYNC k = 0, 1, 2, ... with counter ``k % counter + 1`` on one bus.
+    """SYNC producer in the kernel: sends SYNC k = 0, 1, 2, ... with counter ``k % counter + 1`` on one bus.
 
-    The kernel's timer needs no wake-up of ours, so SYNC is punctual on a busy machine too. It counts each period from
-    the end of the last one: the period comes out longer by what a timer is late, which is why the clock of
-    several buses would drift apart, and nothing can be sent right behind SYNC.
+    The kernel's timer needs no wake-up of a process, so SYNC is punctual on a busy machine too. It starts each period
+    at the end of the last one, so the period is longer by the timer's latency. Therefore the clocks of several buses
+    would drift apart. Set points cannot be sent directly after SYNC.
 
     Parameters
     ----------
-    bus, period_us, counter
-        Where, how often, and the overflow of the counter.
+    bus
+        The bus.
+    period_us
+        SYNC period, us.
+    counter
+        Overflow of the SYNC counter (1019h).
     """
 
     sent: int | None = None
-    """Only who receives them knows how many SYNC were sent."""
+    """Number of SYNCs sent: unknown, only a receiver can count them."""
 
     def __init__(self, bus: Bus, period_us: int, counter: int) -> None:
         self._channel, self._message = bus.channel, setup_message(period_us, counter)
@@ -51,11 +63,11 @@ class KernelSync:
         Raises
         ------
         ConfigError
-            If there is no such bus, or the kernel has no CAN_BCM.
+            If the bus does not exist, or the kernel has no CAN_BCM.
         BusDown
             If the bus is down.
         """
-        # Says what is wrong with the interface, and what to do about it.
+        # Raises an error that names the administrator's command if the interface is not usable.
         RawSocket(self._channel, filters=(), receive_buffer=4096).close()
         try:
             self._socket = socket.socket(socket.AF_CAN, socket.SOCK_DGRAM, socket.CAN_BCM)
@@ -72,12 +84,12 @@ class KernelSync:
             raise BusDown(f"bus {self._channel}: the kernel does not take SYNC: {error.strerror}") from error
 
     def stop(self) -> None:
-        """Send no further SYNC: the kernel's timer ends with the socket. Nothing happens the second time."""
+        """Stop SYNC: the kernel's timer ends with the socket. Further calls have no effect."""
         if self._socket is not None:
             self._socket.close()
 
     def check(self) -> None:
-        """Nothing to tell: the kernel goes on by itself, and a bus that is down is seen by those who receive."""
+        """Do nothing: the kernel continues by itself, and receivers detect a bus that is down."""
 
     def __enter__(self) -> Self:
         """Start SYNC."""

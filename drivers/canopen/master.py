@@ -1,7 +1,7 @@
-"""The CANopen master: finds the drives, configures what they send, enables them and watches over them.
+"""CANopen master: checks, configures, enables and supervises the drives of a session.
 
-canopen does the protocol (SDO, NMT). Filters in the kernel keep TPDO and SYNC away from its socket:
-it costs tens of microseconds per frame and must never see the hot path.
+The canopen library handles SDO and NMT. Kernel filters keep TPDO and SYNC away from its socket, because it takes tens
+of microseconds per frame.
 """
 
 import logging
@@ -17,7 +17,7 @@ from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.drivers.can.frames import BusDown
 from armident.drivers.canopen import objects as od
-from armident.drivers.canopen.cia402_enable import POLL_INTERVAL, enable_drive, stand_still, state_of
+from armident.drivers.canopen.cia402_enable import POLL_INTERVAL, enable_drive, hold_position, read_state
 from armident.drivers.canopen.heartbeat_monitor import HeartbeatMonitor
 from armident.drivers.canopen.network import NodeNetwork
 from armident.drivers.canopen.objects import Control, DriveState, NmtCommand, NmtState
@@ -28,21 +28,22 @@ NMT_TIMEOUT = 2.0
 """Longest wait for a heartbeat that reports the NMT state commanded, s."""
 
 HEARTBEATS_MISSED = 3
-"""A drive is lost after this many of its heartbeat periods without one."""
+"""Number of heartbeat periods without heartbeat after which a drive is lost."""
 
 HEARTBEAT_MARGIN = 0.1
-"""What the host may be late on top, s."""
+"""Additional time for delays of this machine before a drive is lost, s."""
 
-LOOK_S = 0.02
-"""How often heartbeats are looked at, s."""
+HEARTBEAT_CHECK_S = 0.02
+"""Interval at which heartbeats are checked, s."""
 
-AGAIN_S = 0.5
-"""A drive that could not be configured again is tried again after this, s."""
+RETRY_S = 0.5
+"""Time until the next attempt to reconfigure a drive, s."""
 
 QUIET_S = 0.2
-"""A mapping that others change is put right when they have written nothing for so long, s."""
+"""Time without foreign SDO writes after which a changed mapping is restored, s."""
 
 NEVER = 2**63 - 1
+"""End time of an interval that has not ended, ns."""
 
 EventKind = Literal[
     "emcy", "heartbeat_lost", "heartbeat_back", "nmt_state", "rebooted", "mapping_changed", "configured", "failed"
@@ -53,38 +54,50 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DriveEvent:
-    """Something a drive reported, or failed to."""
+    """Event of a drive.
+
+    Parameters
+    ----------
+    kind
+        Kind of the event.
+    joint, node_id
+        Joint and node id of the drive.
+    t_ns
+        Time of the frame, or of the detection of a loss, ns UTC.
+    text
+        Message that names the drive.
+    code
+        EMCY error code, or NMT state.
+    """
 
     kind: EventKind
     joint: str
     node_id: int
     t_ns: int
-    """Time of the frame, or of the moment the loss was noticed; ns, UTC."""
     text: str
     code: int = 0
-    """EMCY error code, or NMT state."""
 
 
 class DriveMaster:
-    """The master of the drives of one session; use it in a ``with`` block.
+    """CANopen master of the drives of one session; use it in a ``with`` block.
 
-    ``configure()``, then ``start()``, then ``supervise()`` every now and then, and ``stop()`` at the end. A drive that
-    boots again after ``start()``, or whose PDO mapping somebody else changes, is configured, started and enabled once
-    more by itself. Until then its TPDOs are not what the session says, which ``suspect`` tells.
+    Call `configure`, then `start`, then `supervise` regularly, and `stop` at the end. After `start` a drive that boots
+    again, or whose PDO mapping another master changes, is configured, started and enabled again automatically. Until
+    then its TPDOs may differ from the session; `unverified_mapping` holds these times.
 
     Parameters
     ----------
     session
-        Bus, nodes and streams.
+        Buses, nodes and streams.
     robot
-        What the drives must match.
+        Expected encoder resolutions and rated currents.
 
     Raises
     ------
     ConfigError
-        If there is no such bus.
+        If a bus does not exist.
     BusDown
-        If the bus is down.
+        If a bus is down.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
@@ -95,10 +108,10 @@ class DriveMaster:
         self._limit = HEARTBEATS_MISSED * session.heartbeat_ms * 1e-3 + HEARTBEAT_MARGIN
         self._lost: set[str] = set()
         self._joints = {(session.bus_of(d).channel, d.node_id): d.joint for d in session.drives}
-        self._silences: HeartbeatMonitor | None = None
-        self._reviving: dict[str, threading.Thread] = {}
-        self.suspect: dict[str, tuple[int, int]] = {}
-        """From when on, and until when (ns, UTC), the TPDOs of joints are not to be trusted; a new one per change."""
+        self._heartbeats: HeartbeatMonitor | None = None
+        self._threads: dict[str, threading.Thread] = {}
+        self.unverified_mapping: dict[str, tuple[int, int]] = {}
+        """Start and end (ns, UTC) of the time in which a joint's TPDOs may be mapped otherwise; replaced on change."""
         self._written: dict[str, float] = {}
         self._started = False
         self._started_ns = 0
@@ -116,21 +129,22 @@ class DriveMaster:
         node = self._network_of(drive).add(drive)
         sdo = DriveSdo(node, drive, self._session)
         node.nmt.add_heartbeat_callback(lambda state: self._on_heartbeat(sdo, state))
-        self._network_of(drive).overhear(drive.node_id, lambda index, t_ns: self._on_others(sdo, index, t_ns))
+        network = self._network_of(drive)
+        network.on_sdo_write(drive.node_id, lambda index, t_ns: self._on_foreign_write(sdo, index, t_ns))
         return sdo
 
     def _network_of(self, drive: DriveNode) -> NodeNetwork:
         return self._networks[self._session.bus_of(drive).channel]
 
     def configure(self) -> None:
-        """Check every drive against the robot, then map and switch on what the session streams.
+        """Check every drive against the robot, then map and enable the TPDOs of the session.
 
         Raises
         ------
         ConfigError
-            If a drive is missing, is not the one expected, or refuses a mapping.
+            If a drive is missing, is not the expected one, or refuses a mapping.
         BusDown
-            If the bus went down.
+            If a bus went down.
         """
         for sdo in self._drives:
             self._command(NmtCommand.PRE_OPERATIONAL, sdo)
@@ -140,76 +154,81 @@ class DriveMaster:
             map_drive(sdo, self._session)
 
     def start(self, enable: bool = True) -> None:
-        """Start the nodes (NMT) and, where the arm shall hold or move, bring the drives to operation enabled.
+        """Start the nodes (NMT) and bring the drives to operation enabled.
+
+        Parameters
+        ----------
+        enable
+            ``False``: start the nodes only.
 
         Raises
         ------
         ArmidentError
             If a drive does not follow; names its state.
         BusDown
-            If the bus went down.
+            If a bus went down.
         """
         for sdo in self._drives:
             self._command(NmtCommand.START, sdo)
         for sdo in self._drives:
             self._await_operational(sdo)
-        self._heard()
-        self._silences = HeartbeatMonitor(self._joints.values(), time.monotonic())
+        self._new_heartbeats()
+        self._heartbeats = HeartbeatMonitor(self._joints.values(), time.monotonic())
         self._started, self._started_ns = True, time.time_ns()
         if not enable:
             return
         self._enabled = True
         for sdo in self._drives:
-            stand_still(sdo)
+            hold_position(sdo)
         for sdo in self._drives:
             enable_drive(sdo)
         for sdo in self._drives:
             mode = sdo.read(od.MODE_DISPLAY, 0, "b")
             if mode != od.CYCLIC_SYNCHRONOUS_POSITION:
-                raise ConfigError(f"{sdo.who}: stays in mode of operation {mode} (6061h), 8 was commanded")
+                raise ConfigError(f"{sdo.label}: stays in mode of operation {mode} (6061h), 8 was commanded")
 
     def supervise(self) -> list[DriveEvent]:
-        """Return what has happened since the last call: EMCY, lost and returned heartbeats, NMT states, reboots.
+        """Events since the last call: EMCY, lost and returned heartbeats, NMT states, reboots, changed mappings.
 
-        Never waits. A bus that went down is opened again when it is back; while others are up, the heartbeats of its
-        drives are lost meanwhile.
+        Never waits. A bus that went down is reopened when it is back. While other buses are up, the drives of a bus
+        that is down count as lost.
 
         Raises
         ------
         BusDown
             If all buses are down.
         """
-        alive = {channel: network.revive() for channel, network in self._networks.items()}
+        alive = {channel: network.reopen() for channel, network in self._networks.items()}
         if not any(alive.values()):
             raise BusDown(f"bus {', '.join(alive)}: went down")
-        if self._started and self._silences is not None:
-            self._judge(self._silences)
-        self.listen()
+        if self._started and self._heartbeats is not None:
+            self._check_heartbeats(self._heartbeats)
+        self.collect_reports()
         events = []
         while not self._events.empty():
             events.append(self._events.get())
         return events
 
-    def listen(self) -> None:
-        """Take note of what drives have reported and others have written to them by now; never waits.
+    def collect_reports(self) -> None:
+        """Process received emergency messages and SDO writes of other masters; never waits.
 
-        ``suspect`` says so then; `supervise` does so, too. Where TPDOs were dropped, the requests before those that
-        were not may be among them.
+        Updates `unverified_mapping`. `supervise` includes this. After dropped TPDOs, call it before the TPDOs that
+        follow are used: a foreign SDO write may have come before them.
         """
         by_joint = {sdo.drive.joint: sdo for sdo in self._drives}
         for channel, network in self._networks.items():
             for emcy in network.emergencies():
                 sdo = by_joint[self._joints[channel, emcy.node]]
                 self._report("emcy", sdo, emcy.t_ns, emcy.text(sdo.emcy_texts), emcy.code)
-            for node, index, t_ns in network.written():
+            for node, index, t_ns in network.sdo_writes():
                 joint = self._joints[channel, node]
-                # What we write ourselves, or somebody beside us, is in the time that is suspect anyway.
-                if t_ns > max(self._started_ns, self.suspect.get(joint, (0, 0))[1]):
-                    self._on_others(by_joint[joint], index, t_ns)
+                # Our own writes fall into a time that is unverified already.
+                if t_ns > max(self._started_ns, self.unverified_mapping.get(joint, (0, 0))[1]):
+                    self._on_foreign_write(by_joint[joint], index, t_ns)
 
     @property
     def drives(self) -> tuple[DriveSdo, ...]:
-        """The drives over SDO, in the order of the session's."""
+        """SDO access to the drives, in the order of the session."""
         return tuple(self._drives)
 
     def positions(self) -> list[int]:
@@ -218,17 +237,17 @@ class DriveMaster:
 
     def states(self) -> list[DriveState | None]:
         """CiA 402 states from the statuswords over SDO, in the order of the session's drives."""
-        return [state_of(sdo) for sdo in self._drives]
+        return [read_state(sdo) for sdo in self._drives]
 
     def quick_stop(self) -> None:
-        """Order a quick stop from every drive that still answers; raises nothing."""
-        self._order((Control.QUICK_STOP,))
+        """Command a quick stop of every drive that is not lost; raises nothing."""
+        self._send_controls((Control.QUICK_STOP,))
 
     def stop(self) -> None:
-        """Take the drives out of operation and the nodes to pre-operational; raises nothing, may be repeated."""
+        """Disable the drives and set the nodes to pre-operational; raises nothing, further calls have no effect."""
         if self._enabled:
             self._enabled = False
-            self._order((Control.SWITCH_ON, Control.SHUTDOWN, Control.DISABLE_VOLTAGE))
+            self._send_controls((Control.SWITCH_ON, Control.SHUTDOWN, Control.DISABLE_VOLTAGE))
         if self._started:
             self._started = False
             for sdo in self._drives:
@@ -238,9 +257,9 @@ class DriveMaster:
                     log.debug("%s", error)
 
     def close(self) -> None:
-        """Stop the drives and leave the buses."""
+        """Stop the drives and release the buses."""
         self.stop()
-        for thread in list(self._reviving.values()):
+        for thread in list(self._threads.values()):
             thread.join()
         for network in self._networks.values():
             network.close()
@@ -250,7 +269,7 @@ class DriveMaster:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop the drives and leave the buses."""
+        """Stop the drives and release the buses."""
         self.close()
 
     def _await_operational(self, sdo: DriveSdo) -> None:
@@ -258,49 +277,48 @@ class DriveMaster:
         while self._nmt.get(sdo.drive.joint) != NmtState.OPERATIONAL:
             self._network_of(sdo.drive).check()
             if time.monotonic() > deadline:
-                raise ArmidentError(f"{sdo.who}: does not report operational after NMT start")
+                raise ArmidentError(f"{sdo.label}: does not report operational after NMT start")
             time.sleep(POLL_INTERVAL)
 
-    def _order(self, controls: tuple[Control, ...]) -> None:
-        # A lost drive would cost a timeout each; NMT reaches it too, if anything does.
+    def _send_controls(self, controls: tuple[Control, ...]) -> None:
+        # A lost drive would cost a timeout each; NMT is sent to it anyway.
         for sdo in [sdo for sdo in self._drives if sdo.drive.joint not in self._lost]:
             try:
                 for control in controls:
-                    sdo.order(od.CONTROLWORD, 0, control, "H")
+                    sdo.command(od.CONTROLWORD, 0, control, "H")
             except ArmidentError as error:
                 log.debug("%s", error)
 
     def _command(self, command: NmtCommand, sdo: DriveSdo) -> None:
         self._network_of(sdo.drive).command(command, sdo.drive.node_id)
 
-    def _heard(self) -> list[tuple[str, float]]:
-        """Joint and time of the heartbeats that have come since the last call."""
+    def _new_heartbeats(self) -> list[tuple[str, float]]:
+        """Joint and time of the heartbeats since the last call."""
         return [
             (self._joints[channel, node], at)
             for channel, network in self._networks.items()
             for node, at in network.heartbeats.read()
         ]
 
-    def _judge(self, silences: HeartbeatMonitor) -> None:
-        """Tell whose heartbeats stay away, and whose are back, by when they came and not by when they are looked at."""
-        if time.monotonic() - silences.looked < LOOK_S:
+    def _check_heartbeats(self, monitor: HeartbeatMonitor) -> None:
+        """Report lost and returned heartbeats, judged by their receive times."""
+        if time.monotonic() - monitor.updated < HEARTBEAT_CHECK_S:
             return
-        # What waits in the sockets is read before anybody is said to be missing.
-        heard = self._heard()
-        silences.look(heard, time.monotonic())
+        # Heartbeats that wait in the sockets count.
+        monitor.update(self._new_heartbeats(), time.monotonic())
         for sdo in self._drives:
             joint = sdo.drive.joint
-            lasts, ended = silences.lasts(joint), silences.ended(joint)
-            if joint not in self._lost and max(lasts, ended) > self._limit:
+            silence, ended = monitor.silence(joint), monitor.ended_silence(joint)
+            if joint not in self._lost and max(silence, ended) > self._limit:
                 self._lost.add(joint)
-                self._report("heartbeat_lost", sdo, time.time_ns(), f"no heartbeat for {max(lasts, ended):.2f} s")
-            if joint in self._lost and lasts <= self._limit:
+                self._report("heartbeat_lost", sdo, time.time_ns(), f"no heartbeat for {max(silence, ended):.2f} s")
+            if joint in self._lost and silence <= self._limit:
                 self._lost.discard(joint)
                 self._report("heartbeat_back", sdo, time.time_ns(), "heartbeat is back")
 
     def _report(self, kind: EventKind, sdo: DriveSdo, t_ns: int, text: str, code: int = 0) -> None:
         drive = sdo.drive
-        self._events.put(DriveEvent(kind, drive.joint, drive.node_id, t_ns, f"{sdo.who}: {text}", code))
+        self._events.put(DriveEvent(kind, drive.joint, drive.node_id, t_ns, f"{sdo.label}: {text}", code))
 
     def _on_heartbeat(self, sdo: DriveSdo, state: int) -> None:
         joint = sdo.drive.joint
@@ -310,38 +328,38 @@ class DriveMaster:
             return
         if state == NmtState.BOOT_UP:
             self._report("rebooted", sdo, time.time_ns(), "has booted again", state)
-            self._distrust(sdo, time.time_ns())
-            self._begin(self._revive, sdo)
+            self._mark_unverified(sdo, time.time_ns())
+            self._start_thread(self._reconfigure, sdo)
         elif state != before:
             self._report("nmt_state", sdo, time.time_ns(), f"NMT state is {_nmt_name(state)}", state)
             if state == NmtState.OPERATIONAL and before is not None:
-                self._begin(self._verify, sdo)
+                self._start_thread(self._verify, sdo)
 
-    def _on_others(self, sdo: DriveSdo, index: int, t_ns: int) -> None:
-        """Somebody else writes to a drive: if it is what its TPDOs hold, that is not what we asked for any more."""
+    def _on_foreign_write(self, sdo: DriveSdo, index: int, t_ns: int) -> None:
+        """Handle an SDO write of another master: a change of the PDO mapping makes the TPDOs unverified."""
         if not self._started or not od.TPDO_COMMUNICATION <= index < od.TPDO_MAPPING + od.PDOS:
             return
         joint = sdo.drive.joint
         self._written[joint] = time.monotonic()
-        if self.suspect.get(joint, (0, 0))[1] != NEVER:
+        if self.unverified_mapping.get(joint, (0, 0))[1] != NEVER:
             self._report("mapping_changed", sdo, t_ns, f"somebody else changes its PDO mapping (object {index:04X}h)")
-            self._distrust(sdo, t_ns)
-        self._begin(self._revive, sdo)
+            self._mark_unverified(sdo, t_ns)
+        self._start_thread(self._reconfigure, sdo)
 
-    def _distrust(self, sdo: DriveSdo, since_ns: int) -> None:
-        if self.suspect.get(sdo.drive.joint, (0, 0))[1] != NEVER:
-            self.suspect = {**self.suspect, sdo.drive.joint: (since_ns, NEVER)}
+    def _mark_unverified(self, sdo: DriveSdo, since_ns: int) -> None:
+        if self.unverified_mapping.get(sdo.drive.joint, (0, 0))[1] != NEVER:
+            self.unverified_mapping = {**self.unverified_mapping, sdo.drive.joint: (since_ns, NEVER)}
 
-    def _begin(self, work: Callable[[DriveSdo], None], sdo: DriveSdo) -> None:
-        """Do something with a drive in a thread of its own, which SDO may keep waiting; nothing twice at once."""
+    def _start_thread(self, work: Callable[[DriveSdo], None], sdo: DriveSdo) -> None:
+        """Run ``work`` for a drive in a thread, because SDO may wait; at most one thread per drive."""
         joint = sdo.drive.joint
-        if joint not in self._reviving:
-            thread = threading.Thread(target=work, args=(sdo,), name=f"revive {joint}", daemon=True)
-            self._reviving[joint] = thread
+        if joint not in self._threads:
+            thread = threading.Thread(target=work, args=(sdo,), name=f"reconfigure {joint}", daemon=True)
+            self._threads[joint] = thread
             thread.start()
 
     def _verify(self, sdo: DriveSdo) -> None:
-        """Look whether a drive that somebody else has started still sends what the session wants."""
+        """Compare the mapping of a drive that another master has started with the session."""
         since, difference = time.time_ns(), None
         try:
             difference = mapping_differs(sdo, self._session)
@@ -349,37 +367,38 @@ class DriveMaster:
             log.debug("%s", error)
         if difference is not None:
             self._report("mapping_changed", sdo, since, f"its PDO mapping was changed: {difference}")
-            self._distrust(sdo, since)
-        self._end(sdo)
+            self._mark_unverified(sdo, since)
+        self._finish(sdo)
 
-    def _revive(self, sdo: DriveSdo) -> None:
-        """Configure and start a drive that has booted again, or that somebody else has configured otherwise."""
-        joint, told = sdo.drive.joint, False
+    def _reconfigure(self, sdo: DriveSdo) -> None:
+        """Configure and start a drive that has booted again or whose mapping was changed, until it succeeds."""
+        joint, reported = sdo.drive.joint, False
         try:
             while self._started:
                 try:
-                    if self._configured_again(sdo):
+                    if self._try_configure(sdo):
                         break
                 except ArmidentError as error:
-                    if not told:
+                    if not reported:
                         self._report("failed", sdo, time.time_ns(), f"could not be configured again: {error}")
-                    told = True
-                time.sleep(AGAIN_S)
+                    reported = True
+                time.sleep(RETRY_S)
             if self._started:
-                if joint in self.suspect:
-                    self.suspect = {**self.suspect, joint: (self.suspect[joint][0], time.time_ns())}
+                if joint in self.unverified_mapping:
+                    span = self.unverified_mapping[joint][0], time.time_ns()
+                    self.unverified_mapping = {**self.unverified_mapping, joint: span}
                 self._report("configured", sdo, time.time_ns(), "configured again, and started")
         finally:
-            self._end(sdo)
+            self._finish(sdo)
 
-    def _end(self, sdo: DriveSdo) -> None:
-        """Be done with a drive, unless its mapping is not what it should be by now."""
-        self._reviving.pop(sdo.drive.joint, None)
-        if self._started and self.suspect.get(sdo.drive.joint, (0, 0))[1] == NEVER:
-            self._begin(self._revive, sdo)
+    def _finish(self, sdo: DriveSdo) -> None:
+        """End the thread of a drive; start another one if its mapping became unverified meanwhile."""
+        self._threads.pop(sdo.drive.joint, None)
+        if self._started and self.unverified_mapping.get(sdo.drive.joint, (0, 0))[1] == NEVER:
+            self._start_thread(self._reconfigure, sdo)
 
-    def _configured_again(self, sdo: DriveSdo) -> bool:
-        """Configure and start a drive once more; ``False`` if its bus went down meanwhile, or somebody else wrote.
+    def _try_configure(self, sdo: DriveSdo) -> bool:
+        """Configure and start a drive once; ``False`` if its bus went down or another master wrote meanwhile.
 
         Raises
         ------
@@ -398,7 +417,7 @@ class DriveMaster:
             self._command(NmtCommand.START, sdo)
             self._await_operational(sdo)
             if self._enabled:
-                stand_still(sdo)
+                hold_position(sdo)
                 enable_drive(sdo)
         except BusDown:
             return False

@@ -1,6 +1,6 @@
-"""One bus as canopen sees it: SDO, NMT and heartbeats of its drives, and nothing of the hot path.
+"""Access to the nodes of one bus: SDO and NMT by the canopen library, heartbeats and EMCY by sockets of their own.
 
-Filters in the kernel keep TPDO and SYNC away from canopen's socket: it costs tens of microseconds per frame.
+Kernel filters keep TPDO and SYNC away from canopen's socket, because it takes tens of microseconds per frame.
 """
 
 import logging
@@ -14,7 +14,7 @@ from canopen.network import MessageListener
 
 from armident.configs.errors import ArmidentError, ConfigError
 from armident.configs.schema.session import Bus, DriveNode
-from armident.drivers.can.filtered_socket import SideSocket
+from armident.drivers.can.filtered_socket import FilteredSocket
 from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown
 from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen import objects as od
@@ -23,32 +23,32 @@ from armident.drivers.canopen.heartbeat_monitor import HeartbeatSocket
 from armident.drivers.canopen.objects import NmtCommand
 
 REOPEN_S = 0.25
-"""How often a bus that is down is tried again."""
+"""Interval at which a bus that is down is tried, s."""
 
 log = logging.getLogger(__name__)
 
 
 class _QuietListener(MessageListener):
-    """Keeps a failing bus from printing a traceback in canopen's thread; ``check`` raises the error."""
+    """Suppresses the traceback of a failing bus in canopen's thread; ``check`` raises the error."""
 
     def on_error(self, exc: Exception) -> None:
-        """Take the exception as handled; python-can keeps it for :meth:`canopen.Network.check`."""
+        """Accept the exception as handled; python-can keeps it for :meth:`canopen.Network.check`."""
 
 
 class NodeNetwork:
-    """The nodes of one bus.
+    """Nodes of one bus.
 
     Parameters
     ----------
     bus
         The bus.
     drives
-        The drives that are on it.
+        Its drives.
 
     Raises
     ------
     ConfigError
-        If there is no such bus.
+        If the bus does not exist.
     BusDown
         If the bus is down.
     """
@@ -62,9 +62,9 @@ class NodeNetwork:
             opened.callback(first.shutdown)
             self.heartbeats = HeartbeatSocket(bus, self._nodes)
             opened.callback(self.heartbeats.close)
-            self._requests = SideSocket(bus, [od.COB_SDO_REQUEST + node for node in self._nodes])
+            self._requests = FilteredSocket(bus, [od.COB_SDO_REQUEST + node for node in self._nodes])
             opened.callback(self._requests.close)
-            self._emergencies = SideSocket(bus, [od.COB_EMCY + node for node in self._nodes])
+            self._emergencies = FilteredSocket(bus, [od.COB_EMCY + node for node in self._nodes])
             opened.pop_all()
         self._network = canopen.Network(bus=first)
         self._network.NOTIFIER_CYCLE = 0.05
@@ -79,7 +79,7 @@ class NodeNetwork:
             for base in (od.COB_SDO_RESPONSE, od.COB_SDO_REQUEST, od.COB_HEARTBEAT)
         ]
         if bus.interface == "socketcan":
-            # Says what is wrong with the interface, and what to do about it.
+            # Raises an error that names the administrator's command if the interface is not usable.
             RawSocket(bus.channel, filters=(), receive_buffer=4096).close()
         try:
             return can.Bus(bus.channel, interface=bus.interface, can_filters=filters)
@@ -87,7 +87,12 @@ class NodeNetwork:
             raise ConfigError(f"bus {bus.channel}: {error.__cause__ or error}") from error
 
     def add(self, drive: DriveNode) -> canopen.RemoteNode:
-        """Add a drive.
+        """Add a drive and return its canopen node.
+
+        Parameters
+        ----------
+        drive
+            The drive.
 
         Raises
         ------
@@ -99,22 +104,29 @@ class NodeNetwork:
         except Exception as error:
             raise ConfigError(f"{drive.eds}: not a valid EDS file: {error}") from error
 
-    def overhear(self, node_id: int, told: Callable[[int, int], None]) -> None:
-        """Have ``told`` called with object index and time (ns, UTC) of what others write to a drive over SDO.
+    def on_sdo_write(self, node_id: int, callback: Callable[[int, int], None]) -> None:
+        """Call a function for every SDO write of another master to a node.
 
-        Our own requests do not come back to the socket that sent them.
+        Our own requests are not received by the socket that sent them.
+
+        Parameters
+        ----------
+        node_id
+            Node id of the drive.
+        callback
+            Function of object index and time (ns, UTC), called in canopen's thread.
         """
 
-        def heard(_: int, data: bytearray, timestamp: float) -> None:
+        def on_request(_: int, data: bytearray, timestamp: float) -> None:
             if len(data) == 8 and data[0] >> 5 == od.SDO_DOWNLOAD:
-                told(int.from_bytes(data[1:3], "little"), round(timestamp * 1e9))
+                callback(int.from_bytes(data[1:3], "little"), round(timestamp * 1e9))
 
-        self._network.subscribe(od.COB_SDO_REQUEST + node_id, heard)
+        self._network.subscribe(od.COB_SDO_REQUEST + node_id, on_request)
 
-    def written(self) -> Iterator[tuple[int, int, int]]:
-        """Node, object index and time (ns, UTC) of what anybody, we too, has written over SDO since the last call.
+    def sdo_writes(self) -> Iterator[tuple[int, int, int]]:
+        """Yield node id, object index and time (ns, UTC) of all SDO writes since the last call, our own included.
 
-        Unlike ``overhear`` it waits for no thread.
+        Unlike `on_sdo_write` it does not depend on canopen's thread.
         """
         for batch in self._requests.read():
             downloads = batch[(batch["length"] == 8) & (batch["data"][:, 0] >> 5 == od.SDO_DOWNLOAD)]
@@ -123,12 +135,19 @@ class NodeNetwork:
             yield from zip(nodes.tolist(), index.tolist(), downloads["t_ns"].tolist(), strict=True)
 
     def emergencies(self) -> Iterator[Emergency]:
-        """The emergency messages since the last call, however busy canopen's thread is."""
+        """Yield the emergency messages since the last call, independently of canopen's thread."""
         for batch in self._emergencies.read():
             yield from read_emergencies(batch)
 
     def command(self, command: NmtCommand, node_id: int) -> None:
         """Send an NMT command to one node.
+
+        Parameters
+        ----------
+        command
+            The command.
+        node_id
+            Node id of the drive.
 
         Raises
         ------
@@ -141,7 +160,7 @@ class NodeNetwork:
             raise self._bus_down(error) from error
 
     def check(self) -> None:
-        """Raise what ended the reading of the bus, if something did.
+        """Raise the error that ended canopen's receive thread, if any.
 
         Raises
         ------
@@ -153,8 +172,8 @@ class NodeNetwork:
         except Exception as error:
             raise self._bus_down(error) from error
 
-    def revive(self) -> bool:
-        """Whether the bus can be used; one that went down is opened anew as soon as it is back."""
+    def reopen(self) -> bool:
+        """Reopen a bus that went down and is back; return True if the bus is usable."""
         if not self.down:
             try:
                 self.check()
@@ -167,7 +186,7 @@ class NodeNetwork:
                 fresh = self._open()
             except ArmidentError:
                 return False
-            with suppress(Exception):  # canopen raises here again what ended its receive thread
+            with suppress(Exception):  # canopen raises the error of its receive thread again
                 self._network.disconnect()
             self._network.bus = fresh
             self._network.connect()
@@ -178,11 +197,11 @@ class NodeNetwork:
         return BusDown(f"bus {self.bus.channel}: {error}")
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Release the bus."""
         self.heartbeats.close()
         self._requests.close()
         self._emergencies.close()
         try:
             self._network.disconnect()
-        except Exception as error:  # canopen raises here again what ended its receive thread
+        except Exception as error:  # canopen raises the error of its receive thread again
             log.debug("disconnect: %s", error)

@@ -1,4 +1,4 @@
-"""CANopen by its names: objects, identifiers, states and error codes of CiA 301 and CiA 402."""
+"""Objects, identifiers, states and commands of CiA 301 and CiA 402."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,20 +13,20 @@ from armident.configs.schema.robot import Drive
 from armident.configs.schema.session import ObjectName
 
 PDO_BYTES = 8
-"""Data bytes of a classic CAN frame, and so the most a PDO can carry."""
+"""Maximum number of data bytes of a PDO in a classic CAN frame."""
 
 FD_PDO_BYTES = 64
-"""The same of a CAN FD frame."""
+"""Maximum number of data bytes of a PDO in a CAN FD frame."""
 
 MAPPED_OBJECTS = 64
-"""Most objects that a PDO maps (CiA 301 section 7.5.2.36)."""
+"""Maximum number of objects mapped into a PDO (CiA 301 section 7.5.2.36)."""
 
-TO_ARRAY = 0x4000
-"""From an object of CiA 402 (6064h) down to the manufacturer's array of its values (2064h): sub-index i holds the value
-at the i-th SYNC of the last pack, so that the last sub-index is the SYNC at which the TPDO is sent."""
+ARRAY_OFFSET = 0x4000
+"""Offset from an object of CiA 402 (6064h) down to the manufacturer-specific array of its values (2064h). Sub-index i
+holds the value at the i-th SYNC of the last pack; the last sub-index belongs to the SYNC that triggers the TPDO."""
 
 PDO_NOT_VALID = 1 << 31
-"""Bit of a PDO's COB-ID entry (sub-index 1) that switches the PDO off (CiA 301 section 7.5.2.35)."""
+"""Bit of a PDO's COB-ID entry (sub-index 1) that disables the PDO (CiA 301 section 7.5.2.35)."""
 
 COB_NMT = 0x000
 COB_SYNC = 0x080
@@ -47,7 +47,7 @@ RPDO_MAPPING = 0x1600
 TPDO_COMMUNICATION = 0x1800
 TPDO_MAPPING = 0x1A00
 PDOS = 0x200
-"""Most PDOs that a node has of each kind (CiA 301 section 7.5.2.35)."""
+"""Maximum number of TPDOs, and of RPDOs, of a node (CiA 301 section 7.5.2.35)."""
 ERROR_CODE = 0x603F
 CONTROLWORD = 0x6040
 STATUSWORD = 0x6041
@@ -68,12 +68,22 @@ DEVICE_PROFILE_CIA402 = 402
 """Low word of the device type (1000h) of every drive that follows CiA 402."""
 
 CYCLIC_SYNCHRONOUS_POSITION = 8
-"""Mode of operation (6060h) in which the drive follows a set point per cycle (CiA 402 part 2)."""
+"""Mode of operation (6060h) in which the drive follows one set point per cycle (CiA 402 part 2)."""
 
 
 @dataclass(frozen=True)
 class MappedObject:
-    """An object that fits into a PDO: where it stands in the dictionary and how its bytes read."""
+    """Object that can be mapped into a PDO.
+
+    Parameters
+    ----------
+    name
+        Name of the object in a session.
+    index, subindex
+        Place in the object dictionary.
+    format
+        NumPy format of its bytes.
+    """
 
     name: str
     index: int
@@ -82,17 +92,23 @@ class MappedObject:
 
     @property
     def bits(self) -> int:
-        """Length in bits, as the mapping entry states it."""
+        """Length in bits."""
         return 8 * np.dtype(self.format).itemsize
 
     @property
     def entry(self) -> int:
-        """The mapping entry: index, sub-index and length in bits (CiA 301 section 7.5.2.36)."""
+        """Mapping entry: index, sub-index and length in bits (CiA 301 section 7.5.2.36)."""
         return self.index << 16 | self.subindex << 8 | self.bits
 
     def packed(self, sample: int) -> "MappedObject":
-        """The element of the object's array that holds ``sample`` (1, the oldest, to ``pack``) of a packed TPDO."""
-        return MappedObject(self.name, self.index - TO_ARRAY, sample, self.format)
+        """Element of the object's array that holds one sample of a packed TPDO.
+
+        Parameters
+        ----------
+        sample
+            Number of the sample, from 1 (the oldest) to ``pack``.
+        """
+        return MappedObject(self.name, self.index - ARRAY_OFFSET, sample, self.format)
 
 
 OBJECTS: dict[str, MappedObject] = {
@@ -106,24 +122,31 @@ OBJECTS: dict[str, MappedObject] = {
         MappedObject("status", STATUSWORD, 0, "<u2"),
     )
 }
-"""The objects a stream may carry, by the names of the session schema."""
+"""Objects that a stream may contain, by their names in the session schema."""
 
 SETPOINT = MappedObject("target", TARGET_POSITION, 0, "<i4")
-"""What the RPDO of the set points carries: the target position in counts."""
+"""Object in the RPDO of the set points: the target position, counts."""
 
 
 CONTROL_ENTRY = CONTROLWORD << 16 | 16
 """Mapping entry of the controlword."""
 
 EVENT_DRIVEN = 255
-"""Transmission type of a PDO that acts when it arrives, without SYNC (CiA 301 section 7.5.2.35)."""
+"""Transmission type of a PDO that takes effect on reception, without SYNC (CiA 301 section 7.5.2.35)."""
 
 
 @dataclass(frozen=True)
 class TpdoLayout:
-    """The data bytes of one TPDO: its objects in mapping order, little endian, without gaps.
+    """Data bytes of one TPDO: its objects in mapping order, little endian, without gaps.
 
-    A packed TPDO holds ``pack`` samples of them, the oldest first, mapped from the objects' arrays (:data:`TO_ARRAY`).
+    A packed TPDO holds several samples, the oldest first, mapped from the objects' arrays (:data:`ARRAY_OFFSET`).
+
+    Parameters
+    ----------
+    objects
+        Mapped objects in order.
+    pack
+        Number of samples per TPDO.
     """
 
     objects: tuple[MappedObject, ...]
@@ -133,12 +156,23 @@ class TpdoLayout:
     def of(
         cls, names: Sequence[ObjectName | str], where: str = "stream", pack: int = 1, fd: bool = False
     ) -> "TpdoLayout":
-        """The layout of a stream's objects, on a bus with CAN FD or without.
+        """Layout of a stream's objects.
+
+        Parameters
+        ----------
+        names
+            Names of the objects in mapping order.
+        where
+            Name of the stream in messages.
+        pack
+            Number of samples per TPDO.
+        fd
+            ``True`` on a bus with CAN FD.
 
         Raises
         ------
         ConfigError
-            If an object is unknown or repeated, or the objects need more bytes than the frame has.
+            If an object is unknown or repeated, or the objects exceed the frame.
         """
         for name in names:
             if name not in OBJECTS:
@@ -170,7 +204,7 @@ class TpdoLayout:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Structured type of a sample, one field per object, padded to whole numbers of eight bytes."""
+        """Structured type of a sample, one field per object, padded to a multiple of eight bytes."""
         offsets = [sum(o.bits for o in self.objects[:k]) // 8 for k in range(len(self.objects))]
         return np.dtype(
             {
@@ -183,33 +217,67 @@ class TpdoLayout:
 
     @property
     def entries(self) -> tuple[int, ...]:
-        """The mapping entries to write to 1A00h and following, in order."""
+        """Mapping entries for 1A00h and following, in order."""
         if self.pack == 1:
             return tuple(o.entry for o in self.objects)
         return tuple(o.packed(k).entry for k in range(1, self.pack + 1) for o in self.objects)
 
     def decode(self, data: NDArray[np.uint8]) -> NDArray[Any]:
-        """Samples' data bytes, shape (N, 8) or wider, as records of shape (N,); a view where ``data`` is contiguous."""
+        """Data bytes of samples as records, shape (N,); a view if ``data`` is contiguous.
+
+        Parameters
+        ----------
+        data
+            Data bytes, uint8, shape (N, itemsize of `dtype`).
+        """
         return np.ascontiguousarray(data).view(self.dtype)[:, 0]
 
 
 def tpdo_cob(tpdo: int, node: int) -> int:
-    """COB-ID of TPDO 1 to 4 in the predefined connection set (CiA 301 section 7.3.5)."""
+    """COB-ID of a TPDO in the predefined connection set (CiA 301 section 7.3.5).
+
+    Parameters
+    ----------
+    tpdo
+        Number of the TPDO, 1 to 4.
+    node
+        Node id.
+    """
     return 0x180 + 0x100 * (tpdo - 1) + node
 
 
 def rpdo_cob(rpdo: int, node: int) -> int:
-    """COB-ID of RPDO 1 to 4 in the predefined connection set (CiA 301 section 7.3.5)."""
+    """COB-ID of an RPDO in the predefined connection set (CiA 301 section 7.3.5).
+
+    Parameters
+    ----------
+    rpdo
+        Number of the RPDO, 1 to 4.
+    node
+        Node id.
+    """
     return 0x200 + 0x100 * (rpdo - 1) + node
 
 
 def stop_rpdo(setpoints: int) -> int:
-    """Which RPDO carries the controlword beside the one of the set points: 2, or 1 where those have 2."""
+    """Number of the RPDO for the controlword: 2, or 1 if the set points use 2.
+
+    Parameters
+    ----------
+    setpoints
+        Number of the RPDO of the set points.
+    """
     return 1 if setpoints == 2 else 2
 
 
 def rated_milliamperes(drive: Drive) -> int:
-    """What 6075h of the drive must hold so that 1000 per mille of 6078h is ``drive.rated``."""
+    """Rated current for 6075h, mA, so that 1000 per mille of 6078h is ``drive.rated``.
+
+    Parameters
+    ----------
+    drive
+        Drive of the robot configuration.
+    """
     return round(drive.rated * 1000)
 
 
@@ -224,7 +292,7 @@ class NmtCommand(IntEnum):
 
 
 class NmtState(IntEnum):
-    """NMT states as a heartbeat carries them (CiA 301 section 7.2.8.3.2)."""
+    """NMT states in a heartbeat (CiA 301 section 7.2.8.3.2)."""
 
     BOOT_UP = 0
     STOPPED = 4
@@ -233,7 +301,7 @@ class NmtState(IntEnum):
 
 
 class Control(IntEnum):
-    """Controlword (6040h) of each command of the CiA 402 state machine."""
+    """Controlwords (6040h) of the commands of the CiA 402 state machine."""
 
     DISABLE_VOLTAGE = 0x00
     QUICK_STOP = 0x02
@@ -244,7 +312,7 @@ class Control(IntEnum):
 
 
 class DriveState(StrEnum):
-    """States of the CiA 402 state machine, by the names of the standard."""
+    """States of the CiA 402 state machine, with their names in the standard."""
 
     NOT_READY = "not ready to switch on"
     SWITCH_ON_DISABLED = "switch on disabled"
@@ -270,7 +338,13 @@ STATE_CODES: dict[DriveState, tuple[int, int]] = {
 
 
 def drive_state(statusword: int) -> DriveState | None:
-    """The CiA 402 state that a statusword (6041h) reports; ``None`` for a pattern the standard does not know."""
+    """CiA 402 state of a statusword; ``None`` for a pattern that the standard does not define.
+
+    Parameters
+    ----------
+    statusword
+        Value of 6041h.
+    """
     for state, (mask, value) in STATE_CODES.items():
         if statusword & mask == value:
             return state

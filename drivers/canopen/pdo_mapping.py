@@ -1,4 +1,4 @@
-"""Configures one drive over SDO: is it the drive we expect, and what does it send and receive."""
+"""Configuration of one drive over SDO: identity and scales, PDO mapping, heartbeat and SYNC counter."""
 
 import logging
 
@@ -12,17 +12,24 @@ log = logging.getLogger(__name__)
 
 
 def check_drive(sdo: DriveSdo, robot: RobotConfig) -> None:
-    """Refuse a node that is not the drive the robot configuration describes.
+    """Refuse a node that is not the drive of the robot configuration.
+
+    Parameters
+    ----------
+    sdo
+        The drive.
+    robot
+        Expected encoder resolution and rated current.
 
     Raises
     ------
     ConfigError
-        If it is no CiA 402 drive, another product than its EDS says, or scales or rates otherwise than the robot.
+        If the node is not a CiA 402 drive, or if product, encoder resolution or rated current differ.
     """
     device = sdo.read(od.DEVICE_TYPE, 0, "I")
     if device & 0xFFFF != od.DEVICE_PROFILE_CIA402:
         raise ConfigError(
-            f"{sdo.who}: is no CiA 402 drive: device type (1000h) is {device:08X}h, profile {device & 0xFFFF} "
+            f"{sdo.label}: is no CiA 402 drive: device type (1000h) is {device:08X}h, profile {device & 0xFFFF} "
             "instead of 402"
         )
     for sub, what in ((1, "vendor"), (2, "product code")):
@@ -30,34 +37,42 @@ def check_drive(sdo: DriveSdo, robot: RobotConfig) -> None:
         expected = known.default if known is not None else None
         found = sdo.read(od.IDENTITY, sub, "I")
         if expected and found != expected:
-            raise ConfigError(f"{sdo.who}: {what} (1018h:{sub}) is {found:X}h, {sdo.drive.eds.name} says {expected:X}h")
+            eds = sdo.drive.eds.name
+            raise ConfigError(f"{sdo.label}: {what} (1018h:{sub}) is {found:X}h, {eds} says {expected:X}h")
     _check_scales(sdo, robot.name, next(j for j in robot.joints if j.name == sdo.drive.joint))
 
 
 def _check_scales(sdo: DriveSdo, robot: str, joint: Joint) -> None:
     expected = joint.drive.counts_per_unit
-    # Counts per metre of a prismatic joint say nothing about the turns of its motor.
+    # Counts per metre of a prismatic joint do not determine the counts per motor turn.
     if joint.type == "revolute" and expected is not None:
         increments = sdo.read(od.ENCODER_RESOLUTION, 1, "I")
         turns = sdo.read(od.ENCODER_RESOLUTION, 2, "I")
         if not turns or abs(increments / turns - expected) > 0.5:
             raise ConfigError(
-                f"{sdo.who}: encoder has {increments}/{turns} counts per turn (608Fh), "
+                f"{sdo.label}: encoder has {increments}/{turns} counts per turn (608Fh), "
                 f"robot {robot} says {expected:g}; is it another drive?"
             )
     if joint.drive.signal == "current":
         rated = sdo.read(od.RATED_CURRENT, 0, "I")
         if rated != od.rated_milliamperes(joint.drive):
             raise ConfigError(
-                f"{sdo.who}: rated current is {rated} mA (6075h), robot {robot} says "
+                f"{sdo.label}: rated current is {rated} mA (6075h), robot {robot} says "
                 f"{od.rated_milliamperes(joint.drive)} mA; is it another drive?"
             )
 
 
 def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
-    """Write heartbeat, SYNC counter, the session's TPDOs and the RPDO of its set points, and read all of it back.
+    """Write heartbeat, SYNC counter, the session's TPDOs and the RPDO of its set points, and read them back.
 
-    TPDOs that the session does not name are switched off.
+    Other TPDOs are disabled.
+
+    Parameters
+    ----------
+    sdo
+        The drive, in pre-operational.
+    session
+        Heartbeat, SYNC, streams and set points.
 
     Raises
     ------
@@ -84,14 +99,21 @@ def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
         cob = od.rpdo_cob(k + 1, node)
         _map_pdo(sdo, od.RPDO_COMMUNICATION + k, od.RPDO_MAPPING + k, cob, (od.SETPOINT.entry,), every)
         sdo.write(od.INTERPOLATION_MODE, 0, 0, "h")
-        value, exponent = interpolation_period(session.sync.period_us * every, sdo.who)
+        value, exponent = interpolation_period(session.sync.period_us * every, sdo.label)
         sdo.write(od.INTERPOLATION_PERIOD, 1, value, "B")
         sdo.write(od.INTERPOLATION_PERIOD, 2, exponent, "b")
         _map_stop(sdo, od.stop_rpdo(session.setpoints.rpdo))
 
 
 def mapping_differs(sdo: DriveSdo, session: SessionConfig) -> str | None:
-    """What a drive has mapped otherwise than the session wants, in words; ``None`` if nothing.
+    """Description of the first difference between a drive's TPDO mapping and the session; ``None`` if there is none.
+
+    Parameters
+    ----------
+    sdo
+        The drive.
+    session
+        Expected streams.
 
     Raises
     ------
@@ -111,9 +133,9 @@ def mapping_differs(sdo: DriveSdo, session: SessionConfig) -> str | None:
 
 
 def _map_stop(sdo: DriveSdo, rpdo: int) -> None:
-    """Have the controlword (6040h) in an RPDO that acts when it arrives: what stops a drive faster than SDO can.
+    """Map the controlword (6040h) into an event-driven RPDO, which stops a drive faster than SDO.
 
-    A drive that has no such RPDO, or does not map the controlword, is stopped by SDO alone.
+    A drive without this RPDO, or that does not map the controlword, is stopped by SDO.
     """
     communication, mapping = od.RPDO_COMMUNICATION + rpdo - 1, od.RPDO_MAPPING + rpdo - 1
     if communication not in sdo.node.object_dictionary or mapping not in sdo.node.object_dictionary:
@@ -126,7 +148,7 @@ def _map_stop(sdo: DriveSdo, rpdo: int) -> None:
 
 
 def _map_pdo(sdo: DriveSdo, communication: int, mapping: int, cob: int, entries: tuple[int, ...], every: int) -> None:
-    """Configure a PDO in the order that CiA 301 (section 7.5.2.36) prescribes."""
+    """Configure a PDO in the order of CiA 301 (section 7.5.2.36)."""
     sdo.write(communication, 1, cob | od.PDO_NOT_VALID, "I")
     sdo.write(mapping, 0, 0, "B")
     for k, entry in enumerate(entries):
@@ -139,14 +161,21 @@ def _map_pdo(sdo: DriveSdo, communication: int, mapping: int, cob: int, entries:
 def interpolation_period(period_us: int, where: str = "setpoints") -> tuple[int, int]:
     """Value and exponent of 60C2h for a set point period: ``value * 10**exponent`` seconds.
 
+    Parameters
+    ----------
+    period_us
+        Period, us.
+    where
+        Name of the set points in messages.
+
     Raises
     ------
     ConfigError
-        If the period cannot be stated with a value up to 255.
+        If the period cannot be expressed with a value up to 255.
     """
     value, exponent = period_us, -6
     while value % 10 == 0 and exponent < -3:
         value, exponent = value // 10, exponent + 1
     if value > 255:
-        raise ConfigError(f"{where}: a set point period of {period_us} us cannot be stated in 60C2h")
+        raise ConfigError(f"{where}: a set point period of {period_us} us cannot be expressed in 60C2h")
     return value, exponent

@@ -1,4 +1,4 @@
-"""One drive over SDO: reads and writes that say in one line what went wrong, and with whom."""
+"""SDO access to one drive; errors are one line that names drive, object and reason."""
 
 import logging
 import struct
@@ -14,46 +14,53 @@ from armident.drivers.can.frames import BusDown
 from armident.drivers.can.socketcan import RawSocket
 
 for _logger in ("canopen", "can"):
-    # Their warnings repeat on stderr what our exceptions say in one line.
+    # Their warnings on stderr would repeat the text of our exceptions.
     logging.getLogger(_logger).addHandler(logging.NullHandler())
 
 _EXPEDITED, _LARGEST = 4, 8
-"""Bytes of a value in the answer itself, and most bytes that an object we read has."""
+"""Maximum size (bytes) of a value in an expedited answer, and of the objects read here."""
 
 
 class DriveSdo:
-    """The object dictionary of one drive.
+    """Access to the object dictionary of one drive.
 
     Parameters
     ----------
     node
-        The remote node, part of a network that is connected.
+        Remote node of a connected network.
     drive
-        The drive as the session names it.
+        Drive of the session.
     session
-        For the bus and the SDO timeout.
+        Bus and SDO timeout.
     """
 
     def __init__(self, node: canopen.RemoteNode, drive: DriveNode, session: SessionConfig) -> None:
         self.node = node
         self.drive = drive
-        self.who = f"node {drive.node_id} ({drive.joint})"
-        """How messages name the drive."""
+        self.label = f"node {drive.node_id} ({drive.joint})"
+        """Name of the drive in messages."""
         self.fd = session.bus_of(drive).fd
-        """Whether the drive's TPDOs are frames of CAN FD."""
+        """``True`` if the drive's TPDOs are CAN FD frames."""
         self.emcy_texts = session.emcy_texts
         self._bus = session.bus_of(drive)
         self._timeout = node.sdo.RESPONSE_TIMEOUT = session.sdo_timeout_s
-        # An SDO channel has one transfer at a time.
+        # An SDO channel carries one transfer at a time.
         self._lock = threading.RLock()
 
     def read(self, index: int, sub: int, code: str) -> int:
-        """Read an object; ``code`` is its type as ``struct`` names it (``B``, ``h``, ``I``).
+        """Read an object.
+
+        Parameters
+        ----------
+        index, sub
+            Index and sub-index.
+        code
+            Type as a format of `struct` (``B``, ``h``, ``I``).
 
         Raises
         ------
         ConfigError
-            If the drive does not answer, or refuses.
+            If the drive does not answer or refuses.
         BusDown
             If the bus is down.
         """
@@ -61,7 +68,7 @@ class DriveSdo:
             with self._lock:
                 data = self._upload(index, sub, struct.calcsize("<" + code))
         except SdoAbortedError as error:
-            raise ConfigError(f"{self.who}: refuses to read {_name(index, sub)}: {_abort(error)}") from error
+            raise ConfigError(f"{self.label}: refuses to read {_name(index, sub)}: {_abort(error)}") from error
         except SdoCommunicationError as error:
             raise self._silent() from error
         except (struct.error, IndexError) as error:
@@ -71,7 +78,14 @@ class DriveSdo:
         return int(struct.unpack("<" + code, data)[0])
 
     def poll(self, index: int, sub: int, code: str, answer_s: float) -> int | None:
-        """Read an object where nobody else is at it, and wait for so long at most; ``None`` where somebody is.
+        """Read an object unless another SDO transfer is in progress; ``None`` in that case.
+
+        Parameters
+        ----------
+        index, sub, code
+            As in `read`.
+        answer_s
+            Longest wait for the answer, s.
 
         Raises
         ------
@@ -88,22 +102,29 @@ class DriveSdo:
             self._lock.release()
 
     def _upload(self, index: int, sub: int, size: int) -> bytes:
-        """The first ``size`` bytes of an object; some drives send four of smaller ones."""
+        """First ``size`` bytes of an object; some drives send four bytes of smaller objects."""
         data = b""
         with self.node.sdo.open(index, sub, "rb", buffering=0) as stream:
-            # A drive that never says that it has ended is not listened to for ever.
+            # Bounded, because a faulty drive may never end the transfer.
             while len(data) <= _LARGEST and (part := stream.read(_LARGEST)):
                 data += part
-            said = stream.size
-        if not (said == len(data) >= size or (said is None and len(data) in (size, max(size, _EXPEDITED)))):
+            stated = stream.size
+        if not (stated == len(data) >= size or (stated is None and len(data) in (size, max(size, _EXPEDITED)))):
             raise ConfigError(
-                f"{self.who}: {_name(index, sub)} has {'more than ' * (len(data) > _LARGEST)}"
-                f"{min(len(data), _LARGEST)} bytes{'' if said is None else f', says {said}'}; expected {size}"
+                f"{self.label}: {_name(index, sub)} has {'more than ' * (len(data) > _LARGEST)}"
+                f"{min(len(data), _LARGEST)} bytes{'' if stated is None else f', says {stated}'}; expected {size}"
             )
         return data[:size]
 
-    def order(self, index: int, sub: int, value: int, code: str) -> None:
-        """Write an object that acts at once and need not read back the same.
+    def command(self, index: int, sub: int, value: int, code: str) -> None:
+        """Write an object without reading it back.
+
+        Parameters
+        ----------
+        index, sub, code
+            As in `read`.
+        value
+            Value to write.
 
         Raises
         ------
@@ -116,7 +137,7 @@ class DriveSdo:
             with self._lock:
                 self.node.sdo.download(index, sub, struct.pack("<" + code, value))
         except SdoAbortedError as error:
-            raise ConfigError(f"{self.who}: refuses {_name(index, sub)} = {value:X}h: {_abort(error)}") from error
+            raise ConfigError(f"{self.label}: refuses {_name(index, sub)} = {value:X}h: {_abort(error)}") from error
         except SdoCommunicationError as error:
             raise self._silent() from error
         except (struct.error, IndexError) as error:
@@ -127,6 +148,13 @@ class DriveSdo:
     def write(self, index: int, sub: int, value: int, code: str) -> None:
         """Write an object and read it back.
 
+        Parameters
+        ----------
+        index, sub, code
+            As in `read`.
+        value
+            Value to write.
+
         Raises
         ------
         ConfigError
@@ -134,25 +162,25 @@ class DriveSdo:
         BusDown
             If the bus is down.
         """
-        self.order(index, sub, value, code)
+        self.command(index, sub, value, code)
         found = self.read(index, sub, code)
         if found != value:
-            raise ConfigError(f"{self.who}: {_name(index, sub)} reads {found:X}h after writing {value:X}h")
+            raise ConfigError(f"{self.label}: {_name(index, sub)} reads {found:X}h after writing {value:X}h")
 
     def _silent(self) -> ArmidentError:
         if self._bus.interface == "socketcan":
-            # A bus that is down looks like a silent drive from here; opening it tells them apart.
+            # A bus that is down looks like a silent drive; opening it distinguishes the two.
             try:
                 RawSocket(self._bus.channel, filters=(), receive_buffer=4096).close()
             except ArmidentError as error:
                 return error
         return ConfigError(
-            f"{self.who}: does not answer on {self._bus.channel} within {self._timeout:g} s; "
+            f"{self.label}: does not answer on {self._bus.channel} within {self._timeout:g} s; "
             "is the drive on, and the node id right?"
         )
 
     def _garbled(self, index: int, sub: int) -> ConfigError:
-        return ConfigError(f"{self.who}: its answer about {_name(index, sub)} is no SDO answer (CiA 301)")
+        return ConfigError(f"{self.label}: its answer about {_name(index, sub)} is no SDO answer (CiA 301)")
 
     def _down(self, error: Exception) -> BusDown:
         return BusDown(f"bus {self._bus.channel}: {error}")

@@ -1,4 +1,4 @@
-"""Position set points as they are played: which drive, which row, every how many SYNCs."""
+"""Position set points for the SYNC producer."""
 
 from dataclasses import dataclass
 
@@ -8,18 +8,23 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class SetpointPlan:
-    """Position set points for all drives, one row per ``every`` SYNCs.
+    """Position set points of all drives, one row per ``every`` SYNCs.
 
     Parameters
     ----------
     rows
-        Targets in counts, shape (M, n) int32, one column per drive.
+        Targets, counts, int32, shape (M, n), one column per drive.
     cob_ids
-        COB-ID of each drive's set point RPDO, in the order of the columns.
+        COB-ID of each drive's set point RPDO, in the order of the columns, length n.
     every
-        SYNCs between two rows.
+        Number of SYNCs between two rows.
     bus_of
-        Number of the bus that each drive is on; empty: all on one.
+        Number of each drive's bus, length n; empty: all drives are on one bus.
+
+    Raises
+    ------
+    ValueError
+        If shapes or types do not match.
     """
 
     rows: NDArray[np.int32]

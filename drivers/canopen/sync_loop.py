@@ -1,4 +1,4 @@
-"""The compiled loop of the SYNC producer: sleep until the deadline, send, account for the lateness."""
+"""Compiled loop of the SYNC producer: sleep until the deadline, send, record the delay."""
 
 import errno
 import socket
@@ -12,27 +12,27 @@ from armident.drivers.can.socketcan import Messages
 from armident.drivers.canopen.objects import COB_SYNC
 
 MAX_LATE_PERIODS = 10
-"""Lateness, in periods, beyond which the time grid moves instead of being caught up with."""
+"""Delay, in periods, beyond which the time grid moves instead of being caught up with."""
 
 BIN_NS = 5_000
-"""Width of a bin of the lateness histogram, ns."""
+"""Width of a bin of the delay histogram, ns."""
 
 BINS = 10_000
-"""Bins of the lateness histogram; the last one also holds everything later."""
+"""Number of bins of the delay histogram; the last one holds all larger delays."""
 
 STOP, RETURN, SENT, ERROR, SKIPPED, OVERRUNS, ROW, FIRST, LATE_MAX, BASE_NS, LAST_NS, WANTED = range(12)
-"""Places in the shared state. ``STOP``: end. ``RETURN``: leave the loop to take a new plan. ``ERROR``: errno while all
-buses refuse SYNC. ``WANTED``: how many SYNCs there shall be in all."""
+"""Indices of the shared state. ``STOP``: end. ``RETURN``: leave the loop for a new plan. ``ERROR``: errno while all
+buses refuse SYNC. ``WANTED``: total number of SYNCs to send."""
 
 STATE_SIZE = 12
 
 TIMES = 1 << 16
-"""So many SYNCs have the times kept at which they were sent."""
+"""Number of SYNCs whose send times are kept."""
 
 _SEND_ATTEMPTS = 5000
 _RETRY_NS = 100_000
 _FEW_ATTEMPTS = 3
-"""The same where other buses wait for their SYNC meanwhile."""
+"""Number of attempts if other buses wait for their SYNC."""
 _REALTIME, _MONOTONIC = 0, 1
 _ABSOLUTE = 1
 _EINTR, _EAGAIN, _ENOBUFS = errno.EINTR, errno.EAGAIN, errno.ENOBUFS
@@ -47,25 +47,33 @@ _errno_location: Any = types.ExternalFunction("__errno_location", types.voidptr(
 
 
 def is_knot(k: int, every: int) -> bool:
-    """Whether SYNC ``k`` is one at which set points become targets: its counter is a multiple of ``every``."""
+    """Return True if set points become targets at a SYNC: its counter is a multiple of ``every``.
+
+    Parameters
+    ----------
+    k
+        Number of the SYNC, from 0.
+    every
+        Number of SYNCs between two set points.
+    """
     return (k + 1) % every == 0
 
 
 class Loop:
-    """The loop with the arrays it works on; called again, it goes on where it was.
+    """Compiled SYNC loop with its arrays; a further call continues where the last one ended.
 
     Parameters
     ----------
     descriptors
-        One socket per bus.
+        Socket of each bus, shape (B,).
     period_ns, counter
-        Of SYNC.
+        SYNC period, ns, and overflow of the SYNC counter.
     state, late
-        Shared state and histogram of the lateness.
+        Shared state, shape (STATE_SIZE,), and histogram of the delays, shape (BINS,).
     errors, unsent
-        Per bus the errno with which it refused the last SYNC (0: none), and how many SYNCs it refused.
+        Per bus the errno of the last SYNC (0: sent), and the number of refused SYNCs, shape (B,).
     times
-        Ring of the time (ns, UTC) at which SYNC k had just been sent, at ``k % TIMES``.
+        Ring of the times (ns, UTC) just after SYNC k was sent, at index ``k % TIMES``.
     """
 
     def __init__(
@@ -85,22 +93,22 @@ class Loop:
         self._spec = np.zeros(2, dtype=np.int64)
         ended = np.ones(STATE_SIZE, dtype=np.int64)
         none = np.zeros((0, 0), dtype=np.int32)
-        # Compiled here, where nothing waits for the first SYNC yet.
+        # Compile before the first SYNC is due.
         self._call(ended, none, np.zeros(0, np.uint32), np.zeros(0, np.int64), 1)
 
     def __call__(
         self, rows: NDArray[np.int32], cob_ids: NDArray[np.uint32], bus_of: NDArray[np.int64], every: int
     ) -> None:
-        """Send SYNCs, and ``rows`` from ``state[ROW]`` on, until ``state[STOP]``, ``state[RETURN]`` or the last wanted.
+        """Send SYNCs and set points until ``state[STOP]``, ``state[RETURN]`` or ``state[WANTED]``.
 
         Parameters
         ----------
         rows
-            Set points, shape (M, n), counts.
+            Set points, counts, shape (M, n); sent from row ``state[ROW]`` on.
         cob_ids, bus_of
-            Identifiers of the set point frames and the bus that each goes to, shape (n,).
+            Identifier and bus number of each drive's set point frame, shape (n,).
         every
-            SYNCs between two rows.
+            Number of SYNCs between two rows.
         """
         self._call(self._state, rows, cob_ids, bus_of, every)
 
@@ -113,7 +121,7 @@ class Loop:
         every: int,
     ) -> None:
         buses = self._fixed[0].size
-        # Per bus the SYNC and behind it the set points of its drives.
+        # Per bus the SYNC, followed by the set points of its drives.
         first = np.searchsorted(np.sort(bus_of), np.arange(buses + 1)) + np.arange(buses + 1)
         place = np.zeros(cob_ids.size, np.int64)
         for bus in range(buses):
@@ -129,21 +137,41 @@ class Loop:
 
 @njit(nogil=True, cache=True)
 def monotonic_ns(spec):  # type: ignore[no-untyped-def]
-    """Read CLOCK_MONOTONIC (ns); ``spec`` (2,) int64 is room for a ``struct timespec``."""
+    """Read CLOCK_MONOTONIC, ns.
+
+    Parameters
+    ----------
+    spec
+        Memory of a ``struct timespec``, int64, shape (2,).
+    """
     _clock_gettime(_MONOTONIC, spec.ctypes.data)
     return spec[0] * 1_000_000_000 + spec[1]
 
 
 @njit(nogil=True, cache=True)
 def utc_ns(spec):  # type: ignore[no-untyped-def]
-    """Read CLOCK_REALTIME (ns), which the kernel stamps frames with; ``spec`` as in `monotonic_ns`."""
+    """Read CLOCK_REALTIME, ns: the clock of the kernel's frame stamps.
+
+    Parameters
+    ----------
+    spec
+        Memory of a ``struct timespec``, int64, shape (2,).
+    """
     _clock_gettime(_REALTIME, spec.ctypes.data)
     return spec[0] * 1_000_000_000 + spec[1]
 
 
 @njit(nogil=True, cache=True)
 def sleep_until(deadline, spec):  # type: ignore[no-untyped-def]
-    """Sleep until CLOCK_MONOTONIC reads ``deadline`` (ns)."""
+    """Sleep until CLOCK_MONOTONIC reaches a deadline.
+
+    Parameters
+    ----------
+    deadline
+        Time, ns.
+    spec
+        Memory of a ``struct timespec``, int64, shape (2,).
+    """
     spec[0], spec[1] = deadline // 1_000_000_000, deadline % 1_000_000_000
     while _clock_nanosleep(_MONOTONIC, _ABSOLUTE, spec.ctypes.data, 0) == _EINTR:
         pass
@@ -151,7 +179,21 @@ def sleep_until(deadline, spec):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True)
 def send_messages(descriptor, address, count, attempts, spec):  # type: ignore[no-untyped-def]
-    """Hand ``count`` messages to the kernel; 0, or errno if it will not take them."""
+    """Send messages by ``sendmmsg``; return 0, or errno if the kernel refuses them.
+
+    Parameters
+    ----------
+    descriptor
+        Socket.
+    address
+        Address of the first ``struct mmsghdr``.
+    count
+        Number of messages.
+    attempts
+        Maximum number of system calls.
+    spec
+        Memory of a ``struct timespec``, int64, shape (2,).
+    """
     sent, code = 0, 0
     for _ in range(attempts):
         done = _sendmmsg(descriptor, address + 64 * sent, count - sent, _DONTWAIT)
@@ -194,17 +236,17 @@ def _run(  # type: ignore[no-untyped-def]
                 refused += 1
                 code = errors[b]
         state[ERROR] = code if refused == buses else 0
-        # Behind it: whoever hears it never hears it later than this, however long we were held up before.
+        # Read after sending, so that no receiver's stamp is later.
         times[k % TIMES] = utc_ns(spec)
-        # Half a period's rest counts from here, too: what takes its time to be sent leaves the processor to others.
+        # The pause of half a period starts here, so that slow sending leaves the processor to other threads.
         now = monotonic_ns(spec)
         state[LAST_NS] = now
-        lateness = now - deadline
-        late[min(BINS - 1, lateness // BIN_NS)] += 1
-        state[LATE_MAX] = max(state[LATE_MAX], lateness)
-        if lateness > period:
+        delay = now - deadline
+        late[min(BINS - 1, delay // BIN_NS)] += 1
+        state[LATE_MAX] = max(state[LATE_MAX], delay)
+        if delay > period:
             state[OVERRUNS] += 1
-        if lateness > MAX_LATE_PERIODS * period:
-            state[SKIPPED] += lateness // period
-            state[BASE_NS] += lateness // period * period
+        if delay > MAX_LATE_PERIODS * period:
+            state[SKIPPED] += delay // period
+            state[BASE_NS] += delay // period * period
         state[SENT] = k + 1

@@ -1,13 +1,12 @@
-"""The SYNC producer: SYNC with counter on an absolute time grid on all buses, and the position set points with it.
+"""SYNC producer: SYNC with counter on an absolute time grid on all buses, and position set points after it.
 
-A compiled loop without the interpreter's lock sleeps until each deadline (``clock_nanosleep``) and hands the
-SYNC and the set points that belong behind it to the kernel in one system call.
+A compiled loop without the interpreter's lock sleeps until each deadline (``clock_nanosleep``). It sends the SYNC and
+the set points that follow it in one system call.
 
-What it does when it wakes up late: the SYNC goes out at once and the following ones return to the grid, never
-closer to each other than half a period. On a machine that is too slow for its buses everything else happens in this
-rest: a loop of real-time priority would not let it otherwise. When it is late by more than ``MAX_LATE_PERIODS`` nothing
-is caught up: the grid moves by whole periods, and ``SyncStats.skipped`` counts them. No SYNC number is ever left out: a
-bus that refuses one (it is down) lacks it, the others go on.
+A late SYNC is sent at once. The following ones return to the grid, at least half a period apart. On a machine that is
+too slow for its buses this pause leaves time to other threads, which a loop of real-time priority would block. If the
+delay exceeds ``MAX_LATE_PERIODS``, the grid moves by whole periods, counted in ``SyncStats.skipped``. No SYNC number is
+left out: a bus that is down misses its SYNC while the others continue.
 """
 
 import errno
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from armident.configs.schema.session import Bus
 from armident.drivers.can.frames import BusDown, FrameBus, frames
-from armident.drivers.can.scheduling import be_punctual
+from armident.drivers.can.scheduling import set_realtime_priority
 from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.can.udp import open_bus
 from armident.drivers.canopen.objects import COB_SYNC
@@ -51,47 +50,58 @@ from armident.drivers.canopen.sync_loop import (
 __all__ = ["SetpointPlan", "SyncProducer", "SyncStats"]
 
 REALTIME_PRIORITY = 10
+"""Priority of ``SCHED_FIFO`` of the producer's thread."""
 
 
 @dataclass(frozen=True)
 class SyncStats:
-    """How punctual the SYNCs were; times in microseconds."""
+    """Punctuality of the SYNCs.
+
+    Parameters
+    ----------
+    sent
+        Number of SYNCs sent.
+    late_p50_us, late_p99_us, late_max_us
+        Median, 99th percentile and maximum of the delay from the grid until all buses took the SYNC, us.
+    overruns
+        Number of SYNCs that were late by more than a period.
+    skipped
+        Number of periods by which the time grid was moved because the producer was held up.
+    realtime
+        ``True`` if the loop ran with real-time priority.
+    unsent
+        Number of SYNCs that each bus refused.
+    """
 
     sent: int
     late_p50_us: float
-    """How long behind its time on the grid a SYNC had been handed to the kernel of every bus."""
     late_p99_us: float
     late_max_us: float
     overruns: int
-    """SYNCs that were late by more than a period."""
     skipped: int
-    """Periods by which the time grid had to move because the producer was held up for too long."""
     realtime: bool
-    """Whether the loop ran with real-time priority."""
     unsent: tuple[int, ...] = ()
-    """SYNCs that each bus refused."""
 
 
 class SyncProducer:
-    """Sends SYNC k = 0, 1, 2, ... with counter ``k % counter + 1`` from a thread of its own.
+    """Sends SYNC k = 0, 1, 2, ... with counter ``k % counter + 1`` in a separate thread.
 
     Parameters
     ----------
     buses
-        The bus to send on, or several; the producer opens sockets of its own, so that other sockets see the SYNC.
+        One bus or several; the producer opens its own sockets, so that other sockets receive the SYNC.
     period_us
-        Time between two SYNCs, us.
+        SYNC period, us.
     counter
         Overflow of the SYNC counter (1019h).
     setpoints
-        Set points to play from the start on; :meth:`play` gives them later, or others.
+        Set points to play from the start; :meth:`play` sets others later.
 
     Notes
     -----
-    A row is sent right behind the SYNC before its knot, the SYNC whose counter is a multiple of ``every``, and
-    becomes the target there: with row 0 at SYNC ``first``, row m becomes the target at ``first + m every``,
-    and the interpolated demand reaches it ``every`` SYNCs later. After the last row nothing more is
-    sent: the drives hold it.
+    A knot is a SYNC whose counter is a multiple of ``every``. A row is sent directly after the SYNC before its knot and
+    becomes the target at the knot. With row 0 at SYNC ``first``, row m becomes the target at ``first + m every``, and
+    the interpolated demand reaches it ``every`` SYNCs later. The drives hold the last row.
     """
 
     def __init__(
@@ -120,8 +130,10 @@ class SyncProducer:
 
         Raises
         ------
-        ConfigError, BusDown
-            As :class:`RawSocket` does.
+        ConfigError
+            If a bus does not exist.
+        BusDown
+            If a bus is down.
         """
         with ExitStack() as opened:
             for bus in self._configured:
@@ -138,25 +150,30 @@ class SyncProducer:
         self._thread.start()
 
     def stop(self) -> None:
-        """Send no further SYNC; returns when the thread has ended. Nothing happens the second time."""
+        """Stop SYNC and wait for the end of the thread; further calls have no effect."""
         self._state[STOP] = 1
         if self._thread is not None:
             self._thread.join()
         for bus in self._buses:
             bus.close()
 
-    def end_after(self, count: int) -> None:
-        """Send SYNC ``count - 1`` as the last one, however late anybody looks; :meth:`stop` remains due.
+    def stop_after(self, count: int) -> None:
+        """Limit the total number of SYNCs; :meth:`stop` is still required.
 
         Parameters
         ----------
         count
-            SYNCs in all; where so many have been sent already, no other follows.
+            Total number of SYNCs; if more were sent already, no other follows.
         """
         self._state[WANTED] = count
 
     def play(self, plan: SetpointPlan) -> int:
-        """Play set points from the next possible knot on, in place of those played so far.
+        """Play set points from the next possible knot on, in place of the present ones.
+
+        Parameters
+        ----------
+        plan
+            The set points.
 
         Returns
         -------
@@ -178,12 +195,12 @@ class SyncProducer:
         return int(self._state[FIRST])
 
     def check(self) -> None:
-        """Raise what keeps SYNC from being sent, if something does.
+        """Raise an error if SYNC cannot be sent.
 
         Raises
         ------
         BusDown
-            If no bus takes SYNC any more.
+            If no bus takes SYNC.
         """
         code = int(self._state[ERROR])
         if code:
@@ -195,16 +212,23 @@ class SyncProducer:
 
     @property
     def sent(self) -> int:
-        """Number of SYNCs sent, and so the number k of the next one."""
+        """Number of SYNCs sent, which is the number k of the next one."""
         return int(self._state[SENT])
 
     def sent_at(self, first: int) -> tuple[int, NDArray[np.int64]]:
-        """When SYNCs had been sent, from ``first`` on or the first whose time is still known.
+        """Send times of the SYNCs from ``first`` on, as far as they are kept (``TIMES``).
+
+        Parameters
+        ----------
+        first
+            Number of the first SYNC.
 
         Returns
         -------
-        tuple
-            Number of the first of them, and the times in ns UTC, shape (N,).
+        number
+            Number of the first SYNC whose time is known.
+        times
+            Times just after sending, ns UTC, shape (N,).
         """
         sent = self.sent
         first = min(max(first, sent - TIMES + 1, 0), sent)
@@ -216,20 +240,20 @@ class SyncProducer:
 
     @property
     def first(self) -> int | None:
-        """SYNC at which row 0 of the set points becomes the target; ``None`` while nothing is played."""
+        """Number of the SYNC at which row 0 of the set points becomes the target; ``None`` while nothing is played."""
         first = int(self._state[FIRST])
         return first if first >= 0 else None
 
     @property
     def last(self) -> int | None:
-        """SYNC at which the last row becomes the target; the demand reaches it ``every`` SYNCs later."""
+        """Number of the SYNC at which the last row becomes the target; the demand reaches it ``every`` SYNCs later."""
         if self.first is None or self._plan is None:
             return None
         return self.first + (len(self._plan.rows) - 1) * self._plan.every
 
     @property
     def finished(self) -> bool:
-        """Whether the demand has reached the last row."""
+        """``True`` if the demand has reached the last row."""
         return self.last is not None and self._plan is not None and self.sent > self.last + self._plan.every
 
     def stats(self) -> SyncStats:
@@ -259,7 +283,7 @@ class SyncProducer:
 
     def _run_compiled(self) -> None:
         assert self._loop is not None
-        self._realtime = be_punctual(REALTIME_PRIORITY)
+        self._realtime = set_realtime_priority(REALTIME_PRIORITY)
         while not self._over:
             self._take_plan()
             rows, cob_ids, every = self._rows()
@@ -268,7 +292,7 @@ class SyncProducer:
             self._loop(rows, cob_ids, np.array(bus_of, np.int64), every)
 
     def _run_interpreted(self) -> None:
-        """Do the same on a bus that takes its frames from Python; for low rates."""
+        """Run the loop in Python for a bus without socket descriptor; for low rates."""
         (bus,) = self._buses
         state, period = self._state, self._period_ns * 1e-9
         base = time.monotonic() + period
@@ -306,7 +330,7 @@ class SyncProducer:
         return np.ascontiguousarray(self._plan.rows), np.array(self._plan.cob_ids, dtype=np.uint32), self._plan.every
 
     def _take_plan(self) -> None:
-        """Begin with row 0 of a new plan at the first knot whose row can still be sent in time."""
+        """Start a new plan with row 0 at the first knot whose row can still be sent in time."""
         self._state[RETURN] = 0
         if self._pending is not None:
             self._plan, self._pending = self._pending, None

@@ -1,4 +1,4 @@
-"""Temperatures of the drives, read now and then over SDO from where each drive has them, out of everybody's way."""
+"""Polling of the drives' temperatures over SDO in the background."""
 
 import threading
 import time
@@ -8,24 +8,24 @@ from armident.configs.errors import ArmidentError
 from armident.drivers.canopen.sdo import DriveSdo
 
 CODES = {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I"}
-"""Types of an object, as ``struct`` names them."""
+"""Formats of `struct` by object type."""
 ANSWER_S = 0.1
-"""How long a drive may take to answer; whoever wants to order it something waits so long at most."""
+"""Longest wait for an answer, s, and so the longest delay of other SDO transfers."""
 REST_S = 60.0
-"""How long a drive that did not answer is left alone."""
+"""Pause after a drive did not answer, s."""
 
 
 class TemperaturePoll:
-    """Reads temperatures in a thread of its own, one drive at a time; use it in a ``with`` block.
+    """Reads temperatures in a separate thread, one drive at a time; use it in a ``with`` block.
 
-    A drive that is just being configured or ordered something is asked another time.
+    A drive with another SDO transfer in progress is skipped until its next turn.
 
     Parameters
     ----------
     drives
-        Those that have a temperature are polled.
+        Drives; those with a configured temperature object are polled.
     rest_s
-        How long a drive that did not answer is left alone.
+        Pause after a drive did not answer, s.
     """
 
     def __init__(self, drives: Sequence[DriveSdo], rest_s: float = REST_S) -> None:
@@ -39,11 +39,11 @@ class TemperaturePoll:
             self._thread.start()
 
     def celsius(self) -> dict[str, float]:
-        """Last temperature of each joint's drive that gives one, degrees Celsius."""
+        """Last temperature of each drive that answers, degrees Celsius, by joint."""
         return dict(self._celsius)
 
     def stop(self) -> None:
-        """Ask no more; does not wait."""
+        """End polling without waiting for the thread."""
         self._over.set()
 
     def __enter__(self) -> "TemperaturePoll":
@@ -51,7 +51,7 @@ class TemperaturePoll:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop, and wait for the last answer."""
+        """Stop polling and wait for the thread."""
         self.stop()
         if self._thread is not None:
             self._thread.join()
@@ -65,7 +65,7 @@ class TemperaturePoll:
             self._over.wait(max(0.0, min(due.values()) - time.monotonic()))
 
     def _ask(self, sdo: DriveSdo) -> float:
-        """Ask one drive; in how many seconds it is asked again."""
+        """Poll one drive; return the time until its next turn, s."""
         wanted, joint = sdo.drive.temperature, sdo.drive.joint
         assert wanted is not None
         try:

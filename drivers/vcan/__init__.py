@@ -1,9 +1,9 @@
-"""Virtual CAN buses: of this kernel where it has SocketCAN, of a User-Mode Linux guest where it has not.
+"""Virtual CAN buses: of this kernel if it has SocketCAN, else of a User-Mode Linux guest.
 
-``python -m armident.drivers.vcan -n 2 -- COMMAND`` runs a command where ``vcan0`` and ``vcan1`` are up, either way.
+``python -m armident.drivers.vcan -n 2 -- COMMAND`` runs a command with ``vcan0`` and ``vcan1`` in either case.
 """
 
-from armident.drivers.vcan.guest import launcher_available, launcher_command
+from armident.drivers.vcan.guest import launcher_command, launcher_obstacle
 from armident.drivers.vcan.interfaces import ensure_vcan, have_socketcan, remove_vcan
 
-__all__ = ["ensure_vcan", "have_socketcan", "launcher_available", "launcher_command", "remove_vcan"]
+__all__ = ["ensure_vcan", "have_socketcan", "launcher_command", "launcher_obstacle", "remove_vcan"]

@@ -8,15 +8,18 @@ from armident.configs.errors import ArmidentError
 from armident.drivers.vcan import guest, interfaces, packages
 
 CANNOT_RUN = 125
+"""Exit code if the command cannot be started, as of ``env`` and ``timeout``."""
 
 
 def main() -> int:
-    """Run the command natively where this kernel has vcan buses for us, in a guest where it has not."""
+    """Run the command on this kernel if it has usable vcan buses, else in a User-Mode Linux guest."""
     parser = argparse.ArgumentParser(prog="python -m armident.drivers.vcan", description=main.__doc__)
-    parser.add_argument("-n", dest="buses", type=int, default=1, metavar="BUSES", help="how many: vcan0 and on (1)")
+    parser.add_argument(
+        "-n", dest="buses", type=int, default=1, metavar="BUSES", help="number of buses, from vcan0 (1)"
+    )
     parser.add_argument("-m", dest="memory", default="4096M", help="memory of a guest (4096M)")
-    parser.add_argument("--guest", action="store_true", help="use a guest even where this kernel has SocketCAN")
-    parser.add_argument("--setup", action="store_true", help="only make sure that it can be done; fetch what it takes")
+    parser.add_argument("--guest", action="store_true", help="use a guest even if this kernel has SocketCAN")
+    parser.add_argument("--setup", action="store_true", help="only check, and fetch the guest's packages if needed")
     parser.add_argument("command", nargs=argparse.REMAINDER, metavar="-- COMMAND")
     options = parser.parse_args()
     command = options.command[1:] if options.command[:1] == ["--"] else options.command
@@ -36,7 +39,7 @@ def main() -> int:
 
 
 def _native(buses: int) -> bool:
-    """Bring this kernel's vcan buses up, if it has any and lets us."""
+    """Bring this kernel's vcan buses up; ``False`` if it has none or refuses."""
     if not interfaces.have_socketcan():
         return False
     try:

@@ -1,8 +1,8 @@
-"""Runs a command under a User-Mode Linux kernel with real vcan buses, over this machine's file system.
+"""Execution of a command under a User-Mode Linux kernel with vcan buses, on this machine's file system.
 
-The guest sees the host's files read-only, with /tmp, the working directory and a few cache folders writable; it has no
-stdin, no terminal and no network but loopback. Output streams live; environment, exit status, Ctrl-C
-and SIGTERM pass through.
+The guest sees the host's files read-only; /tmp, the working directory and cache folders are writable. It has no stdin,
+no terminal and no network except loopback. Output is passed on at once, and so are environment, exit status, Ctrl-C
+and SIGTERM.
 """
 
 import ctypes
@@ -27,21 +27,35 @@ from armident.drivers.vcan import packages
 
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE_S = 15.0
-"""How long a command may take to end after a signal before the guest is switched off."""
+"""Time for a command to end after a signal, before the guest is killed, s."""
 NICENESS = -10
+"""Nice value of the guest."""
 MALLOC_KEEPS = "glibc.malloc.mmap_threshold=1073741824:glibc.malloc.trim_threshold=1073741824"
+"""Tunables of glibc that keep freed memory in the process, because page faults are slow in a guest."""
+CACHES = {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "guest"}
+"""Environment variables of cache folders, and their default folders in the cache of armident. The user's own caches are
+read-only in the guest, which Matplotlib and Fontconfig report on stderr."""
 PR_SET_PDEATHSIG = 1
+"""Option of ``prctl`` (linux/prctl.h)."""
 
 
-def launcher_available() -> str | None:
-    """Why commands cannot be run in a guest here, ``None`` if they can (as far as one can tell without trying)."""
+def launcher_obstacle() -> str | None:
+    """Reason why this machine cannot run a guest; ``None`` if no obstacle is known."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
         return f"User-Mode Linux is for Linux on x86-64, this is {platform.system()} on {platform.machine()}"
     return packages.obstacle()
 
 
 def launcher_command(command: Sequence[str], buses: int = 1) -> list[str]:
-    """The command line that runs ``command`` where ``vcan0`` to ``vcan{buses - 1}`` are up."""
+    """Command line that runs a command with vcan buses.
+
+    Parameters
+    ----------
+    command
+        Program and arguments.
+    buses
+        Number of buses: ``vcan0`` to ``vcan{buses - 1}``.
+    """
     return [sys.executable, "-m", "armident.drivers.vcan", "-n", str(buses), "--", *command]
 
 
@@ -53,33 +67,36 @@ def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable:
     command
         Program and arguments, started in the current directory.
     buses
-        How many vcan interfaces are up.
+        Number of vcan interfaces.
     memory
-        The guest's memory, as the kernel's ``mem=`` takes it; only what is touched is taken from the host.
+        Memory of the guest in the format of the kernel's ``mem=``; only used pages take memory of the host.
     writable
-        Further folders that the command may write to.
+        Further folders that are writable in the guest.
 
     Raises
     ------
     ArmidentError
-        If the guest cannot be set up or ends without a status; the message holds the end of its kernel log.
+        If the guest cannot be set up or ends without a status; contains the end of its kernel log.
     """
-    reason = launcher_available()
+    reason = launcher_obstacle()
     if reason is not None:
         raise ArmidentError(f"no vcan: {reason}")
     root = packages.provide()
     environment = dict(os.environ)
-    # compiled kernels want a folder they can write to, whatever the guest's root is
-    numba = Path(environment.setdefault("NUMBA_CACHE_DIR", str(packages.cache_folder().parent / "numba"))).absolute()
+    caches = [
+        Path(environment.setdefault(name, str(packages.cache_folder().parent / folder))).absolute()
+        for name, folder in CACHES.items()
+    ]
     environment["PATH"] = f"{environment.get('PATH', os.defpath)}:/usr/sbin:/sbin:{root / 'bin'}"
     environment["ARMIDENT_GUEST"] = "1"
     # A page fault costs a guest many times what it costs the host: let freed memory stay with its process.
     environment.setdefault("GLIBC_TUNABLES", MALLOC_KEEPS)
-    numba.mkdir(parents=True, exist_ok=True)
+    for cache in caches:
+        cache.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         cpu = stack.enter_context(_cpu_of_our_own())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="armident-vcan-")))
-        _write_scripts(folder, root, command, environment, buses, [folder, Path.cwd(), numba, *writable])
+        _write_scripts(folder, root, command, environment, buses, [folder, Path.cwd(), *caches, *writable])
         _boot(folder, root, cpu, memory)
         try:
             return int((folder / "status").read_text())
@@ -120,10 +137,9 @@ def _write_scripts(
 
 @contextmanager
 def _cpu_of_our_own() -> Iterator[int]:
-    """One CPU that no other guest uses, as long as there are any.
+    """Reserve one CPU that no other guest uses, if there is one.
 
-    The guest's kernel and its processes hand over to each other at every system call, which takes many times
-    as long from one CPU to another.
+    The guest's kernel and its processes switch at every system call, which takes many times as long between CPUs.
     """
     cpus = sorted(os.sched_getaffinity(0), reverse=True)
     with ExitStack() as stack:
@@ -139,14 +155,14 @@ def _cpu_of_our_own() -> Iterator[int]:
 
 
 def _boot(folder: Path, root: Path, cpu: int, memory: str) -> None:
-    """Boot the guest and wait until it has switched itself off."""
+    """Boot the guest and wait until it has powered off."""
     libc = ctypes.CDLL(None, use_errno=True)
 
     def pin_and_tie() -> None:
         os.sched_setaffinity(0, {cpu})
         libc.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-        # a bus at 5 kHz does not wait for what else this machine does; only root may. Where the scheduler
-        # groups processes by session, the group's niceness counts
+        # A bus at 5 kHz needs priority over other processes; only root may raise it. Where the scheduler groups
+        # processes by session, the nice value of the group counts.
         with suppress(OSError):
             os.nice(NICENESS)
             Path("/proc/self/autogroup").write_text(str(NICENESS))
@@ -184,7 +200,7 @@ def _boot(folder: Path, root: Path, cpu: int, memory: str) -> None:
 
 
 def _memory_folder() -> Path:
-    """Where the file behind the guest's memory lies: in memory, unless containers leave too little of it there."""
+    """Folder of the file that backs the guest's memory: /dev/shm, unless a container leaves too little space there."""
     shared = Path("/dev/shm")
     if shared.is_dir() and os.access(shared, os.W_OK) and shutil.disk_usage(shared).free > 2 << 30:
         return shared
@@ -193,7 +209,7 @@ def _memory_folder() -> Path:
 
 @contextmanager
 def _forwarding(guest: "subprocess.Popen[bytes]", channel: int) -> Iterator[None]:
-    """Pass signals on to the command; switch the guest off if it does not end in time."""
+    """Forward signals to the command; kill the guest if the command does not end in time."""
     deadline: list[float] = []
 
     def forward(number: int, _frame: FrameType | None) -> None:

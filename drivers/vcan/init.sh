@@ -1,5 +1,5 @@
-# First process of the guest. Variables from the launcher: MODULES RUN BUSES; files in $RUN:
-# busybox, command (script to run), mounts (script that makes host folders writable), status (written here at the end).
+# First process of the guest. Variables from the launcher: MODULES RUN BUSES. Files in $RUN: busybox, command (script to
+# run), mounts (script that makes host folders writable), status (exit status of the command, written at the end).
 B=$RUN/busybox
 
 give_up() {
@@ -33,7 +33,7 @@ while [ $bus -lt $BUSES ]; do
 done
 $B hostname vcan-guest
 
-# ttyS0 carries stdout, ttyS1 stderr, ttyS2 the names of signals; the command itself sees pipes, as under CI
+# ttyS0 carries stdout, ttyS1 stderr, ttyS2 the names of signals; the command writes to pipes.
 for port in 0 1 2; do
   $B stty -F /dev/ttyS$port raw -echo
 done
@@ -52,7 +52,7 @@ done < /dev/ttyS2 &
 $B setsid $B sh -c 'echo $$ > /run/pid; exec "$0" sh "$1"' $B "$RUN/command" < /dev/null > /run/stdout 2> /run/stderr
 status=$?
 
-# what the command left behind holds the pipes open; it ends here, and the output drains
+# Processes that the command left behind hold the pipes open: kill them so that the output drains.
 for entry in /proc/[0-9]*; do
   process=${entry#/proc/}
   [ -e "$entry/exe" ] || continue

@@ -1,4 +1,4 @@
-"""The vcan interfaces of the running kernel."""
+"""Creation and removal of vcan interfaces of the running kernel."""
 
 import socket
 import subprocess
@@ -11,7 +11,7 @@ IFF_UP = 1
 
 
 def have_socketcan() -> bool:
-    """Whether this kernel opens raw CAN sockets (loading its module on the way, where it has one)."""
+    """Return True if this kernel opens raw CAN sockets; loads the kernel module if there is one."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except (OSError, AttributeError):
@@ -20,7 +20,13 @@ def have_socketcan() -> bool:
 
 
 def is_up(name: str) -> bool:
-    """Whether the network interface exists and is administratively up."""
+    """Return True if the network interface exists and is administratively up.
+
+    Parameters
+    ----------
+    name
+        Name of the interface.
+    """
     try:
         flags = int((NETWORK / name / "flags").read_text(), 16)
     except (OSError, ValueError):
@@ -29,12 +35,17 @@ def is_up(name: str) -> bool:
 
 
 def ensure_vcan(name: str = "vcan0") -> None:
-    """Bring the vcan interface up, creating it first if there is none of that name.
+    """Bring a vcan interface up, and create it first if it does not exist.
+
+    Parameters
+    ----------
+    name
+        Name of the interface.
 
     Raises
     ------
     ConfigError
-        If this takes rights we do not have; the message is the command for an administrator.
+        If rights are missing; contains the command for an administrator.
     """
     if is_up(name):
         return
@@ -51,7 +62,12 @@ def ensure_vcan(name: str = "vcan0") -> None:
 
 
 def remove_vcan(name: str) -> None:
-    """Delete the vcan interface; nothing happens if it is gone already.
+    """Delete a vcan interface if it exists.
+
+    Parameters
+    ----------
+    name
+        Name of the interface.
 
     Raises
     ------
@@ -66,7 +82,7 @@ def remove_vcan(name: str) -> None:
 
 
 def _run(command: list[str]) -> str | None:
-    """Run a command; what went wrong in one line, ``None`` if nothing."""
+    """Run a command; return its error on one line, ``None`` on success."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:

@@ -1,8 +1,8 @@
-"""The guest's kernel and tools: five Debian packages, unpacked into a private folder; nothing is installed.
+"""Kernel and tools of the guest: five Debian packages, unpacked into a private folder; nothing is installed.
 
-The kernel is Debian testing's ``user-mode-linux``: from 6.16 on it runs guests by seccomp, fast, and on CPUs
-with AMX; Debian 12's does neither. It needs testing's C library, which is unpacked beside it and named
-in the binary, so that the machine's own stays what it is. Fetching takes no root.
+The kernel is ``user-mode-linux`` of Debian testing. From 6.16 on it runs guests by seccomp, which is fast, and on CPUs
+with AMX; the one of Debian 12 does neither. It needs the C library of testing, which is unpacked beside it and entered
+in the binary, so that the machine's own library is unchanged. Fetching needs no root.
 """
 
 import fcntl
@@ -19,20 +19,20 @@ GUEST_PACKAGES = ("user-mode-linux", "libc6")
 HOST_PACKAGES = ("patchelf", "busybox-static", "can-utils")
 SUITES = ("testing", "unstable")
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
-# in the order in which they load; those that this kernel lacks are left out
+# In the order of loading; modules that the kernel lacks are left out.
 MODULES = ("can-dev", "can", "can-raw", "can-bcm", "can-gw", "can-isotp", "can-j1939", "vcan")
 NEEDED_MODULES = {"can", "can-raw", "vcan"}
 
 
 def cache_folder() -> Path:
-    """Where packages and locks live: ``$VCAN_CACHE``, else ``armident/vcan`` in the user's cache folder."""
+    """Folder of packages and locks: ``$VCAN_CACHE``, else ``armident/vcan`` in the user's cache folder."""
     if "VCAN_CACHE" in os.environ:
         return Path(os.environ["VCAN_CACHE"]).absolute()
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "armident" / "vcan"
 
 
 def obstacle() -> str | None:
-    """Why the packages cannot be had here, ``None`` if nothing stands in the way."""
+    """Reason why the packages are not available on this machine; ``None`` if no obstacle is known."""
     if kernel(cache_folder() / "root").exists():
         return None
     if shutil.which("dpkg") is None:
@@ -47,17 +47,23 @@ def obstacle() -> str | None:
 
 
 def kernel(root: Path) -> Path:
-    """The kernel's executable below an unpacked folder."""
+    """Path of the kernel's executable.
+
+    Parameters
+    ----------
+    root
+        Folder of the unpacked packages.
+    """
     return root / "usr" / "bin" / "linux.uml"
 
 
 def provide() -> Path:
-    """The folder with kernel, ``modules/`` and ``bin/``, fetched and unpacked if it is not there yet.
+    """Folder with kernel, ``modules/`` and ``bin/``; fetched and unpacked if it does not exist yet.
 
     Raises
     ------
     ArmidentError
-        If the packages can be neither found nor unpacked; says where the log is.
+        If the packages cannot be found or unpacked; names the log.
     """
     cache = cache_folder()
     root = cache / "root"
@@ -101,7 +107,7 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def _collect(folder: Path, log: int) -> None:
-    """Put the five packages into ``folder``, from ``VCAN_DEBS`` or by apt."""
+    """Copy the five packages into ``folder`` from ``VCAN_DEBS``, or download them by apt."""
     folder.mkdir(parents=True)
     if "VCAN_DEBS" in os.environ:
         for deb in sorted(Path(os.environ["VCAN_DEBS"]).glob("*.deb")):
@@ -119,7 +125,7 @@ def _collect(folder: Path, log: int) -> None:
 
 
 def _debian() -> tuple[str, str]:
-    """Code name of this Debian and the mirror it is configured with (``$VCAN_MIRROR`` names another)."""
+    """Code name of this Debian release and its configured mirror (``$VCAN_MIRROR`` replaces it)."""
     facts = dict(line.split("=", 1) for line in Path("/etc/os-release").read_text().splitlines() if "=" in line)
     release = facts.get("VERSION_CODENAME", "").strip('"')
     if facts.get("ID", "").strip('"') != "debian" or not release:
@@ -135,7 +141,7 @@ def _debian() -> tuple[str, str]:
 
 
 def _apt_download(folder: Path, mirror: str, wanted: dict[str, tuple[str, ...]], log: int) -> None:
-    """Download packages by suite with lists of our own: needs no root and leaves the machine's lists alone."""
+    """Download packages by suite with private package lists: needs no root and does not change the machine's lists."""
     state = folder.parent / "apt"
     shutil.rmtree(state, ignore_errors=True)
     for part in ("lists/partial", "cache/archives/partial"):
@@ -159,7 +165,7 @@ def _apt_download(folder: Path, mirror: str, wanted: dict[str, tuple[str, ...]],
 
 
 def _unpack(folder: Path, root: Path, log: int) -> None:
-    """Unpack ``folder/debs`` so that it works once ``folder`` is renamed to ``root``."""
+    """Unpack ``folder/debs`` for the later path ``root`` of ``folder``."""
     for deb in sorted((folder / "debs").glob("*.deb")):
         target = folder / "libc" if deb.name.startswith("libc6_") else folder
         target.mkdir(exist_ok=True)

@@ -276,23 +276,23 @@ def test_what_others_write_is_known_as_soon_as_it_is_asked_for_and_our_own_reque
     ):
         master.configure()
         master.start()
-        master.listen()
-        assert master.suspect == {}
+        master.collect_reports()
+        assert master.unverified_mapping == {}
         before = time.time_ns()
         other.send(request)
-        master.listen()
-        (since, until) = master.suspect["joint_2"]
+        master.collect_reports()
+        (since, until) = master.unverified_mapping["joint_2"]
         assert before <= since <= time.time_ns() < until
         told = events_within(master, 10.0, "configured")
         assert [e.kind for e in told if e.kind in ("mapping_changed", "configured")] == [
             "mapping_changed",
             "configured",
         ]
-        assert since < master.suspect["joint_2"][1] <= time.time_ns()
+        assert since < master.unverified_mapping["joint_2"][1] <= time.time_ns()
         # What we wrote to put it right was heard, too.
         told = events_within(master, 0.3, "mapping_changed")
         assert [e.kind for e in told if e.kind == "mapping_changed"] == []
-        assert set(master.suspect) == {"joint_2"}
+        assert set(master.unverified_mapping) == {"joint_2"}
 
 
 def test_a_bus_that_goes_down_under_the_master_is_no_missing_drive(vcan_bus: str) -> None:

@@ -72,7 +72,7 @@ def test_two_syncs_are_never_closer_than_half_a_period(vcan_bus: str) -> None:
 
 def test_the_last_sync_is_the_last_however_late_somebody_looks(vcan_bus: str) -> None:
     producer = producer_on(vcan_bus, counter=10)
-    producer.end_after(70)
+    producer.stop_after(70)
     begin = time.monotonic()
     got = record(vcan_bus, producer, lambda: time.monotonic() > begin + 0.5 and producer.sent == 70)
     assert got["data"][:, 0].tolist() == [k % 10 + 1 for k in range(70)]

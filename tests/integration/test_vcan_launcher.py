@@ -14,14 +14,14 @@ from armident.configs.errors import ConfigError
 from armident.drivers.vcan import (
     ensure_vcan,
     have_socketcan,
-    launcher_available,
     launcher_command,
+    launcher_obstacle,
     packages,
     remove_vcan,
 )
 
 IN_THE_GUEST = "ARMIDENT_GUEST" in os.environ
-REASON = "inside the guest already" if IN_THE_GUEST else launcher_available()
+REASON = "inside the guest already" if IN_THE_GUEST else launcher_obstacle()
 needs_launcher = pytest.mark.skipif(REASON is not None, reason=f"no vcan launcher: {REASON}")
 
 WAIT_FOR_SIGNAL = """

@@ -138,7 +138,7 @@ def table(*options: str) -> str:
 
 def test_a_bus_with_fd_remains_one_at_another_bit_rate() -> None:
     shipped = "tx40_one_fd.yaml"
-    assert "vcan0: CAN FD, which needs --data-bitrate, too" in table("--config", shipped, "--bitrate", "1000000")
+    assert "vcan0: a CAN FD bus needs --data-bitrate, too" in table("--config", shipped, "--bitrate", "1000000")
     both = table("--config", shipped, "--bitrate", "1000000", "--data-bitrate", "5000000")
     assert "vcan0 (CAN FD)" in both
     assert "%" in both

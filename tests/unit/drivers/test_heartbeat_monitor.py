@@ -12,49 +12,49 @@ def beats(drive: str, first: float, last: float) -> list[tuple[str, float]]:
     return [(drive, first + BEATS * k) for k in range(round((last - first) / BEATS) + 1)]
 
 
-def looked(silences: HeartbeatMonitor, until: float, since: float = 0.0, step: float = 0.02) -> None:
+def looked(monitor: HeartbeatMonitor, until: float, since: float = 0.0, step: float = 0.02) -> None:
     """Look all the time, and hear nobody."""
     for k in range(1, round((until - since) / step) + 1):
-        silences.look([], since + step * k)
+        monitor.update([], since + step * k)
 
 
 def test_heartbeats_that_waited_while_nobody_looked_are_no_silence() -> None:
-    silences = HeartbeatMonitor("ab", 0.0)
-    silences.look([*beats("a", 0.1, 1.9), *beats("b", 0.05, 1.95)], 2.0)
-    assert silences.ended("a") == pytest.approx(0.1, abs=0.01)
-    assert silences.lasts("b") == pytest.approx(0.05)
+    monitor = HeartbeatMonitor("ab", 0.0)
+    monitor.update([*beats("a", 0.1, 1.9), *beats("b", 0.05, 1.95)], 2.0)
+    assert monitor.ended_silence("a") == pytest.approx(0.1, abs=0.01)
+    assert monitor.silence("b") == pytest.approx(0.05)
 
 
 def test_a_drive_that_was_silent_while_others_were_heard_is_told_whoever_was_held_up() -> None:
-    silences = HeartbeatMonitor("ab", 0.0)
-    silences.look([("a", 0.1), ("a", 0.9), *beats("b", 0.05, 1.05)], 1.1)
-    assert silences.ended("a") == pytest.approx(0.8)
-    silences.look(beats("b", 1.15, 2.05), 2.1)
-    assert silences.ended("a") == 0.0
-    assert silences.lasts("a") == pytest.approx(1.2, abs=0.01)
+    monitor = HeartbeatMonitor("ab", 0.0)
+    monitor.update([("a", 0.1), ("a", 0.9), *beats("b", 0.05, 1.05)], 1.1)
+    assert monitor.ended_silence("a") == pytest.approx(0.8)
+    monitor.update(beats("b", 1.15, 2.05), 2.1)
+    assert monitor.ended_silence("a") == 0.0
+    assert monitor.silence("a") == pytest.approx(1.2, abs=0.01)
 
 
 def test_a_drive_that_stays_away_is_told_in_time() -> None:
-    silences = HeartbeatMonitor("a", 0.0)
-    looked(silences, 0.44)
-    assert silences.lasts("a") == pytest.approx(0.44)
+    monitor = HeartbeatMonitor("a", 0.0)
+    looked(monitor, 0.44)
+    assert monitor.silence("a") == pytest.approx(0.44)
 
 
 @pytest.mark.parametrize("heard", [[], [("a", 1.0), ("b", 1.0)]])
 def test_a_machine_that_stood_still_as_a_whole_has_missed_nobody(heard: list[tuple[str, float]]) -> None:
     """Whether the heartbeats of that time are stamped when it goes on, or have not come yet."""
-    silences = HeartbeatMonitor("ab", 0.0)
-    silences.look([("a", 0.15), ("b", 0.2)], 0.22)
-    silences.look(heard, 1.01)
+    monitor = HeartbeatMonitor("ab", 0.0)
+    monitor.update([("a", 0.15), ("b", 0.2)], 0.22)
+    monitor.update(heard, 1.01)
     for drive in "ab":
-        assert max(silences.ended(drive), silences.lasts(drive)) < 0.2
+        assert max(monitor.ended_silence(drive), monitor.silence(drive)) < 0.2
     # Who is really gone is missed all the same.
-    looked(silences, 1.45, since=1.01)
-    assert silences.lasts("a") > 0.4
+    looked(monitor, 1.45, since=1.01)
+    assert monitor.silence("a") > 0.4
 
 
 def test_a_machine_that_stands_still_again_and_again_misses_who_is_gone() -> None:
-    silences = HeartbeatMonitor("a", 0.0)
+    monitor = HeartbeatMonitor("a", 0.0)
     for k in range(1, 5):
-        silences.look([], 0.3 * k)
-    assert silences.lasts("a") == pytest.approx(0.9)
+        monitor.update([], 0.3 * k)
+    assert monitor.silence("a") == pytest.approx(0.9)

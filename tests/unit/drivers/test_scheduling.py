@@ -3,7 +3,7 @@
 import os
 import threading
 
-from armident.drivers.can.scheduling import HIGHEST, ahead, be_punctual
+from armident.drivers.can.scheduling import HIGHEST, raised_priority, set_realtime_priority
 
 
 def niceness(thread: int) -> int:
@@ -23,7 +23,7 @@ def test_one_thread_comes_before_the_others_and_goes_back() -> None:
     try:
         me, before = threading.get_native_id(), niceness(threading.get_native_id())
         assert other.native_id is not None
-        with ahead(7):
+        with raised_priority(7):
             assert niceness(me) == (max(HIGHEST, before - 7) if may_rise() else before)
             assert niceness(other.native_id) == before
         assert niceness(me) == before
@@ -36,7 +36,7 @@ def test_real_time_is_of_one_thread_and_told() -> None:
     said: list[tuple[bool, int]] = []
 
     def run() -> None:
-        granted = be_punctual(3)
+        granted = set_realtime_priority(3)
         said.append((granted, os.sched_getscheduler(0)))
 
     thread = threading.Thread(target=run)

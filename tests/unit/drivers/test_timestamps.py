@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armident.drivers.can.mmsg import DROP_CONTROL_BYTES, HARDWARE_CONTROL, STAMP_CONTROL
-from armident.drivers.can.timestamps import InterfaceClock, has_hardware_stamps
+from armident.drivers.can.timestamps import InterfaceClock, has_hardware_timestamps
 
 PERIOD_NS = 200_000
 START = 1_700_000_000_000_000_000
@@ -60,4 +60,4 @@ def test_control_messages_lie_where_the_kernel_puts_them() -> None:
 
 
 def test_an_interface_that_is_not_there_has_no_hardware_stamps() -> None:
-    assert not has_hardware_stamps("can97")
+    assert not has_hardware_timestamps("can97")
