@@ -1,4 +1,4 @@
-"""Commands of this package: robot, demo."""
+"""Commands ``armident robot`` and ``armident demo``."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,15 +7,17 @@ import typer
 
 
 def robot(
-    config: Annotated[Path, typer.Option(help="Session: bus, nodes, robot.")] = Path("tx40_cell.yaml"),
-    scenario: Annotated[Path | None, typer.Option(help="Effects hidden in the arm.")] = None,
-    replay: Annotated[Path | None, typer.Option(help="Recording to play instead of the plant.")] = None,
+    config: Annotated[Path, typer.Option(help="Session configuration.")] = Path("tx40_cell.yaml"),
+    scenario: Annotated[Path | None, typer.Option(help="Scenario: effects hidden in the arm.")] = None,
+    replay: Annotated[Path | None, typer.Option(help="Recording to replay in place of the plant.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
-    noise: Annotated[float, typer.Option(min=0.0, help="Amplitude of the noise; 0 switches it off.")] = 1.0,
-    truth: Annotated[Path | None, typer.Option(help="Write the arm's own parameters to this file (JSON).")] = None,
-    duration: Annotated[float | None, typer.Option(min=0.0, help="Seconds to run; without it until Ctrl-C.")] = None,
+    noise: Annotated[float, typer.Option(min=0.0, help="Factor on the noise amplitude; 0: no noise.")] = 1.0,
+    truth: Annotated[Path | None, typer.Option(help="Write the true parameters of the arm to this JSON file.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(min=0.0, help="Duration, s. [default: until Ctrl-C]", show_default=False)
+    ] = None,
     to_file: Annotated[
-        Path | None, typer.Option(help="Without a bus: write a recording of one trajectory, as fast as it computes.")
+        Path | None, typer.Option(help="Simulate one trajectory without a bus and write it to this recording.")
     ] = None,
     trajectory: Annotated[
         Path | None, typer.Option(help="Trajectory of --to-file. [default: that of the session's set points]")
@@ -27,16 +29,16 @@ def robot(
         bool | None,
         typer.Option(
             "--velocity-feedback/--velocity-error",
-            help="What the drives' velocity loop is fed with. [default: the error; the velocity where the robot's "
-            "configuration knows its controller]",
+            help="Input of the drives' velocity loop: the velocity, or the error of the velocity. [default: the error; "
+            "the velocity if the robot has a known controller]",
             show_default=False,
         ),
     ] = None,
     list_effects: Annotated[
-        bool, typer.Option("--list-effects", help="List the effects that a scenario can hide, and exit.")
+        bool, typer.Option("--list-effects", help="List the effects of scenarios with their parameters, and exit.")
     ] = False,
 ) -> None:
-    """Put the virtual arm on a bus: six CiA 402 drives, or a measured recording behind them.
+    """Run a virtual robot arm on a bus: its CiA 402 drives with a simulated plant, or with a recording to replay.
 
     Example: armident robot --config tx40_cell.yaml --scenario scenarios/tx40_worn_joint2.yaml
     """
@@ -57,7 +59,7 @@ def robot(
         record_robot(config, to_file, scenario, seed, noise, trajectory, encoder_counts, truth, velocity_feedback)
         return
     if scenario is not None and replay is not None:
-        raise ConfigError("--scenario hides effects in the plant, --replay has no plant: give one of them")
+        raise ConfigError("--scenario hides effects in the plant, and --replay has no plant: give only one of them")
     if velocity_feedback is not None and replay is not None:
         raise ConfigError("--velocity-feedback and --velocity-error choose drives, --replay has none")
     if truth is not None and replay is not None:
@@ -68,13 +70,13 @@ def robot(
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Directory of recordings, results and the report.")] = Path("demo"),
     keep_going: Annotated[
-        bool, typer.Option("--keep-going", help="Leave the virtual cell running at the end.")
+        bool, typer.Option("--keep-going", help="Leave the virtual arm running at the end, until Ctrl-C.")
     ] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="Only the first chapter.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Only capture and identification, no diagnosis.")] = False,
 ) -> None:
-    """Show the whole story on this machine without hardware, and write a report.
+    """Demonstrate capture, identification and diagnosis on this machine without hardware, and write a report.
 
-    A virtual arm on a virtual bus is captured and identified; then one with a hidden effect is diagnosed.
+    A virtual arm on a virtual bus is recorded and identified; then one with a hidden effect is recorded and diagnosed.
 
     Example: armident demo --out demo
     """
