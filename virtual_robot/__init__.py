@@ -1,1 +1,1 @@
-"""The stand-in arm: a plant behind CANopen drives, or a measured recording replayed through them."""
+"""Virtual robot arm: a simulated plant behind CANopen drives, or a recording replayed through them."""

@@ -1,4 +1,4 @@
-"""The virtual arm: servo drives on the plant, one control period at a time."""
+"""Virtual arm: servo drives on the plant, simulated by control periods."""
 
 from typing import Protocol
 
@@ -19,10 +19,14 @@ Raw16 = NDArray[np.int16]
 
 
 class DriveBackend(Protocol):
-    """What stands behind the drives: raw numbers for the coming SYNC, and how to get to the next.
+    """Interface of the plant or recording behind the drives: raw numbers for the coming SYNC.
 
-    ``position`` (n,) int32 counts, ``current`` (n,) int16 per mille of rated and ``demand`` (n,) int32 counts
-    are replaced in place by ``advance``.
+    Attributes
+    ----------
+    position, demand
+        Actual and demanded motor positions, counts, int32, shape (n,); changed in place by `advance`.
+    current
+        Reported signal of the drives, per mille of rated, int16, shape (n,); changed in place by `advance`.
     """
 
     position: Raw32
@@ -30,32 +34,48 @@ class DriveBackend(Protocol):
     demand: Raw32
 
     def enable(self, joint: int, enabled: bool) -> None:
-        """Drive ``joint`` enters or leaves operation enabled."""
+        """Handle that a drive enters or leaves operation enabled.
+
+        Parameters
+        ----------
+        joint
+            Number of the joint.
+        enabled
+            New state.
+        """
 
     def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
-        """Take ``targets`` (n,) counts over where ``fresh``: the drives reach them after their interpolation time."""
+        """Set new targets, which the drives reach after their interpolation time.
+
+        Parameters
+        ----------
+        targets
+            Target positions, counts, int32, shape (n,).
+        fresh
+            ``True`` where the target is new, shape (n,).
+        """
 
     def advance(self) -> None:
-        """Move on by one SYNC period."""
+        """Advance by one SYNC period."""
 
 
 class Arm:
-    """Plant, drives and noise; numbers as they stand on the bus.
+    """Virtual arm: plant, drives and noise, with the raw numbers of the bus.
 
     Parameters
     ----------
     robot
-        Its joints, transmission and drives; every joint needs ``counts_per_unit``.
+        Joints, transmission and drives; every joint needs ``counts_per_unit``.
     q
-        Posture at the start, shape (n,), rad or m.
+        Initial posture, rad or m, shape (n,).
     sync_period
-        Time between two SYNC, s: a multiple of the drives' control period; ``None``: one of them.
+        SYNC period, s, a multiple of the drives' control period; ``None``: one control period.
     seed, noise
-        Noise of the size measured (see ``armident.virtual_robot.noise``), ``noise`` scales its amplitude.
+        Seed of the noise, and factor on its amplitude (see ``armident.virtual_robot.noise``).
     scenario
         Hidden effects.
     velocity_feedback
-        Of the drives, see ``servo.design``.
+        Structure of the drives' velocity loop, see ``servo.design``.
 
     Raises
     ------
@@ -89,7 +109,7 @@ class Arm:
         self._torque = self._ratio.T * np.array([drive.gain for drive in drives])
         self._limit = np.array([drive.saturation or np.inf for drive in drives])
         self._permille = np.array([1000.0 / drive.rated for drive in drives])
-        # Drives are tuned for the arm that is known.
+        # Drives are tuned for the arm without hidden effects.
         known = self.plant if scenario is None else Plant(robot, q)
         self._servo = servo.design(robot, known.mass_matrix(), velocity_feedback)
         self._origin, self._target = np.zeros(n), np.zeros(n)
@@ -105,16 +125,40 @@ class Arm:
         self._control()
 
     def interpolation_time(self, joint: int, seconds: float) -> None:
-        """How long drive ``joint`` takes from one target to the next (60C2h), s."""
+        """Set the interpolation time of a drive (60C2h).
+
+        Parameters
+        ----------
+        joint
+            Number of the joint.
+        seconds
+            Time from one target to the next, s.
+        """
         self._steps[joint] = max(round(seconds / self._servo.period), 1)
 
     def enable(self, joint: int, enabled: bool) -> None:
-        """Open or close the brake of ``joint``; its demand starts at the measured position."""
+        """Open or close the brake of a joint; its demand starts at the measured position.
+
+        Parameters
+        ----------
+        joint
+            Number of the joint.
+        enabled
+            ``True`` opens the brake.
+        """
         self._held[joint] = not enabled
         self.plant.brake[joint] = 0.0 if enabled else BRAKE
 
     def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
-        """Take new targets (n,) in counts where ``fresh``: interpolation starts where the last one ends."""
+        """Set new targets; interpolation starts at the last target.
+
+        Parameters
+        ----------
+        targets
+            Target positions, counts, int32, shape (n,).
+        fresh
+            ``True`` where the target is new, shape (n,).
+        """
         take = fresh & ~self._held
         np.copyto(self._origin, self._target, where=take)
         np.copyto(self._target, targets, where=take)
@@ -122,7 +166,7 @@ class Arm:
         np.copyto(self._age, 1, where=take)
 
     def advance(self) -> None:
-        """Move on by one SYNC period."""
+        """Advance by one SYNC period."""
         for _ in range(self._periods):
             self.plant.advance(self._tau, self._servo.period)
             self._control()
@@ -141,7 +185,7 @@ class Arm:
             self._distort(measured, disturbance)
 
     def _distort(self, noise: NDArray[np.float64], disturbance: NDArray[np.float64]) -> None:
-        """Put hidden errors of amplifiers, wiring and names between drives, plant and bus."""
+        """Apply hidden errors of amplifiers, wiring and names between drives, plant and bus."""
         signals, (position, current, demand) = self._signals, self._own
         self._tau[:] = signals.applied(self._current)
         self._tau += disturbance

@@ -1,8 +1,8 @@
-"""Recordings of virtual arms by the hundred: ``python -m armident.virtual_robot.batch`` answers one request a line.
+"""Batch simulation of recordings: ``python -m armident.virtual_robot.batch`` answers one request per line.
 
-A request is ``{robot, trajectory, repeats, period, seed, effects, out}``; ``effects`` is a list of ``{effect, joint,
-other, parameters, strength, truth, hide}`` whose parameters and truth may be expressions; with ``hide`` false the arm
-has the effect anyhow. The answer names the recording, and what parameters and truth have become.
+A request is ``{robot, trajectory, repeats, period, seed, effects, out}``. ``effects`` is a list of ``{effect, joint,
+other, parameters, strength, truth, hide}`` whose parameters and truth may be expressions. With ``hide`` false the arm
+has the effect already. The answer contains the path of the recording and the values of parameters and truth.
 """
 
 import time
@@ -21,18 +21,22 @@ from armident.virtual_robot.plant import Plant
 
 
 def joint_scale(robot: RobotConfig, joint: int, q: tuple[float, ...]) -> dict[str, float]:
-    """What expressions may refer to: properties of one joint of the healthy arm, SI, joint side.
+    """Properties of one joint of the healthy arm for use in expressions, SI, joint side.
 
     Parameters
     ----------
+    robot
+        The robot.
+    joint
+        Number of the joint.
     q
-        Posture (n,) at which ``inertia`` is taken.
+        Posture of ``inertia``, rad or m, length n.
 
     Returns
     -------
     dict
-        ``fv``, ``fc``: friction; ``ia``: rotor inertia; ``inertia``: all inertia about the joint; ``speed``,
-        ``torque``, ``span``: limits of velocity and torque, and width of the position range; ``ratio``: of the gear.
+        ``fv``, ``fc``: friction; ``ia``: rotor inertia; ``inertia``: total inertia about the joint; ``speed``,
+        ``torque``, ``span``: limits of velocity and torque, and width of the position range; ``ratio``: gear ratio.
     """
     standard, limits = plant_parameters(robot), robot.joints[joint].limits
     return {
@@ -48,12 +52,21 @@ def joint_scale(robot: RobotConfig, joint: int, q: tuple[float, ...]) -> dict[st
 
 
 def resolved(entry: Document, robot: RobotConfig, trajectory: Trajectory) -> tuple[HiddenEffect, dict[str, float]]:
-    """A hidden effect of a request with its expressions evaluated, and its truth.
+    """Hidden effect of a request with evaluated expressions, and its true parameters.
+
+    Parameters
+    ----------
+    entry
+        Element of ``effects`` of a request.
+    robot
+        The robot.
+    trajectory
+        Its trajectory, whose start is the posture of `joint_scale`.
 
     Raises
     ------
     ConfigError
-        Naming the expression that has no value.
+        If an expression has no value; names the expression.
     """
     names = [joint.name for joint in robot.joints]
     where, joint = f"{entry['effect']} of {entry['joint']}", entry["joint"]
@@ -65,12 +78,17 @@ def resolved(entry: Document, robot: RobotConfig, trajectory: Trajectory) -> tup
 
 
 def record(request: Document) -> Document:
-    """Simulate one recording and write it.
+    """Simulate one recording, write it, and return the answer.
+
+    Parameters
+    ----------
+    request
+        The request.
 
     Raises
     ------
     ConfigError
-        If robot, trajectory or effects are not what the virtual arm takes.
+        If robot, trajectory or effects are not valid for the virtual arm.
     """
     begin = time.perf_counter()
     robot, once = load_robot(request["robot"]), load_trajectory(request["trajectory"])

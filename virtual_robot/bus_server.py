@@ -1,4 +1,4 @@
-"""The virtual drives on one bus: their frames, and canopen for their SDO, NMT and EMCY."""
+"""Virtual drives on one bus: PDO exchange in batches, and SDO, NMT and EMCY by the canopen library."""
 
 import time
 from collections.abc import Sequence
@@ -20,14 +20,15 @@ from armident.virtual_robot.node import Drive
 from armident.virtual_robot.pdo_exchange import Exchange
 
 PDO_FILTERS = ((0x180, 0x780), (0x200, 0x700), (0x300, 0x700), (0x400, 0x700), (0x500, 0x780))
-"""Identifiers 180h to 57Fh, which PDOs may have; a socket does not receive what it sends itself."""
+"""Filters for the identifiers of PDOs, 180h to 57Fh; a socket does not receive its own frames."""
 BATCH = 1024
+"""Maximum number of frames per batch."""
 REOPEN_S = 0.02
-"""How often a bus that is down is looked at."""
+"""Interval at which a bus that is down is checked, s."""
 
 
 class DriveBus:
-    """One bus and the drives on it.
+    """Virtual drives on one bus.
 
     Parameters
     ----------
@@ -39,7 +40,7 @@ class DriveBus:
     Raises
     ------
     ConfigError
-        If there is no such bus.
+        If the bus does not exist.
     """
 
     def __init__(self, bus: Bus, drives: Sequence[Drive], motion: DriveBackend, period: float) -> None:
@@ -56,23 +57,23 @@ class DriveBus:
         self.down = False
         self._count = self._at = 0
         self._syncs: list[tuple[int, int]] = []
-        """Counter and time stamp of the SYNCs in ``batch`` that wait for an answer, the next one last."""
+        """Counter and time stamp of the unanswered SYNCs in ``batch``, the next one last."""
         self._outbox, self._queued = frames(BATCH, fd=self.bus.fd), 0
         self._tried = 0.0
-        # Compile before anybody waits for an answer.
+        # Compile before the first SYNC.
         self.take(0, 0, 1)
 
     def _connected(self, network: Any) -> Any:
-        """Canopen's own bus, to which the kernel passes NMT commands and SDO requests only."""
+        """Connect canopen to the bus with a filter for NMT commands and SDO requests."""
         wanted = [COB_NMT, *(COB_SDO_REQUEST + drive.node_id for drive in self.drives)]
         filters = [{"can_id": can_id, "can_mask": STANDARD_ID_MASK, "extended": False} for can_id in wanted]
 
-        # Whoever takes the error keeps canopen's receive thread alive: its socket and the kernel's heartbeats work
-        # again by themselves when the bus is back. An error that is kept would end every SDO transfer from then on.
-        def forget(error: Exception) -> None:
+        # Clearing the error keeps canopen's receive thread alive: its socket and the kernel's heartbeats work again
+        # when the bus is back. A kept error would end every later SDO transfer.
+        def clear(error: Exception) -> None:
             network.notifier.exception = None
 
-        network.listeners[0].on_error = forget
+        network.listeners[0].on_error = clear
         try:
             network.connect(interface=self.config.interface, channel=self.config.channel, can_filters=filters)
         except (OSError, can.CanError) as error:
@@ -80,37 +81,48 @@ class DriveBus:
         return network
 
     def boot(self) -> None:
-        """Boot-up message, pre-operational, heartbeat."""
+        """Boot all drives: boot-up message, pre-operational, heartbeat."""
         for drive in self.drives:
             self._network.add_node(drive)
             drive.nmt.boot()
 
     def take(self, start: int, stop: int, sequence: int) -> int:
-        """As :meth:`Exchange.take`, of the frames in ``batch``."""
+        """Process the frames of ``batch`` up to the next SYNC, as :meth:`Exchange.take`.
+
+        Parameters
+        ----------
+        start, stop, sequence
+            As in :meth:`Exchange.take`.
+        """
         return self.exchange.take(*self._columns, start, stop, sequence)
 
     def receive(self, wait: bool) -> int:
-        """Take what has arrived into ``batch``; the number of frames.
+        """Receive frames into ``batch`` and return their number.
+
+        Parameters
+        ----------
+        wait
+            ``True``: wait up to ``RECEIVE_TIMEOUT`` for the first frame.
 
         Raises
         ------
         BusDown
             If the bus is down.
         """
-        # In a guest kernel system calls are dear: with one where the bus can.
+        # One system call if possible, because they are slow in a guest kernel.
         if isinstance(self.bus, RawSocket):
             return self.bus.receive(self.batch, wait=wait)
         return self.bus.receive(self.batch) if not wait or self.bus.poll(RECEIVE_TIMEOUT) else 0
 
     def next_sync(self) -> tuple[int, int] | None:
-        """Counter (0: it carries none) and time stamp of the next SYNC, read from the bus if none has been yet.
+        """Counter (0: none) and time stamp (ns) of the next SYNC; ``None`` if there is none.
 
-        The bus is left alone while it is down, and used again once it is back.
+        Reads from the bus if no SYNC is left in the batch. A bus that is down is used again when it is back.
         """
         if not self._syncs:
             self.flush()
             if self._at < self._count:
-                # Set points behind the last SYNC.
+                # Set points after the last SYNC.
                 self._at = self.take(self._at, self._count, 1)
             if self.down and not self._is_back():
                 return None
@@ -125,7 +137,13 @@ class DriveBus:
         return self._syncs[-1] if self._syncs else None
 
     def answer(self, sequence: int) -> None:
-        """Answer the next SYNC and let set points act; ``sequence`` is its counter if it has none."""
+        """Queue the answers to the next SYNC and apply set points.
+
+        Parameters
+        ----------
+        sequence
+            Counter of the SYNC if it carries none.
+        """
         self._syncs.pop()
         at = self.take(self._at, self._count, sequence)
         self._at = at + 1
@@ -137,7 +155,7 @@ class DriveBus:
         self.exchange.act()
 
     def flush(self) -> None:
-        """Send the answers that are due, in one system call; nothing where the bus is down."""
+        """Send the queued answers in one system call; they are dropped if the bus is down."""
         if self._queued:
             try:
                 self.bus.send(self._outbox[: self._queued])
@@ -146,9 +164,9 @@ class DriveBus:
             self._queued = 0
 
     def _lose(self) -> None:
-        """The bus is down. What came before is not answered any more: drives queue no answers for a bus that is off."""
+        """Handle a bus that went down: earlier SYNCs are not answered, as by real drives."""
         self._syncs, self._at, self._count = [], 0, 0
-        # The error is told once more if it was sending that found it.
+        # The error is raised once more if sending detected it.
         for _ in range(2):
             with suppress(BusDown):
                 while self.receive(wait=False) == BATCH:
@@ -163,7 +181,7 @@ class DriveBus:
         return not self.down
 
     def close(self) -> None:
-        """Take the drives off the bus."""
+        """Stop the drives and release the bus."""
         for drive in self.drives:
             drive.nmt.halt()
         with suppress(can.CanError, OSError):

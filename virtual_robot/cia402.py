@@ -1,4 +1,4 @@
-"""The state machine of a CiA 402 drive (CiA 402 part 2): controlword in, statusword out."""
+"""State machine of a drive (CiA 402 part 2): statusword by state, and next state by controlword."""
 
 from armident.drivers.canopen.objects import STATE_CODES, Control, DriveState
 
@@ -10,7 +10,13 @@ MOVING = (DriveState.ENABLED, DriveState.QUICK_STOP_ACTIVE)
 
 
 def statusword(state: DriveState) -> int:
-    """Statusword (6041h) of a drive in cyclic synchronous position mode."""
+    """Statusword (6041h) of a drive in cyclic synchronous position mode.
+
+    Parameters
+    ----------
+    state
+        State of the drive.
+    """
     word = STATE_CODES[state][1] | REMOTE
     if state is not DriveState.SWITCH_ON_DISABLED:
         word |= VOLTAGE_ENABLED
@@ -22,7 +28,15 @@ def statusword(state: DriveState) -> int:
 
 
 def next_state(state: DriveState, control: int, before: int) -> DriveState:
-    """State after the controlword (6040h) changed from ``before`` to ``control``."""
+    """State of a drive after a controlword (6040h).
+
+    Parameters
+    ----------
+    state
+        Present state.
+    control, before
+        New and previous controlword.
+    """
     if state is DriveState.FAULT:
         rising = control & Control.FAULT_RESET and not before & Control.FAULT_RESET
         return DriveState.SWITCH_ON_DISABLED if rising else state

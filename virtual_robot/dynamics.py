@@ -1,7 +1,7 @@
-"""Compiled integration of the arm over one control period: stiff friction inside, held torque outside.
+"""Compiled integration of the arm over one control period, with constant torque and stiff friction.
 
-Coordinates ``y`` (N,): the joints as their motors see them (n,), then links behind a gear that gives, then masses
-that swing. Without such effects N = n, and motor and link are one.
+Coordinates ``y`` (N,): motors, joint side (n,), then links behind elastic gears, then swinging masses. Without such
+effects N = n.
 """
 
 import math
@@ -14,7 +14,7 @@ from armident.virtual_robot.effects.forces import CODES, effect_torque
 from armident.virtual_robot.effects.gears import gear_torque
 
 SUBSTEPS = 6
-"""Inner steps per control period of 200 us: 33 us against the 50 us time constant of joint 6 at standstill."""
+"""Inner steps per control period of 200 us: 33 us, below the time constant of 50 us of joint 6 at standstill."""
 
 LOAD_CODE = CODES.index("load_dependent_friction")
 
@@ -26,10 +26,28 @@ M2, M3 = 6.1697947043828245592553615689730, -0.42772256543218573326238373806514
 
 @njit(cache=True, error_model="numpy")
 def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, out, slope):  # type: ignore[no-untyped-def]
-    """Friction, couplings (eq. B.1), brakes and hidden torques: torque ``out`` (N,) and ``slope`` (N, N).
+    """Torques of friction, couplings (equation B.1), brakes and hidden effects, and their slopes over the velocities.
 
-    ``friction`` (n, 4) holds fv, fc, the offset and the viscous coefficient of the brake; ``pairs`` (C, 4) the two
-    joints, fv and fc of the couplings; ``table`` the hidden torques, ``load`` (n,) what the gears pass on.
+    Parameters
+    ----------
+    q, qd
+        Coordinates and velocities, shape (N,).
+    t
+        Time, s.
+    friction
+        fv, fc, offset and viscous coefficient of the brake by joint, shape (n, 4).
+    smoothing
+        ``g`` in ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
+    pairs
+        The two joints, fv and fc of the couplings, shape (C, 4).
+    ratio
+        Transmission matrix, shape (n, n).
+    table
+        Hidden torques (`force_table`), shape (E, 9).
+    load
+        Torques that the gears transmit to the links, shape (n,).
+    out, slope
+        Resulting torques, shape (N,), and slopes, shape (N, N); written in place.
     """
     n = friction.shape[0]
     slope[:, :] = 0.0
@@ -59,13 +77,25 @@ def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, o
         beside = 0.0 if other < 0 else qd[other]
         torque, steep = effect_torque(code, table[e, 3:], q[j], qd[j], motor, beside, load[j], t, smoothing)
         out[j] += torque
-        # A falling characteristic stays out of the matrix, which must remain positive definite.
+        # Negative slopes are limited, because the matrix must remain positive definite.
         slope[j, j] += max(steep, 0.0) if steep > 0.0 else max(steep, -0.9 * slope[j, j])
 
 
 @njit(cache=True, error_model="numpy")
 def gear_torques(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-def]
-    """Add the torques of the gears that give to ``out`` (N,), their slopes to ``slope`` and ``stiff`` (N, N)."""
+    """Add the torques of elastic gears and their slopes.
+
+    Parameters
+    ----------
+    q, qd
+        Coordinates and velocities, shape (N,).
+    gears
+        Elastic gears (`gear_rows`), shape (G, 6).
+    out
+        Torques, shape (N,), changed in place.
+    slope, stiff
+        Slopes over velocities and coordinates, shape (N, N), changed in place.
+    """
     for e in range(gears.shape[0]):
         a, b = int(gears[e, 0]), int(gears[e, 1])
         twist, rate = q[a], qd[a]
@@ -88,7 +118,7 @@ def gear_torques(q, qd, gears, out, slope, stiff):  # type: ignore[no-untyped-de
 
 @njit(cache=True, error_model="numpy")
 def _factor(a):  # type: ignore[no-untyped-def]
-    """Cholesky factor of ``a`` (n, n) in its lower triangle, in place; the diagonal is inverted."""
+    """Cholesky factor of ``a`` (n, n) in its lower triangle, in place, with inverted diagonal."""
     n = a.shape[0]
     for j in range(n):
         s = a[j, j]
@@ -124,11 +154,32 @@ def advance(  # type: ignore[no-untyped-def]
     period, substeps, t, state, z, tau, mass, bias, rotor, link,
     friction, smoothing, pairs, ratio, table, load, gears, bristles,
 ):  # fmt: skip
-    """Move ``state`` (4, N) and the bristles ``z`` (B,) on by ``period`` under the held torque ``tau`` (n,), in place.
+    """Integrate the state over one period with constant torque (ROS3).
 
-    ``mass`` (upper triangle) and ``bias`` are Pinocchio's mass matrix and nonlinear effects at the predicted
-    middle of the period, of the coordinates ``link``; ``rotor`` (N, N) is added to the mass matrix. The rows of the
-    state are position, velocity, and the two as predicted for the middle of the next period.
+    Parameters
+    ----------
+    period, substeps
+        Period, s, and number of inner steps.
+    t
+        Time at the beginning, s.
+    state
+        Position, velocity, and both as predicted for the middle of the next period, shape (4, N); changed in place.
+    z
+        Deflection of the bristles, shape (B,); changed in place.
+    tau
+        Joint torques, shape (n,).
+    mass, bias
+        Pinocchio's mass matrix (upper triangle) and nonlinear effects at the predicted middle of the period.
+    rotor
+        Additional inertias, shape (N, N).
+    link
+        Coordinates of ``mass`` and ``bias``.
+    friction, smoothing, pairs, ratio, table, load
+        As in `friction_torques`.
+    gears
+        As in `gear_torques`.
+    bristles
+        Bristles (`bristle_table`), shape (B, 7).
     """
     q, qd, middle, speed = state[0], state[1], state[2], state[3]
     n, count, total = tau.size, bristles.shape[0], q.size
@@ -176,7 +227,7 @@ def advance(  # type: ignore[no-untyped-def]
                     matrix[i, j] += hg * stiff[i, j]
                     k1[i] -= hg * stiff[i, j] * qd[j]
         for b in range(count):
-            # The bristle's own stage is solved for and put into that of its joint.
+            # The bristle's own stage is eliminated into the stage of its joint.
             j = int(bristles[b, 0])
             rate[b], own, cross[b] = bristle_rate(bristles[b], z[b], qd[j])
             inverse[b] = 1.0 / (1.0 / hg - own)

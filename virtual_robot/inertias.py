@@ -1,8 +1,8 @@
-"""Link parameters of the virtual arms; those of the TX40 physically consistent, and equal to table B.4 where it speaks.
+"""Link parameters of the virtual arms; those of the TX40 are physically consistent and agree with table B.4.
 
-Table B.4 gives fourteen essential base inertial values; the links need sixty standard ones. A semidefinite
-programme chooses them: every link's pseudo-inertia positive definite (Wensing, Kim, Slotine 2018), rotor
-inertias positive, the essential values met, everything else small. Regenerate the data file with
+Table B.4 of the thesis gives fourteen essential base inertial values; the links need sixty standard ones. A
+semidefinite programme determines them: every pseudo-inertia is positive definite (Wensing, Kim, Slotine 2018), rotor
+inertias are positive, the essential values are met, and all other values are small. Regenerate the data file with
 ``python -m armident.virtual_robot.inertias``.
 """
 
@@ -34,7 +34,7 @@ ESSENTIAL: dict[str, float] = {
 """Table B.4, met exactly: kg m^2, kg m."""
 
 WITHIN_STD: dict[str, tuple[float, float]] = {"xx3r": (0.13, 0.13 * 0.106), "zz3r": (0.11, 0.11 * 0.0957)}
-"""Table B.4, value and standard deviation: a rigid link 3 needs xx3r < zz3r, so these are met within one."""
+"""Table B.4, value and standard deviation; met within one standard deviation, as a rigid link 3 needs xx3r < zz3r."""
 
 FRICTION: dict[str, float] = {
     "fv1": 8.00, "fc1": 7.34, "fv2": 5.50, "fc2": 8.24, "fv3": 1.93, "fc3": 6.48,
@@ -44,26 +44,30 @@ FRICTION: dict[str, float] = {
 """Table B.4: N m s/rad, N m."""
 
 IAM6 = 0.002
-"""Coupling inertia, kg m^2: absent from table B.4, so below what such an experiment can tell from zero."""
+"""Coupling inertia, kg m^2; absent from table B.4, so not significantly different from zero in its experiment."""
 
 REST = (0.0, 0.0, 1.5708, 0.0, 0.0, 0.0)
 """Posture at power-on, rad: forearm at a right angle."""
 
 NOMINAL_MASS = (6.0, 6.0, 5.0, 1.6, 0.6, 0.2)
-"""Masses the programme leans towards, kg: 27 kg of arm less its base."""
+"""Preferred masses of the links, kg: 27 kg of the arm less its base."""
 GYRATION_RADIUS = 0.08
-"""Radius of gyration the programme leans towards, m."""
+"""Preferred radius of gyration, m."""
 MASS_TOTAL = (17.0, 22.0)
+"""Range of the total mass of the links, kg."""
 SECOND_MOMENT_MARGIN = (1e-3, 1e-3, 5e-4, 5e-5, 2e-5, 1e-5)
-"""Smallest second moment (kg m^2) left above the singular pseudo-inertia, per link."""
+"""Smallest second moment above the singular pseudo-inertia by link, kg m^2."""
 MASS_MARGIN = 0.02
-"""As ``SECOND_MOMENT_MARGIN``, for the mass (kg)."""
+"""Smallest mass above the singular pseudo-inertia, kg."""
 
 
 def base_parameters(standard: Mapping[str, float]) -> dict[str, float]:
-    """Compute the 40 base inertial parameters of the TX40 from its standard ones (tables B.2 and B.3).
+    """Base inertial parameters of the TX40 from its standard ones (thesis tables B.2 and B.3).
 
-    An arm of fewer links has those whose standard parameters it has; a single axis has none that are regrouped.
+    Parameters
+    ----------
+    standard
+        Standard parameters by name, SI; for an arm of fewer links only the groups with known parameters result.
     """
     groups = {name: terms for name, terms in regrouping().items() if terms.keys() <= standard.keys()}
     return {name: sum(c * standard[k] for k, c in terms.items()) for name, terms in groups.items()}
@@ -71,7 +75,7 @@ def base_parameters(standard: Mapping[str, float]) -> dict[str, float]:
 
 @cache
 def regrouping() -> dict[str, dict[str, float]]:
-    """Return the base inertial parameters as sums of standard ones, ``{base: {standard: factor}}`` (table B.3)."""
+    """Base inertial parameters as sums of standard ones, ``{base: {standard: factor}}`` (thesis table B.3)."""
 
     def outer(first: int, factor: float) -> dict[str, float]:
         return {f"m{k}": factor for k in range(first, JOINTS + 1)}
@@ -100,7 +104,15 @@ def regrouping() -> dict[str, dict[str, float]]:
 
 
 def pseudo_inertia(standard: Mapping[str, float], link: int) -> NDArray[np.float64]:
-    """Pseudo-inertia matrix (4, 4) of a link (numbered from 1): positive definite for a real body."""
+    """Pseudo-inertia matrix of a link, shape (4, 4): positive definite for a real body (Wensing, Kim, Slotine 2018).
+
+    Parameters
+    ----------
+    standard
+        Standard parameters by name, SI.
+    link
+        Number of the link, from 1.
+    """
     xx, xy, xz, yy, yz, zz, mx, my, mz, m = (standard[f"{k}{link}"] for k in INERTIAL)
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     out = np.empty((4, 4))
@@ -111,7 +123,7 @@ def pseudo_inertia(standard: Mapping[str, float], link: int) -> NDArray[np.float
 
 
 def solve() -> dict[str, float]:
-    """Find standard parameters of the six links that meet table B.4 (kg, kg m, kg m^2).
+    """Standard parameters of the six links that meet table B.4 (kg, kg m, kg m^2).
 
     Raises
     ------
@@ -177,7 +189,7 @@ def solve() -> dict[str, float]:
         sparse.csc_matrix(np.vstack(matrices)), np.concatenate(offsets), cones, settings,
     ).solve()  # fmt: skip
     if str(solution.status) != "Solved":
-        raise ArmidentError(f"no link parameters meet table B.4: the solver says {solution.status}")
+        raise ArmidentError(f"no link parameters meet table B.4: solver status {solution.status}")
     return {name: float(x) for name, x in zip(names, solution.x, strict=True)}
 
 
@@ -192,12 +204,17 @@ def _stored(path: Path) -> dict[str, float]:
 
 
 def plant_parameters(robot: RobotConfig) -> dict[str, float]:
-    """Every standard parameter of the virtual arm that stands in for ``robot``, by standard name.
+    """All standard parameters of the virtual arm of a robot, by name, SI.
+
+    Parameters
+    ----------
+    robot
+        Robot with the name, joints and couplings of a virtual arm.
 
     Raises
     ------
     ConfigError
-        If there is no virtual arm of that name, or its joints or couplings are not those of ``robot``.
+        If there is no virtual arm of that name, or its joints or couplings differ.
     """
     path = HERE / f"{robot.name}_inertias.yaml"
     if not is_file(path):
@@ -212,7 +229,13 @@ def plant_parameters(robot: RobotConfig) -> dict[str, float]:
 
 
 def rest_posture(robot: RobotConfig) -> tuple[float, ...]:
-    """Return where the virtual arm stands when it is switched on, joint side, rad or m."""
+    """Posture of the virtual arm at power-on, joint side, rad or m, length n.
+
+    Parameters
+    ----------
+    robot
+        Robot of a virtual arm.
+    """
     plant_parameters(robot)
     data = yaml.safe_load((HERE / f"{robot.name}_inertias.yaml").read_text(encoding="utf-8"))
     return tuple(float(x) for x in data["rest"])

@@ -1,4 +1,4 @@
-"""The arm as a Pinocchio model, built joint by joint from the modified Denavit-Hartenberg table."""
+"""Pinocchio model of the arm from its modified Denavit-Hartenberg table."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,15 +14,20 @@ pin: Any = pinocchio
 def build_model(robot: RobotConfig, standard: Mapping[str, float]) -> Any:
     """Build a Pinocchio model whose joint frames are the MDH frames (thesis section 2.1.1).
 
-    ``Rot(z, theta)`` and ``Trans(z, r)`` commute, so offset and ``r`` go before the joint and the
-    frame that moves with the joint is frame j itself: the standard parameters apply unchanged.
+    ``Rot(z, theta)`` and ``Trans(z, r)`` commute, so offset and ``r`` precede the joint. The frame that moves with the
+    joint is then frame j itself, and the standard parameters apply unchanged.
 
     Parameters
     ----------
     robot
         Geometry and gravity.
     standard
-        Standard parameters by name (``xx1`` ... ``m6``), inertias about the frame origins.
+        Standard parameters by name (``xx1`` ... ``m6``), inertias about the frame origins, SI.
+
+    Returns
+    -------
+    pinocchio.Model
+        The model with n joints.
     """
     model = pin.Model()
     model.name = robot.name

@@ -1,4 +1,4 @@
-"""One virtual drive as a CANopen node: NMT, SDO server with its object dictionary, EMCY, CiA 402 states."""
+"""Virtual drive as a CANopen node: NMT, SDO server with object dictionary, EMCY, and the states of CiA 402."""
 
 # mypy: disable-error-code="no-untyped-call"
 # canopen is typed in part only.
@@ -57,9 +57,10 @@ ABORT_NOT_MAPPABLE = 0x06040041
 ABORT_PDO_LENGTH = 0x06040042
 ABORT_VALUE_RANGE = 0x06090030
 ABORT_DEVICE_STATE = 0x08000022
+"""SDO abort codes (CiA 301 section 7.2.4.3.17)."""
 
 MAPPING = RPDO_MAPPING - RPDO_COMMUNICATION
-"""From a PDO's communication record (1400h, 1800h) to its mapping record (1600h, 1A00h)."""
+"""Offset from a PDO's communication record (1400h, 1800h) to its mapping record (1600h, 1A00h)."""
 ERROR_HISTORY = 0x1003
 FOLLOWING_ERROR = 0x60F4
 SUPPORTED_MODES = 0x6502
@@ -87,10 +88,16 @@ STATE_AFTER: dict[int, NmtState] = {
 
 
 class Nmt(NmtSlave):
-    """NMT slave (CiA 301, section 7.3.2): resets end in pre-operational, after a boot-up message."""
+    """NMT slave (CiA 301, section 7.3.2): a reset ends in pre-operational, after a boot-up message."""
 
     def on_command(self, can_id: int, data: bytes, timestamp: float) -> None:
-        """Obey a command addressed to this node or to all; malformed ones are ignored."""
+        """Execute a command addressed to this node or to all; malformed commands are ignored.
+
+        Parameters
+        ----------
+        can_id, data, timestamp
+            Identifier, data bytes and receive time of the frame.
+        """
         if len(data) != 2 or data[1] not in (0, self.id):
             return
         drive: Drive = self._local_node
@@ -103,7 +110,7 @@ class Nmt(NmtSlave):
         drive.changed()
 
     def boot(self) -> None:
-        """Announce the node, enter pre-operational and start the heartbeat (1017h)."""
+        """Send the boot-up message, enter pre-operational and start the heartbeat (1017h)."""
         self.stop_heartbeat()
         self.network.send_message(COB_HEARTBEAT + self.id, b"\0")
         self._state = int(NmtState.PRE_OPERATIONAL)
@@ -114,7 +121,7 @@ class Nmt(NmtSlave):
         self.start_heartbeat(int.from_bytes(self._local_node.get_data(HEARTBEAT_PRODUCER, 0), "little"))
 
     def stop_heartbeat(self) -> None:
-        """Stop the heartbeat, also where the bus that it was on is closed by now."""
+        """Stop the heartbeat, even if its bus is closed already."""
         try:
             super().stop_heartbeat()
         except (can.CanError, OSError):
@@ -126,47 +133,59 @@ class Nmt(NmtSlave):
 
     @property
     def operational(self) -> bool:
-        """Whether PDOs are exchanged."""
+        """``True`` if the node is operational and exchanges PDOs."""
         return bool(self._state == NmtState.OPERATIONAL)
 
     @property
     def stopped(self) -> bool:
-        """Whether the node answers to nothing but NMT."""
+        """``True`` if the node is stopped and reacts to NMT only."""
         return bool(self._state == NmtState.STOPPED)
 
 
 class Sdo(SdoServer):
-    """SDO server that is silent while stopped and answers nothing that is not eight bytes long."""
+    """SDO server that does not answer while the node is stopped, nor requests of other than eight bytes.
+
+    Parameters
+    ----------
+    node
+        The drive.
+    """
 
     def __init__(self, node: "Drive") -> None:
         super().__init__(COB_SDO_REQUEST + node.node_id, COB_SDO_RESPONSE + node.node_id, node)
         self._index = self._subindex = 0
 
     def on_request(self, can_id: int, data: bytes, timestamp: float) -> None:
-        """Serve one request."""
+        """Serve one request.
+
+        Parameters
+        ----------
+        can_id, data, timestamp
+            Identifier, data bytes and receive time of the frame.
+        """
         if len(data) == 8 and not self._node.nmt.stopped:
             super().on_request(can_id, data, timestamp)
 
 
 class Drive(canopen.LocalNode):
-    """One CiA 402 drive.
+    """One virtual CiA 402 drive.
 
     Parameters
     ----------
     node_id, eds
-        Its address and object dictionary.
+        Node id, and EDS of the object dictionary.
     index
         Number of its joint.
-    fd
-        Whether its TPDOs are frames of CAN FD.
     joint
-        Encoder resolution (608Fh) and rated current (6075h) come from here.
+        Source of encoder resolution (608Fh) and rated current (6075h).
     motion
-        What moves behind it.
+        Plant or recording behind the drive.
     changed
         Called when PDO configuration, NMT state or a mapped constant may have changed.
     status_changed
         Called when the statusword has changed.
+    fd
+        ``True`` if its TPDOs are CAN FD frames.
 
     Raises
     ------
@@ -219,7 +238,13 @@ class Drive(canopen.LocalNode):
             self.data_store.setdefault(index, {})[subindex] = entry.encode_raw(value)
 
     def reset(self, communication_only: bool) -> None:
-        """Return to power-on values: all of them, or those of the communication profile (1000h to 1FFFh)."""
+        """Restore the power-on values of the object dictionary.
+
+        Parameters
+        ----------
+        communication_only
+            ``True``: only the communication profile (1000h to 1FFFh).
+        """
         for index in list(self.data_store):
             if not communication_only or index < 0x2000:
                 del self.data_store[index]
@@ -229,7 +254,17 @@ class Drive(canopen.LocalNode):
             self._enter(DriveState.SWITCH_ON_DISABLED)
 
     def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:
-        """Write an object; a controlword acts at once."""
+        """Write an object; a controlword takes effect at once.
+
+        Parameters
+        ----------
+        index, subindex
+            The object.
+        data
+            Its bytes.
+        check_writable
+            Refuse read-only objects.
+        """
         super().set_data(index, subindex, data, check_writable)
         if index == CONTROLWORD:
             self.obey(int.from_bytes(data, "little"))
@@ -247,17 +282,29 @@ class Drive(canopen.LocalNode):
 
     @property
     def status(self) -> int:
-        """The statusword (6041h)."""
+        """Statusword (6041h)."""
         return statusword(self.state)
 
     def obey(self, control: int) -> None:
-        """Take over a controlword (6040h)."""
+        """Apply a controlword (6040h).
+
+        Parameters
+        ----------
+        control
+            The controlword.
+        """
         state = next_state(self.state, control, self.control)
         self.control = control
         self._enter(state)
 
     def fault(self, code: int, register: int) -> None:
-        """Enter the fault state and say so (EMCY, 1001h, 1003h)."""
+        """Enter the fault state and report it (EMCY, 1001h, 1003h).
+
+        Parameters
+        ----------
+        code, register
+            Emergency error code, and error register.
+        """
         if self.state is DriveState.FAULT:
             return
         self._enter(DriveState.FAULT)
@@ -303,7 +350,7 @@ class Drive(canopen.LocalNode):
         return int.from_bytes(self.get_data(index, subindex), "little")
 
     def _check(self, index: int, subindex: int, od: Any, data: bytes) -> None:
-        """Refuse what CiA 301 (sections 7.5.2.35 to 7.5.2.38) or CiA 402 forbids, before it is stored."""
+        """Refuse values that CiA 301 (sections 7.5.2.35 to 7.5.2.38) or CiA 402 forbids, before they are stored."""
         value = int.from_bytes(data, "little")
         for base in (RPDO_COMMUNICATION, TPDO_COMMUNICATION):
             if base <= index < base + MAPPING:
@@ -349,7 +396,7 @@ class Drive(canopen.LocalNode):
             raise SdoAbortedError(ABORT_NOT_MAPPABLE) from None
         listed = self.object_dictionary[entry >> 16]
         if isinstance(listed, ODArray) and entry >> 8 & 0xFF:
-            # The elements of a compact array are all like its first; there are as many as sub-index 0 says.
+            # All elements of a compact array are like its first one; sub-index 0 holds their number.
             if entry >> 8 & 0xFF > self._number(entry >> 16, 0):
                 raise SdoAbortedError(ABORT_NOT_MAPPABLE)
             mapped = listed[1]
@@ -358,7 +405,13 @@ class Drive(canopen.LocalNode):
             raise SdoAbortedError(ABORT_NOT_MAPPABLE)
 
     def pdos(self, base: int) -> list[tuple[int, int, list[tuple[int, int, int]]]]:
-        """Return enabled PDOs: COB-ID, transmission type, mapped (index, subindex, bytes) in order."""
+        """Enabled PDOs: COB-ID, transmission type, and mapped objects (index, subindex, bytes) in order.
+
+        Parameters
+        ----------
+        base
+            First communication record: 1400h (RPDO) or 1800h (TPDO).
+        """
         out = []
         for index in range(base, base + MAPPING):
             if index not in self.object_dictionary:

@@ -1,4 +1,4 @@
-"""Noise of the size measured: white on the measured current (or voltage), and slow torque on the arm itself."""
+"""Noise with measured variances: white noise on the measured signal, and a slow disturbance torque on the arm."""
 
 from dataclasses import dataclass
 
@@ -11,34 +11,55 @@ from armident.configs import RobotConfig
 
 @dataclass(frozen=True)
 class NoiseSize:
-    """Variances of the joint torque's noise, (N m)^2 or N^2: as sampled, and what of it lies below 20 Hz."""
+    """Variances of the joint torque's noise, (N m)^2 or N^2.
+
+    Parameters
+    ----------
+    sampled
+        Variance as sampled, by joint.
+    decimated
+        Variance of the part below 20 Hz, by joint.
+    """
 
     sampled: tuple[float, ...]
     decimated: tuple[float, ...]
 
 
 RESIDUAL_VARIANCE = (34.35, 21.01, 4.198, 0.4400, 1.425, 0.5057)
-"""Joint torque residual as sampled, (N m)^2 (table 6.3, without decimation)."""
+"""Variance of the joint torque residual as sampled, (N m)^2 (thesis table 6.3, without decimation)."""
 DECIMATED_VARIANCE = (1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523)
-"""The same below the cut-off of the decimation (table 6.3)."""
+"""Variance of the joint torque residual below the cut-off of the decimation, (N m)^2 (thesis table 6.3)."""
 SIZES = {
     "tx40": NoiseSize(RESIDUAL_VARIANCE, DECIMATED_VARIANCE),
     "emps": NoiseSize((0.346,), (0.0708,)),
 }
-"""By virtual arm. EMPS: the measured one runs through the same reference of 6.24 s three times; the noise is what of
-the residual of the published model differs from one time to the next, 0.588 N in all and 0.266 N below 20 Hz. What
-comes again, 2.4 and 1.9 N, is error of the model, and belongs to whatever is hidden in the plant."""
+"""Noise by virtual arm. EMPS: the measured arm repeats a reference of 6.24 s three times. The noise is the part of the
+published model's residual that differs between repetitions, 0.588 N in all and 0.266 N below 20 Hz. The repeated part,
+2.4 and 1.9 N, is model error and not part of the noise."""
 DECIMATION_HZ = 20.0
+"""Cut-off of the decimation of table 6.3, Hz."""
 DISTURBANCE_HZ = 20.0
-"""Corner of the first-order spectrum of the disturbance: nearly white after decimation, as the thesis found."""
+"""Corner of the first-order spectrum of the disturbance, Hz: nearly white after decimation, as the thesis found."""
 BLOCK = 1024
+"""Number of control periods whose noise is drawn at once."""
 
 
 class Noise:
-    """Reproducible noise, one column per control period.
+    """Reproducible noise of one arm, by control period.
 
-    A white part and a slow part together have the variance as sampled; what of both lies below the cut-off
-    has the decimated one. ``level`` scales amplitudes; 0 switches the noise off.
+    A white part and a slow part together have the variance as sampled; their parts below the cut-off have the
+    decimated variance.
+
+    Parameters
+    ----------
+    robot
+        Transmission and drive gains.
+    period
+        Control period, s.
+    seed
+        Seed of the random numbers.
+    level
+        Factor on the amplitudes; 0: no noise.
     """
 
     def __init__(self, robot: RobotConfig, period: float, seed: int, level: float = 1.0) -> None:
@@ -60,7 +81,7 @@ class Noise:
         self.disturbance: NDArray[np.float64] = np.zeros((BLOCK, n))
 
     def next(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Noise on the measured currents (A) and disturbance torques (N m, joint side), (n,) each."""
+        """Noise on the measured signals (A or V) and disturbance torques (N m, joint side), shape (n,) each."""
         if self._row == BLOCK:
             self._refill()
         self._row += 1

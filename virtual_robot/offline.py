@@ -1,4 +1,4 @@
-"""A recording of the virtual arm without a bus: the same drives and plant, as fast as they compute."""
+"""Simulated recordings of the virtual arm without a bus, with the same drives and plant."""
 
 from typing import Literal
 
@@ -32,20 +32,20 @@ def simulate_recording(
     start_ns: int = 0,
     velocity_feedback: bool | None = None,
 ) -> Recording:
-    """Simulate what ``armident capture`` would record of the virtual arm on a trajectory.
+    """Simulate a recording of the virtual arm on a trajectory, as ``armident capture`` would write it.
 
     Parameters
     ----------
     robot
-        The arm; one that ``virtual_robot`` has link parameters for.
+        Robot with the name of a virtual arm (``tx40``, ``emps``).
     trajectory
-        Reference, joint side; the arm stands at its start when the recording begins.
+        Reference trajectory, joint side; the arm is at its start when the recording begins.
     seed, noise, scenario, velocity_feedback
         As for ``Arm``.
     period
         SYNC period, s; ``None``: the control period of the drives.
     setpoint_every
-        Set points go out, and demands are recorded, on every so many SYNC.
+        Number of SYNCs between two set points, and between two recorded demands.
     settle
         Time at rest recorded before and after the trajectory, s.
     start_ns
@@ -54,13 +54,12 @@ def simulate_recording(
     Returns
     -------
     Recording
-        Streams ``samples`` (position, current or what else the drives report as effort, status) and ``demand``, and the
-        marks of the experiment.
+        Streams ``samples`` (position, effort, status) and ``demand``, and the marks of the experiment.
 
     Raises
     ------
     ConfigError
-        If the trajectory leaves the robot's limits, or there is no such virtual arm.
+        If the trajectory exceeds the robot's limits, or there is no virtual arm of this name.
     """
     trajectory.check(robot)
     every, period = setpoint_every, servo.control_period(robot) if period is None else period
@@ -82,7 +81,7 @@ def simulate_recording(
         position[k], current[k] = arm.position, arm.current
         if (k % COUNTER + 1) % every == 0:
             demand[k // every] = arm.demand
-            # Row m is the demand at SYNC first + m every, so it has to be the target one interpolation earlier.
+            # Row m is the demand at SYNC first + m every, so it must be the target one interpolation earlier.
             m = (k + every - first) // every
             arm.set_targets(rows[min(max(m, 0), len(rows) - 1)], fresh)
         arm.advance()
@@ -107,7 +106,15 @@ def simulate_recording(
 
 
 def with_encoder_counts(robot: RobotConfig, counts: float) -> RobotConfig:
-    """Return the robot with encoders of ``counts`` per turn (or metre) on every motor."""
+    """Robot with another encoder resolution on every motor.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    counts
+        Counts per motor turn, or per metre.
+    """
     joints = tuple(
         joint.model_copy(update={"drive": joint.drive.model_copy(update={"counts_per_unit": float(counts)})})
         for joint in robot.joints
@@ -116,21 +123,32 @@ def with_encoder_counts(robot: RobotConfig, counts: float) -> RobotConfig:
 
 
 def effort_of(robot: RobotConfig) -> Effort:
-    """What the robot's drives report as effort.
+    """Quantity that the robot's drives report as effort.
+
+    Parameters
+    ----------
+    robot
+        The robot.
 
     Raises
     ------
     ConfigError
-        If some report another effort than others.
+        If the drives report different quantities.
     """
     efforts: list[Effort] = sorted({joint.drive.signal for joint in robot.joints})
     if len(efforts) > 1:
-        raise ConfigError(f"robot {robot.name!r}: its drives report {' and '.join(efforts)}, a stream has room for one")
+        raise ConfigError(f"robot {robot.name!r}: its drives report {' and '.join(efforts)}; a stream holds only one")
     return efforts[0]
 
 
 def sample_fields(robot: RobotConfig) -> dict[str, Field]:
-    """Fields of the ``samples`` stream: motor positions, efforts, statuswords."""
+    """Fields of the ``samples`` stream: motor positions, efforts, statuswords.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    """
     rated = tuple(joint.drive.rated / 1000.0 for joint in robot.joints)
     effort, metres = effort_of(robot), _position_unit(robot) == "m"
     unit = {"current": "A", "voltage": "V", "torque": "N" if metres else "N m"}[effort]
@@ -142,7 +160,13 @@ def sample_fields(robot: RobotConfig) -> dict[str, Field]:
 
 
 def demand_fields(robot: RobotConfig) -> dict[str, Field]:
-    """Field of the ``demand`` stream: motor positions wanted."""
+    """Field of the ``demand`` stream: demanded motor positions.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    """
     return {"demand": Field("demand", "demand", _position_unit(robot), "motor", _per_count(robot))}
 
 

@@ -1,4 +1,4 @@
-"""PDO exchange of all drives, compiled: frames to set points and live values to frames."""
+"""Compiled PDO exchange of all drives: RPDOs to set points and live values to TPDOs."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -27,7 +27,7 @@ from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.node import FOLLOWING_ERROR, Drive
 
 POSITION, CURRENT, DEMAND, STATUS, VELOCITY, ERROR, CONSTANT = range(7)
-"""Rows of the live values; objects that do not move get rows of their own from ``CONSTANT`` on."""
+"""Rows of the live values; objects with constant values follow from row ``CONSTANT`` on."""
 LIVE = {
     POSITION_ACTUAL: POSITION,
     CURRENT_ACTUAL: CURRENT,
@@ -37,11 +37,15 @@ LIVE = {
     VELOCITY_ACTUAL: VELOCITY,
     FOLLOWING_ERROR: ERROR,
 }
+"""Row of the live values by object."""
 TARGET, CONTROL, IGNORED = range(3)
+"""Kinds of received objects."""
 RECEIVED = {TARGET_POSITION: TARGET, CONTROLWORD: CONTROL}
+"""Kind of a received object by its index."""
 IDENTIFIERS = 2048
+"""Number of 11-bit identifiers."""
 HISTORY = 64
-"""Live values of so many SYNCs are kept for the arrays of packed samples."""
+"""Number of SYNCs whose live values are kept for packed samples."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -52,11 +56,11 @@ def _exchange(  # type: ignore[no-untyped-def]
     rx_kinds, rx_first, rx_what, rx_drive, rx_offset, rx_size, table, need, stored, fresh, short,
     targets, targets_fresh, control, result,
 ):  # fmt: skip
-    """Take frames from ``start`` on up to the next SYNC and answer it; returns its place, or ``stop``.
+    """Process frames from ``start`` on up to the next SYNC and answer it; return its index, or ``stop``.
 
-    ``sequence`` is the counter of a SYNC that carries none. ``result`` (3,) gets how many frames are to be sent,
-    whether set points (1) and controlwords (2) act at this SYNC (``targets`` and ``control`` hold them), and counts
-    the SYNCs, whose live values ``history`` keeps: an entry may ask for those of ``tx_back`` SYNCs ago.
+    ``sequence`` is the counter of a SYNC that carries none. ``result`` (3,) receives the number of frames to send, bits
+    for set points (1) and controlwords (2) that take effect at this SYNC (in ``targets`` and ``control``), and the
+    number of SYNCs. ``history`` keeps the live values; an entry sends those of ``tx_back`` SYNCs ago.
     """
     at = stop
     for k in range(start, stop):
@@ -122,16 +126,16 @@ def _exchange(  # type: ignore[no-untyped-def]
 
 
 class Exchange:
-    """Tables of the PDOs as the drives have them mapped now, and the exchange at every SYNC.
+    """PDO exchange at every SYNC by the present mapping of the drives.
 
     Parameters
     ----------
     drives
         The drives, in any order.
     motion
-        What moves behind them.
+        Plant or recording behind the drives.
     period
-        SYNC period, s: velocity actual (606Ch) is a difference of positions over it.
+        SYNC period, s; velocity actual (606Ch) is the difference of positions over it.
     """
 
     def __init__(self, drives: Sequence[Drive], motion: DriveBackend, period: float) -> None:
@@ -143,14 +147,14 @@ class Exchange:
         self._result = np.zeros(3, np.int64)
         self._history = np.zeros((HISTORY, CONSTANT, n), np.int64)
         self.fd = any(drive.fd for drive in drives)
-        """Whether the TPDOs are frames of CAN FD."""
+        """``True`` if the TPDOs are CAN FD frames."""
         self._follows = np.zeros(n, np.bool_)
         self.out = frames(0, fd=self.fd)
-        """Frames that answer the SYNC taken last."""
+        """Frames that answer the last SYNC."""
         self.rebuild()
 
     def rebuild(self) -> None:
-        """Read mapping, NMT state and status of every drive again."""
+        """Rebuild the tables from mapping, NMT state and status of every drive."""
         n = self._motion.position.size
         constants: list[NDArray[np.int64]] = []
         tx: list[Pdo] = []
@@ -185,7 +189,7 @@ class Exchange:
         self._tx_ids = np.array([cob_id for cob_id, _, _ in tx], np.uint32)
         sizes = [sum(e[3] for e in entries) for _, _, entries in tx]
         self._tx_lengths = np.array([fd_length(size) if self.fd else size for size in sizes], np.uint8)
-        # Arrays of one frame or none count as contiguous, which would compile the exchange anew for the others.
+        # At least two frames: smaller arrays count as contiguous and would need another compilation.
         self._out = frames(max(len(tx), 2), fd=self.fd)
         if self.fd:
             self._out["flags"] = FD_FLAG | BIT_RATE_SWITCH
@@ -204,13 +208,13 @@ class Exchange:
         self._arrange()
 
     def refresh_status(self) -> None:
-        """Take over the statuswords; only enabled drives follow set points (a quick stop holds the last one)."""
+        """Update the statuswords; only enabled drives follow set points (a quick stop holds the last one)."""
         for drive in self._drives:
             self.values[STATUS, drive.index] = drive.status
             self._follows[drive.index] = drive.state is DriveState.ENABLED
 
     def _arrange(self) -> None:
-        """Put the arguments of the compiled exchange together, once per mapping."""
+        """Collect the arguments of the compiled exchange, once per mapping."""
         motion, out = self._motion, self._out
         self._arguments = (
             self._period, motion.position, self._before, motion.current, motion.demand, self.values, self._history,
@@ -230,13 +234,13 @@ class Exchange:
         return at
 
     def take_short(self) -> list[int]:
-        """Joints whose RPDOs were ignored for having too few bytes since the last call."""
+        """Joints with RPDOs that were ignored since the last call because they were too short."""
         joints = [self._rx_drive[p] for p in np.flatnonzero(self._short)]
         self._short[:] = 0
         return joints
 
     def act(self) -> None:
-        """Let the RPDOs act that were due at the SYNC just taken."""
+        """Apply the RPDOs that take effect at the last SYNC."""
         found = self._result[1]
         if found & 1:
             self._motion.set_targets(self._targets, self._targets_fresh & self._follows)

@@ -1,4 +1,4 @@
-"""The arm's mechanics: Pinocchio's rigid bodies, rotor inertias, friction and whatever is hidden in it."""
+"""Mechanics of the virtual arm: Pinocchio's rigid bodies, rotor inertias, friction and hidden effects."""
 
 import math
 from typing import Any
@@ -21,37 +21,37 @@ from armident.virtual_robot.model import build_model
 pin: Any = pinocchio
 
 BRAKE = 1e9
-"""Viscous coefficient (N m s/rad) of a closed holding brake: it creeps less than an encoder count an hour."""
+"""Viscous coefficient (N m s/rad) of a closed holding brake: it creeps less than an encoder count per hour."""
 
 FINE_STEP = 34e-6
-"""Longest inner step (s) with gears that give or bristles: a twentieth of the fastest contact's period."""
+"""Longest inner step (s) with elastic gears or bristles: a twentieth of the fastest contact's period."""
 
 SETTLING = 20
-"""Iterations for the twist of gears under the weight of their links, which turns with the twist."""
+"""Iterations for the static twist of gears under the weight of their links, which depends on the twist."""
 
 
 class Plant:
     """State and equations of motion of the arm; SI, joint side.
 
-    Over one period mass matrix and nonlinear effects are taken once, at the predicted middle; friction
-    is integrated in finer steps. Against a reference at a relative tolerance of 1e-9 the positions
-    stay far below an encoder count.
+    Mass matrix and nonlinear effects are evaluated once per period, at the predicted middle; friction is integrated in
+    finer steps. The error of the positions against a reference with a relative tolerance of 1e-9 is far below an
+    encoder count.
 
     Parameters
     ----------
     robot
         Geometry, gravity, couplings and smoothing of Coulomb friction.
     q
-        Initial position, shape (n,), rad or m; the arm stands still.
+        Initial position, rad or m, shape (n,); the initial velocity is zero.
     scenario
         Hidden effects.
 
     Attributes
     ----------
     q, qd
-        Position and velocity of the joints as their motors have them, shape (n,).
+        Position and velocity of the motors, joint side, shape (n,).
     coordinates, velocities
-        The same, then links behind a gear that gives, then masses that swing, shape (N,).
+        Position and velocity of motors, links behind elastic gears, and swinging masses, shape (N,).
     bristles
         Deflection of the bristles, rad, shape (B,).
     """
@@ -83,7 +83,7 @@ class Plant:
                 viscous = h.given("viscous", 0.3 * h["coulomb"])
                 friction[[h.joint, h.other], 0] += viscous
                 pairs.append((h.joint, h.other, viscous, h["coulomb"]))
-        # A bristle stands in place of the joint's Coulomb friction.
+        # A bristle replaces the joint's Coulomb friction.
         friction[bristles[:, 0].astype(np.int64), 1] = 0.0
 
         soft, behind = len(gears), gears[:, 0].astype(np.int64)
@@ -98,7 +98,7 @@ class Plant:
         hinges = [[n + soft + k, -1, 0.0, d, 0.0, 0.0] for k, d in enumerate(hinge_damping(hidden, self._gravity))]
         gears = np.vstack([gears, np.array(hinges).reshape(-1, gears.shape[1])])
 
-        # Position, velocity, and both as predicted for the middle of the coming period.
+        # Position, velocity, and both as predicted for the middle of the next period.
         self._state = np.zeros((4, total))
         self.coordinates, self.velocities = self._state[:2]
         self.coordinates[:] = np.concatenate([start, start[behind], swing])
@@ -126,7 +126,7 @@ class Plant:
             raise ConfigError(f"{hidden[0].where}: robot {robot.name!r} is left without inertia by its hidden effects")
 
     def mass_matrix(self) -> NDArray[np.float64]:
-        """Joint-side mass matrix (n, n) at the present position, rotors included, gears taken as rigid."""
+        """Mass matrix at the present position, joint side, shape (n, n), rotors included, with rigid gears."""
         n = self.q.size
         position = self.coordinates[self._link]
         position[:n] = self.q
@@ -151,9 +151,21 @@ class Plant:
     def acceleration(
         self, q: NDArray[np.float64], qd: NDArray[np.float64], tau: NDArray[np.float64], t: float = 0.0
     ) -> NDArray[np.float64]:
-        """Direct dynamics (N,) of ``coordinates`` at any state: what ``advance`` integrates, without approximations.
+        """Accelerations by direct dynamics, without the approximations of `advance`; bristles slide steadily.
 
-        Bristles slide steadily.
+        Parameters
+        ----------
+        q, qd
+            Coordinates and velocities, shape (N,).
+        tau
+            Joint torques, N m or N, shape (n,).
+        t
+            Time, s.
+
+        Returns
+        -------
+        ndarray
+            Accelerations of the coordinates, shape (N,).
         """
         n, total = self.q.size, self.coordinates.size
         force, slope = np.zeros(total), np.zeros((total, total))
@@ -165,7 +177,15 @@ class Plant:
         return np.asarray(np.linalg.solve(self._inertia(q), -force), np.float64)
 
     def advance(self, tau: NDArray[np.float64], period: float) -> None:
-        """Hold the joint torques ``tau`` (n,) for ``period`` seconds."""
+        """Integrate over one control period with constant torques.
+
+        Parameters
+        ----------
+        tau
+            Joint torques, N m or N, shape (n,).
+        period
+            Control period, s.
+        """
         if self._shaking.size:
             self._shake(self._time + 0.5 * period)
         middle, speed = self._state[2], self._state[3]
@@ -190,7 +210,7 @@ class Plant:
         return mass
 
     def _shake(self, t: float) -> None:
-        """Put the acceleration of the base at ``t`` into gravity."""
+        """Add the acceleration of the base at ``t`` to gravity."""
         rows = self._shaking
         self.model.gravity.linear = self._gravity - np.sin(rows[:, 3] * t) @ rows[:, :3]
 

@@ -1,4 +1,4 @@
-"""A measured recording in place of the plant: the drives send what an arm once sent."""
+"""Replay of a recording through the virtual drives."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,32 +9,32 @@ from armident.daq.recording import Recording, Stream
 from armident.virtual_robot.arm import Raw32
 
 RATE_TOLERANCE = 1e-3
-"""Relative difference allowed between the recording's sample rate and the SYNC rate."""
+"""Largest relative difference of the recording's sample rate and the SYNC rate."""
 
 
 class Replay:
-    """Plays positions and currents of a recording, one sample per SYNC, through the drives.
+    """Drive backend that replays positions and currents of a recording, one sample per SYNC.
 
-    Before all drives of ``joints`` are enabled the first sample stands; sample k is sent on the k-th SYNC
-    after that; the last one stands when the recording is over. Set points are not followed.
+    The first sample is sent until all drives of ``joints`` are enabled. Sample k is sent on the k-th SYNC after that,
+    and the last sample is repeated at the end. Set points are ignored.
 
     Parameters
     ----------
     recording
-        What is played; gaps repeat the sample before them.
+        The recording; gaps repeat the sample before them.
     robot
-        Encoder resolution, transmission, rated currents of the drives that send it.
+        Encoder resolutions, transmission and rated currents of the virtual drives.
     sync_period
-        Time between two SYNC, s.
+        SYNC period, s.
     joints
-        Numbers of the joints that have to be enabled.
+        Numbers of the joints whose drives must be enabled.
 
     Raises
     ------
     ConfigError
-        If the recording is of another robot, or was not sampled at the SYNC rate.
+        If the recording is of another robot, or its sample rate is not the SYNC rate.
     DataError
-        If it has no positions or no efforts, or they do not fit into the drives' numbers.
+        If the recording has no positions or no efforts, or if they exceed the range of the drives' numbers.
     """
 
     def __init__(self, recording: Recording, robot: RobotConfig, sync_period: float, joints: tuple[int, ...]) -> None:
@@ -72,19 +72,33 @@ class Replay:
 
     @property
     def finished(self) -> bool:
-        """Whether the last sample has been reached."""
+        """``True`` if the last sample has been reached."""
         return self._row == len(self._positions) - 1
 
     def enable(self, joint: int, enabled: bool) -> None:
-        """Start playing when the last drive is enabled."""
+        """Start the replay when the last drive is enabled.
+
+        Parameters
+        ----------
+        joint
+            Number of the joint.
+        enabled
+            New state of its drive.
+        """
         if enabled:
             self._waiting.discard(joint)
 
     def set_targets(self, targets: Raw32, fresh: NDArray[np.bool_]) -> None:
-        """Set points mean nothing to a recording."""
+        """Ignore set points.
+
+        Parameters
+        ----------
+        targets, fresh
+            As in `DriveBackend.set_targets`.
+        """
 
     def advance(self) -> None:
-        """Go on to the next sample."""
+        """Advance to the next sample."""
         if self._waiting or self.finished:
             return
         self._row += 1

@@ -1,9 +1,9 @@
-"""``armident robot``: the virtual arm, or a measured recording, on the bus of a session."""
+"""``armident robot``: the virtual arm, or the replay of a recording, on the bus of a session."""
 
 import json
+import logging
 import math
 import signal
-import sys
 from pathlib import Path
 from types import FrameType
 
@@ -20,6 +20,8 @@ from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.replay import Replay
 from armident.virtual_robot.server import Server
 
+log = logging.getLogger(__name__)
+
 
 def run_robot(
     config: Path,
@@ -31,12 +33,26 @@ def run_robot(
     truth: Path | None = None,
     velocity_feedback: bool | None = None,
 ) -> None:
-    """Serve the drives of a session until SIGINT or SIGTERM, or for ``duration`` seconds.
+    """Serve the drives of a session until SIGINT or SIGTERM, or for a given time.
 
-    ``truth`` names a file for the arm's own parameters: standard ones, base ones where several act as one, and the
-    drives' (``kp``, 1/s; ``kv``, units of their signal per rad/s or m/s at the motor; ``velocity_samples``;
-    ``velocity_filter_hz`` where there is a filter; ``velocity_feedback``, 0 or 1). ``velocity_feedback`` chooses the
-    latter, see ``servo.design``.
+    Parameters
+    ----------
+    config
+        Session configuration.
+    scenario
+        Scenario with hidden effects.
+    replay
+        Recording to replay in place of the plant.
+    seed, noise
+        Seed of the noise, and factor on its amplitude.
+    duration
+        Time to run, s; ``None``: unlimited.
+    truth
+        File for the true parameters of the arm (JSON): standard and base parameters, and those of the drives. These
+        are ``kp`` (1/s), ``kv`` (units of the signal per rad/s or m/s at the motor), ``velocity_samples``,
+        ``velocity_filter_hz`` if there is a filter, and ``velocity_feedback`` (0 or 1).
+    velocity_feedback
+        Structure of the drives' velocity loop, see ``servo.design``.
 
     Raises
     ------
@@ -61,9 +77,10 @@ def run_robot(
     with Server(session, robot, motion) as server:
         nodes = ", ".join(str(drive.node_id) for drive in server.drives)
         buses = ", ".join(bus.channel for bus in session.all_buses)
+        # On stdout: programs that start the arm wait for this line.
         print(f"ready: {robot.name} on {buses}, nodes {nodes}", flush=True)
-        report = server.run(lambda: stop.asked, duration)
-    print(report, file=sys.stderr, flush=True)
+        report = server.run(lambda: stop.requested, duration)
+    log.info("%s", report)
 
 
 def record_robot(
@@ -77,18 +94,20 @@ def record_robot(
     truth: Path | None = None,
     velocity_feedback: bool | None = None,
 ) -> None:
-    """Write a recording of one trajectory of the virtual arm to ``out``, without a bus.
+    """Write a simulated recording of one trajectory of the virtual arm, without a bus.
 
     Parameters
     ----------
     config
-        Session: robot, SYNC period, set points.
-    trajectory
-        File of the trajectory; ``None``: the session's.
-    encoder_counts
-        Counts per motor turn in place of the robot's; the drives see them too.
-    truth, velocity_feedback
+        Session configuration: robot, SYNC period, set points.
+    out
+        The recording to write.
+    scenario, seed, noise, truth, velocity_feedback
         As for ``run_robot``.
+    trajectory
+        Trajectory; ``None``: that of the session.
+    encoder_counts
+        Counts per motor turn in place of the robot's, also for the control loops.
 
     Raises
     ------
@@ -96,12 +115,12 @@ def record_robot(
         If a file is wrong, no trajectory is given, or ``out`` exists already.
     """
     if out.exists():
-        raise ConfigError(f"{out}: there is such a file already")
+        raise ConfigError(f"{out}: the file exists already")
     session = load_session(config)
     robot = load_robot(session.robot)
     setpoints = session.setpoints
     if setpoints is None:
-        raise ConfigError(f"{config}: setpoints: --to-file needs them, they say how the arm moves")
+        raise ConfigError(f"{config}: setpoints: --to-file needs them for the motion of the arm")
     motion = load_trajectory(trajectory or setpoints.trajectory)
     if encoder_counts is not None:
         robot = with_encoder_counts(robot, encoder_counts)
@@ -113,11 +132,11 @@ def record_robot(
     if truth is not None:
         _write_truth(robot, motion.start, truth, velocity_feedback)
     write_recording(recording, out)
-    print(f"{recording.samples.sync.size} samples of {robot.name} in {out}", file=sys.stderr)
+    log.info("%d samples of %s in %s", recording.samples.sync.size, robot.name, out)
 
 
 def _write_truth(robot: RobotConfig, q: ArrayLike, path: Path, velocity_feedback: bool | None) -> None:
-    """Parameters of the plant, and of the drives, tuned at posture ``q`` (n,)."""
+    """Write the parameters of the plant, and of the drives tuned at posture ``q`` (n,)."""
     parameters = plant_parameters(robot)
     drives = servo.design(robot, Plant(robot, q).mass_matrix(), velocity_feedback)
     values = parameters | base_parameters(parameters)
@@ -137,17 +156,17 @@ def _replay(session: SessionConfig, robot: RobotConfig, path: Path) -> DriveBack
 
 
 def _warm_up(robot: RobotConfig, session: SessionConfig) -> None:
-    """Compile the loops before anybody waits for an answer."""
+    """Compile the loops before the first SYNC."""
     Arm(robot, rest_posture(robot), session.sync_period).advance()
 
 
 class _Stop:
-    """Whether SIGINT or SIGTERM asked to stop."""
+    """Flag that SIGINT or SIGTERM sets."""
 
     def __init__(self) -> None:
-        self.asked = False
+        self.requested = False
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._ask)
+            signal.signal(number, self._request)
 
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        self.asked = True
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True

@@ -1,4 +1,4 @@
-"""The virtual drives of a session: canopen serves SDO and NMT, a loop of its own answers every SYNC of every bus."""
+"""Virtual drives of a session: the canopen library serves SDO and NMT, a fast loop answers every SYNC of every bus."""
 
 import select
 import time
@@ -19,25 +19,42 @@ from armident.virtual_robot.bus_server import BATCH, DriveBus
 from armident.virtual_robot.node import Drive
 
 TOGETHER_S = 0.05
-"""How long a SYNC of one bus waits for that of another, before the arm moves on without it."""
+"""Longest wait of a SYNC of one bus for that of another bus, s."""
 ANSWERED_SYNCS = 32
-"""Most SYNCs whose answers wait for each other when the drives are behind."""
+"""Maximum number of SYNCs that are answered in one system call if the drives are behind."""
 SUPERVISION_SYNCS = 64
-"""Following errors are checked every so many SYNC."""
+"""Number of SYNCs between two checks of the following errors."""
 FOLLOWING_ERROR_LIMIT = 0.5
-"""Following error at which a drive faults, rad or m at the joint."""
+"""Following error at which a drive enters the fault state, rad or m at the joint."""
 DELAY_SYNCS = 16
-"""How long a SYNC waited is measured at every so many, and at every one that found another before it."""
+"""Number of SYNCs between two measurements of the delay; it is also measured at each SYNC that waited for another."""
 DELAY_BINS = 50_000
-"""Lateness is counted in bins of 1 us; the last one holds everything later."""
+"""Number of bins of 1 us of the delay histogram; the last one holds all larger delays."""
 EMCY_FOLLOWING_ERROR, EMCY_PDO_LENGTH = 0x8611, 0x8210
+"""Emergency error codes (CiA 402, CiA 301)."""
 MOTION_ERROR, COMMUNICATION_ERROR = 0x20, 0x10
 """Bits of the error register (1001h)."""
 
 
 @dataclass(frozen=True)
 class ServerReport:
-    """How the drives kept up; ``lateness`` is how long a SYNC had waited in the kernel when its turn came."""
+    """Timing of the drives' answers.
+
+    Parameters
+    ----------
+    syncs
+        Number of SYNCs answered.
+    delay_p50_us, delay_p99_us, delay_max_us
+        Median, 99th percentile and maximum of the time that a SYNC waited in the kernel, us.
+    backlog_max
+        Largest number of SYNCs received at once.
+    seconds
+        Duration, s.
+    cpu_share
+        CPU time over duration.
+    dropped
+        Number of frames dropped by the kernel.
+    """
 
     syncs: int
     delay_p50_us: float
@@ -57,7 +74,7 @@ class ServerReport:
             else f"at worst {self.backlog_max - 1} SYNC behind ({self.delay_max_us / 1000:.1f} ms)"
         )
         return (
-            f"{self.syncs} SYNC answered, late by {self.delay_p50_us:.0f} us (p50), "
+            f"{self.syncs} SYNC answered, delayed by {self.delay_p50_us:.0f} us (p50), "
             f"{self.delay_p99_us:.0f} us (p99), {self.delay_max_us:.0f} us (worst); {behind}; "
             f"{100 * self.cpu_share:.0f} % of one CPU; "
             f"{self.dropped} frames dropped by the kernel"
@@ -65,14 +82,14 @@ class ServerReport:
 
 
 class Server:
-    """All drives of a session on its buses.
+    """All virtual drives of a session on its buses; use it in a ``with`` block.
 
     Parameters
     ----------
     session, robot
         Buses, nodes and SYNC; joints and drives.
     motion
-        What moves behind the drives.
+        Plant or recording behind the drives.
 
     Raises
     ------
@@ -85,11 +102,11 @@ class Server:
         names = [joint.name for joint in robot.joints]
         self._dirty = self._status_dirty = False
         self.drives: list[Drive] = []
-        told = (self._changed, self._status_changed)
+        callbacks = (self._changed, self._status_changed)
         for node in session.drives:
             j = names.index(node.joint)
             fd = session.bus_of(node).fd
-            self.drives.append(Drive(node.node_id, node.eds, j, robot.joints[j], motion, *told, fd))
+            self.drives.append(Drive(node.node_id, node.eds, j, robot.joints[j], motion, *callbacks, fd))
         self._limit = _following_limit(robot)
         self._histogram = np.zeros(DELAY_BINS + 1, np.int64)
         self._latest = 0.0
@@ -129,17 +146,24 @@ class Server:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Take the drives off their buses."""
+        """Stop the drives and release their buses."""
         for line in self._buses:
             line.close()
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> ServerReport:
-        """Answer every SYNC until ``stopped()`` or for ``duration`` seconds.
+        """Answer every SYNC.
+
+        Parameters
+        ----------
+        stopped
+            Function that returns ``True`` to end.
+        duration
+            Longest duration, s; ``None``: unlimited.
 
         Raises
         ------
         BusDown
-            If the only bus goes down; of several the others go on, and one that is back is served again.
+            If the only bus goes down; with several buses the others go on, and a bus that is back is served again.
         """
         begin, cpu = time.monotonic(), time.process_time()
 
@@ -171,14 +195,14 @@ class Server:
                     queued = 0
                 outbox[queued : queued + answers] = exchange.out
                 queued += answers
-                # One system call for all answers that are due: the further behind, the cheaper each of them.
+                # One system call for all answers that are due, so that drives that are behind catch up.
                 if at + 1 == count or (backlog + 1) % ANSWERED_SYNCS == 0:
                     bus.send(outbox[:queued])
                     queued = 0
                 if backlog or self._syncs % DELAY_SYNCS == 0:
                     self._note(time.time_ns() - int(stamps[at]))
                 exchange.act()
-                # Drives that are behind obey at the same SYNC as those that are not.
+                # Drives that are behind apply commands at the same SYNC as those that are not.
                 self._catch_up()
                 self._advance()
                 backlog += 1
@@ -189,7 +213,7 @@ class Server:
             self._backlog = max(self._backlog, backlog)
 
     def _serve_several(self, over: Callable[[], bool]) -> None:
-        """Answer SYNC k on every bus before the arm moves on to k + 1."""
+        """Answer SYNC k on every bus before the arm advances to k + 1."""
         poll = select.poll()
         for line in self._buses:
             assert isinstance(line.bus, RawSocket)
@@ -210,7 +234,7 @@ class Server:
             since = None
             _, counter, stamp = min(waiting, key=lambda one: one[2])
             for line, other, at in waiting:
-                # A bus that lacked a SYNC is ahead of the others: its next one waits for theirs.
+                # A bus that missed a SYNC is ahead of the others: its next one waits for theirs.
                 if other == counter and abs(at - stamp) < half_turn_ns:
                     line.answer(counter or self._counter)
             if self._syncs % DELAY_SYNCS == 0:
@@ -219,7 +243,7 @@ class Server:
 
     @property
     def _counter(self) -> int:
-        """Counter of the next SYNC where that carries none."""
+        """Counter of the next SYNC if it carries none."""
         return self._syncs % self._session.sync.counter + 1
 
     def _advance(self) -> None:
@@ -242,7 +266,7 @@ class Server:
             next(d for d in self.drives if d.index == index).emcy.send(EMCY_PDO_LENGTH, COMMUNICATION_ERROR)
 
     def report(self) -> ServerReport:
-        """How the drives kept up so far."""
+        """Timing of the drives' answers so far."""
         counts = np.cumsum(self._histogram)
         p50, p99 = (float(np.searchsorted(counts, share * counts[-1])) for share in (0.5, 0.99))
         return ServerReport(

@@ -1,4 +1,4 @@
-"""What the drives compute every control period: encoder, interpolated demand, cascade, current."""
+"""Servo drives: encoder, interpolated demand, cascade controller and current, by control period."""
 
 import math
 from dataclasses import dataclass
@@ -10,36 +10,36 @@ from numpy.typing import NDArray
 from armident.configs import ConfigError, RobotConfig
 
 CONTROL_PERIOD = 200e-6
-"""Period of position, velocity and current command, s."""
+"""Control period of position, velocity and current command, s."""
 
 OTHER_PERIODS = {"emps": 1e-3}
-"""Control periods of virtual arms whose drives have another one, s; EMPS: that of its recordings."""
+"""Control periods of virtual arms that differ from ``CONTROL_PERIOD``, s; EMPS: that of its recordings."""
 
 BANDWIDTH_HZ = (5.0, 5.0, 6.0, 8.0, 8.0, 10.0)
-"""Closed-loop bandwidth of each position loop; thesis appendix B.2: at most 10 Hz, reached by joint 6."""
+"""Closed-loop bandwidth of each position loop, Hz; thesis appendix B.2: at most 10 Hz, reached by joint 6."""
 
 VELOCITY_FILTER_HZ = 400.0
-"""Corner of the first-order filter on the velocity loop's difference of encoder counts."""
+"""Corner of the first-order filter on the velocity from encoder differences, Hz."""
 
 SHARE_OF_POLE = 0.6436
-"""Bandwidth (-3 dB) of two equal poles, over the poles' frequency."""
+"""Bandwidth (-3 dB) of two equal poles relative to the poles' frequency: sqrt(sqrt(2) - 1)."""
 
 
 @dataclass(frozen=True)
 class Servo:
-    """The cascade of all drives, motor side (thesis figure B.1): a velocity loop inside a position loop.
+    """Cascade controllers of all drives, motor side (thesis figure B.1): a velocity loop inside a position loop.
 
     Parameters
     ----------
     period
         Control period, s.
     kp, kv
-        Gains (n,), 1/s and units of the drives' signal per rad/s or m/s.
+        Gains, 1/s and units of the drives' signal per rad/s or m/s, shape (n,).
     velocity_feedback
-        ``signal = kv (kp e - qd)``, ``e = demand - position``; otherwise the velocity loop has the demand's velocity as
-        well, ``signal = kv (kp e + de/dt)``, as drives in cyclic synchronous position mode do.
+        ``True``: ``signal = kv (kp e - qd)`` with ``e = demand - position``. ``False``: ``signal = kv (kp e + de/dt)``,
+        with the velocity of the demand, as in cyclic synchronous position mode.
     velocity_samples
-        Periods over which the velocity is the mean.
+        Number of periods over which the velocity is averaged.
     filter_hz
         Corner of the first-order low-pass on the velocity, Hz; infinite: none.
     """
@@ -53,7 +53,7 @@ class Servo:
 
     @property
     def smooth(self) -> float:
-        """Share of a new velocity that the low-pass lets through at once."""
+        """Weight of a new velocity in the discrete first-order low-pass."""
         return 1.0 - math.exp(-2 * math.pi * self.filter_hz * self.period)
 
 
@@ -62,12 +62,12 @@ def control(  # type: ignore[no-untyped-def]
     period, feedback, q, ratio, counts_per_rad, origin, target, age, steps, held, kp, kv, smooth, limit, noise,
     permille, past, rate, current, position, reported, demand, torque, disturbance, tau,
 ):  # fmt: skip
-    """One control period of all drives (arrays (n,), motor side); state and outputs change in place.
+    """Compute one control period of all drives (arrays (n,), motor side); state and outputs change in place.
 
-    Cascade of ``Servo``. ``past`` (n, velocity samples) holds what the velocity loop differentiates, newest first,
-    ``rate`` its filtered change over a period. ``tau`` (n,) gets the joint torques until the next period, ``torque``
-    (n, n) being N m per ampere (or N per volt, as the drives have it). ``held`` drives (not enabled) give no current
-    and let their demand follow the position.
+    Cascade of ``Servo``. ``past`` (n, velocity samples) holds the signal that the velocity loop differentiates, newest
+    first, and ``rate`` its filtered change over a period. ``tau`` (n,) receives the joint torques until the next period
+    by ``torque`` (n, n), N m or N per unit of the signal. ``held`` drives (not enabled) give no current, and their
+    demand follows the position.
     """
     n, samples = past.shape
     for j in range(n):
@@ -104,26 +104,32 @@ def control(  # type: ignore[no-untyped-def]
 
 
 def control_period(robot: RobotConfig) -> float:
-    """Control period of the robot's drives, s."""
-    return OTHER_PERIODS.get(robot.name, CONTROL_PERIOD)
-
-
-def design(robot: RobotConfig, mass: NDArray[np.float64], velocity_feedback: bool | None = None) -> Servo:
-    """The drives of a virtual arm: with the controller that its configuration knows, else tuned.
+    """Control period of the robot's drives, s.
 
     Parameters
     ----------
     robot
-        Transmission, drive gains, and perhaps a known controller, which feeds back the velocity.
+        The robot.
+    """
+    return OTHER_PERIODS.get(robot.name, CONTROL_PERIOD)
+
+
+def design(robot: RobotConfig, mass: NDArray[np.float64], velocity_feedback: bool | None = None) -> Servo:
+    """Design the drives of a virtual arm: the known controller of its configuration, else tuned gains.
+
+    Parameters
+    ----------
+    robot
+        Transmission, drive gains, and optionally a known controller, which has velocity feedback.
     mass
-        Mass matrix (n, n) at the posture the gains are tuned for, joint side, rotors included.
+        Mass matrix at the posture for which the gains are tuned, joint side, rotors included, shape (n, n).
     velocity_feedback
-        As for ``Servo``; ``None``: as the controller of the configuration, without one not.
+        As for ``Servo``; ``None``: ``True`` with a known controller, else ``False``.
 
     Raises
     ------
     ConfigError
-        If the known controller is wanted without its velocity feedback.
+        If ``velocity_feedback`` is ``False`` with a known controller.
     """
     period, known = control_period(robot), robot.controller
     if known is None:
@@ -134,14 +140,19 @@ def design(robot: RobotConfig, mass: NDArray[np.float64], velocity_feedback: boo
 
 
 def gains(robot: RobotConfig, mass: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gains ``kp`` (1/s) and ``kv`` (A s/rad), motor side, for two equal poles at the bandwidths wanted.
+    """Gains ``kp`` (1/s) and ``kv`` (A s/rad), motor side, for two equal poles at the bandwidths of ``BANDWIDTH_HZ``.
 
     Parameters
     ----------
     robot
         Transmission and drive gains.
     mass
-        Mass matrix (n, n) at the posture the gains are tuned for, joint side, rotors included.
+        Mass matrix at the posture for which the gains are tuned, joint side, rotors included, shape (n, n).
+
+    Returns
+    -------
+    kp, kv
+        Gains, shape (n,) each.
     """
     inverse = np.linalg.inv(robot.transmission_matrix)
     inertia = np.diag(inverse.T @ mass @ inverse)

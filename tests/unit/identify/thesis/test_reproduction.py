@@ -95,7 +95,7 @@ def test_recording_to_a_file_is_the_simulation_of_the_sessions_set_points(tmp_pa
     truth = json.loads((tmp_path / "truth.json").read_text())
     assert truth["fv1"] == 8.0
     assert truth["kp6"] > truth["kp1"] > 0
-    with pytest.raises(ConfigError, match="there is such a file already"):
+    with pytest.raises(ConfigError, match="the file exists already"):
         record_robot(Path("tx40_cell.yaml"), out)
 
 
