@@ -23,7 +23,7 @@ from armident.daq.recording import Recording
 from armident.identify.document import DiagnosisDocument, IdentificationDocument, from_json, to_json
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
-from armident.identify.excitation.previous_estimate import prior_from
+from armident.identify.excitation.previous_estimate import previous_estimate
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.monitoring.change_test import Inconclusive, ParameterChangeTest, compare
@@ -31,9 +31,10 @@ from armident.identify.monitoring.history import History
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
-from armident.identify.monitoring.reidentify.record_run import Say, Start, play, start_process
+from armident.identify.monitoring.reidentify.record_run import Say, play, start_process
 from armident.identify.monitoring.reidentify.summary import found, told
 from armident.identify.report.files import write_identification
+from armident.processes import Start
 
 DRIFTED = 4
 """Exit code: done, and the arm has changed."""
@@ -137,7 +138,7 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
     trajectory.check(robot, name)
     if baseline.document is None:
         return
-    prior = prior_from(baseline.document, robot, baseline.name)
+    prior = previous_estimate(baseline.document, robot, baseline.name)
     torque = arm_model(robot).inverse_dynamics(prior.theta, *sample_trajectory(trajectory, CHECK_PERIOD))
     for joint, peak in zip(robot.joints, np.abs(torque).max(axis=0), strict=True):
         if peak > joint.limits.torque:
