@@ -1,4 +1,4 @@
-"""Hidden changes of the rigid bodies: what is mounted on the arm, and what the arm is mounted on."""
+"""Hidden changes of the rigid bodies: payloads, rotors, and tilt and vibration of the base."""
 
 import math
 from collections.abc import Sequence
@@ -15,9 +15,16 @@ pin: Any = pinocchio
 
 
 def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:
-    """Mount payloads and vessels on a Pinocchio model, and tilt it; in place.
+    """Add payloads and vessels to a Pinocchio model, and tilt its gravity; in place.
 
-    A swinging mass is a further joint, after those of the arm.
+    A swinging mass is an additional joint after those of the arm.
+
+    Parameters
+    ----------
+    model
+        Pinocchio model with n joints.
+    hidden
+        Hidden effects.
     """
     for h in hidden:
         if h.effect == "payload":
@@ -34,7 +41,22 @@ def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:
 
 
 def hanging(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angles at which the swinging masses rest with the arm at ``q`` (n,): rad, in Pinocchio's order."""
+    """Rest angles of the swinging masses.
+
+    Parameters
+    ----------
+    model
+        Pinocchio model with the swinging masses.
+    hidden
+        Hidden effects.
+    q
+        Posture of the arm, rad or m, shape (n,).
+
+    Returns
+    -------
+    ndarray
+        Angles, rad, in Pinocchio's order, shape (S,).
+    """
     data = model.createData()
     swinging = [h for h in hidden if h.effect == "slosh_payload"]
     zero = np.concatenate([q, np.zeros(len(swinging))])
@@ -47,7 +69,20 @@ def hanging(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) -> NDA
 
 
 def hinge_damping(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Viscous coefficients (N m s/rad) of the swinging masses' hinges."""
+    """Viscous coefficients of the swinging masses' hinges.
+
+    Parameters
+    ----------
+    hidden
+        Hidden effects.
+    gravity
+        Acceleration of gravity, m/s^2, shape (3,).
+
+    Returns
+    -------
+    ndarray
+        Coefficients, N m s/rad, shape (S,).
+    """
     out = []
     for h in hidden:
         if h.effect == "slosh_payload":
@@ -57,14 +92,21 @@ def hinge_damping(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDA
 
 
 def add_rotors(rotor: NDArray[np.float64], hidden: Sequence[Hidden], links: NDArray[np.float64]) -> None:
-    """Add hidden rotor inertias to ``rotor`` (n, n), in place.
+    """Add hidden rotor inertias to the rotors' matrix, in place.
 
-    ``links`` is the mass matrix (n, n) of the links at the start.
+    Parameters
+    ----------
+    rotor
+        Rotor inertias, joint side, shape (n, n), changed in place.
+    hidden
+        Hidden effects.
+    links
+        Mass matrix of the links at the start, shape (n, n).
 
     Raises
     ------
     ConfigError
-        If an inertia taken away, or one between joints, leaves a mass matrix that is not positive definite.
+        If the resulting mass matrix is not positive definite.
     """
     for h in hidden:
         if h.effect == "rotor_inertia":
@@ -77,7 +119,22 @@ def add_rotors(rotor: NDArray[np.float64], hidden: Sequence[Hidden], links: NDAr
 
 
 def tilted(gravity: NDArray[np.float64], tilt: float, azimuth: float) -> NDArray[np.float64]:
-    """Gravity (3,) after the base was turned by ``tilt`` about a horizontal axis, ``azimuth`` from its x axis."""
+    """Gravity in the frame of a tilted base.
+
+    Parameters
+    ----------
+    gravity
+        Acceleration of gravity, m/s^2, shape (3,).
+    tilt
+        Angle of the tilt, rad.
+    azimuth
+        Angle of the horizontal axis of the tilt from the base's x axis, rad.
+
+    Returns
+    -------
+    ndarray
+        Acceleration of gravity, m/s^2, shape (3,).
+    """
     one, two = _horizontal(gravity)
     axis = math.cos(azimuth) * one + math.sin(azimuth) * two
     out: NDArray[np.float64] = pin.exp3(tilt * axis) @ gravity
@@ -85,7 +142,20 @@ def tilted(gravity: NDArray[np.float64], tilt: float, azimuth: float) -> NDArray
 
 
 def shaking(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Amplitude vector (m/s^2) and angular frequency of every vibration of the base, shape (V, 4)."""
+    """Vibrations of the base.
+
+    Parameters
+    ----------
+    hidden
+        Hidden effects.
+    gravity
+        Acceleration of gravity, m/s^2, shape (3,).
+
+    Returns
+    -------
+    ndarray
+        Amplitude vector (m/s^2) and angular frequency (rad/s) of each vibration, shape (V, 4).
+    """
     one, two = _horizontal(gravity)
     rows = []
     for h in hidden:
@@ -96,7 +166,7 @@ def shaking(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[n
 
 
 def _horizontal(gravity: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two axes across gravity: the base's x axis made level, and the one across both."""
+    """Two horizontal unit vectors: the projected x axis of the base, and the vector orthogonal to it and to gravity."""
     size = float(np.linalg.norm(gravity))
     down = gravity / size if size > 0.0 else np.array([0.0, 0.0, -1.0])
     start = np.array([1.0, 0.0, 0.0]) if abs(down[0]) < 0.9 else np.array([0.0, 1.0, 0.0])

@@ -1,4 +1,4 @@
-"""LuGre bristles in place of Coulomb friction: a state per joint (Canudas de Wit, Olsson, Astrom, Lischinsky 1995)."""
+"""LuGre bristles in place of Coulomb friction, one state per joint (Canudas de Wit et al. 1995)."""
 
 import math
 from collections.abc import Sequence
@@ -11,12 +11,20 @@ from armident.configs import ConfigError, RobotConfig
 from armident.virtual_robot.effects.hidden import Hidden
 
 COLUMNS = 7
-"""Joint, Coulomb friction, extra at rest, Stribeck velocity, exponent, stiffness, damping."""
+"""Columns of a bristle: joint, Coulomb friction, extra at rest, Stribeck velocity, exponent, stiffness, damping."""
 
 
 @njit(cache=True, error_model="numpy")
 def sliding_level(row, qd):  # type: ignore[no-untyped-def]
-    """Friction (N m) when sliding at ``qd``, without its sign, and its slope over ``abs(qd)``."""
+    """Magnitude of the friction (N m) when sliding, and its slope over ``abs(qd)``.
+
+    Parameters
+    ----------
+    row
+        Row of `bristle_table`, shape (COLUMNS,).
+    qd
+        Velocity of the joint, rad/s or m/s.
+    """
     speed = abs(qd)
     ratio = (speed / row[3]) ** row[4]
     bump = row[2] * math.exp(-ratio)
@@ -25,7 +33,17 @@ def sliding_level(row, qd):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def bristle_rate(row, z, qd):  # type: ignore[no-untyped-def]
-    """Rate of a bristle's deflection ``z``, ``qd - abs(qd) z stiffness / g(qd)``, and its slopes over z and qd."""
+    """Rate of a bristle's deflection, ``qd - abs(qd) z stiffness / g(qd)``, and its slopes over ``z`` and ``qd``.
+
+    Parameters
+    ----------
+    row
+        Row of `bristle_table`, shape (COLUMNS,).
+    z
+        Deflection, rad or m.
+    qd
+        Velocity of the joint, rad/s or m/s.
+    """
     level, fall = sliding_level(row, qd)
     pull = row[5] / level
     side = math.copysign(1.0, qd)
@@ -35,26 +53,35 @@ def bristle_rate(row, z, qd):  # type: ignore[no-untyped-def]
 def bristle_table(
     hidden: Sequence[Hidden], robot: RobotConfig, friction: NDArray[np.float64], inertia: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Rows of the joints with a bristle, shape (B, COLUMNS); Stribeck and presliding of one joint share it.
+    """Parameters of the bristles; Stribeck and presliding friction of one joint share a bristle.
 
     Parameters
     ----------
+    hidden
+        Hidden effects.
+    robot
+        The robot.
     friction
-        fv, fc and offset of the healthy arm, shape (n, 3).
+        fv, fc and offset of the healthy arm (further columns are ignored), shape (n, 3 or more).
     inertia
-        What each joint's motor moves at the start (n,): it says what critical damping is.
+        Inertia about each joint at the start, for the critical damping, shape (n,).
+
+    Returns
+    -------
+    ndarray
+        One row per bristle, shape (B, COLUMNS).
 
     Raises
     ------
     ConfigError
-        If a joint has no Coulomb friction that the bristle could stand for.
+        If a joint has no Coulomb friction for a bristle to replace.
     """
     rows: list[NDArray[np.float64]] = []
-    mine = [h for h in hidden if h.place == "bristle"]
+    mine = [h for h in hidden if h.target == "bristle"]
     for j in sorted({h.joint for h in mine}):
         speed, coulomb = robot.joints[j].limits.velocity, float(friction[j, 1])
         extra, velocity, exponent, deflection, damping = 0.0, 0.02 * speed, 2.0, 4e-6 * speed, 0.0
-        # Sorted by name: the deflection of presliding comes first and yields to one given for Stribeck friction.
+        # Sorted by name: the deflection of presliding comes first and is replaced by one given for Stribeck friction.
         for h in sorted((h for h in mine if h.joint == j), key=lambda h: h.effect):
             if coulomb <= 0.0:
                 raise ConfigError(f"{h.where}: {robot.joints[j].name} has no Coulomb friction to make a bristle of")

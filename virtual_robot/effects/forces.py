@@ -1,4 +1,4 @@
-"""Hidden torques without memory: one row of a table and one branch of the compiled loop each."""
+"""Hidden torques without state: one row of a table and one branch of the compiled function each."""
 
 import math
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ CODES = (
 """Effects in the order of the branches of ``effect_torque``."""
 
 PARAMETERS = 6
-"""Parameters of a row; before them stand code, joint and other joint."""
+"""Number of parameters of a row, after code, joint and other joint."""
 
 
 @njit(cache=True, error_model="numpy")
 def _random(seed, cell):  # type: ignore[no-untyped-def]
-    """Uniform number in [0, 1) of a seed and an interval's number (splitmix64, Steele et al. 2014)."""
+    """Uniform random number in [0, 1) of a seed and the number of an interval (splitmix64, Steele et al. 2014)."""
     x = np.uint64(seed) * np.uint64(0xD1342543DE82EF95) + np.uint64(cell + 1) * np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -33,17 +33,32 @@ def _random(seed, cell):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def effect_torque(code, p, q, qd, motor, other, load, t, smoothing):  # type: ignore[no-untyped-def]
-    """Torque resisting the motion (N m) and its slope over ``qd`` (N m s/rad).
+    """Torque against the joint (N m) and its slope over ``qd`` (N m s/rad).
 
-    ``p`` are the parameters that ``force_table`` writes for effect ``CODES[code]``; ``q``, ``qd`` position and
-    velocity of the joint, ``motor`` the angle of its motor, ``other`` the velocity of the other joint, ``load`` the
-    torque that the gear passes on to the links, ``t`` the time.
+    Parameters
+    ----------
+    code
+        Index of the effect in ``CODES``.
+    p
+        Parameters of its row in `force_table`, shape (PARAMETERS,).
+    q, qd
+        Position and velocity of the joint, rad or m.
+    motor
+        Angle of its motor, rad.
+    other
+        Velocity of the other joint, rad/s or m/s.
+    load
+        Torque that the gear transmits to the links, N m.
+    t
+        Time, s.
+    smoothing
+        ``g`` in ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
     """
     side = 2.0 / math.pi * math.atan(smoothing * qd)
     side_slope = 2.0 / math.pi * smoothing / (1.0 + (smoothing * qd) ** 2)
     if code == 0:  # ratio fv |qd|
         return p[0] * abs(qd), p[0] * math.copysign(1.0, qd)
-    if code == 1:  # ratio fc, built up with the speed by the film of lubricant
+    if code == 1:  # ratio fc, which builds up with speed
         film = math.tanh(qd / p[1])
         return p[0] * film * film, p[0] * 2.0 * film * (1.0 - film * film) / p[1]
     if code == 2:  # fv qd (1 / (1 + |qd / v0|^exponent) - 1)
@@ -79,9 +94,21 @@ def effect_torque(code, p, q, qd, motor, other, load, t, smoothing):  # type: ig
 
 
 def force_table(hidden: Sequence[Hidden], robot: RobotConfig, friction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows for ``effect_torque``: code, joint, other joint (-1: none), parameters; shape (E, 3 + PARAMETERS).
+    """Table of hidden torques for `effect_torque`.
 
-    ``friction`` (n, 3) holds fv, fc and the offset of the healthy arm.
+    Parameters
+    ----------
+    hidden
+        Hidden effects.
+    robot
+        The robot.
+    friction
+        fv, fc and offset of the healthy arm (further columns are ignored), shape (n, 3 or more).
+
+    Returns
+    -------
+    ndarray
+        Code, joint, other joint (-1: none) and parameters of each torque, shape (E, 3 + PARAMETERS).
     """
     mine = [h for h in hidden if h.effect in CODES]
     table = np.zeros((len(mine), 3 + PARAMETERS))
@@ -128,7 +155,15 @@ def _row(h: Hidden, robot: RobotConfig, fv: float, fc: float) -> tuple[float, ..
 
 
 def waves(h: Hidden, joint: Joint) -> float:
-    """Angular wave number (1/rad or 1/m) of an effect with waves per turn of its joint, or per metre."""
+    """Angular wave number (1/rad or 1/m) of an effect that is periodic in the joint position.
+
+    Parameters
+    ----------
+    h
+        Hidden effect with the parameter ``per_turn``.
+    joint
+        Its joint.
+    """
     if joint.type == "revolute":
         return h.given("per_turn", 1.0)
     low, high = joint.limits.position

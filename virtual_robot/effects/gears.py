@@ -1,4 +1,4 @@
-"""Gears that give: motor and link are two masses with a spring, and perhaps a gap, between them."""
+"""Elastic gears: motor and link are two masses with a spring, and optionally backlash, between them."""
 
 import math
 from collections.abc import Sequence
@@ -11,18 +11,18 @@ from armident.configs import ConfigError, RobotConfig
 from armident.virtual_robot.effects.hidden import Hidden
 
 COLUMNS = 6
-"""Coordinate of the motor, coordinate of the link (-1: the ground), stiffness, damping, gap, its rounding."""
+"""Columns of a gear: coordinates of motor and link (-1: the base), stiffness, damping, gap, rounding of the gap."""
 CONTACT_HZ = 100.0
-"""Frequency of motor against link in the contact of a gap, unless the scenario gives its stiffness."""
+"""Natural frequency of motor against link in contact, Hz, unless the scenario gives the stiffness."""
 MOTOR_SHARE = 0.3
-"""Share of the motor in a joint's inertia where the robot's parameters do not tell them apart."""
+"""Motor's fraction of a joint's inertia if the robot has no separate rotor inertia."""
 ROUNDING = 0.004
-"""Way over which a contact closes, of the gap, to either side of its edge."""
+"""Distance over which a contact closes on either side of its edge, relative to the gap."""
 
 
 @njit(cache=True, error_model="numpy")
 def _press(way, rounding):  # type: ignore[no-untyped-def]
-    """How far a contact is pressed in that has closed by ``way`` (negative: open), and its slope."""
+    """Compression of a contact that has closed by ``way`` (negative: open), and its slope."""
     if way <= -rounding:
         return 0.0, 0.0
     if way >= rounding:
@@ -32,7 +32,15 @@ def _press(way, rounding):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
-    """Torque between motor and link (N m) at a ``twist`` (rad) and its rate, and its slopes over both."""
+    """Torque between motor and link (N m), and its slopes over twist and rate.
+
+    Parameters
+    ----------
+    row
+        Row of `gear_rows`, shape (COLUMNS,).
+    twist, rate
+        Position of the motor relative to the link (rad or m), and its rate.
+    """
     if row[4] == 0.0:
         return row[2] * twist + row[3] * rate, row[2], row[3]
     one, share = _press(twist - 0.5 * row[4], row[5])
@@ -42,7 +50,15 @@ def gear_torque(row, twist, rate):  # type: ignore[no-untyped-def]
 
 
 def twist_under(row: NDArray[np.float64], torque: float) -> float:
-    """Twist (rad) at which a gear at rest carries ``torque`` (N m)."""
+    """Twist (rad or m) of a gear at rest under a torque.
+
+    Parameters
+    ----------
+    row
+        Row of `gear_rows`, shape (COLUMNS,).
+    torque
+        Transmitted torque, N m or N.
+    """
     end = torque / float(row[2]) + math.copysign(float(row[4]), torque)
     low, high = min(0.0, end), max(0.0, end)
     for _ in range(80):
@@ -57,24 +73,33 @@ def twist_under(row: NDArray[np.float64], torque: float) -> float:
 def gear_rows(
     hidden: Sequence[Hidden], robot: RobotConfig, rotor: NDArray[np.float64], mass: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rows of the joints whose gear gives (E, COLUMNS), and what of the links' inertia is the motor's (E,).
-
-    The link of row e gets coordinate n + e.
+    """Parameters of the elastic gears; the link of gear e has coordinate n + e.
 
     Parameters
     ----------
+    hidden
+        Hidden effects.
+    robot
+        The robot.
     rotor
-        Rotor inertias (n, n), joint side.
+        Rotor inertias, joint side, shape (n, n).
     mass
-        Mass matrix (n, n) of the links alone at the start.
+        Mass matrix of the links alone at the start, shape (n, n).
+
+    Returns
+    -------
+    rows
+        One row per elastic gear, shape (G, COLUMNS).
+    moved
+        Inertia of the links that is assigned to the motor, by gear, shape (G,).
 
     Raises
     ------
     ConfigError
-        If the motor would have more inertia than motor and link together.
+        If the inertia of the motor exceeds that of motor and link together.
     """
     rows, moved = [], []
-    mine = [h for h in hidden if h.place == "gear"]
+    mine = [h for h in hidden if h.target == "gear"]
     for e, j in enumerate(sorted({h.joint for h in mine})):
         entries = {h.effect: h for h in mine if h.joint == j}
         first = next(iter(entries.values()))

@@ -1,19 +1,31 @@
-"""Checks the effects of a scenario against the catalogue and the robot."""
+"""Validation of the effects of a scenario against the catalogue and the robot."""
 
 import math
 from dataclasses import dataclass
 
 from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import HiddenEffect, Scenario
-from armident.virtual_robot.effects.catalogue import EFFECTS, Parameter, Place
+from armident.virtual_robot.effects.catalogue import EFFECTS, ParameterSpec, Target
 
 REPEATABLE = ("cogging_torque", "torque_bump", "position_dependent_friction", "encoder_eccentricity", "mains_ripple")
-"""Effects that one joint may have several of: harmonics, spots."""
+"""Effects that one joint may have several times, such as harmonics."""
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """A checked effect; joints by number, ``other`` -1 without one, values with defaults (``AUTO`` is NaN)."""
+    """Validated hidden effect.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    joint, other
+        Numbers of its joints; ``other`` is -1 if there is none.
+    values
+        Parameters including defaults; ``AUTO`` (NaN): derived from the robot.
+    where
+        Name of the entry in messages.
+    """
 
     effect: str
     joint: int
@@ -22,26 +34,43 @@ class Hidden:
     where: str
 
     @property
-    def place(self) -> Place:
-        """What it changes."""
-        return EFFECTS[self.effect].place
+    def target(self) -> Target:
+        """Target of the effect."""
+        return EFFECTS[self.effect].target
 
     def __getitem__(self, name: str) -> float:
         return self.values[name]
 
     def given(self, name: str, otherwise: float) -> float:
-        """Value of a parameter, ``otherwise`` if it is to follow from the robot."""
+        """Value of a parameter, or a default derived from the robot.
+
+        Parameters
+        ----------
+        name
+            Name of the parameter.
+        otherwise
+            Value if the parameter is ``AUTO``.
+        """
         value = self.values[name]
         return otherwise if math.isnan(value) else value
 
 
 def hidden_effects(scenario: Scenario | None, robot: RobotConfig, where: str = "scenario") -> tuple[Hidden, ...]:
-    """Check a scenario.
+    """Validate the effects of a scenario.
+
+    Parameters
+    ----------
+    scenario
+        The scenario; ``None``: no effects.
+    robot
+        The robot.
+    where
+        Name of the scenario in messages.
 
     Raises
     ------
     ConfigError
-        Naming the entry and what was expected.
+        If an entry is invalid; names the entry and the expected value.
     """
     out: list[Hidden] = []
     for k, entry in enumerate(() if scenario is None else scenario.effects):
@@ -94,7 +123,7 @@ def _values(entry: HiddenEffect, kind: str, at: str) -> dict[str, float]:
     return values
 
 
-def _check_range(value: float, parameter: Parameter, at: str) -> None:
+def _check_range(value: float, parameter: ParameterSpec, at: str) -> None:
     low, high = parameter.low, parameter.high
     if low <= value <= high and not (parameter.above and value == low):
         return

@@ -1,4 +1,4 @@
-"""Hidden errors between plant, drives and what is recorded: encoders, amplifiers, wiring, names."""
+"""Hidden errors of encoders, amplifiers, wiring and signal names between plant, drives and bus."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ Vector = NDArray[np.float64]
 
 @njit(cache=True, error_model="numpy")
 def _measured(q, encoders, to_joints):  # type: ignore[no-untyped-def]
-    """Joint positions (n,) with encoder errors: rows of joint, amplitude, phase and wave numbers (n,)."""
+    """Joint positions (n,) with encoder errors; rows of joint, amplitude, phase and wave numbers (n,)."""
     n = q.size
     error, out = np.zeros(n), q.copy()
     for e in range(encoders.shape[0]):
@@ -32,13 +32,13 @@ def _measured(q, encoders, to_joints):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def _applied(signal, level, knee, lag, lagging, period, torque):  # type: ignore[no-untyped-def]
-    """Joint torques (n,) of signals (n,); ``lagging`` moves on in place."""
+    """Joint torques (n,) of signals (n,); ``lagging`` is advanced in place."""
     n = signal.size
     given, out = np.empty(n), np.zeros(n)
     for j in range(n):
         mean = signal[j]
         if lag[j] > 0.0:
-            # The mean of the exponential over the period, which the plant holds.
+            # Mean of the exponential over the period, constant in the plant.
             left = math.exp(-period / lag[j])
             away = lagging[j] - signal[j]
             mean = signal[j] + away * lag[j] / period * (1.0 - left)
@@ -52,7 +52,7 @@ def _applied(signal, level, knee, lag, lagging, period, torque):  # type: ignore
 
 @njit(cache=True, error_model="numpy")
 def _reported(signal, past, newest, delay, leak, ripples, t):  # type: ignore[no-untyped-def]
-    """Signals (n,) as reported at ``t``; ``past`` (L, n) is a ring whose row ``newest`` gets the present one.
+    """Signals (n,) as reported at ``t``; row ``newest`` of the ring ``past`` (L, n) receives the present ones.
 
     Ripples are rows of drive, amplitude, angular frequency and phase.
     """
@@ -74,7 +74,7 @@ def _reported(signal, past, newest, delay, leak, ripples, t):  # type: ignore[no
 
 @njit(cache=True, error_model="numpy")
 def _permille(signal, noise, permille, out):  # type: ignore[no-untyped-def]
-    """Signals (n,) with noise as numbers on the bus, int16, into ``out`` (n,)."""
+    """Write signals (n,) with noise as numbers of the bus, int16, to ``out`` (n,)."""
     for j in range(signal.size):
         raw = math.floor((signal[j] + noise[j]) * permille[j] + 0.5)
         out[j] = np.int16(min(max(raw, -32768.0), 32767.0))
@@ -82,18 +82,18 @@ def _permille(signal, noise, permille, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def _rewired(own, origin, sign, low, high, out):  # type: ignore[no-untyped-def]
-    """Numbers (n,) of other drives with other signs, within what the bus can carry, into ``out`` (n,)."""
+    """Write numbers (n,) of permuted drives with changed signs, limited to the bus's range, to ``out`` (n,)."""
     for j in range(own.size):
         out[j] = min(max(sign[j] * np.int64(own[origin[j]]), low), high)
 
 
 class Signals:
-    """What becomes of positions and signals on their way, once per control period.
+    """Hidden errors of positions and signals, applied once per control period.
 
     Parameters
     ----------
     hidden
-        Effects; those of other places are ignored.
+        Hidden effects; only those with target ``drive`` or ``report`` are used.
     robot
         Transmission and drives.
     period
@@ -102,13 +102,13 @@ class Signals:
     Attributes
     ----------
     acts
-        Whether there is anything to do.
+        ``True`` if there is any such effect.
     swapped
-        Whether positions, demands or signals are recorded under other names or signs.
+        ``True`` if positions, demands or signals are recorded under other names or signs.
     """
 
     def __init__(self, hidden: Sequence[Hidden], robot: RobotConfig, period: float) -> None:
-        mine = [h for h in hidden if h.place in ("drive", "report")]
+        mine = [h for h in hidden if h.target in ("drive", "report")]
         self.acts = bool(mine)
         self.swapped = any(h.effect in ("sign_error", "joint_order") for h in mine)
         n, ratio = robot.n, robot.transmission_matrix
@@ -163,19 +163,37 @@ class Signals:
                         origin[both], sign[both] = origin[turned], sign[turned]
 
     def measured(self, q: Vector) -> Vector:
-        """Joint positions (n,) as the encoders have them."""
+        """Joint positions as measured by the encoders, shape (n,).
+
+        Parameters
+        ----------
+        q
+            Joint positions, rad or m, shape (n,).
+        """
         if not len(self._encoders):
             return q
         out: Vector = _measured(q, self._encoders, self._to_joints)
         return out
 
     def applied(self, signal: Vector) -> Vector:
-        """Joint torques (n,) that the motors give over the coming period at the drives' ``signal`` (n,)."""
+        """Joint torques of the motors over the next period, N m or N, shape (n,).
+
+        Parameters
+        ----------
+        signal
+            Signals of the drives, A, V or N m, shape (n,).
+        """
         out: Vector = _applied(signal, self._level, self._knee, self._lag, self._lagging, self._period, self._torque)
         return out
 
     def reported(self, signal: Vector) -> Vector:
-        """The drives' ``signal`` (n,) as it is reported now, before noise, in the drives' own order."""
+        """Reported signals at the present time, without noise, in the drives' own order, shape (n,).
+
+        Parameters
+        ----------
+        signal
+            Signals of the drives, A, V or N m, shape (n,).
+        """
         newest = -self._periods % len(self._past)
         out: Vector = _reported(
             signal, self._past, newest, self._delay, self._leak, self._ripples, self._periods * self._period
@@ -184,20 +202,46 @@ class Signals:
         return out
 
     def on_the_bus(self, signal: Vector, noise: Vector, permille: Vector, out: NDArray[np.int16]) -> None:
-        """Signals (n,) with noise, as numbers of ``permille`` per unit, into ``out`` (n,)."""
+        """Write the reported signals with noise as numbers of the bus.
+
+        Parameters
+        ----------
+        signal, noise
+            Signals of the drives, and their noise, shape (n,).
+        permille
+            Numbers per unit of the signal, shape (n,).
+        out
+            Numbers of the bus, int16, shape (n,), written in place.
+        """
         _permille(self.reported(signal), noise, permille, out)
 
     def rewired_torque(self, own: NDArray[np.int16], out: NDArray[np.int16]) -> None:
-        """The drives' ``own`` numbers (n,) under the names and signs that they are recorded with, into ``out``."""
+        """Write the torque signals under the names and signs of the recording.
+
+        Parameters
+        ----------
+        own
+            Numbers in the drives' own order, shape (n,).
+        out
+            Recorded numbers, shape (n,), written in place.
+        """
         _rewired(own, self.torque_from, self.torque_sign, -32768, 32767, out)
 
     def rewired_position(self, own: NDArray[np.int32], out: NDArray[np.int32]) -> None:
-        """The same of positions and demands, in counts."""
+        """Write positions or demands under the names and signs of the recording.
+
+        Parameters
+        ----------
+        own
+            Counts in the drives' own order, shape (n,).
+        out
+            Recorded counts, shape (n,), written in place.
+        """
         _rewired(own, self.position_from, self.position_sign, -(2**31), 2**31 - 1, out)
 
 
 def _encoder(h: Hidden, robot: RobotConfig) -> Vector:
-    """Joint, amplitude, phase, and wave numbers over the joint positions (n,): (3 + n,)."""
+    """Row of an encoder error: joint, amplitude, phase, and wave numbers over the joint positions, shape (3 + n,)."""
     joint, wave = robot.joints[h.joint], np.zeros(robot.n)
     if h["motor"] <= 0.5:
         wave[h.joint] = waves(h, joint)

@@ -115,7 +115,7 @@ def test_every_effect_of_the_catalogue_can_be_hidden_and_at_least_five_outside_i
     assert set(EXAMPLES) == set(EFFECTS)
     assert not set(CATALOGUE) & set(OUTSIDE)
     assert len(OUTSIDE) >= 5
-    assert {e for e in EFFECTS if EFFECTS[e].place == "force"} == {*CODES, "coupling_friction"}
+    assert {e for e in EFFECTS if EFFECTS[e].target == "force"} == {*CODES, "coupling_friction"}
 
 
 def test_a_scenario_needs_one_number_per_effect_at_most() -> None:
