@@ -1,16 +1,22 @@
-"""What every report shares: the page, its template, and figures drawn into it."""
+"""Templates and figures of the reports."""
 
 import base64
 import io
+import logging
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import matplotlib
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup, escape
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+# Matplotlib warns that it builds its font cache, which is no matter of the user's.
+logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
 
 INK, MUTED, MEASURED, MODEL, RESIDUAL, BAND = "#1d2733", "#6b7785", "#b3bac4", "#c2410c", "#2f6f9f", "#dfe8f1"
 STYLE: Any = {
@@ -38,18 +44,27 @@ _TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
+_TEMPLATES.filters["code"] = lambda text: Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 _TEMPLATES.filters["g"] = lambda value, digits=4: "" if value is None else f"{value:.{digits}g}"
 _TEMPLATES.filters["fixed"] = lambda value, digits=2: "" if value is None else f"{value:.{digits}f}"
 
 
 def render(template: str, **content: Any) -> str:
-    """Fill in a template of this package; the result needs no other file."""
+    """Return the HTML page of a template; it needs no other file.
+
+    Parameters
+    ----------
+    template
+        Name in ``templates``.
+    **content
+        Variables of the template.
+    """
     return _TEMPLATES.get_template(template).render(**content)
 
 
 @contextmanager
 def figure(rows: int, columns: int, height: float) -> Iterator[tuple["Figure", Any, list[str]]]:
-    """Draw on a grid of axes; the list receives the picture as a ``data:`` address when the block ends.
+    """Draw on a grid of axes; at the end of the block the list receives the picture as a ``data:`` URL.
 
     Parameters
     ----------
@@ -57,6 +72,11 @@ def figure(rows: int, columns: int, height: float) -> Iterator[tuple["Figure", A
         Size of the grid.
     height
         Height of one row, inches.
+
+    Yields
+    ------
+    tuple of Figure, ndarray and list of str
+        Figure, its axes (rows, columns), and the list for the picture.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
