@@ -1,4 +1,4 @@
-"""What every test may ask for: the shared data, and a bus of its own."""
+"""Fixtures of all tests: the measured data, a bus of its own, and the folder of results shared between processes."""
 
 import itertools
 import os
@@ -9,6 +9,7 @@ import hypothesis
 import pytest
 
 from armident.drivers.vcan import ensure_vcan, have_socketcan, remove_vcan
+from tests.fixtures.store import use_folder
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 NO_SOCKETCAN = "no SocketCAN in this kernel; run through `make test`"
@@ -25,6 +26,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         if os.environ.get("ARMIDENT_REQUIRE_VCAN") == "1":
             pytest.fail(NO_SOCKETCAN, pytrace=False)
         pytest.skip(NO_SOCKETCAN)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of this run in which its processes share recordings, estimates and diagnoses."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    use_folder(folder)
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -91,6 +91,7 @@ LEAST = {
 """Of the quick subset, one run of each effect: below what it comes to by two binomial deviations or more."""
 
 
+@pytest.mark.proof
 def test_most_of_the_quick_subset_is_named_and_no_healthy_arm_is_blamed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,7 +11,9 @@ from armident.identify.diagnosis import batch
 from armident.identify.evaluation.cases import all_cases
 from armident.virtual_robot.batch import record
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+proof = pytest.mark.proof
+"""Of the TX40, whose cases take a quarter of a minute each, `make test` runs three; the suite runs all of them."""
 
 
 def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]]:
@@ -45,6 +47,7 @@ def test_a_late_torque_of_joint_2_is_found_in_the_loop_that_it_makes(tmp_path: P
     assert told["verdict"] == "explained"
 
 
+@proof
 @pytest.mark.parametrize("run", [3, 5])
 def test_a_late_torque_is_no_friction_that_yields_where_noise_hides_what_the_loop_gains(
     run: int, tmp_path: Path
@@ -74,7 +77,7 @@ def test_a_link_that_swings_beyond_the_bandwidth_is_found_where_measured_positio
     )
 
 
-@pytest.mark.parametrize("run", [2, 5])
+@pytest.mark.parametrize("run", [2, pytest.param(5, marks=proof)])
 def test_a_link_on_a_spring_is_found_at_its_own_joint_although_the_one_before_shows_more_of_it(
     run: int, tmp_path: Path
 ) -> None:
@@ -94,6 +97,7 @@ def test_a_link_on_a_spring_is_found_at_its_own_joint_although_the_one_before_sh
         assert errors["after"]["by_joint"][joint] < 0.93 * errors["before"]["by_joint"][joint]
 
 
+@proof
 @pytest.mark.parametrize("strength", ["obvious tx40 run 2", "typical tx40 run 2"])
 def test_a_coupling_has_to_account_for_both_of_its_joints(strength: str, tmp_path: Path) -> None:
     """Crosstalk of currents, which the catalogue does not have, is no coupling of friction.
@@ -109,7 +113,11 @@ def test_a_coupling_has_to_account_for_both_of_its_joints(strength: str, tmp_pat
 
 
 @pytest.mark.parametrize(
-    "case", ["outside stick_events joint_2 obvious tx40 run 4", "outside stick_events joint_1 typical emps run 1"]
+    "case",
+    [
+        pytest.param("outside stick_events joint_2 obvious tx40 run 4", marks=proof),
+        "outside stick_events joint_1 typical emps run 1",
+    ],
 )
 def test_friction_for_moments_at_random_times_is_no_noise(case: str, tmp_path: Path) -> None:
     """Dirt in the gear, which the catalogue does not have, adds a small part to the power of the residual."""
@@ -155,6 +163,7 @@ def test_friction_far_from_where_it_seems_is_found_where_the_arm_sticks_and_its_
     assert errors["after"]["all"] < 1.0
 
 
+@proof
 def test_friction_of_a_joint_that_moves_the_same_without_it_is_looked_for_in_its_own_loop(tmp_path: Path) -> None:
     """With it the simulated wrist follows the arm neither better nor worse; the torque of its reversals differs."""
     case = "pair asymmetric_viscous_friction joint_2 and stribeck_friction joint_5 typical tx40 run 5"
@@ -166,6 +175,7 @@ def test_friction_of_a_joint_that_moves_the_same_without_it_is_looked_for_in_its
     assert told["verdict"] == "explained"
 
 
+@proof
 def test_what_shows_at_no_joint_alone_shows_at_all_of_them_together(tmp_path: Path) -> None:
     """A base that shakes: a thousandth by chance is no alarm at the worst of six joints, but is one over all."""
     told, _ = diagnosed("outside base_vibration joint_1 typical tx40 run 5", tmp_path)
@@ -182,6 +192,7 @@ def test_a_saturated_drive_is_found_where_a_stiff_loop_moves_the_same_without_it
     assert abs(found["parameters"]["gain_loss"] - hidden["gain_loss"]) < 3.0 * found["evidence"]["std"]["gain_loss"]
 
 
+@proof
 @pytest.mark.parametrize("joint", ["joint_3", "joint_5"])
 def test_a_joint_that_yields_before_it_slides_is_found_where_the_rigid_loop_reverses_at_other_instants(
     joint: str, tmp_path: Path
@@ -192,6 +203,7 @@ def test_a_joint_that_yields_before_it_slides_is_found_where_the_rigid_loop_reve
     assert (found["effect"], found["joint"], told["verdict"]) == ("presliding_friction", joint, "explained")
 
 
+@proof
 @pytest.mark.parametrize(
     "case", ["friction_drift joint_5 typical tx40 run 4", "joint_spring joint_4 typical tx40 run 1"]
 )

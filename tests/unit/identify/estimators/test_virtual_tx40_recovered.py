@@ -22,7 +22,6 @@ ESSENTIAL = (
     *("mx4", "ia4", "fv4", "fc4", "my5r", "ia5", "fv5", "fc5", "ia6", "fv6", "fc6", "fvm6", "fcm6"),
 )
 """Table B.4."""
-SEEDS = 20
 
 
 @cache
@@ -100,10 +99,12 @@ def test_a_recording_without_reference_still_gives_the_parameters() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1800)
-def test_essential_parameters_are_recovered_within_their_own_standard_deviations_over_20_seeds() -> None:
+@pytest.mark.parametrize(
+    "seeds", [3, pytest.param(20, marks=[pytest.mark.proof, pytest.mark.timeout(1800)])], ids=lambda n: f"{n} seeds"
+)
+def test_essential_parameters_are_recovered_within_their_own_standard_deviations(seeds: int) -> None:
     deviations, outside = [], []
-    for seed in range(1, SEEDS + 1):
+    for seed in range(1, seeds + 1):
         experiments, _ = experiments_from_recording(simulate_recording(robot(), trajectory(), seed=seed), robot())
         result = identify_experiment(experiments, robot(), Options())
         assert result.converged
@@ -114,4 +115,5 @@ def test_essential_parameters_are_recovered_within_their_own_standard_deviations
     assert np.mean(z < 3) >= 0.98
     assert z.max() < 5
     # White residuals have 5 % of their lags outside; the mean over 20 seeds and 20 lags is known to 1 %.
-    assert (np.mean(outside, axis=0) < 0.08).all()
+    known = 0.01 * np.sqrt(20 / seeds)
+    assert (np.mean(outside, axis=0) < 0.05 + 3 * known).all()
