@@ -1,5 +1,6 @@
-"""The commands of this room, as the command line sees them."""
+"""Commands of data acquisition: options and help texts; the work is imported when a command runs."""
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,20 +12,23 @@ if TYPE_CHECKING:
 
 def capture(
     config: Annotated[str, typer.Option("--config", help="Session configuration.")] = "tx40_cell.yaml",
-    out: Annotated[Path | None, typer.Option("--out", help="Directory of recordings; default: the session's.")] = None,
-    duration: Annotated[float | None, typer.Option("--duration", help="Stop after so many seconds.", min=0.001)] = None,
-    listen_only: Annotated[bool, typer.Option("--listen-only", help="Send nothing at all to the bus.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Directory of recordings; default: that of the session.")
+    ] = None,
+    duration: Annotated[float | None, typer.Option("--duration", help="Stop after this time, s.", min=0.001)] = None,
+    listen_only: Annotated[bool, typer.Option("--listen-only", help="Send nothing to the bus.")] = False,
     sniff: Annotated[
         float | None,
-        typer.Option("--sniff", min=0.1, help="With --listen-only: find out in so many seconds what drives send."),
+        typer.Option("--sniff", min=0.1, help="With --listen-only: discover the TPDOs of the drives in this time, s."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print path and counters as JSON.")] = False,
 ) -> None:
     """Record the drives of a session to an MCAP file and publish them on Zenoh.
 
-    Starts and supervises the drives, plays the session's trajectory if it has one, and ends when that is over, after
-    --duration, or on Ctrl-C or SIGTERM; the file is finished in every case. With --listen-only nothing is sent, not
-    even to configure the drives: what they send is what the session says, or with --sniff what is heard.
+    The capture configures and supervises the drives and moves the arm along the trajectory of the session, if there is
+    one. It ends with the trajectory, after --duration, on Ctrl-C or SIGTERM; the file is finished in every case. With
+    --listen-only nothing is sent, and the drives are not configured: their TPDOs are those of the session, or with
+    --sniff those that are received.
 
     Example: armident capture --config tx40_cell.yaml --out recordings
     """
@@ -35,14 +39,14 @@ def capture(
 
 def command(
     name: Annotated[str, typer.Argument(help="save, mark, reload or stop.")],
-    text: Annotated[str, typer.Argument(help="What a mark says.")] = "",
+    text: Annotated[str, typer.Argument(help="Text of the mark.")] = "",
     config: Annotated[str, typer.Option("--config", help="Session configuration of the capture.")] = "tx40_cell.yaml",
 ) -> None:
-    """Ask a running capture for something: save what was just recorded, set a mark, reload its session, or stop.
+    """Send a command to a running capture: save the last seconds, set a mark, reload the session, or stop.
 
-    The session of the capture has to allow it (zenoh.commands: true). `save` is for sessions with recording.trigger,
-    which keep only what happens around events; `systemctl kill -s USR1` asks for the same without Zenoh.
-    `reload` reads the session again, as `systemctl reload` does: what can change without losing a sample does.
+    The session must permit it (zenoh.commands: true). `save` applies to sessions with recording.trigger, which record
+    only around events; `systemctl kill -s USR1` does the same without Zenoh. `reload` reads the session again, as
+    `systemctl reload` does, and applies the keys that can change without losing a sample.
 
     Example: armident command mark "gripper changed" --config cell.yaml
     """
@@ -51,29 +55,38 @@ def command(
 
     known = next((each for each in COMMANDS if each == name), None)
     if known is None:
-        raise ConfigError(f"no command {name!r}; there are {', '.join(COMMANDS)}")
+        raise ConfigError(f"no command {name!r}; choose from {', '.join(COMMANDS)}")
     session = load_session(config)
     send_command(session, load_robot(session.robot).name, Command(known, text))
     print(f"{name}: accepted")
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, rosbag2's MCAP, or the log of a bus.")],
-    config: Annotated[str, typer.Option("--config", help="Robot configuration; of a bus log the session's.")],
+    file: Annotated[Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, rosbag2 (MCAP), or a bus log.")],
+    config: Annotated[
+        str, typer.Option("--config", help="Robot configuration; for a bus log the session configuration.")
+    ],
     out: Annotated[Path, typer.Option("--out", help="The recording to write.")],
-    effort: Annotated[Path | None, typer.Option("--effort", help="Second CSV with one effort per joint.")] = None,
-    motor_side: Annotated[bool, typer.Option("--motor-side", help="Values are the motors', not the joints'.")] = False,
+    effort: Annotated[
+        Path | None, typer.Option("--effort", help="Second CSV file with one effort column per joint.")
+    ] = None,
+    motor_side: Annotated[
+        bool, typer.Option("--motor-side", help="Values are those of the motors, not of the joints.")
+    ] = False,
     rate: Annotated[
         float | None, typer.Option("--rate", help="Sampling rate, Hz; default: column t.", min=0.001)
     ] = None,
     names: Annotated[
-        str, typer.Option("--map", help="Names in the file: position=qm,voltage=vir,...; demand=- leaves it out.")
+        str, typer.Option("--map", help="Names in the file: position=qm,voltage=vir,...; demand=- omits it.")
     ] = "",
     polled: Annotated[
-        bool, typer.Option("--polled", help="Rows were read without waiting: put them on the clock of --rate.")
+        bool,
+        typer.Option(
+            "--polled", help="Timestamps jitter because samples were polled: resample to an even clock at --rate."
+        ),
     ] = False,
 ) -> None:
-    """Make a recording of measurements that other tools wrote.
+    """Convert measurements of other tools to a recording.
 
     CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the reference qr1..qrn; SI units. MAT, NPZ
     and Parquet: the same names, or positions, torques, times. ROS 2 bags (.mcap): sensor_msgs/msg/JointState. Logs of
@@ -88,7 +101,7 @@ def import_(
 
     if file.suffix.lower() in SUFFIXES:
         if effort is not None or motor_side or rate is not None or names or polled:
-            raise ConfigError(f"{file}: what is in the log of a bus is said by --config alone")
+            raise ConfigError(f"{file}: a bus log takes no option but --config and --out")
         session = load_session(config)
         logged = recording_from_log(file, session, load_robot(session.robot))
         write_recording(logged, out)
@@ -115,7 +128,7 @@ def import_(
 
 
 def _fields(recording: "Recording") -> str:
-    """What a recording holds, in words."""
+    """Return the names of the fields of a recording."""
     return ", ".join(name for stream in recording.streams.values() for name in stream.fields)
 
 
@@ -126,10 +139,10 @@ def export(
         typer.Option("--out", help="File to write: .csv, .npz, .mat, .parquet, .mcap (ROS 2), .log, .asc, .blf, .trc."),
     ],
 ) -> None:
-    """Write a recording for other tools, in SI units at the joints.
+    """Export a recording for other tools, in SI units at the joints.
 
     .mcap is a rosbag2 file with sensor_msgs/msg/JointState; .log (candump -l), .asc, .blf and .trc hold the SYNCs and
-    TPDOs that it was recorded from.
+    TPDOs of the recording.
 
     Example: armident export tx40.mcap --out tx40.csv
     """
@@ -138,7 +151,7 @@ def export(
 
     read = read_recording(recording)
     if read.missing is not None:
-        typer.echo(f"armident: warning: {recording}: {read.missing}", err=True)
+        logging.getLogger(__name__).warning("%s: %s", recording, read.missing)
     export_recording(read, out)
     print(out)
 
@@ -147,15 +160,15 @@ def doctor(
     config: Annotated[str, typer.Option("--config", help="Session configuration.")] = "tx40_cell.yaml",
     as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
 ) -> None:
-    """Check a session and this machine before a capture: configuration, bus, clock, disk, Zenoh.
+    """Check session and machine before a capture: configuration, bus, clock, disk, Zenoh.
 
-    Nothing is sent to the bus. Exit code 2 if a capture would not run; warnings alone are exit code 0.
+    Nothing is sent to the bus. The exit code is 2 if a capture would not run, and 0 if there are only warnings.
 
     Example: armident doctor --config cell.yaml
     """
-    from armident.daq.doctor import doctor as examine
+    from armident.daq.doctor import doctor as run
 
-    examine(config, print, as_json)
+    run(config, as_json)
 
 
 def heal(

@@ -1,4 +1,4 @@
-"""Checks a machine and a session before a capture is started: what would fail, and what to do about it."""
+"""The command ``armident doctor``: checks session and machine before a capture, and names the remedies."""
 
 import json
 import os
@@ -7,7 +7,7 @@ import socket
 import statistics
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -34,25 +34,41 @@ from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 Verdict = Literal["ok", "warning", "failed"]
 
 _LEAST_HOURS = 24.0
-"""Hours of recording that the disk should have room for."""
+"""Recording time for which the disk should have space, h."""
 
 _CHUNKS = 20
-"""Written to see how fast the disk is."""
+"""Number of chunks that are written to measure the speed of the disk."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at: what, how it is, and in words what was found and what to do."""
+    """Result of one check.
 
-    what: str
+    Parameters
+    ----------
+    name
+        Name of the check.
+    verdict
+        ``ok``, ``warning`` or ``failed``: a capture would not run.
+    message
+        Findings, and the remedy if there are any.
+    """
+
+    name: str
     verdict: Verdict
-    found: str
+    message: str
 
 
-def examine(config: str | Path) -> list[Check]:
-    """Look at everything that a capture of a session needs; nothing is sent, and nothing is written but a probe.
+def run_checks(config: str | Path) -> list[Check]:
+    """Check everything that a capture of a session needs.
 
-    What depends on the configuration is left out where that cannot be read, which is a check of its own.
+    Nothing is sent to the buses, and only a probe file is written. If the configuration is invalid, the checks are that
+    and the clock.
+
+    Parameters
+    ----------
+    config
+        Session configuration.
     """
     checks: list[Check] = []
     try:
@@ -89,11 +105,11 @@ def _bus_load(session: SessionConfig, config: str | Path) -> Check:
 
 
 def _interface(bus: Bus) -> Iterator[Check]:
-    """The interface of a bus, its state, whose clock stamps its frames, and whether its bit rates are as configured."""
+    """Check interface, state, bit rates, time stamps and receive buffer of a bus."""
     name = bus.channel
     if bus.interface == "udp_multicast":
         yield Check(
-            "bus", "warning", "UDP multicast stands in for a bus: frames may be lost and times are not the kernel's"
+            "bus", "warning", "UDP multicast instead of CAN: frames may be lost, times are not those of the kernel"
         )
         return
     if not have_socketcan():
@@ -115,7 +131,7 @@ def _interface(bus: Bus) -> Iterator[Check]:
             return
     state = details.get("state")
     if state not in (None, "ERROR-ACTIVE"):
-        yield Check("bus", "warning", f"{name} is {state}: look at its cabling and termination")
+        yield Check("bus", "warning", f"{name} is {state}: check its cabling and termination")
         return
     timing = details.get("bittiming")
     rate = f" at {timing['bitrate']} bit/s" if isinstance(timing, dict) and "bitrate" in timing else ""
@@ -132,7 +148,7 @@ def _is_can(path: Path) -> bool:
 
 
 def _link(name: str) -> dict[str, object]:
-    """What `ip` knows of a CAN interface: state and bit timing; nothing where it cannot be asked."""
+    """Return state and bit timing of a CAN interface from `ip`; empty if that fails."""
     try:
         done = subprocess.run(
             ["ip", "-json", "-details", "link", "show", "dev", name],
@@ -148,7 +164,7 @@ def _link(name: str) -> dict[str, object]:
 
 
 def _receive_buffer(bus: Bus) -> Check:
-    """Whether the kernel keeps as many frames as the capture asks for, while it cannot look."""
+    """Check the size of the receive buffer, which holds the frames while the capture does not run."""
     try:
         with RawSocket(bus.channel, fd=bus.fd) as receiver:
             given = receiver.receive_buffer
@@ -165,13 +181,13 @@ def _receive_buffer(bus: Bus) -> Check:
 
 
 def _clock() -> Check:
-    """Whether something disciplines the clock, and which source it has."""
+    """Check source and synchronisation of the system clock."""
     source = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     name = source.read_text().strip() if source.is_file() else "unknown"
     try:
         state = clock_state()
     except OSError as error:
-        return Check("clock", "warning", f"source {name}; its state cannot be asked: {error.strerror}")
+        return Check("clock", "warning", f"source {name}; its state is unknown: {error.strerror}")
     if not state.synchronised:
         return Check(
             "clock", "warning", f"source {name}, not synchronised: run chrony, or times of several machines drift apart"
@@ -181,7 +197,7 @@ def _clock() -> Check:
 
 
 def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:
-    """Whether recordings can be written, and how long there is room."""
+    """Check that recordings can be written, the speed of the disk, and its free space."""
     folder = session.recording.directory
     rate = (
         sum(s.layout.record[0].itemsize / s.layout.every for s in captured_streams(session, robot))
@@ -204,7 +220,9 @@ def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:
     found = f"{folder}: {free / 1e9:.1f} GB free, at least {hours:.0f} h ({rate * 3.6e-6:.1f} GB/h before compression)"
     options = session.recording
     if hours < _LEAST_HOURS and options.keep_days is None and options.min_free_gb is None:
-        yield Check("recordings", "warning", f"{found}; recording.min_free_gb or keep_days would make room")
+        yield Check(
+            "recordings", "warning", f"{found}; set recording.min_free_gb or keep_days to delete old recordings"
+        )
     elif options.min_free_gb is not None and free < options.min_free_gb * 1e9:
         yield Check(
             "recordings",
@@ -216,7 +234,7 @@ def _disk(session: SessionConfig, robot: RobotConfig) -> Iterator[Check]:
 
 
 def _write_times(probe: Path, size: int) -> list[float]:
-    """How long the disk takes for chunks, s."""
+    """Return the times in which chunks of ``size`` bytes are written and synced, s."""
     times, content = [], os.urandom(size)
     with probe.open("xb", buffering=0) as file:
         for _ in range(_CHUNKS):
@@ -228,20 +246,18 @@ def _write_times(probe: Path, size: int) -> list[float]:
 
 
 def _speed(times: list[float], span_s: float) -> Check:
-    """Whether a disk that took so long for chunks keeps up with a capture that writes one every ``span_s``."""
+    """Check the times of writing chunks (s) against the time span of a chunk (s)."""
     usual, worst = statistics.median(times), max(times)
     found = (
         f"{1e3 * span_s:.0f} ms of rows are written and synced in {1e3 * usual:.2g} ms, {1e3 * worst:.2g} ms at worst"
     )
     if usual > 0.5 * span_s:
-        return Check(
-            "disk", "warning", f"{found}: too slow; a larger recording.chunk_ms asks less often, and loses more"
-        )
+        return Check("disk", "warning", f"{found}: too slow; try a larger recording.chunk_ms (a crash loses more then)")
     return Check("disk", "ok", found)
 
 
 def _zenoh(session: SessionConfig) -> Check:
-    """Whether Zenoh understands its configuration, and the capture's own port is free."""
+    """Check the configuration of Zenoh, and that the port of the capture is free."""
     try:
         configuration(session, "capture")
     except ConfigError as error:
@@ -254,26 +270,31 @@ def _zenoh(session: SessionConfig) -> Check:
         try:
             probe.bind((host, int(port)))
         except OSError as error:
-            return Check(
-                "zenoh", "warning", f"{host}:{port}: {error.strerror}; does a capture of this cell run already?"
-            )
+            return Check("zenoh", "warning", f"{host}:{port}: {error.strerror}; is a capture of this cell running?")
     return Check("zenoh", "ok", f"peers on loopback, port {port}")
 
 
-def doctor(config: str, say: Callable[[str], None], as_json: bool) -> None:
-    """``armident doctor``.
+def doctor(config: str, as_json: bool) -> None:
+    """Run ``armident doctor``: print the checks.
+
+    Parameters
+    ----------
+    config
+        Session configuration.
+    as_json
+        Print JSON.
 
     Raises
     ------
     ConfigError
-        If something would keep a capture from running.
+        If a check failed: a capture would not run.
     """
-    checks = examine(config)
+    checks = run_checks(config)
     if as_json:
-        say(json.dumps([{"what": c.what, "verdict": c.verdict, "found": c.found} for c in checks]))
+        print(json.dumps([{"what": c.name, "verdict": c.verdict, "found": c.message} for c in checks]))
     else:
         for check in checks:
-            say(f"{check.verdict:8} {check.what}: {check.found}")
-    failed = [check.what for check in checks if check.verdict == "failed"]
+            print(f"{check.verdict:8} {check.name}: {check.message}")
+    failed = [check.name for check in checks if check.verdict == "failed"]
     if failed:
         raise ConfigError(f"{config}: a capture would not run: {', '.join(failed)}")

@@ -1,1 +1,1 @@
-"""The guard: a process that watches a moving arm on its bus, and stops the drives within one cycle."""
+"""The guard: a process that monitors a moving arm on its bus, and stops the drives within one cycle."""

@@ -10,15 +10,15 @@ def guard(
     following_s: Annotated[
         float,
         typer.Option(
-            "--following", min=0.001, help="Following error allowed: seconds of motion at the velocity limit."
+            "--following", min=0.001, help="Largest following error, in seconds of motion at the velocity limit."
         ),
     ] = 0.1,
 ) -> None:
-    """Watch a moving arm on its bus, and stop its drives within one cycle when something is wrong.
+    """Monitor a moving arm on its bus, and stop its drives within one cycle when a limit is violated.
 
-    A quick stop (CiA 402) is ordered when a joint leaves its limits of position, velocity or torque, or lags too far
-    behind its set points; on EMCY, a lost heartbeat, a drive that leaves operational, SYNC that fails in the middle of
-    the motion, and on Ctrl-C or SIGTERM. `armident reidentify` runs one beside every capture.
+    The guard commands a quick stop (CiA 402) when a joint exceeds its limits of position, velocity, torque or following
+    error. So it does on EMCY, a lost heartbeat, a drive that leaves the state operational, missing SYNC during the
+    motion, Ctrl-C and SIGTERM. `armident reidentify` runs a guard beside every capture.
 
     Example: armident guard --config tx40_cell.yaml
     """

@@ -1,4 +1,4 @@
-"""What a moving arm may do before its drives are stopped."""
+"""Limits of a moving arm beyond which the guard stops its drives."""
 
 from dataclasses import dataclass
 
@@ -8,29 +8,38 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig
 
 FOLLOWING_S = 0.1
-"""A joint may lag behind its demand by what it covers in this time at its velocity limit, s."""
+"""Largest following error, as the time of motion at the velocity limit, s."""
 
 VELOCITY_S = 0.01
-"""Velocity is a difference of positions over this time (s): a lost frame must not look like haste."""
+"""Time over which positions are differentiated, s; long enough that a lost frame is no excess velocity."""
 
 TORQUE_S, TORQUE_SAMPLES = 0.01, 20
-"""Torque is a mean over this time (s) and at least so many samples: measured currents chop, gears do not feel it."""
+"""Torque is averaged over this time (s) and at least this number of samples, to suppress ripple of the current."""
 
 TORQUE_PEAK = 2.0
-"""A single sample beyond this multiple of the limit is no chopping."""
+"""Multiple of the torque limit that no single sample may exceed."""
 
 HEARTBEATS_MISSED = 3
 HEARTBEAT_MARGIN_S = 0.1
-"""A drive is lost after so many of its heartbeat periods, and what a host may be late on top; so is SYNC."""
+"""A heartbeat or SYNC is lost after this number of heartbeat periods plus a margin for the delay of the host, s."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the joints, (n,) each: rad or m, per second, N m or N.
+    """Limits of the joints.
 
-    ``following`` is the largest distance between demand and position.
+    Parameters
+    ----------
+    low, high
+        Range of position (n,), rad or m.
+    velocity
+        Largest speed (n,), rad/s or m/s.
+    torque
+        Largest effort (n,), N m or N.
+    following
+        Largest distance between demand and position (n,), rad or m.
     """
 
     low: Floats
@@ -41,14 +50,14 @@ class Limits:
 
 
 def limits_of(robot: RobotConfig, following_s: float = FOLLOWING_S) -> Limits:
-    """Limits as the robot's configuration states them.
+    """Return the limits of a robot.
 
     Parameters
     ----------
     robot
-        The robot.
+        Robot whose joints have limits.
     following_s
-        See `FOLLOWING_S`.
+        Largest following error, as the time of motion at the velocity limit, s.
     """
     limits = [joint.limits for joint in robot.joints]
     velocity = np.array([limit.velocity for limit in limits])

@@ -1,4 +1,4 @@
-"""Frame by frame through what is on the bus, compiled: the first thing that a moving arm must not do."""
+"""Monitor of a moving arm: checks every frame on its buses against the limits, in compiled code."""
 
 from dataclasses import dataclass
 
@@ -32,40 +32,51 @@ from armident.drivers.canopen.objects import (
 )
 
 IDENTIFIERS = 2048
+"""Number of 11-bit identifiers."""
 SYNC, SAMPLE, DEMAND, SETPOINT, EMCY, HEARTBEAT, NMT = range(7)
-"""Kinds of frames."""
+"""Kinds of frames: DEMAND is a TPDO with the demand of a drive, SETPOINT an RPDO with its target."""
 
-QUIET, POSITION, VELOCITY, TORQUE, FOLLOWING, EMERGENCY, STATE, SILENT, NO_SYNC = range(9)
-"""What can be wrong."""
+NO_ALARM, POSITION, VELOCITY, TORQUE, FOLLOWING, EMERGENCY, STATE, SILENT, NO_SYNC = range(9)
+"""Causes of an alarm."""
 
 ARMED, JOINT, FRAME = range(3)
-"""Places in the state: whether set points are played; then joint and frame of an alarm."""
+"""Indices of the state: 1 while set points are played; joint and frame of an alarm."""
 
 LAST, SINCE = range(2)
-"""Rows of what is known of SYNC on every bus: when the last one came (ns), and how many since a set point."""
+"""Rows of the state of SYNC on every bus: time of the last one (ns), and number since a set point."""
 
 ARMED_STATE = int(NmtState.OPERATIONAL)
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """Why the drives have to be stopped; ``frame`` is the number of the frame in its batch, -1 for a silence."""
+    """A reason to stop the drives.
+
+    Parameters
+    ----------
+    text
+        Joint, measured value and limit.
+    frame
+        Index of the frame in its batch; -1 for missing frames.
+    """
 
     text: str
     frame: int
 
 
-class Watch:
-    """What was on the buses so far; give it every batch of frames.
+class MotionMonitor:
+    """Checks all frames on the buses of a moving arm.
 
-    It is armed by the first set point and disarmed by the NMT command that ends the motion.
+    The first set point arms it; the NMT command that ends the motion disarms it.
 
     Parameters
     ----------
-    session, robot
-        Nodes, streams and scales.
+    session
+        Gives nodes, streams and set points.
+    robot
+        Gives transmission, scales and drive gains.
     limits
-        What is allowed.
+        Limits of the joints.
 
     Raises
     ------
@@ -79,9 +90,9 @@ class Watch:
         self._robot, self._limits, n = robot, limits, robot.n
         shape = len(session.all_buses), IDENTIFIERS
         self._kind, self._joint = np.full(shape, -1, np.int64), np.zeros(shape, np.int64)
-        self._at = np.full(3, -1, np.int64)
+        self._offsets = np.full(3, -1, np.int64)
         self._identify(session, robot)
-        # Of a packed TPDO the newest sample is looked at.
+        # The newest sample of a packed TPDO is checked.
         pack = session.streams["samples"].pack
         period = session.sync_period * pack
         self._per_count = np.linalg.inv(robot.transmission_matrix) / counts_per_si(robot)
@@ -102,19 +113,19 @@ class Watch:
         self._silence = round(heartbeat * 1e9)
 
     def _identify(self, session: SessionConfig, robot: RobotConfig) -> None:
-        """Which identifier means what; the drives' own demand is taken where they send it, else the set points."""
+        """Set kind and joint of every identifier; the demand is that of the drives if they send it, else the target."""
         nodes = node_ids(session, robot)
         samples = session.streams["samples"]
-        at = _places(samples)
+        at = _byte_offsets(samples)
         if "position" not in at:
             raise ConfigError("streams.samples.objects: the guard needs the position of every drive")
-        self._at[:] = at["position"], at.get("current", at.get("torque", -1)), 0
+        self._offsets[:] = at["position"], at.get("current", at.get("torque", -1)), 0
         self._kind[:, [COB_SYNC, COB_NMT]] = SYNC, NMT
         assert session.setpoints is not None
-        told = None
+        stream_of_demand = None
         for stream in session.streams.values():
             if "demand" in stream.objects and stream is not samples:
-                told = stream
+                stream_of_demand = stream
         for j, (node, bus) in enumerate(zip(nodes, bus_numbers(session, robot), strict=True)):
             kinds = {
                 tpdo_cob(samples.tpdo, node): SAMPLE,
@@ -122,45 +133,51 @@ class Watch:
                 COB_EMCY + node: EMCY,
                 COB_HEARTBEAT + node: HEARTBEAT,
             }
-            if told is not None:
-                kinds[tpdo_cob(told.tpdo, node)] = DEMAND
+            if stream_of_demand is not None:
+                kinds[tpdo_cob(stream_of_demand.tpdo, node)] = DEMAND
             for identifier, kind in kinds.items():
                 self._kind[bus, identifier], self._joint[bus, identifier] = kind, j
-        self._own_demand = told is not None
-        if told is not None:
-            self._at[2] = _places(told)["demand"]
+        self._own_demand = stream_of_demand is not None
+        if stream_of_demand is not None:
+            self._offsets[2] = _byte_offsets(stream_of_demand)["demand"]
 
     def identifiers(self, bus: int) -> list[int]:
-        """COB-IDs that it wants to see of a bus."""
+        """Return the COB-IDs of a bus that are checked.
+
+        Parameters
+        ----------
+        bus
+            Number of the bus, in the order of the session.
+        """
         return [int(k) for k in np.flatnonzero(self._kind[bus] >= 0)]
 
     @property
     def armed(self) -> bool:
-        """Whether set points are being played."""
+        """True while set points are played."""
         return bool(self._state[ARMED])
 
-    def look(self, frames: Frames, now_ns: int, bus: int = 0) -> Alarm | None:
-        """Take frames, in the order in which they were on the bus; the first reason to stop, if there is one.
+    def check(self, frames: Frames, now_ns: int, bus: int = 0) -> Alarm | None:
+        """Check the next frames of a bus, and return the first reason to stop.
 
         Parameters
         ----------
         frames
-            What came since the last call, shape (N,), N from 0.
+            Frames (N,) since the last call, in the order of the bus; N may be 0.
         now_ns
-            Monotonic time before they were taken.
+            Monotonic time before they were received, ns.
         bus
             Number of the bus, in the order of the session.
         """
         limits = self._limits
         code = check_batch(
             frames["can_id"], frames["length"], frames["data"], now_ns, bus,
-            self._kind[bus], self._joint[bus], self._at, self._own_demand, self._every,
+            self._kind[bus], self._joint[bus], self._offsets, self._own_demand, self._every,
             self._raw, self._seen, self._demanded, self._beat, self._silence,
             self._per_count, self._per_mille, self._positions, self._efforts, self._samples, self._velocity_s,
             limits.low, limits.high, limits.velocity, limits.torque, limits.following,
             self._state, self._sync, self._value,
         )  # fmt: skip
-        return None if code == QUIET else Alarm(self._text(code), int(self._state[FRAME]))
+        return None if code == NO_ALARM else Alarm(self._text(code), int(self._state[FRAME]))
 
     def _text(self, code: int) -> str:
         joint = self._robot.joints[int(self._state[JOINT])]
@@ -184,19 +201,19 @@ class Watch:
         return f"no SYNC for {found:.2f} s in the middle of the motion; has the capture died?"
 
 
-def _places(stream: Stream) -> dict[str, int]:
-    """First byte of each object in the TPDO of a stream, of the newest sample where it is packed."""
+def _byte_offsets(stream: Stream) -> dict[str, int]:
+    """Return the first byte of each object in the TPDO of a stream, of the newest sample if it is packed."""
     layout = TpdoLayout.of(stream.objects, "streams", stream.pack, fd=True)
-    at, places = layout.size * (stream.pack - 1), {}
+    offset, offsets = layout.size * (stream.pack - 1), {}
     for mapped in layout.objects:
-        places[mapped.name] = at
-        at += mapped.bits // 8
-    return places
+        offsets[mapped.name] = offset
+        offset += mapped.bits // 8
+    return offsets
 
 
 @njit(cache=True)
 def _number(data, k, at, size):  # type: ignore[no-untyped-def]
-    """A signed little-endian number of ``size`` bytes."""
+    """Return the signed little-endian number of ``size`` bytes."""
     value = np.int64(0)
     for b in range(size):
         value |= np.int64(data[k, at + b]) << (8 * b)
@@ -209,7 +226,7 @@ def check_limits(  # type: ignore[no-untyped-def]
     moved, raw, seen, demanded, per_count, per_mille, positions, efforts, samples, velocity_s,
     low, high, velocity, torque, following, state, value,
 ):  # fmt: skip
-    """What is known of motor ``moved`` against the limits of the joints that it moves; what is wrong with it."""
+    """Check the joints that motor ``moved`` drives; return the cause of an alarm or ``NO_ALARM``."""
     n, ring = low.size, positions.shape[0]
     for j in range(n):
         if per_count[j, moved] == 0.0 and per_mille[j, moved] == 0.0:
@@ -220,7 +237,7 @@ def check_limits(  # type: ignore[no-untyped-def]
                 known = known and seen[m]
                 q += per_count[j, m] * raw[0, m]
                 if samples[m] >= ring:
-                    # Behind the newest sample in the ring stands the oldest.
+                    # The oldest sample follows the newest one in the ring.
                     speed += per_count[j, m] * (raw[0, m] - positions[(samples[m] + 1) % ring, m]) / velocity_s
                 if demanded[m]:
                     lag += per_count[j, m] * (raw[2, m] - raw[0, m])
@@ -229,7 +246,7 @@ def check_limits(  # type: ignore[no-untyped-def]
                 peak += per_mille[j, m] * raw[1, m]
         if not known:
             continue
-        code = QUIET
+        code = NO_ALARM
         if q < low[j] or q > high[j]:
             code, value[0], value[1] = POSITION, q, 0.0
         elif abs(speed) > velocity[j]:
@@ -238,10 +255,10 @@ def check_limits(  # type: ignore[no-untyped-def]
             code, value[0], value[1] = TORQUE, tau if abs(tau) > torque[j] else peak, torque[j]
         elif abs(lag) > following[j]:
             code, value[0], value[1] = FOLLOWING, lag, following[j]
-        if code != QUIET:
+        if code != NO_ALARM:
             state[JOINT] = j
             return code
-    return QUIET
+    return NO_ALARM
 
 
 @njit(cache=True)
@@ -250,7 +267,7 @@ def check_batch(  # type: ignore[no-untyped-def]
     per_count, per_mille, positions, efforts, samples, velocity_s,
     low, high, velocity, torque, following, state, sync, value,
 ):  # fmt: skip
-    """All frames of a batch, then the silences."""
+    """Check all frames of a batch, then for missing heartbeats and SYNC; return the cause of an alarm."""
     for k in range(ids.size):
         if ids[k] >= IDENTIFIERS or kinds[ids[k]] < 0:
             continue
@@ -276,7 +293,7 @@ def check_batch(  # type: ignore[no-untyped-def]
             if not state[ARMED]:
                 state[ARMED] = 1
                 sync[LAST, :] = now
-                # A bus that has had no set point yet has not lost SYNC either.
+                # SYNC is not checked on a bus before its first set point.
                 sync[SINCE, :] = every + 2
                 beat[:] = now
                 demanded[:] = False
@@ -303,7 +320,7 @@ def check_batch(  # type: ignore[no-untyped-def]
                 j, raw, seen, demanded, per_count, per_mille, positions, efforts, samples, velocity_s,
                 low, high, velocity, torque, following, state, value,
             )  # fmt: skip
-            if code != QUIET:
+            if code != NO_ALARM:
                 return code
     state[FRAME] = -1
     if state[ARMED]:
@@ -311,9 +328,9 @@ def check_batch(  # type: ignore[no-untyped-def]
             if now - beat[j] > silence:
                 state[JOINT], value[0] = j, (now - beat[j]) * 1e-9
                 return SILENT
-        # Whoever ends a motion properly goes on with SYNC for a while after the last set point.
+        # A master that ends a motion regularly sends SYNC for some time after the last set point.
         for b in range(sync.shape[1]):
             if sync[SINCE, b] <= every + 1 and now - sync[LAST, b] > silence:
                 value[0] = (now - sync[LAST, b]) * 1e-9
                 return NO_SYNC
-    return QUIET
+    return NO_ALARM

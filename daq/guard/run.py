@@ -1,7 +1,8 @@
-"""``armident guard``: reads the buses, and orders a quick stop from every drive when something is wrong."""
+"""The command ``armident guard``: monitors the buses, and commands a quick stop of every drive on an alarm."""
 
+import logging
 import signal
-import sys
+import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
@@ -12,7 +13,7 @@ import numpy as np
 from armident.configs import ArmidentError, ConfigError, RobotConfig, SessionConfig, load_robot, load_session
 from armident.configs.schema.session import Bus
 from armident.daq.guard.limits import FOLLOWING_S, limits_of
-from armident.daq.guard.monitor import Alarm, Watch
+from armident.daq.guard.monitor import Alarm, MotionMonitor
 from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown, FrameBus, Frames, frames
 from armident.drivers.can.scheduling import set_realtime_priority
@@ -20,29 +21,41 @@ from armident.drivers.can.udp import open_bus
 from armident.drivers.canopen.objects import COB_SDO_REQUEST, CONTROLWORD, Control, rpdo_cob, stop_rpdo
 
 BATCH = 512
-LOOK_S = 0.02
-"""How long the guard sleeps on a silent bus before it looks at the time."""
+"""Most frames that are received at once."""
 
-LOOKS = 0.5
-"""Pause between two looks, in SYNC periods: one for every frame would cost several times as much."""
+POLL_S = 0.02
+"""Longest wait for a frame before heartbeats and SYNC are checked, s."""
+
+PAUSE_PERIODS = 0.5
+"""Pause between two reads, in SYNC periods: a wake-up for every frame costs several times as much CPU time."""
 
 _SDO_WRITE_TWO_BYTES = 0x2B
 """Command byte of an expedited download of two bytes (CiA 301 section 7.2.4.3.3)."""
 
 _PRIORITY = 60
-"""Real-time priority, above that of SYNC: what stops an arm comes first."""
+"""Real-time priority, above that of the SYNC producer."""
+
+log = logging.getLogger(__name__)
 
 
 def stop_frames(session: SessionConfig, robot: RobotConfig) -> list[Frames]:
-    """Frames that order a quick stop (CiA 402 part 2, controlword 02h) from every drive, for each bus of a session.
+    """Return the frames of a quick stop (CiA 402 part 2, controlword 02h) of every drive, for each bus of a session.
 
-    For each drive the RPDO of its controlword, which acts when it arrives, then an SDO for those that have none.
+    The RPDOs of the controlwords come first, since they act at once; SDO requests follow for drives that map no
+    controlword.
+
+    Parameters
+    ----------
+    session
+        Session with ``setpoints``.
+    robot
+        The robot.
     """
     assert session.setpoints is not None
     word = int(Control.QUICK_STOP).to_bytes(2, "little")
     request = bytes([_SDO_WRITE_TWO_BYTES]) + CONTROLWORD.to_bytes(2, "little") + b"\0" + word + b"\0\0"
     rpdo = stop_rpdo(session.setpoints.rpdo)
-    found = []
+    stops = []
     for number, bus in enumerate(session.all_buses):
         on_it = zip(node_ids(session, robot), bus_numbers(session, robot), strict=True)
         nodes = [node for node, place in on_it if place == number]
@@ -52,67 +65,69 @@ def stop_frames(session: SessionConfig, robot: RobotConfig) -> list[Frames]:
         for k, (identifier, data) in enumerate(orders):
             out["can_id"][k], out["length"][k] = identifier, len(data)
             out["data"][k, : len(data)] = np.frombuffer(data, np.uint8)
-        found.append(out)
-    return found
+        stops.append(out)
+    return stops
 
 
 class Guard:
-    """Watches the buses of one session.
+    """Monitors the buses of one session and stops the drives.
 
     Parameters
     ----------
     buses
-        Their sockets; everything that ``watch`` asks for is let through.
-    watch
-        What is wrong.
-    orders
-        What stops the drives of each bus.
+        The buses, with filters for the identifiers of the monitor.
+    monitor
+        Checks their frames.
+    stops
+        Frames that stop the drives of each bus.
     period
         SYNC period, s.
     """
 
-    def __init__(self, buses: Sequence[FrameBus], watch: Watch, orders: Sequence[Frames], period: float) -> None:
-        self._buses, self._watch, self._orders, self._pause = buses, watch, orders, period * LOOKS
+    def __init__(
+        self, buses: Sequence[FrameBus], monitor: MotionMonitor, stops: Sequence[Frames], period: float
+    ) -> None:
+        self._buses, self._monitor, self._stops, self._pause = buses, monitor, stops, period * PAUSE_PERIODS
         self._batches = [frames(BATCH, fd=bus.fd) for bus in buses]
         self._over = False
         for number, batch in enumerate(self._batches):
-            # Compiled before anything moves; arrays of one frame count as contiguous, those of more do not.
+            # Compile now, before the arm moves: arrays of one frame have another type (contiguous) than longer ones.
             for size in (1, 2):
-                watch.look(batch[:size], 0, number)
+                monitor.check(batch[:size], 0, number)
 
     def stop(self) -> None:
-        """Order the quick stop now, on every bus that is up; may be called from a signal handler."""
-        for bus, orders in zip(self._buses, self._orders, strict=True):
+        """Command a quick stop on every bus that is up; may be called from a signal handler."""
+        for bus, stops in zip(self._buses, self._stops, strict=True):
             with suppress(BusDown):
-                bus.send(orders)
+                bus.send(stops)
         self._over = True
 
     def leave(self) -> None:
-        """End without a word to the drives; for a signal handler, too."""
+        """End without a quick stop; may be called from a signal handler."""
         self._over = True
 
     def run(self) -> Alarm | None:
-        """Watch until something is wrong (the drives are stopped then), or ``stop`` or ``leave`` was called.
+        """Monitor until an alarm, `stop` or `leave`; return the alarm, after which the drives are stopped.
 
         Raises
         ------
         BusDown
-            If a bus went down while nothing moved.
+            If a bus went down while the arm did not move.
         """
         while not self._over:
-            alarm, heard = None, 0
+            alarm, received = None, 0
             for number, batch in enumerate(self._batches):
-                # The time comes first: a guard that was kept waiting must not take that for a silence of the bus.
+                # Taken before the frames: otherwise a delay of this process would count as missing heartbeats.
                 now = time.monotonic_ns()
                 try:
                     got = self._receive(number)
                 except BusDown as error:
-                    if not self._watch.armed:
+                    if not self._monitor.armed:
                         raise
                     alarm = Alarm(str(error), -1)
                     break
-                heard += got
-                alarm = self._watch.look(batch[:got], now, number)
+                received += got
+                alarm = self._monitor.check(batch[:got], now, number)
                 if alarm is not None:
                     break
             if alarm is not None:
@@ -121,43 +136,52 @@ class Guard:
                     return alarm
                 late = (time.time_ns() - int(batch["t_ns"][alarm.frame])) * 1e-6
                 return Alarm(f"{alarm.text}; stop ordered {late:.2f} ms after the frame", alarm.frame)
-            if heard or len(self._buses) > 1:
+            if received or len(self._buses) > 1:
                 time.sleep(self._pause)
         return None
 
     def _receive(self, number: int) -> int:
-        """Frames of a bus; only where there is but one may the guard wait for them."""
+        """Receive frames of a bus; with a single bus wait for them."""
         bus = self._buses[number]
-        if len(self._buses) == 1 and not bus.poll(LOOK_S):
+        if len(self._buses) == 1 and not bus.poll(POLL_S):
             return 0
         return bus.receive(self._batches[number])
 
 
 def guard(config: str, following_s: float = FOLLOWING_S) -> None:
-    """Carry out ``armident guard`` until a signal or an alarm.
+    """Run ``armident guard`` until a signal or an alarm.
 
-    An alarm, SIGINT and SIGTERM stop the drives. SIGUSR1 ends it quietly: the motion is over.
+    An alarm, SIGINT and SIGTERM stop the drives. SIGUSR1 ends the guard after the motion, without a quick stop.
+
+    Parameters
+    ----------
+    config
+        Session configuration.
+    following_s
+        Largest following error, as the time of motion at the velocity limit, s.
 
     Raises
     ------
     ConfigError
-        If the session moves nothing, or a bus is not there.
+        If the session has no set points, or a bus does not exist.
     ArmidentError
-        If it had to stop the drives; says why.
+        If the guard stopped the drives on an alarm; the message gives the reason.
     """
     session = load_session(config)
     robot = load_robot(session.robot)
     try:
-        watch = Watch(session, robot, limits_of(robot, following_s))
+        monitor = MotionMonitor(session, robot, limits_of(robot, following_s))
     except ConfigError as error:
         raise ConfigError(f"{config}: {error}") from error
     with ExitStack() as stack:
-        buses = [stack.enter_context(_opened(bus, watch, k)) for k, bus in enumerate(session.all_buses)]
-        watcher = Guard(buses, watch, stop_frames(session, robot), session.sync_period)
+        buses = [stack.enter_context(_open_bus(bus, monitor, k)) for k, bus in enumerate(session.all_buses)]
+        watcher = Guard(buses, monitor, stop_frames(session, robot), session.sync_period)
+
+        stopped = threading.Event()
 
         def stop(_signal: int, _frame: FrameType | None) -> None:
             watcher.stop()
-            print("guard: quick stop ordered on a signal", file=sys.stderr, flush=True)
+            stopped.set()
 
         def leave(_signal: int, _frame: FrameType | None) -> None:
             watcher.leave()
@@ -168,9 +192,11 @@ def guard(config: str, following_s: float = FOLLOWING_S) -> None:
         set_realtime_priority(_PRIORITY)
         print(f"guard: ready on {', '.join(bus.channel for bus in buses)}", flush=True)
         alarm = watcher.run()
+        if stopped.is_set():
+            log.info("guard: quick stop ordered on a signal")
     if alarm is not None:
         raise ArmidentError(f"guard: {alarm.text}; the drives were stopped")
 
 
-def _opened(bus: Bus, watch: Watch, number: int) -> FrameBus:
-    return open_bus(bus, filters=[(identifier, STANDARD_ID_MASK) for identifier in watch.identifiers(number)])
+def _open_bus(bus: Bus, monitor: MotionMonitor, number: int) -> FrameBus:
+    return open_bus(bus, filters=[(identifier, STANDARD_ID_MASK) for identifier in monitor.identifiers(number)])

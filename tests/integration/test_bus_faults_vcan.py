@@ -1,4 +1,4 @@
-"""Faults of buses and drives while they are captured: told, counted, and over when they are over."""
+"""Faults of buses and drives during a capture are logged and counted, and the capture recovers from them."""
 
 import json
 import signal
@@ -18,18 +18,18 @@ from armident.drivers.canopen.objects import NmtCommand
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.integration.test_several_buses_vcan import (
     SLOW,
-    every_sync_is_accounted_for,
+    gaps_of_samples,
     robot,
     session_file,
     start,
-    wait_until_it_says,
+    wait_for_line,
 )
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
 
 
 def events_until(receiver: Receiver, kind: str) -> list[BusEvent]:
-    """Events up to the first of a kind; frames are read meanwhile."""
+    """Return the events up to the first of a kind; frames are received meanwhile."""
     found: list[BusEvent] = []
     deadline = time.monotonic() + 10
     while not any(event.kind == kind for event in found):
@@ -42,7 +42,7 @@ def events_until(receiver: Receiver, kind: str) -> list[BusEvent]:
 
 @pytest.mark.parametrize("removed", [False, True])
 def test_a_bus_that_is_back_is_read_again(vcan_buses: list[str], removed: bool) -> None:
-    """Down and up again with the same socket; removed and made again with a new one. The other bus goes on."""
+    """An interface that was down keeps its socket; one that was removed gets a new one. The other bus works on."""
     names = vcan_buses
     with Receiver([partial(RawSocket, name) for name in names]) as receiver:
         socket = receiver._buses[1].bus
@@ -64,7 +64,7 @@ def test_a_bus_that_is_back_is_read_again(vcan_buses: list[str], removed: bool) 
         assert [(k, batch["can_id"].tolist()) for k, batch, _ in receiver.drain()] == [(1, [0x124])]
 
 
-def test_error_frames_are_taken_out_counted_and_told(vcan_bus: str) -> None:
+def test_error_frames_are_removed_counted_and_reported(vcan_bus: str) -> None:
     with (
         Receiver([lambda: RawSocket(vcan_bus, errors=True)]) as receiver,
         RawSocket(vcan_bus, filters=()) as sender,
@@ -78,34 +78,34 @@ def test_error_frames_are_taken_out_counted_and_told(vcan_bus: str) -> None:
         assert [event.kind for event in receiver.events()] == ["bus_off", "bus_restarted"]
 
 
-def test_a_drive_that_boots_again_is_configured_and_its_errors_are_told(vcan_bus: str, tmp_path: Path) -> None:
+def test_a_drive_that_reboots_is_configured_again_and_its_errors_are_logged(vcan_bus: str, tmp_path: Path) -> None:
     texts = {0xFF01: "encoder battery low"}
     session = session_file(tmp_path, "tx40_replay.yaml", [vcan_bus] * 6, sync=SLOW, emcy_texts=texts)
     with robot(session):
         process = start("capture", "--config", session, "--out", tmp_path / "out", "--json")
-        said = wait_until_it_says(process, "recording to")
+        log = wait_for_line(process, "recording to")
         time.sleep(1.5)
         with RawSocket(vcan_bus, filters=()) as other:
             other.send(frame(0x82, bytes([0x01, 0xFF, 0x81, 1, 2, 0, 0, 0])))
-            said += wait_until_it_says(process, "EMCY")
+            log += wait_for_line(process, "EMCY")
             error = frame(0x0)
             error["can_id"], error["length"] = ERROR_FLAG | 0x20, 8
             other.send(error)
             other.send(frame(0, bytes([NmtCommand.RESET_NODE, 2])))
-        said += wait_until_it_says(process, "configured again")
+        log += wait_for_line(process, "configured again")
         time.sleep(2.0)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
-    assert process.returncode == 0, said + err
-    assert "node 2 (joint_2): EMCY FF01h, encoder battery low (error register 81h, manufacturer 01 02 00 00 00)" in said
-    assert "node 2 (joint_2): has booted again" in said
+    assert process.returncode == 0, log + err
+    assert "node 2 (joint_2): EMCY FF01h, encoder battery low (error register 81h, manufacturer 01 02 00 00 00)" in log
+    assert "node 2 (joint_2): has booted again" in log
     recording = read_recording(json.loads(out)["recording"])
-    gaps = every_sync_is_accounted_for(recording)
+    gaps = gaps_of_samples(recording)
     assert gaps
     assert {gap.joint for gap in recording.gaps} == {"joint_2"}
     assert recording.counters["rebooted"] == 1
     assert recording.counters["emcy"] >= 1
     assert recording.counters["error_frames"] == 1
-    # It answers again; on a busy machine answers come in bursts, some of which are given up as ambiguous.
+    # It answers again; on a busy machine answers come in bursts, some of which are discarded as ambiguous.
     (configured,) = (mark.sync for mark in recording.marks if "configured again" in mark.text)
     assert np.count_nonzero(recording.samples.sync > configured) > 200

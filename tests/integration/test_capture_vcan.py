@@ -1,4 +1,4 @@
-"""Capture on a real bus: nothing lost, everything accounted for, and every ending is a clean one."""
+"""Captures on vcan: no sample is lost, gaps account for all others, and every end leaves a finished file."""
 
 import json
 import os
@@ -29,7 +29,7 @@ COUNTED = ("samples.expected", "samples.rows", "samples.in_gaps", "kernel_drops"
 
 
 def session_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
-    """The shipped cell on another bus, under a name of its own."""
+    """Write the shipped cell with another bus, cell name and changed keys."""
     shipped = config_path("tx40_cell.yaml")
     data = yaml.safe_load(shipped.read_text()) | changes
     data |= {"cell": cell, "robot": str(config_path(data["robot"])), "bus": {"channel": bus}}
@@ -43,14 +43,14 @@ def session_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
 
 
 def run(*arguments: Any, **options: Any) -> subprocess.Popen[str]:
-    """An armident command as a process."""
+    """Start an armident command as a process."""
     command = ARMIDENT + [str(a) for a in arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
 @pytest.fixture
 def robot(vcan_bus: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """The virtual arm on the bus, ready."""
+    """The virtual arm on the bus, when it is ready."""
     process = run("robot", "--config", session_file(tmp_path, vcan_bus, "robot"))
     assert process.stdout is not None
     assert "ready" in process.stdout.readline()
@@ -61,7 +61,7 @@ def robot(vcan_bus: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def wait_for_file(folder: Path, size: int, process: subprocess.Popen[str]) -> Path:
-    """The recording, once it holds something."""
+    """Wait until a recording is larger than ``size`` bytes; return its path."""
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline and process.poll() is None:
         for path in folder.glob("*.mcap"):
@@ -73,7 +73,7 @@ def wait_for_file(folder: Path, size: int, process: subprocess.Popen[str]) -> Pa
 
 @pytest.mark.usefixtures("robot")
 def test_ten_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path: Path) -> None:
-    """With set points on the bus, and the marks where the motion begins and ends."""
+    """With set points, and marks at begin and end of the motion."""
     session = session_file(tmp_path, vcan_bus, "ten_seconds")
     process = run("capture", "--config", session, "--out", tmp_path / "out", "--json")
     out, err = process.communicate(timeout=200)
@@ -90,7 +90,7 @@ def test_ten_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path:
     ((first, last),) = recording.experiments()
     assert (first + 1) % 5 == (last + 1) % 5 == 0
     assert recording.metadata["cell"] == "ten_seconds"
-    # At both marks the demand stands at the ends of the trajectory, which are the same posture.
+    # The trajectory begins and ends in the same posture, so the demands at both marks are equal.
     demand = recording.streams["demand"]
     ends = demand.raw["demand"][np.isin(demand.sync, [first, last])]
     assert np.array_equal(ends[0], ends[1])
@@ -98,61 +98,59 @@ def test_ten_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path:
 
 @pytest.mark.usefixtures("robot")
 def test_sixty_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path: Path) -> None:
-    """However busy the machine is: an arm that is behind is waited for."""
+    """On a busy machine the capture waits for drives that lag."""
     session = session_file(tmp_path, vcan_bus, "minute", setpoints=None)
     process = run("capture", "--config", session, "--duration", "60", "--out", tmp_path / "out", "--json")
     out, err = process.communicate(timeout=230)
     assert process.returncode == 0, err
     recording = read_recording(json.loads(out)["recording"])
     expected, rows, gaps, drops = (recording.counters[name] for name in COUNTED)
-    told = f"{recording.counters}\n{recording.gaps[:20]}\n{err}"
-    assert gaps == drops == 0, told
-    assert recording.gaps == (), told
-    assert expected == rows == recording.counters["sync_sent"] >= 300_000, told
+    context = f"{recording.counters}\n{recording.gaps[:20]}\n{err}"
+    assert gaps == drops == 0, context
+    assert recording.gaps == (), context
+    assert expected == rows == recording.counters["sync_sent"] >= 300_000, context
 
 
-def test_drives_without_a_cpu_for_seconds_are_waited_for_at_the_end(
+def test_the_end_waits_for_drives_that_are_stopped_for_seconds(
     vcan_bus: str, robot: subprocess.Popen[str], tmp_path: Path
 ) -> None:
-    """Nobody answers the last SYNCs for longer than a lost answer is waited for, then all do: nothing is in a gap."""
+    """All drives answer the last SYNCs later than the limit for a single lost answer: there are no gaps."""
     session = session_file(tmp_path, vcan_bus, "starved", sync={"period_us": 1000}, setpoints=None)
     process = run("capture", "--config", session, "--duration", "3", "--out", tmp_path / "out", "--json")
     wait_for_file(tmp_path / "out", 20_000, process)
     robot.send_signal(signal.SIGSTOP)
     try:
         assert process.stderr is not None
-        told = next(line for line in process.stderr if "behind: waiting for their answers" in line)
+        lag = next(line for line in process.stderr if "behind: waiting for their answers" in line)
         time.sleep(LATE_S + 2.0)
-        assert process.poll() is None, told
+        assert process.poll() is None, lag
     finally:
         robot.send_signal(signal.SIGCONT)
     out, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
     recording = read_recording(json.loads(out)["recording"])
     expected, rows, gaps, drops = (recording.counters[name] for name in COUNTED)
-    assert gaps == drops == 0, (told, err)
+    assert gaps == drops == 0, (lag, err)
     assert expected == rows == 3000
 
 
-def test_drives_that_died_are_not_waited_for_at_the_end(
-    vcan_bus: str, robot: subprocess.Popen[str], tmp_path: Path
-) -> None:
+def test_the_end_does_not_wait_for_dead_drives(vcan_bus: str, robot: subprocess.Popen[str], tmp_path: Path) -> None:
     session = session_file(tmp_path, vcan_bus, "died", sync={"period_us": 1000}, setpoints=None)
     process = run("capture", "--config", session, "--duration", "3", "--out", tmp_path / "out", "--json")
     wait_for_file(tmp_path / "out", 20_000, process)
     robot.kill()
     assert process.stderr is not None
-    told = [line for line in process.stderr]
-    begin = next(k for k, line in enumerate(told) if "behind: waiting for their answers" in line)
-    assert process.wait(timeout=200) == 0, told
+    lines = list(process.stderr)
+    begin = next(k for k, line in enumerate(lines) if "behind: waiting for their answers" in line)
+    assert process.wait(timeout=200) == 0, lines
     recording = read_recording(next((tmp_path / "out").glob("*.mcap")))
-    assert recording.counters["heartbeat_lost"] == 6, told[begin:]
+    assert recording.counters["heartbeat_lost"] == 6, lines[begin:]
     assert recording.counters["samples.rows"] + recording.counters["samples.in_gaps"] == 3000
 
 
 @pytest.mark.usefixtures("robot")
-def test_files_follow_each_other_without_losing_a_sample(vcan_bus: str, tmp_path: Path) -> None:
-    """Every SYNC of six seconds at 5 kHz is in exactly one file, old captures make room meanwhile."""
+def test_no_sample_is_lost_between_files(vcan_bus: str, tmp_path: Path) -> None:
+    """Every SYNC of 6 s at 5 kHz is in exactly one file; an old recording is deleted meanwhile."""
     options = {"rotate_minutes": 0.02, "keep_days": 300}
     session = session_file(tmp_path, vcan_bus, "rotated", setpoints=None, recording=options)
     (tmp_path / "out").mkdir()
@@ -163,7 +161,7 @@ def test_files_follow_each_other_without_losing_a_sample(vcan_bus: str, tmp_path
     assert process.returncode == 0, err
     document = json.loads(out)
     parts = [read_recording(path) for path in document["recordings"]]
-    # Six seconds and what the producer was late: a file every 1.2 s of it, also where answers came all at once.
+    # A file for every 1.2 s of recorded time, even if answers of a longer time came at once.
     assert len(parts) >= 5
     assert all(part.missing is None for part in parts)
     sync = np.concatenate([part.samples.sync for part in parts])
@@ -174,8 +172,8 @@ def test_files_follow_each_other_without_losing_a_sample(vcan_bus: str, tmp_path
 
 
 @pytest.mark.usefixtures("robot")
-def test_only_events_are_written_where_the_session_says_so(vcan_bus: str, tmp_path: Path) -> None:
-    """Saved by SIGUSR1 with the seconds before; a mark and the end come over Zenoh."""
+def test_a_trigger_writes_only_the_time_around_events(vcan_bus: str, tmp_path: Path) -> None:
+    """SIGUSR1 saves the seconds before it; mark, save and stop are commands over Zenoh."""
     changes = {
         "recording": {"trigger": {"before_s": 20.0, "after_s": 1.0}},
         "metrics": {"port": 0},
@@ -185,19 +183,19 @@ def test_only_events_are_written_where_the_session_says_so(vcan_bus: str, tmp_pa
     session = session_file(tmp_path, vcan_bus, "events", setpoints=None, **changes)
     process = run("capture", "--config", session, "--out", tmp_path / "out")
     assert process.stderr is not None
-    said = ""
-    while "keeping the last 20 s" not in said:
+    log = ""
+    while "keeping the last 20 s" not in log:
         line = process.stderr.readline()
         assert line, "capture ended"
-        said += line
+        log += line
     time.sleep(5.0)
-    (address,) = (word for word in said.split() if word.startswith("http://127.0.0.1:"))
+    (address,) = (word for word in log.split() if word.startswith("http://127.0.0.1:"))
     with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(address, timeout=10) as answer:
         assert 'armident_frames_total{cell="events",robot="tx40"}' in answer.read().decode()
     for words in (["mark", "gripper changed"], ["save"]):
-        asked = run("command", *words, "--config", session)
-        out, err = asked.communicate(timeout=60)
-        assert asked.returncode == 0, err
+        command = run("command", *words, "--config", session)
+        out, err = command.communicate(timeout=60)
+        assert command.returncode == 0, err
         assert out == f"{words[0]}: accepted\n"
     path = wait_for_file(tmp_path / "out", 20_000, process)
     time.sleep(3.0)
@@ -219,7 +217,7 @@ def test_only_events_are_written_where_the_session_says_so(vcan_bus: str, tmp_pa
 
 @pytest.mark.usefixtures("robot")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_with_a_finished_file(vcan_bus: str, tmp_path: Path, number: signal.Signals) -> None:
+def test_a_signal_ends_the_capture_with_a_finished_file(vcan_bus: str, tmp_path: Path, number: signal.Signals) -> None:
     session = session_file(tmp_path, vcan_bus, "signal", sync={"period_us": 1000}, setpoints=None)
     process = run("capture", "--config", session, "--out", tmp_path / "out")
     path = wait_for_file(tmp_path / "out", 20_000, process)
@@ -235,7 +233,7 @@ def test_a_signal_ends_with_a_finished_file(vcan_bus: str, tmp_path: Path, numbe
 
 
 def moving_session(folder: Path, bus: str, cell: str, moves: list[dict[str, Any]]) -> Path:
-    """A session that moves joint 1 from 0, at 500 Hz."""
+    """Write a session that moves joint 1 from 0, at 500 Hz."""
     motion = {"schema": "armident/trajectory/1", "start": [0.0, 0.0, 1.57, 0.0, 0.0, 0.0], "moves": moves}
     (folder / f"{cell}_motion.yaml").write_text(yaml.safe_dump(motion))
     session = session_file(folder, bus, cell, sync={"period_us": 2000})
@@ -245,8 +243,8 @@ def moving_session(folder: Path, bus: str, cell: str, moves: list[dict[str, Any]
     return session
 
 
-class Late(threading.Event):
-    """Nobody asks a capture to stop, but whoever looks is held up, as on a machine that is too slow."""
+class SlowEvent(threading.Event):
+    """An event that is never set, and delays every query, as on a machine that is too slow."""
 
     def is_set(self) -> bool:
         time.sleep(0.4)
@@ -254,11 +252,11 @@ class Late(threading.Event):
 
 
 @pytest.mark.usefixtures("robot")
-def test_sync_goes_on_until_somebody_disables_the_drives_of_an_arm_that_moved(vcan_bus: str, tmp_path: Path) -> None:
-    """Enabled drives, and who guards them, take silence for the death of their master."""
+def test_sync_continues_until_the_drives_are_disabled_after_a_motion(vcan_bus: str, tmp_path: Path) -> None:
+    """To enabled drives and to the guard, a missing SYNC is a failure of the master."""
     there = {"to": [0.1, 0.0, 1.57, 0.0, 0.0, 0.0], "duration": 0.6}
     session = moving_session(tmp_path, vcan_bus, "ends_late", [there])
-    done = capture(load_plan(session, tmp_path / "out", None, False), Late())
+    done = capture(load_plan(session, tmp_path / "out", None, False), SlowEvent())
     assert done.failure is None
     end = next(mark.sync for mark in done.marks if mark.kind == "experiment_end")
     settled = end + 0.1 / 0.002
@@ -267,7 +265,7 @@ def test_sync_goes_on_until_somebody_disables_the_drives_of_an_arm_that_moved(vc
 
 
 @pytest.mark.usefixtures("robot")
-def test_a_capture_that_is_over_in_the_middle_of_a_motion_stops_the_arm(vcan_bus: str, tmp_path: Path) -> None:
+def test_a_capture_that_ends_during_a_motion_stops_the_arm(vcan_bus: str, tmp_path: Path) -> None:
     away = {"to": [1.5, 0.0, 1.57, 0.0, 0.0, 0.0], "duration": 4.0}
     session = moving_session(tmp_path, vcan_bus, "cut_short", [away])
     done = capture(load_plan(session, tmp_path / "out", 2.5, False), threading.Event())
@@ -278,7 +276,7 @@ def test_a_capture_that_is_over_in_the_middle_of_a_motion_stops_the_arm(vcan_bus
     raw = recording.samples.raw["position"], recording.streams["demand"].raw["demand"]
     position, held = (np.linalg.solve(robot.transmission_matrix, (r / counts_per_si(robot)).T)[0] for r in raw)
     assert 0.2 < position[-1] < 1.3
-    # It overshoots and swings back to where its drives hold it.
+    # The arm overshoots and returns to the position that the drives hold.
     assert abs(position[-1] - held[-1]) < 0.01
     assert position.max() < 1.3
     velocity = np.diff(position) / 0.002
@@ -287,7 +285,7 @@ def test_a_capture_that_is_over_in_the_middle_of_a_motion_stops_the_arm(vcan_bus
 
 
 def refused(process: subprocess.Popen[str], out: Path, code: int) -> str:
-    """The one line that a command ended with, and that it left nothing."""
+    """Return the error line of a command, after a check that it left no files."""
     _, err = process.communicate(timeout=120)
     lines = [line for line in err.splitlines() if line.startswith("armident:")]
     assert process.returncode == code, err
@@ -297,14 +295,14 @@ def refused(process: subprocess.Popen[str], out: Path, code: int) -> str:
     return lines[0]
 
 
-def test_a_missing_drive_is_one_line_and_leaves_nothing(vcan_bus: str, tmp_path: Path) -> None:
+def test_a_missing_drive_is_one_error_line_and_leaves_no_files(vcan_bus: str, tmp_path: Path) -> None:
     session = session_file(tmp_path, vcan_bus, "nobody", sdo_timeout_s=0.2)
     line = refused(run("capture", "--config", session, "--out", tmp_path / "out"), tmp_path / "out", 2)
     assert "node 1" in line
     assert "joint_1" in line
 
 
-def test_a_missing_bus_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_missing_bus_is_one_error_line_and_leaves_no_files(tmp_path: Path) -> None:
     session = session_file(tmp_path, "vcan77", "nobus")
     line = refused(run("capture", "--config", session, "--out", tmp_path / "out"), tmp_path / "out", 2)
     assert "vcan77" in line
@@ -312,7 +310,9 @@ def test_a_missing_bus_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("robot")
-def test_a_bus_that_goes_down_ends_with_a_finished_file_and_one_line(vcan_bus: str, tmp_path: Path) -> None:
+def test_a_bus_that_goes_down_ends_the_capture_with_a_finished_file_and_one_error_line(
+    vcan_bus: str, tmp_path: Path
+) -> None:
     session = session_file(tmp_path, vcan_bus, "down", sync={"period_us": 1000}, setpoints=None)
     process = run("capture", "--config", session, "--out", tmp_path / "out")
     path = wait_for_file(tmp_path / "out", 20_000, process)
@@ -334,7 +334,7 @@ def test_listen_only_records_the_same_and_sends_nothing(vcan_bus: str, tmp_path:
     sent_before = int(Path(f"/sys/class/net/{vcan_bus}/statistics/tx_packets").read_text())
     time.sleep(1.0)
     heartbeats = int(Path(f"/sys/class/net/{vcan_bus}/statistics/tx_packets").read_text()) - sent_before
-    assert heartbeats <= 6 * 12, "with nobody else there, only the drives' heartbeats are on the bus"
+    assert heartbeats <= 6 * 12, "without another master, only the drives' heartbeats are on the bus"
     active = run("capture", "--config", one, "--out", tmp_path / "one", "--duration", "3", "--json")
     out, err = active.communicate(timeout=120)
     assert active.returncode == 0, err

@@ -1,4 +1,4 @@
-"""The guard on a real bus: every reason to stop is followed by a quick stop within one cycle, and nothing else is."""
+"""The guard on vcan: every violation is followed by a quick stop within one cycle, and nothing else is."""
 
 import multiprocessing
 import os
@@ -32,7 +32,7 @@ from armident.drivers.canopen.objects import (
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
 
 PERIOD_S = 0.02
-"""Slow, so that a cycle is long beside what a busy machine takes to wake a process."""
+"""SYNC period, s; long in comparison with the wake-up time of a process on a busy machine."""
 HEARTBEAT_MS = 100
 N = 6
 QUICK_STOP = b"\x02\x00"
@@ -41,7 +41,7 @@ Change = Callable[["Cell"], None]
 
 @dataclass
 class Cell:
-    """What drives and master send in a cycle, in counts and per mille of rated current."""
+    """Frames of drives and master in a cycle; positions in counts, currents in per mille of the rated current."""
 
     position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(N))
     current: NDArray[np.float64] = field(default_factory=lambda: np.zeros(N))
@@ -52,7 +52,7 @@ class Cell:
     sync: bool = True
 
     def cycle(self, k: int) -> list[tuple[int, bytes]]:
-        """Frames of cycle ``k``, in their order on the bus."""
+        """Return the frames of cycle ``k`` in the order of the bus."""
         out = [(COB_SYNC, bytes([k % 240 + 1]))] if self.sync else []
         for j in range(N):
             sample = int(self.position[j]).to_bytes(4, "little", signed=True)
@@ -80,7 +80,7 @@ def session_file(folder: Path, bus: str) -> Path:
 
 
 def _guarded(config: Path, log: Path) -> None:
-    """Run the guard as the command does, with what it prints in a file."""
+    """Run the guard as the command does, with its output in a file."""
     with log.open("w", buffering=1) as out:
         sys.stdout = sys.stderr = out
         try:
@@ -93,7 +93,7 @@ def _guarded(config: Path, log: Path) -> None:
 
 
 class Guarded:
-    """The guard in a process of its own; forked, so that every test need not import everything anew."""
+    """The guard in a forked process, which saves the imports in every test."""
 
     def __init__(self, folder: Path, bus: str) -> None:
         self._log = folder / "guard.log"
@@ -111,7 +111,7 @@ class Guarded:
         return self._log.read_text()
 
     def end(self) -> tuple[int | None, str]:
-        """Its exit code and all that it printed."""
+        """Return exit code and output of the process."""
         self.process.join(30)
         return self.process.exitcode, self.text
 
@@ -126,7 +126,7 @@ def guarded(vcan_bus: str, tmp_path: Path) -> Iterator[Guarded]:
 
 @dataclass
 class Dump:
-    """What was on the bus, as candump would show it: kernel time (ns), identifier, data."""
+    """Frames on the bus, as candump shows them: kernel time (ns), identifier, data."""
 
     rows: list[tuple[int, int, bytes]]
 
@@ -134,14 +134,17 @@ class Dump:
         return next((k for k, (_, can_id, data) in enumerate(self.rows) if wanted(can_id, data)), None)
 
     def orders(self) -> list[int]:
-        """Where nodes were told to stop, by RPDO and by SDO."""
+        """Return the indices of quick stop commands, by RPDO and by SDO."""
         words = {rpdo_cob(2, node): QUICK_STOP for node in range(1, N + 1)}
         words |= {COB_SDO_REQUEST + node: b"\x2b\x40\x60\x00" + QUICK_STOP + b"\0\0" for node in range(1, N + 1)}
         return [k for k, (_, can_id, data) in enumerate(self.rows) if words.get(can_id) == data]
 
 
 def play(bus: str, guarded: Guarded, cell: Cell, fault: Change, quiet: int = 15, after: int = 150) -> Dump:
-    """Cycles without and then with a fault, until some after the guard has ended; everything that was on the bus."""
+    """Run ``quiet`` cycles without and ``after`` cycles with a fault; return all frames on the bus.
+
+    The run ends three cycles after the guard.
+    """
     with RawSocket(bus, filters=()) as sender, RawSocket(bus) as listener:
         batch, rows, ended = frames(4096), [], None
         k = 0
@@ -163,7 +166,7 @@ def play(bus: str, guarded: Guarded, cell: Cell, fault: Change, quiet: int = 15,
 
 
 def check(dump: Dump, offending: int | None, most_syncs: int = 1) -> float:
-    """All six drives were told to stop, both ways, within ``most_syncs`` SYNCs of a frame; how late, in ms."""
+    """Check that all six drives got both stop commands within ``most_syncs`` SYNCs of a frame; return the delay, ms."""
     assert offending is not None
     orders = dump.orders()
     assert len(orders) == 2 * N, f"{len(orders)} orders"
@@ -180,7 +183,7 @@ COUNTS = counts_per_si(ROBOT)
 
 
 def motor_counts(*joints: float) -> NDArray[np.float64]:
-    """Motor positions (counts) of joint positions (rad)."""
+    """Return the motor positions (n,), counts, of joint positions, rad."""
     counts: NDArray[np.float64] = np.rint(ROBOT.transmission_matrix @ np.array(joints) * COUNTS)
     return counts
 
@@ -239,7 +242,7 @@ def test_an_offending_frame_is_followed_by_a_stop_within_one_cycle(
 
 
 def test_a_position_beyond_its_limit_stops_the_arm(vcan_bus: str, guarded: Guarded) -> None:
-    """Reached slowly, so that it is the position that is wrong: 2.16 rad, then 2.19 rad in steps below the limit."""
+    """From 2.16 rad to 2.19 rad: a step within the limit of velocity."""
     cell = Cell()
     cell.position[:] = cell.demand[:] = motor_counts(0, 2.16, 0, 0, 0, 0)
 
@@ -253,8 +256,8 @@ def test_a_position_beyond_its_limit_stops_the_arm(vcan_bus: str, guarded: Guard
     check(dump, dump.first(sample_of(1, wanted)))
 
 
-def test_a_lost_heartbeat_stops_the_arm_within_a_cycle_of_its_time(vcan_bus: str, guarded: Guarded) -> None:
-    """Its time is three periods and a tenth of a second after the last one."""
+def test_a_lost_heartbeat_stops_the_arm_within_a_cycle_of_its_timeout(vcan_bus: str, guarded: Guarded) -> None:
+    """The timeout is three periods and 0.1 s."""
     dump = play(vcan_bus, guarded, Cell(), lambda cell: setattr(cell, "beating", (1, 2, 4, 5, 6)))
     _, err = guarded.end()
     assert "joint_3: no heartbeat for 0.4" in err
@@ -263,7 +266,7 @@ def test_a_lost_heartbeat_stops_the_arm_within_a_cycle_of_its_time(vcan_bus: str
     allowed = (3 * HEARTBEAT_MS + 100) / 1000
     begin = dump.rows[beats[-1]][0]
     syncs = [t for t, can_id, _ in dump.rows if can_id == COB_SYNC and t > begin + allowed * 1e9]
-    # Of the SYNCs after the time was up, one may come before the last order.
+    # One SYNC may come between the timeout and the last stop command.
     assert late * 1e6 + begin <= syncs[1]
 
 
@@ -284,7 +287,7 @@ def test_a_signal_stops_the_arm_at_once(vcan_bus: str, guarded: Guarded, number:
     print(f"last stop order {(dump.rows[dump.orders()[-1]][0] - sent[0]) * 1e-6:.2f} ms after the signal")
 
 
-def test_a_capture_that_dies_in_the_middle_of_the_motion_is_noticed(vcan_bus: str, guarded: Guarded) -> None:
+def test_a_capture_that_dies_during_the_motion_is_detected(vcan_bus: str, guarded: Guarded) -> None:
     def die(cell: Cell) -> None:
         cell.sync = cell.setpoints = False
 
@@ -294,8 +297,8 @@ def test_a_capture_that_dies_in_the_middle_of_the_motion_is_noticed(vcan_bus: st
     assert len(dump.orders()) == 2 * N
 
 
-def test_a_motion_that_ends_properly_is_left_alone(vcan_bus: str, guarded: Guarded) -> None:
-    """SYNC goes on after the last set point, NMT takes the drives out of operation, then all is silent."""
+def test_the_regular_end_of_a_motion_is_no_alarm(vcan_bus: str, guarded: Guarded) -> None:
+    """SYNC continues after the last set point, NMT ends the state operational, then no frames follow."""
     cell = Cell()
     play(vcan_bus, guarded, cell, lambda cell: setattr(cell, "setpoints", False), quiet=20, after=20)
 
@@ -309,8 +312,8 @@ def test_a_motion_that_ends_properly_is_left_alone(vcan_bus: str, guarded: Guard
     assert dump.orders() == []
 
 
-def test_nothing_is_stopped_before_the_arm_moves(vcan_bus: str, guarded: Guarded) -> None:
-    """Whatever the drives say: the capture has not begun, or somebody else moves the arm by hand."""
+def test_there_is_no_alarm_before_the_arm_moves(vcan_bus: str, guarded: Guarded) -> None:
+    """Excess velocity before the first set point: the arm is moved by hand, for example."""
     dump = play(vcan_bus, guarded, Cell(setpoints=False), jumping, quiet=10, after=20)
     assert guarded.process.is_alive()
     assert dump.orders() == []

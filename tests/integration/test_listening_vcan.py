@@ -1,4 +1,4 @@
-"""Listening only: nothing of ours is on the bus, and what the drives send is found out or refused."""
+"""Captures with --listen-only: nothing is sent, and TPDOs are recorded, discovered or refused."""
 
 import json
 import threading
@@ -24,11 +24,14 @@ PERIOD_S = 0.005
 SYNC = {"role": "producer", "period_us": 5000, "counter": 240}
 
 
-class Strangers:
-    """Six drives and their master, of which we know nothing: SYNC, a TPDO of each, and EMCY of one every second."""
+class UnknownDrives:
+    """Six drives and their master: SYNC, a TPDO of each drive, and EMCY of node 3 every second.
+
+    ``foreign`` holds the frames that others send on the bus.
+    """
 
     def __init__(self, channel: str, length: int, every: int = 1) -> None:
-        self.heard: list[Frames] = []
+        self.foreign: list[Frames] = []
         self._length, self._every = length, every
         self._bus = RawSocket(channel)
         self._stop = threading.Event()
@@ -47,12 +50,12 @@ class Strangers:
             self._bus.send(out)
             if k % 200 == 100:
                 self._bus.send(frame(COB_EMCY + 3, b"\x11\x86\x20\0\0\0\0\0"))
-            # A socket does not hear itself: what comes here is somebody else's.
+            # A socket does not receive its own frames: these are from another sender.
             if got := self._bus.receive(batch):
-                self.heard.append(batch[:got].copy())
+                self.foreign.append(batch[:got].copy())
             k += 1
 
-    def __enter__(self) -> "Strangers":
+    def __enter__(self) -> "UnknownDrives":
         self._thread.start()
         return self
 
@@ -63,15 +66,15 @@ class Strangers:
 
 
 @contextmanager
-def nothing_of_ours(channel: str, length: int, every: int = 1) -> Iterator[None]:
-    """The strangers on the bus, who hear nothing but themselves."""
-    with Strangers(channel, length, every) as strangers:
+def checked_silence(channel: str, length: int, every: int = 1) -> Iterator[None]:
+    """Put the drives on the bus, and check at the end that no other sender was on it."""
+    with UnknownDrives(channel, length, every) as drives:
         yield
-    assert strangers.heard == []
+    assert drives.foreign == []
 
 
 def listening(channel: str, folder: Path, *options: Any, **changes: Any) -> tuple[int, str, str]:
-    """Exit code, output and errors of a capture that listens for two seconds."""
+    """Return exit code, stdout and stderr of a capture of 2 s with --listen-only."""
     session = session_file(folder, "tx40_replay.yaml", [channel] * 6, sync=SYNC, **changes)
     process = start(
         "capture", "--config", session, "--out", folder / "out", "--listen-only", "--duration", "2", "--json", *options
@@ -80,8 +83,8 @@ def listening(channel: str, folder: Path, *options: Any, **changes: Any) -> tupl
     return process.returncode, out, err
 
 
-def test_the_mapping_of_the_session_is_recorded_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
-    with nothing_of_ours(vcan_bus, 8):
+def test_streams_of_the_session_are_recorded_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
+    with checked_silence(vcan_bus, 8):
         code, out, err = listening(vcan_bus, tmp_path)
     assert code == 0, err
     recording = read_recording(json.loads(out)["recording"])
@@ -92,8 +95,8 @@ def test_the_mapping_of_the_session_is_recorded_and_nothing_is_sent(vcan_bus: st
     assert recording.counters["emcy"] == len([mark for mark in recording.marks if mark.kind == "emcy"]) >= 1
 
 
-def test_an_eds_that_fits_what_is_heard_is_recorded_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
-    """The session says eight bytes; six are heard, as the drives' EDS has them."""
+def test_the_default_mapping_of_an_eds_is_discovered_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
+    """The session maps eight bytes; the drives send six, as their EDS maps by default."""
     text = config_path("eds/cia402_servo.eds").read_text()
     begin, end = text.index("[1A00sub0]"), text.index("[1A00sub3]")
     mapped = text[begin:end].replace("DefaultValue=1\n", "DefaultValue=2\n")
@@ -101,7 +104,7 @@ def test_an_eds_that_fits_what_is_heard_is_recorded_and_nothing_is_sent(vcan_bus
     eds = tmp_path / "drive.eds"
     eds.write_text(text[:begin] + mapped + text[end:])
     drives = [{"joint": f"joint_{k}", "node_id": k, "eds": str(eds)} for k in range(1, 7)]
-    with nothing_of_ours(vcan_bus, 6):
+    with checked_silence(vcan_bus, 6):
         code, out, err = listening(vcan_bus, tmp_path, "--sniff", "1", drives=drives)
     assert code == 0, err
     assert "TPDO1 is samples: position, current on every 1. SYNC, as the EDS says" in err
@@ -110,17 +113,17 @@ def test_an_eds_that_fits_what_is_heard_is_recorded_and_nothing_is_sent(vcan_bus
     assert recording.counters["samples.rows"] >= 300
 
 
-def test_what_nobody_can_tell_is_refused_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
-    with nothing_of_ours(vcan_bus, 5):
+def test_an_unknown_mapping_is_refused_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:
+    with checked_silence(vcan_bus, 5):
         code, _, err = listening(vcan_bus, tmp_path, "--sniff", "1")
     assert code == 2
     assert "181h with 5 bytes, every 1 SYNC" in err
-    assert "say in streams what the TPDO holds" in err
+    assert "add the objects of the TPDO to streams" in err
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_a_tpdo_of_another_length_than_mapped_is_noticed(vcan_bus: str, tmp_path: Path) -> None:
-    with nothing_of_ours(vcan_bus, 6):
+def test_a_tpdo_of_another_length_than_mapped_is_detected(vcan_bus: str, tmp_path: Path) -> None:
+    with checked_silence(vcan_bus, 6):
         code, out, err = listening(vcan_bus, tmp_path)
     assert code == 0, err
     assert "joint_1: TPDO of samples has another length than mapped; was its mapping changed?" in err

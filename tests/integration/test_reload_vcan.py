@@ -1,4 +1,4 @@
-"""A capture on a real bus takes over a changed configuration, refuses another, and loses no SYNC over either."""
+"""Reload during a capture on vcan: one change is applied, one is refused, and no SYNC is lost."""
 
 import json
 import os
@@ -23,8 +23,8 @@ pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
 COUNTED = ("samples.expected", "samples.rows", "samples.in_gaps", "kernel_drops")
 
 
-def told(process: "subprocess.Popen[str]", word: str) -> Iterator[str]:
-    """Lines of stderr up to one with a word."""
+def lines_until(process: "subprocess.Popen[str]", word: str) -> Iterator[str]:
+    """Yield the lines of stderr up to the first with a word."""
     assert process.stderr is not None
     for line in process.stderr:
         yield line
@@ -33,10 +33,10 @@ def told(process: "subprocess.Popen[str]", word: str) -> Iterator[str]:
 
 
 @pytest.mark.usefixtures("robot")
-def test_no_sync_is_lost_over_a_reload(vcan_bus: str, tmp_path: Path) -> None:
+def test_no_sync_is_lost_during_a_reload(vcan_bus: str, tmp_path: Path) -> None:
     plain: dict[str, Any] = {"setpoints": None, "sync": {"role": "producer", "period_us": 1000, "counter": 240}}
     data = yaml.safe_load(session_file(tmp_path, vcan_bus, "reloaded", **plain).read_text())
-    # The virtual drives have no thermometer; the mode of operation (6061h) is 8, in a unit of five degrees 40.
+    # The virtual drives have no temperature: 6061h (mode of operation) stands for it, 8 in units of 5 degrees is 40.
     warm = {"index": 0x6061, "type": "int8", "scale": 5.0, "every_s": 1.0}
     plain["drives"] = [drive | {"temperature": warm} for drive in data["drives"]]
     session_file(tmp_path, vcan_bus, "reloaded", **plain)
@@ -46,14 +46,14 @@ def test_no_sync_is_lost_over_a_reload(vcan_bus: str, tmp_path: Path) -> None:
 
     session_file(tmp_path, vcan_bus, "reloaded", **plain, recording={"rotate_minutes": 0.01}, metrics={"port": 0})
     os.kill(process.pid, signal.SIGHUP)
-    lines = list(told(process, "reloaded"))
+    lines = list(lines_until(process, "reloaded"))
     assert lines[-1].endswith("reloaded.yaml: metrics.port, recording.rotate_minutes\n")
     (address,) = [line.split()[-1] for line in lines if line.startswith("metrics on")]
 
     session_file(tmp_path, vcan_bus, "reloaded", **(plain | {"heartbeat_ms": 77}))
     os.kill(process.pid, signal.SIGHUP)
-    *_, refused = told(process, "not reloaded")
-    assert refused.endswith("reloaded.yaml: heartbeat_ms: cannot change while it is captured\n")
+    *_, refusal = lines_until(process, "not reloaded")
+    assert refusal.endswith("reloaded.yaml: heartbeat_ms: cannot change while it is captured\n")
 
     wait_for_file(tmp_path / "out", 50_000, process)
     directly = urllib.request.build_opener(urllib.request.ProxyHandler({}))

@@ -1,4 +1,4 @@
-"""Several buses, CAN FD and packed samples, from the virtual drives to the recording, on real (virtual) buses."""
+"""Several buses, CAN FD and packed samples, from the virtual drives to the recording, on vcan."""
 
 import json
 import signal
@@ -26,7 +26,7 @@ SLOW = {"role": "producer", "period_us": 1000, "counter": 240}
 
 @pytest.fixture
 def channels(request: pytest.FixtureRequest) -> Iterator[list[str]]:
-    """Names of six buses of this test alone."""
+    """Names of six buses that only this test uses."""
     names = [f"w{time.monotonic_ns() % 10**9}n{k}" for k in range(6)]
     for name in names:
         ensure_vcan(name)
@@ -36,7 +36,7 @@ def channels(request: pytest.FixtureRequest) -> Iterator[list[str]]:
 
 
 def session_file(folder: Path, shipped: str, channels: list[str], **changes: Any) -> Path:
-    """A shipped session on other buses, under the name of the test's folder."""
+    """Write a shipped session with other buses; the cell has the name of the folder."""
     source = config_path(shipped)
     text = source.read_text()
     for k in range(6):
@@ -53,14 +53,14 @@ def session_file(folder: Path, shipped: str, channels: list[str], **changes: Any
 
 
 def start(*arguments: Any) -> subprocess.Popen[str]:
-    """An armident command as a process."""
+    """Start an armident command as a process."""
     command = ARMIDENT + [str(a) for a in arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 @contextmanager
 def robot(session: Path, *options: Any) -> Iterator[subprocess.Popen[str]]:
-    """The virtual arm on the session's buses, ready."""
+    """Run the virtual arm on the session's buses."""
     process = start("robot", "--config", session, *options)
     assert process.stdout is not None
     line = process.stdout.readline()
@@ -75,26 +75,26 @@ def robot(session: Path, *options: Any) -> Iterator[subprocess.Popen[str]]:
 
 
 def captured(session: Path, out: Path, *options: Any) -> tuple[Recording, str]:
-    """The recording of a whole capture, and what it said."""
+    """Run a capture; return its recording and its stderr."""
     process = start("capture", "--config", session, "--out", out, "--json", *options)
     stdout, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
     return read_recording(json.loads(stdout)["recording"]), err
 
 
-def wait_until_it_says(process: subprocess.Popen[str], text: str) -> str:
-    """What the process said on stderr up to the line with this text."""
+def wait_for_line(process: subprocess.Popen[str], text: str) -> str:
+    """Return the stderr of a process up to the line with a text."""
     assert process.stderr is not None
-    said = ""
-    while text not in said:
+    log = ""
+    while text not in log:
         line = process.stderr.readline()
-        assert line, f"ended: {said}"
-        said += line
-    return said
+        assert line, f"ended: {log}"
+        log += line
+    return log
 
 
-def every_sync_is_accounted_for(recording: Recording) -> set[int]:
-    """Rows and gaps make up all SYNCs; the SYNCs in gaps."""
+def gaps_of_samples(recording: Recording) -> set[int]:
+    """Return the SYNCs in gaps, after a check that rows and gaps make up all SYNCs."""
     gaps = {k for g in recording.gaps if g.stream == "samples" for k in range(g.first, g.last + 1)}
     rows = set(recording.samples.sync.tolist())
     assert not rows & gaps
@@ -111,10 +111,10 @@ def test_three_seconds_at_5_khz_lose_nothing(shipped: str, pack: int, channels: 
     with robot(session):
         recording, err = captured(session, tmp_path / "out", "--duration", "3")
     assert recording.missing is None
-    gaps = every_sync_is_accounted_for(recording)
+    gaps = gaps_of_samples(recording)
     sent = recording.counters["sync_sent"]
     assert sent == 15_000
-    # The last SYNCs fill no packed TPDO.
+    # The last SYNCs do not fill a packed TPDO.
     assert gaps == set(range(sent - sent % pack, sent)), err
     assert recording.counters["kernel_drops"] == 0
     assert recording.counters["frames_unknown"] == 0
@@ -124,10 +124,8 @@ def test_three_seconds_at_5_khz_lose_nothing(shipped: str, pack: int, channels: 
 
 
 @pytest.mark.parametrize("shipped", ["tx40_two_fd.yaml", "tx40_one_fd.yaml"])
-def test_what_is_played_arrives_sample_by_sample_whatever_the_buses(
-    shipped: str, channels: list[str], tmp_path: Path
-) -> None:
-    """A recording of the classic cell, played by drives on CAN FD."""
+def test_replayed_samples_arrive_unchanged_on_all_buses(shipped: str, channels: list[str], tmp_path: Path) -> None:
+    """Drives on CAN FD replay a recording of the classic CAN cell."""
     classic = session_file(tmp_path, "tx40_replay.yaml", channels, sync=SLOW)
     with robot(classic):
         first, _ = captured(classic, tmp_path / "first", "--duration", "2")
@@ -136,7 +134,7 @@ def test_what_is_played_arrives_sample_by_sample_whatever_the_buses(
     with robot(session, "--replay", path):
         second, _ = captured(session, tmp_path / "second", "--duration", "3")
     played, got = first.samples.raw, second.samples.raw
-    # It begins when the last drive is enabled, which is before SYNC 0, and its last sample stands.
+    # The replay begins when the last drive is enabled, before SYNC 0; its last sample is repeated.
     assert np.unique(played["current"], axis=0).shape[0] > 100
     n = min(len(played["current"]), len(got["current"])) - 1
     starts = [k for k in range(5) if np.array_equal(got["current"][: n - 5], played["current"][k : k + n - 5])]
@@ -145,26 +143,26 @@ def test_what_is_played_arrives_sample_by_sample_whatever_the_buses(
     assert np.array_equal(got["position"][: n - 5], played["position"][k : k + n - 5])
 
 
-def test_one_bus_down_is_a_gap_of_its_axes_and_it_comes_back(channels: list[str], tmp_path: Path) -> None:
+def test_a_bus_that_goes_down_is_a_gap_of_its_axes_until_it_is_back(channels: list[str], tmp_path: Path) -> None:
     session = session_file(tmp_path, "tx40_two_fd.yaml", channels, sync=SLOW)
     with robot(session):
         process = start("capture", "--config", session, "--out", tmp_path / "out", "--json")
-        said = wait_until_it_says(process, "recording to")
+        log = wait_for_line(process, "recording to")
         time.sleep(2.0)
         subprocess.run(["ip", "link", "set", channels[1], "down"], check=True)
-        said += wait_until_it_says(process, "went down")
+        log += wait_for_line(process, "went down")
         time.sleep(1.0)
         subprocess.run(["ip", "link", "set", channels[1], "up"], check=True)
-        said += wait_until_it_says(process, "is back")
+        log += wait_for_line(process, "is back")
         time.sleep(2.0)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
-    assert process.returncode == 0, said + err
+    assert process.returncode == 0, log + err
     recording = read_recording(json.loads(out)["recording"])
-    gaps = every_sync_is_accounted_for(recording)
+    gaps = gaps_of_samples(recording)
     print(recording.gaps, recording.counters)
     assert 500 <= len(gaps) <= recording.counters["sync_sent"] - 2000
-    # None of them is of the axes of the other bus, and nothing is missing well before and well after.
+    # No gap is of an axis on the other bus, and there are none long before and long after.
     assert {g.joint for g in recording.gaps} <= {"joint_4", "joint_5", "joint_6"}
     assert recording.counters["bus_down"] == 1
     assert recording.samples.sync[0] == 0
@@ -178,7 +176,7 @@ def test_the_arm_moves_by_set_points_on_several_buses(channels: list[str], tmp_p
     session = session_file(tmp_path, "tx40_two_fd.yaml", channels, sync=SLOW, setpoints=moved)
     with robot(session):
         recording, err = captured(session, tmp_path / "out")
-    every_sync_is_accounted_for(recording)
+    gaps_of_samples(recording)
     ((first, last),) = recording.experiments()
     inside = (recording.samples.sync >= first) & (recording.samples.sync <= last)
     position = recording.samples.si("position")[inside]

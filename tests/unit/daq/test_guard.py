@@ -1,4 +1,4 @@
-"""What the guard makes of the frames of an arm that moves as it may, and of one that does not."""
+"""Monitor of the guard: alarms for an arm beyond its limits, and none for one within them."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig, SessionConfig, load_robot, load_session, load_trajectory
 from armident.configs.units import counts_per_si
 from armident.daq.guard.limits import limits_of
-from armident.daq.guard.monitor import Watch
+from armident.daq.guard.monitor import MotionMonitor
 from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.can.frames import Frames, frames
 from armident.drivers.canopen.objects import COB_SYNC, TpdoLayout, rpdo_cob, tpdo_cob
@@ -26,7 +26,7 @@ def session() -> SessionConfig:
 
 
 def on_the_bus(robot: RobotConfig, q: NDArray[np.float64], current: NDArray[np.int64] | None = None) -> Frames:
-    """Frames of a motion (N, n): SYNC, every sample, and at every fifth the set points and the demand."""
+    """Return the frames of a motion (N, n): SYNC and samples, with set points and demand at every fifth SYNC."""
     counts = np.rint(q @ robot.transmission_matrix.T * counts_per_si(robot)).astype(np.int64)
     rows: list[tuple[int, bytes]] = []
     for k in range(len(q)):
@@ -40,18 +40,18 @@ def on_the_bus(robot: RobotConfig, q: NDArray[np.float64], current: NDArray[np.i
     return _frames(rows)
 
 
-def watch(session: SessionConfig, robot: RobotConfig) -> Watch:
-    return Watch(session, robot, limits_of(robot))
+def monitor_of(session: SessionConfig, robot: RobotConfig) -> MotionMonitor:
+    return MotionMonitor(session, robot, limits_of(robot))
 
 
 def test_a_motion_within_the_limits_is_no_alarm(session: SessionConfig, robot: RobotConfig) -> None:
-    """The shipped trajectory, given in batches of any size."""
+    """The shipped trajectory, in batches of random size."""
     assert session.setpoints is not None
     bus = on_the_bus(robot, load_trajectory(session.setpoints.trajectory).sample(session.sync_period)[:10_000])
-    guard, at = watch(session, robot), 0
+    guard, at = monitor_of(session, robot), 0
     sizes = np.random.default_rng(0).integers(1, 300, bus.size)
     for size in sizes:
-        assert guard.look(bus[at : at + size], NOW) is None
+        assert guard.check(bus[at : at + size], NOW) is None
         at += int(size)
         if at >= bus.size:
             break
@@ -59,22 +59,22 @@ def test_a_motion_within_the_limits_is_no_alarm(session: SessionConfig, robot: R
 
 
 @pytest.mark.parametrize("joint", range(6))
-def test_haste_is_seen_at_every_joint(session: SessionConfig, robot: RobotConfig, joint: int) -> None:
+def test_excess_velocity_is_detected_at_every_joint(session: SessionConfig, robot: RobotConfig, joint: int) -> None:
     """Five per cent above the limit is an alarm, five per cent below is none; joint 5 also turns motor 6."""
     t = np.arange(200) * session.sync_period
     limit = robot.joints[joint].limits.velocity
     for share, expected in ((0.95, None), (1.05, f"{robot.joints[joint].name}: velocity")):
         q = np.zeros((t.size, robot.n))
         q[:, joint] = share * limit * t
-        alarm = watch(session, robot).look(on_the_bus(robot, q), NOW)
+        alarm = monitor_of(session, robot).check(on_the_bus(robot, q), NOW)
         assert alarm is None if expected is None else alarm is not None and alarm.text.startswith(expected)
 
 
 @pytest.mark.parametrize("joint", range(6))
-def test_a_load_above_the_limit_is_seen_and_one_below_is_not(
+def test_a_torque_above_the_limit_is_detected_and_one_below_is_not(
     session: SessionConfig, robot: RobotConfig, joint: int
 ) -> None:
-    """Held for longer than the mean is taken over; the torque of a joint is that of all motors that drive it."""
+    """Longer than the averaging time; the torque of a joint is that of all motors that drive it."""
     torque = np.zeros(robot.n)
     found = []
     for share in (0.97, 1.03):
@@ -82,50 +82,52 @@ def test_a_load_above_the_limit_is_seen_and_one_below_is_not(
         motor = np.linalg.solve(robot.transmission_matrix.T, torque)
         per_mille = motor / np.array([j.drive.gain * j.drive.rated / 1000 for j in robot.joints])
         current = np.repeat(np.rint(per_mille).astype(np.int64)[None], 100, axis=0)
-        found.append(watch(session, robot).look(on_the_bus(robot, np.zeros((100, robot.n)), current), NOW))
+        found.append(monitor_of(session, robot).check(on_the_bus(robot, np.zeros((100, robot.n)), current), NOW))
     assert found[0] is None
     assert found[1] is not None
     assert found[1].text.startswith(f"{robot.joints[joint].name}: torque")
 
 
-def test_a_batch_that_ends_anywhere_names_the_same_frame(session: SessionConfig, robot: RobotConfig) -> None:
-    """The offending frame is the first sample behind the limit of joint 3, however frames are dealt out."""
+def test_the_offending_frame_does_not_depend_on_the_batches(session: SessionConfig, robot: RobotConfig) -> None:
+    """The offending frame is the first sample behind the limit of joint 3."""
     q = np.zeros((400, robot.n))
     q[:, 2] = np.linspace(2.3, 2.5, 400)
     bus = on_the_bus(robot, q)
-    whole = watch(session, robot).look(bus, NOW)
+    whole = monitor_of(session, robot).check(bus, NOW)
     assert whole is not None
     assert "joint_3: position 2.4" in whole.text
     first = int(np.flatnonzero(q[:, 2] > 2.4)[0])
     samples = np.flatnonzero(bus["can_id"] == tpdo_cob(1, 3))
     assert whole.frame == samples[first]
-    guard = watch(session, robot)
+    guard = monitor_of(session, robot)
     for k in range(bus.size):
-        alarm = guard.look(bus[k : k + 1], NOW)
+        alarm = guard.check(bus[k : k + 1], NOW)
         if alarm is not None:
             break
     assert k == whole.frame
     assert alarm == type(whole)(whole.text, 0)
 
 
-def test_silence_is_judged_by_the_time_before_the_frames(session: SessionConfig, robot: RobotConfig) -> None:
+def test_missing_heartbeats_are_judged_by_the_time_before_the_frames(
+    session: SessionConfig, robot: RobotConfig
+) -> None:
     """Heartbeats at 100 ms: lost after 0.4 s."""
-    guard = watch(session, robot)
-    assert guard.look(on_the_bus(robot, np.zeros((10, robot.n))), NOW) is None
-    assert guard.look(frames(0), NOW + 399_000_000) is None
-    late = guard.look(frames(0), NOW + 401_000_000)
+    guard = monitor_of(session, robot)
+    assert guard.check(on_the_bus(robot, np.zeros((10, robot.n))), NOW) is None
+    assert guard.check(frames(0), NOW + 399_000_000) is None
+    late = guard.check(frames(0), NOW + 401_000_000)
     assert late is not None
     assert late.frame == -1
     assert late.text == "joint_1: no heartbeat for 0.40 s"
 
 
-def test_axes_on_several_buses_are_watched_together(robot: RobotConfig) -> None:
-    """Joint 6 is turned by the motors 5 and 6, each on a bus of its own; the newest of packed samples counts."""
+def test_axes_on_several_buses_are_monitored_together(robot: RobotConfig) -> None:
+    """Joint 6 is turned by the motors 5 and 6, each on its own bus."""
     session = moving(load_session("tx40_six_buses.yaml"))
-    guard = watch(session, robot)
+    guard = monitor_of(session, robot)
     t = np.arange(400) * session.sync_period
     q = np.zeros((t.size, robot.n))
-    # Half their limits each, but both turn motor 6; then joint 6 alone goes too fast.
+    # Both joints below half their limits, both turn motor 6; then joint 6 alone exceeds its limit.
     q[:, 4], q[:, 5] = 4.0 * t, 5.0 * t
     q[200:, 5] += 8.0 * (t[200:] - t[199])
     counts = np.rint(q @ robot.transmission_matrix.T * counts_per_si(robot)).astype(np.int64)
@@ -136,7 +138,7 @@ def test_axes_on_several_buses_are_watched_together(robot: RobotConfig) -> None:
             rows = [(COB_SYNC, bytes([k % 240 + 1])), (tpdo_cob(1, node), position + b"\0\0\x37\x12")]
             if k % 5 == 0:
                 rows += [(rpdo_cob(1, node), position), (tpdo_cob(2, node), position)]
-            alarm = guard.look(_frames(rows), NOW, bus)
+            alarm = guard.check(_frames(rows), NOW, bus)
             if alarm is not None:
                 at = k
                 break
@@ -148,25 +150,25 @@ def test_axes_on_several_buses_are_watched_together(robot: RobotConfig) -> None:
     assert 200 + 42 <= at <= 200 + 46
 
 
-def test_the_newest_of_packed_samples_is_looked_at(robot: RobotConfig) -> None:
+def test_the_newest_of_packed_samples_is_checked(robot: RobotConfig) -> None:
     packed = moving(load_session("tx40_one_fd.yaml"))
     pack = packed.streams["samples"].pack
     assert pack > 1
-    guard = watch(packed, robot)
+    guard = monitor_of(packed, robot)
     node = node_ids(packed, robot)[2]
     far = int(np.rint(2.5 * robot.transmission_matrix[2, 2] * counts_per_si(robot)[2]))
     size = TpdoLayout.of(packed.streams["samples"].objects, pack=pack, fd=True).size
     old, new = (value.to_bytes(4, "little", signed=True) + bytes(size - 4) for value in (0, far))
     start = _frames([(rpdo_cob(1, node), bytes(4))], fd=True)
-    assert guard.look(start, NOW) is None
-    assert guard.look(_frames([(tpdo_cob(1, node), old * pack)], fd=True), NOW) is None
-    alarm = guard.look(_frames([(tpdo_cob(1, node), old * (pack - 1) + new)], fd=True), NOW)
+    assert guard.check(start, NOW) is None
+    assert guard.check(_frames([(tpdo_cob(1, node), old * pack)], fd=True), NOW) is None
+    alarm = guard.check(_frames([(tpdo_cob(1, node), old * (pack - 1) + new)], fd=True), NOW)
     assert alarm is not None
     assert alarm.text.startswith("joint_3: position 2.5")
 
 
 def moving(session: SessionConfig) -> SessionConfig:
-    """A session that plays set points, too."""
+    """Return a session with set points."""
     setpoints = load_session("tx40_cell.yaml").setpoints
     return session.model_copy(update={"setpoints": setpoints})
 
