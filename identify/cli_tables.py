@@ -1,4 +1,4 @@
-"""What the commands show on a terminal: progress on stderr, tables on stdout."""
+"""Terminal output of the commands: progress and warnings on stderr, tables on stdout."""
 
 import sys
 import time
@@ -17,32 +17,42 @@ from armident.identify.document import DiagnosisDocument, IdentificationDocument
 from armident.identify.effects.terms import arm_model
 
 SHOW_AFTER_S = 2.0
-"""Work that takes no longer needs no progress."""
+"""Duration after which progress is shown, s."""
 
 Report = Callable[[str, float], None]
 
 
 class _Compilation(event.Listener):
-    """Says once that kernels are being compiled: the first run on a machine waits for that, and for nothing else."""
+    """Prints one line when kernels are compiled: the first run on a machine waits for the compiler."""
 
     def __init__(self, what: str) -> None:
-        self._what, self._said = what, False
+        self._what, self._printed = what, False
 
     def on_start(self, event: event.Event) -> None:
-        """A kernel that no cache holds is about to be compiled."""
-        if not self._said:
-            self._said = True
+        """Print the line before the first compilation."""
+        if not self._printed:
+            self._printed = True
             print(f"{self._what}: compiling for this machine, once: later runs find it cached", file=sys.stderr)
 
     def on_end(self, event: event.Event) -> None:
-        """Nothing is said of the end."""
+        """Do nothing at the end of a compilation."""
 
 
 @contextmanager
 def progress(what: str) -> Iterator[Report]:
     """Report stages after two seconds: a bar where stderr is a terminal, otherwise one plain line per stage.
 
-    The first run on a machine also says that it waits for the compiler.
+    The first run on a machine also prints that it compiles kernels.
+
+    Parameters
+    ----------
+    what
+        Command and its argument, the beginning of each line.
+
+    Yields
+    ------
+    callable
+        Takes a stage and the share done, 0 to 1.
     """
     begin = time.monotonic()
     with event.install_listener("numba:compile", _Compilation(what)), _stages(what, begin) as report:
@@ -71,13 +81,23 @@ def _stages(what: str, begin: float) -> Iterator[Report]:
 
 
 def warn(lines: list[str]) -> None:
-    """One line each on stderr."""
+    """Print one line per warning on stderr."""
     for line in lines:
         print(f"armident: warning: {line}", file=sys.stderr)
 
 
 def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:
-    """What a trajectory will tell: base parameters (b,), as far as known, and their predicted standard deviations."""
+    """Print base parameters, if known, and their predicted standard deviations.
+
+    Parameters
+    ----------
+    robot
+        For the names of the parameters.
+    theta
+        Base parameters (b,), or ``None``.
+    std
+        Predicted standard deviations (b,).
+    """
     table = Table(title=f"{robot.name}: predicted precision, base parameters", title_justify="left")
     names = arm_model(robot).base.names
     for column in ("parameter", "value", "std", "std %") if theta is not None else ("parameter", "std"):
@@ -92,7 +112,7 @@ def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDA
 
 
 def wanted_table(std: Mapping[str, float]) -> None:
-    """What a designed trajectory will tell of the effects that it was designed for."""
+    """Print the predicted standard deviations of the parameters of the wanted effects, by name."""
     table = Table(title="predicted precision, wanted effect", title_justify="left")
     table.add_column("parameter")
     table.add_column("std", justify="right")
@@ -102,7 +122,7 @@ def wanted_table(std: Mapping[str, float]) -> None:
 
 
 def identification_table(document: IdentificationDocument) -> None:
-    """Essential parameters with their standard deviations, IDIM-LS beside another method's estimate."""
+    """Print the essential parameters with their standard deviations, beside the IDIM-LS estimate."""
     beside = {} if document.comparison is None else {p.name: p for p in document.comparison.parameters}
     table = Table(title=f"{document.robot}: {document.method}, essential parameters", title_justify="left")
     table.add_column("parameter")
@@ -138,7 +158,7 @@ def identification_table(document: IdentificationDocument) -> None:
 
 
 def diagnosis_table(document: DiagnosisDocument) -> None:
-    """The verdict, the findings in the order found, and the gap on held-out data."""
+    """Print the verdict, the findings with their gaps on held-out data, and the unexplained residual."""
     console = Console()
     console.print(f"verdict: {document.verdict}", highlight=False)
     if document.findings:
@@ -151,24 +171,25 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
                 f"{k} {v:.4g}" + (f" ± {std[k]:.2g}" if k in std else "") for k, v in f.parameters.items()
             )
             where = f.joint if f.other is None else f"{f.joint}, {f.other}"
-            table.add_row(
-                where, f.effect, values, f"{100 * f.confidence:.0f} %", f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
-            )
+            gap = f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
+            if f.gap_without_derivative_noise is not None:
+                gap += f" ({f.gap_without_derivative_noise:.2f} % without derivative noise)"
+            table.add_row(where, f.effect, values, f"{100 * f.confidence:.0f} %", gap)
         console.print(table)
         for f in document.findings:
             rivals = f.evidence.get("ambiguous_with", [])
-            unsure = f"; could also be {', '.join(rivals)}" if rivals else ""
+            unsure = f"; ambiguous with {', '.join(rivals)}" if rivals else ""
             console.print(f"{f.joint}: {f.evidence['description']}{unsure}", highlight=False)
     if document.considered:
         named = ", ".join(f.rejection for f in document.considered)
-        console.print(f"considered, and not convincing: {named}", highlight=False, soft_wrap=True)
+        console.print(f"considered and rejected: {named}", highlight=False, soft_wrap=True)
     for u in document.unexplained:
         console.print(
             f"unexplained: {u.joint}, {100 * u.share_of_residual:.0f} % of its residual varies with {u.varies_with}",
             highlight=False,
         )
     if document.recommended_experiment is not None:
-        console.print(f"to decide: {document.recommended_experiment}", highlight=False)
+        console.print(f"next experiment: {document.recommended_experiment}", highlight=False)
     gap = document.gap.validation
     console.print(
         f"torque error on held-out data: {gap.before.all:.2f} % before, {gap.after.all:.2f} % after", highlight=False
@@ -176,7 +197,7 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
 
 
 def _plain_lines(what: str, begin: float) -> Report:
-    """Lines on stderr: one per stage, and one for every further fifth of the work."""
+    """Print lines on stderr: one per stage, and one for every further fifth of the work."""
     last: tuple[str, int] | None = None
 
     def show(stage: str, share: float) -> None:

@@ -115,6 +115,9 @@ class Alternative(Document):
     score: float
 
 
+DERIVATIVE_NOISE = 0.98
+"""Ratio of the gap without derivative noise to the gap, below which both are shown."""
+
 Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
 
 
@@ -131,6 +134,12 @@ class Finding(Document):
     gap_before: float
     gap_after: float
     evidence: dict[str, Any]
+
+    @property
+    def gap_without_derivative_noise(self) -> float | None:
+        """Gap after without derivative noise, percent; ``None`` unless `DERIVATIVE_NOISE` makes a difference."""
+        without = self.evidence.get("gap_without_derivative_noise")
+        return None if without is None or without >= DERIVATIVE_NOISE * self.gap_after else float(without)
 
     @property
     def rejection(self) -> str:

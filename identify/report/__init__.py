@@ -1,1 +1,1 @@
-"""Reports: one self-contained HTML file each, for whoever runs the plant."""
+"""Reports of results: one self-contained HTML file each, and the glossary."""

@@ -1,4 +1,4 @@
-"""The report of a diagnosis: what is missing, how sure, how much of the gap it explains, and what remains."""
+"""HTML report of a diagnosis: findings with confidence and gap, detection limits, unexplained residual."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,30 +9,37 @@ from numpy.typing import NDArray
 from armident.identify.diagnosis.diagnose import Diagnosis
 from armident.identify.diagnosis.where import Disagreement
 from armident.identify.document import DiagnosisDocument, Finding
+from armident.identify.report.glossary import diagnosis_entries
 from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 
 Array = NDArray[np.float64]
 
 VERDICTS = {
-    "no_gap": "The model explains the data: nothing is missing that these recordings could show.",
-    "explained": "Something is missing from the model, and what was found explains it.",
-    "partly_explained": "Something is missing from the model; what was found explains a part of it.",
-    "unexplained": "Something is missing from the model that no effect of the catalogue explains.",
+    "no_gap": "The model explains the data; these recordings show no missing effect.",
+    "explained": "The model lacks effects, and the findings explain the gap.",
+    "partly_explained": "The model lacks effects; the findings explain a part of the gap.",
+    "unexplained": "The model lacks something that no effect of the catalogue explains.",
 }
 CERTAIN, LIKELY = 0.95, 0.6
 """Confidence from which a finding is called certain, and likely."""
 BINS, FILLED = 14, 5
 """Bins of a variable, and the fewest samples of one that is drawn."""
-NOISELESS = 0.98
-"""Torque error without the noise of measured derivatives, over that with it, from which down it is told, too."""
 SHOWN = 700
-"""Most samples of one curve: more would be a band of ink."""
+"""Most samples of one curve."""
 FOLLOWS = 0.6
-"""Share of the power of what a finding adds that its means over a variable have, where it is drawn over that."""
+"""Share of the power of a finding's torque that its means over a variable must have to be drawn over it."""
 
 
 def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
-    """HTML page of a diagnosis, complete in one file."""
+    """Return the HTML page of a diagnosis, complete in one file.
+
+    Parameters
+    ----------
+    diagnosis
+        Curves and configuration with the findings.
+    document
+        ``diagnosis.json``.
+    """
     joints = [joint.name for joint in diagnosis.robot.joints]
     hidden: dict[str, list[str]] = {}
     for i in document.not_visible:
@@ -41,6 +48,7 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
         "diagnosis.html",
         document=document,
         detection_limits=_detection_limits(document),
+        glossary=diagnosis_entries(document),
         verdict=VERDICTS[document.verdict],
         findings=[
             {
@@ -49,7 +57,6 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
                 "where": finding.joint if finding.other is None else f"{finding.joint} and {finding.other}",
                 "sure": certainty(finding),
                 "closed": closed_share(finding, document),
-                "noisy": (finding.evidence.get("gap_without_derivative_noise") or np.inf) < NOISELESS * finding.gap_after,
                 "rows": _rows(finding),
                 "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking),
             }
@@ -64,35 +71,46 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
 
 
 def _detection_limits(document: DiagnosisDocument) -> list[dict[str, str]]:
-    """Rows of the table of what could hide: effect, place, and the sizes from which on it would have been found."""
+    """Return the rows of the table of detection limits."""
     return [
         {
             "effect": h.effect.replace("_", " "),
             "joint": h.joint if h.other is None else f"{h.joint} and {h.other}",
-            "below": ", ".join(f"{name} {value:g} {h.units[name]}".rstrip() for name, value in h.limits.items()),
+            "limits": ", ".join(f"{name} {value:g} {h.units[name]}".rstrip() for name, value in h.limits.items()),
         }
         for h in document.detection_limits
     ]
 
 
 def certainty(finding: Finding) -> str:
-    """How sure a finding is, in words."""
+    """Return the confidence of a finding in words."""
     rivals = finding.evidence.get("ambiguous_with", [])
     if rivals:
-        return "cannot be told apart from " + ", ".join(name.replace("_", " ") for name in rivals)
+        return "ambiguous with " + ", ".join(name.replace("_", " ") for name in rivals)
     if finding.confidence >= CERTAIN:
         return "certain"
-    return "likely" if finding.confidence >= LIKELY else "doubtful: something like it, perhaps outside the catalogue"
+    return "likely" if finding.confidence >= LIKELY else "uncertain: a similar effect, perhaps outside the catalogue"
 
 
 def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:
-    """Share of the joint's held-out gap above the noise floor that a finding closes; ``None`` if there is no gap.
+    """Return the share of the joint's held-out gap above the noise floor that a finding closes, 0 to 1.
 
-    At measured motion, or with what it changes at simulated motion, where that leaves less: noise that derivatives of
-    measured positions bring is no fault of the model.
+    The gap after is that without derivative noise where this is smaller.
+
+    Parameters
+    ----------
+    finding
+        A finding.
+    document
+        Its document, for the noise floor.
+
+    Returns
+    -------
+    float or None
+        ``None`` if there is no gap above the noise floor.
     """
-    foretold = finding.evidence.get("gap_without_derivative_noise")
-    after = finding.gap_after if foretold is None else min(finding.gap_after, foretold)
+    noiseless = finding.evidence.get("gap_without_derivative_noise")
+    after = finding.gap_after if noiseless is None else min(finding.gap_after, noiseless)
     floor = min(document.noise_floor.by_joint[finding.joint], after)
     gap = finding.gap_before**2 - floor**2
     if gap <= 0:
@@ -101,19 +119,19 @@ def closed_share(finding: Finding, document: DiagnosisDocument) -> float | None:
 
 
 def _rows(finding: Finding) -> list[tuple[str, float, float | None, str]]:
-    """Parameters with standard deviation and unit."""
+    """Return the parameters with standard deviation and unit."""
     std, units = finding.evidence.get("std", {}), finding.evidence.get("units", {})
     return [(name, value, std.get(name), units.get(name, "")) for name, value in finding.parameters.items()]
 
 
 def _gap_figure(document: DiagnosisDocument) -> str:
-    """Held-out torque error per joint, before and after, with the noise floor."""
+    """Return a figure of the held-out torque error per joint, before and after, with the noise floor."""
     before, after = document.gap.validation.before.by_joint, document.gap.validation.after.by_joint
     place = np.arange(len(before))
     with figure(1, 1, 2.3) as (_, axes, picture):
         axis = axes[0, 0]
         axis.bar(place - 0.19, list(before.values()), 0.36, color=MEASURED, label="model as configured")
-        axis.bar(place + 0.19, list(after.values()), 0.36, color=MODEL, label="with what was found")
+        axis.bar(place + 0.19, list(after.values()), 0.36, color=MODEL, label="with the findings")
         for k, floor in enumerate(document.noise_floor.by_joint.values()):
             axis.hlines(floor, k - 0.42, k + 0.42, color=MUTED, linestyle=(0, (3, 2)), linewidth=1.2)
         axis.plot([], [], color=MUTED, linestyle=(0, (3, 2)), label="noise floor")
@@ -126,12 +144,17 @@ def _gap_figure(document: DiagnosisDocument) -> str:
 
 
 def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None) -> str:
-    """The joint's held-out residual without and with a finding: over time, and over what the finding follows.
+    """Return a figure of the joint's held-out residual without and with a finding, over time and over its variable.
 
     Parameters
     ----------
+    diagnosis
+        Curves.
+    joint
+        Index of the joint.
     lacking
-        Torques of the model without the finding; ``None`` compares the model as configured with that of all findings.
+        Torques (M, n) of the model without the finding; ``None`` compares the model as configured with that of all
+        findings.
     """
     name, unit = diagnosis.robot.joints[joint].name, _unit(diagnosis, joint)
     seen = [d for d in diagnosis.where if d.joint == name]
@@ -141,10 +164,10 @@ def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None) -> 
     part = telling_stretch(added)
     with figure(1, 2, 2.7) as (_, axes, picture):
         over_time, over_cause = axes[0]
-        curves = (("without it", rest, MEASURED), ("with it", rest - added, MODEL))
+        curves = (("without the effect", rest, MEASURED), ("with the effect", rest - added, MODEL))
         for label, residual, colour in curves:
             over_time.plot(diagnosis.t[part], residual[part], color=colour, linewidth=1.1, label=label)
-        over_time.set_title(f"{name}: measured minus predicted torque, data not used for fitting")
+        over_time.set_title(f"{name}: measured minus predicted torque, held-out data")
         over_time.set_xlabel("s")
         over_time.set_ylabel(unit)
         over_time.legend(frameon=False, ncols=2, fontsize=8.5, loc="upper left")
@@ -158,7 +181,7 @@ def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None) -> 
 
 
 def telling_stretch(added: Array) -> slice:
-    """The samples in a row, as many as a picture can show apart, in which a finding changes most."""
+    """Return the `SHOWN` consecutive samples in which the torque (M,) of a finding has most power."""
     if added.size <= SHOWN:
         return slice(0, added.size)
     power = np.concatenate([[0.0], np.cumsum(added**2)])
@@ -167,7 +190,19 @@ def telling_stretch(added: Array) -> slice:
 
 
 def followed_variable(diagnosis: Diagnosis, joint: int, added: Array) -> tuple[str, str, Array]:
-    """What a finding is drawn over, with unit: the plainest variable that it follows, or its own torque."""
+    """Return the variable that a finding is drawn over: name, unit, values (M,).
+
+    Speed, position or time, the first whose means have the share `FOLLOWS` of its power; otherwise its own torque.
+
+    Parameters
+    ----------
+    diagnosis
+        Curves.
+    joint
+        Index of the joint.
+    added
+        Torque (M,) that the finding adds, N m or N.
+    """
     way = "m" if diagnosis.robot.joints[joint].type == "prismatic" else "rad"
     for name, unit, x in (
         ("joint speed", f"{way}/s", diagnosis.qd[:, joint]),
@@ -176,27 +211,27 @@ def followed_variable(diagnosis: Diagnosis, joint: int, added: Array) -> tuple[s
     ):
         if _followed(x, added) >= FOLLOWS:
             return name, unit, x
-    return "the torque it adds", _unit(diagnosis, joint), added
+    return "torque of the effect", _unit(diagnosis, joint), added
 
 
 def _followed(x: Array, added: Array) -> float:
-    """Share of the power of a torque that its means over a variable have."""
+    """Return the share of the power of a torque that its means over a variable have."""
     varying = added - added.mean()
     power = sum(part.size * varying[part].mean() ** 2 for part in _bins(x))
     return float(power / max(varying @ varying, 1e-300))
 
 
 def _over_cause(axis: Any, rest: Array, added: Array, cause: tuple[str, str, Array], unit: str) -> None:
-    """Means of what is missing, with its spread, and of what a finding adds."""
+    """Draw binned means of the residual without an effect, with spread, and of the torque of the effect."""
     name, unit_of_cause, x = cause
     bins = _bins(x)
     centres, mean = ([float(y[part].mean()) for part in bins] for y in (x, added))
     missing, spread = [rest[part].mean() for part in bins], [rest[part].std() for part in bins]
     axis.errorbar(
         centres, missing, spread, color=MUTED, ecolor=MEASURED, linestyle="", marker="o", markersize=4,
-        label="missing without it: mean and spread",
+        label="residual without the effect: mean and spread",
     )  # fmt: skip
-    axis.plot(centres, mean, color=MODEL, linewidth=1.6, label="what it adds")
+    axis.plot(centres, mean, color=MODEL, linewidth=1.6, label="torque of the effect")
     axis.set_title(f"over {name}")
     axis.set_xlabel(unit_of_cause)
     axis.set_ylabel(unit)
@@ -208,18 +243,18 @@ def _unit(diagnosis: Diagnosis, joint: int) -> str:
 
 
 def _curve(axis: Any, d: Disagreement, unit: str) -> None:
-    """What the model lacks over the variable that the residual depends on most; of a size, what noise has of it."""
+    """Draw a residual dependence with its uncertainty; a spectrum or transients with the noise level."""
     x, value, band = d.curve.x, d.curve.value, d.curve.band
     low, high = (np.zeros_like(band), band) if d.of_noise else (value - band, value + band)
     axis.fill_between(x, low, high, color=BAND, linewidth=0)
     axis.plot(x, value, color=RESIDUAL, linewidth=1.6)
-    axis.set_title(f"what the model as configured lacks, over {d.varies_with}")
+    axis.set_title(f"residual of the model as configured, over {d.varies_with}")
     axis.set_xlabel(d.unit)
     axis.set_ylabel(f"{unit}/√Hz" if d.kind == "motion" else unit)
 
 
 def _map_figure(diagnosis: Diagnosis, joints: Sequence[str]) -> str | None:
-    """Share of each joint's held-out residual that each variable predicts, before; with what is left marked."""
+    """Return a figure of the share of each joint's residual that each variable predicts, unexplained ones marked."""
     kinds = list(dict.fromkeys(d.kind for d in diagnosis.where))
     if not kinds:
         return None
@@ -233,7 +268,7 @@ def _map_figure(diagnosis: Diagnosis, joints: Sequence[str]) -> str | None:
         axis.imshow(shares, cmap="Blues", vmin=0, vmax=max(0.3, float(shares.max())), aspect="auto")
         for row, column in zip(*np.nonzero(shares >= 0.005), strict=True):
             dark = shares[row, column] > 0.55 * max(0.3, float(shares.max()))
-            remains = " left" if (row, column) in left else ""
+            remains = " unexplained" if (row, column) in left else ""
             axis.text(
                 column, row, f"{100 * shares[row, column]:.0f} %{remains}", ha="center", va="center", fontsize=8.5,
                 color="white" if dark else INK,
@@ -245,16 +280,16 @@ def _map_figure(diagnosis: Diagnosis, joints: Sequence[str]) -> str | None:
 
 
 def _curve_figure(d: Disagreement, unit: str) -> str:
-    """Shape of what is left, in the unit of the joint's torque."""
+    """Return a figure of an unexplained residual dependence, in the unit of the joint's torque."""
     with figure(1, 1, 2.3) as (_, axes, picture):
         _curve(axes[0, 0], d, unit)
-        over = {"motion": "frequency; shaded: noise", "transients": "time, from moment to moment; shaded: noise"}
-        axes[0, 0].set_title(f"{d.joint}: what remains, over {over.get(d.kind, d.varies_with)}")
+        over = {"motion": "frequency; shaded: noise", "transients": "time; shaded: noise"}
+        axes[0, 0].set_title(f"{d.joint}: unexplained residual, over {over.get(d.kind, d.varies_with)}")
         axes[0, 0].axhline(0, color=MUTED, linewidth=0.6)
     return picture[0]
 
 
 def _bins(x: Array) -> list[NDArray[np.intp]]:
-    """Samples of equally wide bins of a variable, as far as there are enough of them."""
+    """Return the sample numbers of equally wide bins of a variable, without bins of fewer than `FILLED` samples."""
     number = np.digitize(x, np.linspace(x.min(), x.max(), BINS + 1)[1:-1])
     return [part for k in range(BINS) if (part := np.flatnonzero(number == k)).size >= FILLED]

@@ -1,4 +1,4 @@
-"""Writes result documents and their reports into a folder."""
+"""Writers of result documents and reports."""
 
 from pathlib import Path
 
@@ -10,7 +10,20 @@ from armident.identify.identification.api import IdentificationOutcome
 
 
 def write_identification(outcome: IdentificationOutcome, out: Path) -> tuple[Path, Path]:
-    """Write ``identification.json`` and ``report.html`` into a folder; returns their paths."""
+    """Write ``identification.json`` and ``report.html`` into a folder.
+
+    Parameters
+    ----------
+    outcome
+        Result with its document.
+    out
+        Folder; created if it is missing.
+
+    Returns
+    -------
+    tuple of Path
+        Paths of document and report.
+    """
     from armident.identify.report.identification import identification_report
 
     document, report = out / "identification.json", out / "report.html"
@@ -20,5 +33,5 @@ def write_identification(outcome: IdentificationOutcome, out: Path) -> tuple[Pat
 
 
 def robot_yaml(robot: RobotConfig) -> str:
-    """A robot configuration as its file."""
+    """Return the YAML text of a robot configuration."""
     return yaml.safe_dump(robot.model_dump(mode="json", by_alias=True), sort_keys=False)

@@ -1,4 +1,4 @@
-"""The report of an identification: what was recorded, what came out, and how far to trust it."""
+"""HTML report of an identification: recordings, parameters with uncertainties, residual tests."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,19 +10,35 @@ from armident.configs import RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument
 from armident.identify.identification.result import Identification
+from armident.identify.report.glossary import identification_entries
 from armident.identify.report.page import BAND, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
 
 Array = NDArray[np.float64]
 
 GOOD_PCT = 5.0
-"""Relative standard deviation (percent) up to which a parameter counts as well determined."""
+"""Relative standard deviation, percent, up to which a parameter counts as well determined."""
 FAIR_PCT = 20.0
+"""Relative standard deviation, percent, up to which a parameter counts as usable."""
+WHITE = 0.15
+"""Fraction of autocorrelation lags outside two standard deviations up to which residuals count as white."""
 
 
 def identification_report(
     recordings: Sequence[Recording], robot: RobotConfig, result: Identification, document: IdentificationDocument
 ) -> str:
-    """HTML page of an identification, complete in one file."""
+    """Return the HTML page of an identification, complete in one file.
+
+    Parameters
+    ----------
+    recordings
+        Recordings that were used.
+    robot
+        Their robot.
+    result
+        Estimates and curves.
+    document
+        ``identification.json``.
+    """
     joints = [joint.name for joint in robot.joints]
     return render(
         "identification.html",
@@ -36,11 +52,12 @@ def identification_report(
         controller=_controller_figure(document.controller),
         beside={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
         white=_white_words(document),
+        glossary=identification_entries(document),
     )
 
 
 def recorded(recording: Recording) -> dict[str, Any]:
-    """What a reader asks first about a recording."""
+    """Return the facts of a recording for the report: rate, duration, streams, lost samples."""
     samples = recording.samples
     spans = recording.experiments()
     lost = sum(g.last - g.first + 1 for g in recording.gaps if g.stream == "samples" and g.joint is None)
@@ -67,7 +84,17 @@ def recorded(recording: Recording) -> dict[str, Any]:
 
 
 def torque_figure(t: Array, measured: Array, predicted: Array, joints: list[str], units: list[str]) -> str:
-    """Measured and predicted torque and their difference, one row per joint."""
+    """Return a figure of measured and predicted torque and their difference, one plot per joint.
+
+    Parameters
+    ----------
+    t
+        Instants (M,), s; a step back begins another experiment.
+    measured, predicted
+        Torques (M, n), N m or N.
+    joints, units
+        Name and unit of each joint.
+    """
     t = t - t[0]
     breaks = np.flatnonzero(np.diff(t) <= 0)
     measured, predicted = measured.copy(), predicted.copy()
@@ -151,18 +178,18 @@ def _white_words(document: IdentificationDocument) -> str:
     if worst is None:
         return "not tested"
     outside = 100 * worst.fraction_outside_2sigma
-    if worst.fraction_outside_2sigma <= 0.15:
+    if worst.fraction_outside_2sigma <= WHITE:
         return (
-            f"white (at most {outside:.0f} % of the lags outside, on {worst.joint}): the uncertainties can be trusted"
+            f"white (at most {outside:.0f} % of the lags outside, on {worst.joint}): standard deviations are reliable"
         )
     return (
-        f"not white ({outside:.0f} % of the lags outside on {worst.joint}): something the model lacks is left, "
-        "and the uncertainties may be too small"
+        f"not white ({outside:.0f} % of the lags outside on {worst.joint}): they contain model error, and the standard "
+        "deviations may be too small"
     )
 
 
 def _continued(t: Array) -> Array:
-    """Time of one experiment after the other on one axis."""
+    """Return the times (M,) of consecutive experiments on one axis."""
     steps = np.diff(t, prepend=t[0])
     typical = float(np.median(steps[1:])) if t.size > 1 else 0.0
     return np.cumsum(np.where(steps <= 0, typical, steps))

@@ -66,7 +66,7 @@ def test_document_and_page_hold_what_the_tests_say(method: Method) -> None:
     assert (document["diagnostics"]["endogeneity"] is None) == (method == "idim-ls")
     assert (document["torque_delay_samples"] is None) == (method == "idim-ls")
     page = identification_report(outcome.recordings, outcome.robot, outcome.result, outcome.document)
-    assert "What tests say" in page
+    assert "Statistical tests" in page
     assert ("Durbin" in page) == (method != "idim-ls")
 
 
@@ -83,7 +83,7 @@ def test_a_physical_arm_is_found_on_request() -> None:
     assert len(physical["parameters"]) == 87
     assert physical["compatible"]
     page = identification_report(outcome.recordings, outcome.robot, outcome.result, outcome.document)
-    assert "nearest physically consistent arm" in page
+    assert "Nearest physically consistent parameters" in page
 
 
 def test_the_grey_box_agrees_with_the_black_box() -> None:

@@ -1,4 +1,4 @@
-"""What the commands say while they work."""
+"""Progress of the commands on a terminal."""
 
 import numba
 import pytest
@@ -6,13 +6,13 @@ import pytest
 from armident.identify.cli_tables import progress
 
 
-def test_who_waits_for_the_compiler_is_told_so_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_compiler_message_appears_once(capsys: pytest.CaptureFixture[str]) -> None:
     one = numba.njit(lambda x: x + 1)
     two = numba.njit(lambda x: x + 2)
     with progress("identify tx40.mcap"):
         assert one(1) + two(1) == 5
-    said = capsys.readouterr().err.splitlines()
-    assert [line for line in said if "compiling" in line] == [
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if "compiling" in line] == [
         "identify tx40.mcap: compiling for this machine, once: later runs find it cached"
     ]
     with progress("identify tx40.mcap"):

@@ -1,4 +1,4 @@
-"""The report of a diagnosis: every finding has a picture of its own, drawn from what its numbers are of."""
+"""Report of a diagnosis: one figure per finding, drawn from the curves of its numbers."""
 
 import re
 
@@ -59,7 +59,7 @@ def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: D
     )
     page = diagnosis_report(diagnosis, partly)
     assert "Simulated closed loop" not in page
-    assert "Where model and data disagree" in page
+    assert "Dependence of the residual" in page
 
 
 def test_a_finding_is_drawn_over_what_it_follows(diagnosis: Diagnosis) -> None:
@@ -73,7 +73,7 @@ def test_a_finding_is_drawn_over_what_it_follows(diagnosis: Diagnosis) -> None:
         "joint_spring": ("joint position", "m"),
     }
     noise = np.random.default_rng(1).standard_normal(diagnosis.t.size)
-    assert followed_variable(diagnosis, 0, noise)[:2] == ("the torque it adds", "N")
+    assert followed_variable(diagnosis, 0, noise)[:2] == ("torque of the effect", "N")
 
 
 def test_a_long_recording_is_drawn_where_the_finding_changes_most() -> None:

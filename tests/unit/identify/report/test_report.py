@@ -1,4 +1,4 @@
-"""The report: one file, complete, and honest about what it shows."""
+"""Report of an identification: self-contained, with every essential parameter and warning."""
 
 import re
 from pathlib import Path
