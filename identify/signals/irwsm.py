@@ -4,12 +4,12 @@ The fixed-interval smoother of an integrated random walk of order ``d`` minimise
 ``sum (y - x)^2 + (1/NVR) sum (D x)^2`` with ``D`` the d-th difference, so ``x = y - D' V^-1 D y`` with the banded
 ``V = NVR I + D D'``, and the concentrated likelihood (5.16, 5.21) needs only the factors of ``V``: O(N) throughout.
 
-The likelihood takes the random walk at its word: accelerations whose increments are white. Those of a robot are
-smooth, their spectrum falls faster, and at 100 dB of signal to noise the likeliest ratio follows the noise far beyond
-the frequency where the motion sinks into it (thesis section 5.3.1 saw the same). Cross-validation asks instead which
-smoother predicts a left-out sample best and needs no model of the motion (Craven and Wahba 1979; Wahba 1985 on the two
-criteria where the prior is wrong), but white noise. :func:`automatic_nvr` takes the smoother of cross-validation and
-the likelihood of the third order, whose walk is smooth enough to be believed; each errs towards too little smoothing.
+The likelihood assumes a random walk, that is accelerations with white increments. The accelerations of a robot are
+smoother: their spectrum falls faster. At a signal-to-noise ratio of 100 dB the ratio of maximum likelihood then follows
+the noise far beyond the frequency where the motion vanishes in it (so does thesis section 5.3.1). Cross-validation
+selects the smoother that predicts a left-out sample best. It needs white noise, but no model of the motion (Craven and
+Wahba 1979; Wahba 1985 compares the two criteria where the prior is wrong). :func:`automatic_nvr` takes the smaller of
+the ratios from cross-validation and from the likelihood of the third order; each errs towards too little smoothing.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError
 
 LOG10_NVR_RANGE = {2: (-12.0, 4.0), 3: (-14.0, 4.0)}
-"""Where the ratio is searched; below, third-order factors lose definiteness (about 1e-16)."""
+"""Range of the search for the ratio; below it, third-order factors lose definiteness (about 1e-16)."""
 
 SETTLED = 40.0
 """Time constants, ``NVR^(-1 / (2 order))`` samples, after which the factors of the band are constant to rounding."""
@@ -76,20 +76,28 @@ def irwsm(y: NDArray[np.float64], order: int, nvr: float) -> Smoothed:
     return Smoothed(level=level, slope=np.diff(level), nvr=nvr)
 
 
-def negative_log_likelihood(y: NDArray[np.float64], order: int, nvr: float) -> float:
+def negative_log_likelihood(w: NDArray[np.float64], order: int, nvr: float) -> float:
     """Concentrated ``-2 log L`` of the noise-variance ratio, up to a constant (thesis 5.16, 5.21).
 
     Equals ``(N - order) log(s2) + sum log nu(k)`` of a Kalman filter started from a diffuse state.
+
+    Parameters
+    ----------
+    w
+        Differences of the series, ``numpy.diff(y, n=order)``, shape (N - order,).
+    order
+        2 or 3, see :func:`irwsm`.
+    nvr
+        Noise-variance ratio, positive.
     """
-    w = np.diff(_checked(y, order), n=order)
     return float(_profile(w, _band(order, nvr), _transient(order, nvr)))
 
 
 def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
-    """Noise-variance ratio of greatest likelihood, by a bounded search on ``log10(NVR)``.
+    """Noise-variance ratio of maximum likelihood, by a bounded search on ``log10(NVR)`` (thesis 5.16, 5.21).
 
     On measured positions the likelihood may follow the noise too closely (thesis section 5.3.1: modelling
-    error and vibration count as dynamics); see :func:`automatic_nvr`.
+    error and vibration count as dynamics). See :func:`automatic_nvr`.
 
     Parameters
     ----------
@@ -103,26 +111,27 @@ def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> 
     Returns
     -------
     float
-        The ratio; 1.0 for a series whose differences are all zero (a standstill says nothing).
+        The ratio; 1.0 for a series whose differences are all zero, which determines none.
     """
     w = _scaled_differences(y, order)
     if w is None:
         return 1.0
-    return _search(lambda nvr: float(_profile(w, _band(order, nvr), _transient(order, nvr))), order, tolerance)
+    return _search(lambda nvr: negative_log_likelihood(w, order, nvr), order, tolerance)
 
 
-def cross_validation(y: NDArray[np.float64], order: int, nvr: float) -> float:
+def cross_validation(w: NDArray[np.float64], order: int, nvr: float) -> float:
     """Logarithm of the generalised cross-validation score of a noise-variance ratio, up to a constant.
 
-    ``log(|y - x|^2 / N) - 2 log(tr(I - A) / N)`` with the smoother ``x = A y``: the mean square error of predicting
-    each sample from all others, but for a constant, where the noise is white. The trace is that of a long series.
+    ``log(|y - x|^2 / N) - 2 log(tr(I - A) / N)`` with the smoother ``x = A y``. Where the noise is white this is, but
+    for a constant, the mean square error of predicting each sample from all others. The trace is that of a long series.
+    Parameters are those of :func:`negative_log_likelihood`. Source: Craven and Wahba 1979.
     """
-    w = np.diff(_checked(y, order), n=order)
-    return _score(w, order, nvr)
+    squares = float(_residual_sum(w, _band(order, nvr), _STENCIL[order], _transient(order, nvr)))
+    return float(np.log(squares) - 2 * np.log(1 - kept_share(order, nvr)))
 
 
 def cross_validated_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
-    """Noise-variance ratio that predicts left-out samples best, by a bounded search on ``log10(NVR)``.
+    """Noise-variance ratio of least generalised cross-validation score, by a bounded search on ``log10(NVR)``.
 
     It assumes white measurement noise, as quantisation is while a sample passes several counts, and nothing about the
     motion. Parameters and result are those of :func:`optimal_nvr`.
@@ -130,15 +139,15 @@ def cross_validated_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0
     w = _scaled_differences(y, order)
     if w is None:
         return 1.0
-    return _search(lambda nvr: _score(w, order, nvr), order, tolerance)
+    return _search(lambda nvr: cross_validation(w, order, nvr), order, tolerance)
 
 
 def automatic_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
-    """Noise-variance ratio for positions of which nothing is known: the smoother of two choices.
+    """Noise-variance ratio for positions with unknown noise: the smaller of two choices.
 
-    Cross-validation is right where the measurement noise is white and follows it where it is not; the likelihood of
-    the third-order walk depends less on the colour of the noise and follows it a little too far where it is white. For
-    order 2 the ratio of the third order is taken to the same half-power frequency, ``NVR^(1 / (2 order))``.
+    Cross-validation is right where the measurement noise is white, and follows the noise where it is coloured. The
+    likelihood of the third-order walk depends less on the colour, and follows white noise a little too far. For
+    order 2 the ratio of the third order is converted to the same half-power frequency, ``NVR^(1 / (2 order))``.
     Parameters and result are those of :func:`optimal_nvr`.
     """
     validated = cross_validated_nvr(y, order, tolerance)
@@ -149,19 +158,15 @@ def automatic_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -
 def kept_share(order: int, nvr: float) -> float:
     """Degrees of freedom per sample that the smoother ``x = A y`` of a long series keeps, ``tr(A) / N``.
 
-    The mean over frequency of ``NVR / (NVR + (2 - 2 cos w)^order)``, by partial fractions.
+    The mean over frequency of ``NVR / (NVR + (2 - 2 cos w)^order)``, by partial fractions. Parameters are those of
+    :func:`irwsm`.
     """
     poles = nvr ** (1 / order) * np.exp(1j * np.pi * (2 * np.arange(order) + 1) / order)
     return float(np.sum(-poles / (np.sqrt(-poles) * np.sqrt(4 - poles))).real / order)
 
 
-def _score(w: NDArray[np.float64], order: int, nvr: float) -> float:
-    squares = float(_residual_sum(w, _band(order, nvr), _STENCIL[order], _transient(order, nvr)))
-    return float(np.log(squares) - 2 * np.log(1 - kept_share(order, nvr)))
-
-
 def _scaled_differences(y: NDArray[np.float64], order: int) -> NDArray[np.float64] | None:
-    """Differences of a series with the greatest one 1, or ``None`` for a standstill."""
+    """Differences of a series scaled to a maximum of 1, or ``None`` at standstill."""
     w = np.diff(_checked(y, order), n=order)
     return w / np.abs(w).max() if np.any(w) else None
 
