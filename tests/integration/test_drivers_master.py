@@ -1,4 +1,4 @@
-"""The master against CANopen nodes on a real SocketCAN bus, well-behaved and not."""
+"""CANopen master with correct and faulty nodes on a SocketCAN bus."""
 
 import subprocess
 import time
@@ -32,7 +32,7 @@ NEXT = {
 
 
 class Servo:
-    """A drive on the bus: canopen's local node with the state machine of CiA 402 and none of its physics."""
+    """Drive on the bus: canopen's local node with the state machine of CiA 402, without physics."""
 
     def __init__(self, network: canopen.Network, node_id: int, robot: RobotConfig, session: SessionConfig) -> None:
         drive = next(d for d in session.drives if d.node_id == node_id)
@@ -76,7 +76,7 @@ class Servo:
 
 @contextmanager
 def cell(vcan: str, nodes: tuple[int, ...] = (1, 2), missing: tuple[int, ...] = ()) -> Iterator[Any]:
-    """A session with the drives ``nodes``, all on the bus but the missing ones: session, robot, servos by node."""
+    """Session with drives ``nodes``, on the bus except for missing ones: session, robot, servos by node."""
     whole = load_session("tx40_cell")
     session = whole.model_copy(
         update={
@@ -88,7 +88,7 @@ def cell(vcan: str, nodes: tuple[int, ...] = (1, 2), missing: tuple[int, ...] = 
     robot = load_robot(session.robot)
     network = canopen.Network()
     network.NOTIFIER_CYCLE = 0.05
-    # the bus that goes down in a test takes these drives along
+    # The drives of a test go down with its bus.
     network.listeners[0].on_error = lambda exc: None  # type: ignore[method-assign]
     network.connect(interface="socketcan", channel=vcan)
     try:
@@ -105,7 +105,7 @@ def cell(vcan: str, nodes: tuple[int, ...] = (1, 2), missing: tuple[int, ...] = 
 
 
 def events_within(master: DriveMaster, seconds: float, kind: str) -> list[DriveEvent]:
-    """Events until one of ``kind`` has come, or the time is over."""
+    """Events until one of ``kind`` or a timeout."""
     events: list[DriveEvent] = []
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline and not any(e.kind == kind for e in events):
@@ -230,7 +230,7 @@ def test_an_emcy_becomes_an_event_with_its_text(vcan_bus: str) -> None:
 
 
 def test_an_emcy_is_not_lost_while_canopen_has_no_time(vcan_bus: str) -> None:
-    """Nor because a drive leaves out what it has nothing to say in."""
+    """Messages of fewer than eight bytes are valid."""
     short = frames(1)
     short["can_id"], short["length"] = od.COB_EMCY + 1, 3
     short["data"][0, :3] = [0x30, 0x23, 0x02]
@@ -262,7 +262,7 @@ def test_a_lost_heartbeat_is_reported_once_and_its_return_too(vcan_bus: str) -> 
         assert any(e.joint == "joint_1" for e in events_within(master, 5.0, "heartbeat_back"))
 
 
-def test_what_others_write_is_known_as_soon_as_it_is_asked_for_and_our_own_requests_are_not_taken_for_it(
+def test_foreign_sdo_writes_are_known_at_once_and_distinguished_from_our_own(
     vcan_bus: str,
 ) -> None:
     request = frames(1)
@@ -289,7 +289,7 @@ def test_what_others_write_is_known_as_soon_as_it_is_asked_for_and_our_own_reque
             "configured",
         ]
         assert since < master.unverified_mapping["joint_2"][1] <= time.time_ns()
-        # What we wrote to put it right was heard, too.
+        # Our own writes that restored the mapping were received, too.
         told = events_within(master, 0.3, "mapping_changed")
         assert [e.kind for e in told if e.kind == "mapping_changed"] == []
         assert set(master.unverified_mapping) == {"joint_2"}

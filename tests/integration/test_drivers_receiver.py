@@ -1,4 +1,4 @@
-"""Several buses read by one thread: none waits for the backlog of another."""
+"""Reception of several buses in one thread: no bus waits for the backlog of another."""
 
 from functools import partial
 
@@ -42,7 +42,7 @@ def test_a_bus_that_had_nothing_is_asked_again_behind_every_batch_of_another(vca
         assert [bus for bus, _, _ in receiver.drain()] == []
 
 
-def test_errors_that_were_to_be_told_later_are_told_at_the_end(vcan_bus: str) -> None:
+def test_pending_errors_are_reported_at_the_end(vcan_bus: str) -> None:
     error = frames(1)
     error["can_id"], error["length"] = ERROR_FLAG | NO_ACKNOWLEDGE, 8
     with RawSocket(vcan_bus, filters=()) as other, Receiver([partial(RawSocket, vcan_bus, errors=True)]) as receiver:

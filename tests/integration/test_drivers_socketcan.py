@@ -1,4 +1,4 @@
-"""The fast path on a real SocketCAN bus."""
+"""Batched access to a SocketCAN bus."""
 
 import subprocess
 import time

@@ -1,4 +1,4 @@
-"""The SYNC producer on a real SocketCAN bus."""
+"""SYNC producer on a SocketCAN bus."""
 
 import subprocess
 import time
@@ -22,7 +22,7 @@ COBS = (0x201, 0x202)
 
 
 def record(vcan: str, producer: SyncProducer, until: Callable[[], bool]) -> Frames:
-    """Everything on the bus from the first SYNC until ``until()``, and until the producer has stopped."""
+    """All frames from the first SYNC until ``until()`` and the end of the producer."""
     batch, parts = frames(4096), []
     deadline = time.monotonic() + 60
 
@@ -70,7 +70,7 @@ def test_two_syncs_are_never_closer_than_half_a_period(vcan_bus: str) -> None:
     assert np.diff(got["t_ns"]).min() > PERIOD_US * 500 - 50_000
 
 
-def test_the_last_sync_is_the_last_however_late_somebody_looks(vcan_bus: str) -> None:
+def test_no_sync_follows_the_last_one(vcan_bus: str) -> None:
     producer = producer_on(vcan_bus, counter=10)
     producer.stop_after(70)
     begin = time.monotonic()

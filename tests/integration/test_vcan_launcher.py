@@ -1,4 +1,4 @@
-"""The launcher: what runs under it has real buses, and otherwise looks as if it ran here."""
+"""Launcher: commands have vcan buses, and otherwise run as on the host."""
 
 import os
 import signal
@@ -100,7 +100,7 @@ def test_output_arrives_while_the_command_still_runs() -> None:
 @pytest.mark.parametrize(
     ("number", "said", "status"), [(signal.SIGTERM, "ends cleanly", 9), (signal.SIGINT, "interrupted", 8)]
 )
-def test_a_signal_reaches_the_command_which_ends_as_it_likes(number: signal.Signals, said: str, status: int) -> None:
+def test_a_signal_reaches_the_command_which_may_handle_it(number: signal.Signals, said: str, status: int) -> None:
     with subprocess.Popen(
         launcher_command([sys.executable, "-c", WAIT_FOR_SIGNAL]), stdout=subprocess.PIPE, text=True
     ) as process:
@@ -113,7 +113,7 @@ def test_a_signal_reaches_the_command_which_ends_as_it_likes(number: signal.Sign
 
 @needs_launcher
 @pytest.mark.slow
-def test_what_a_command_leaves_behind_does_not_keep_the_launcher() -> None:
+def test_processes_left_behind_do_not_keep_the_launcher() -> None:
     start = time.monotonic()
     assert launch(["sh", "-c", "sleep 300 & exit 3"]).returncode == 3
     assert time.monotonic() - start < 100

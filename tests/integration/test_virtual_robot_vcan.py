@@ -1,4 +1,4 @@
-"""The virtual arm on a real (virtual) SocketCAN bus, driven by the project's own master and SYNC producer."""
+"""Virtual arm on a vcan bus, driven by the project's master and SYNC producer."""
 
 import os
 import signal
@@ -28,13 +28,13 @@ from armident.virtual_robot.offline import simulate_recording
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-RUN = "import sys; from pathlib import Path; from armident.virtual_robot.cli import robot; "
-RUN += "robot(config=Path(sys.argv[1]), "
+RUN = "import logging, sys; from pathlib import Path; from armident.virtual_robot.cli import robot; "
+RUN += "logging.basicConfig(level=logging.INFO, format='%(message)s'); robot(config=Path(sys.argv[1]), "
 
 
 @dataclass
 class Output:
-    """What the robot process printed on stderr when it ended, and its exit code."""
+    """Stderr and exit code of the robot process."""
 
     process_id: int
     text: str = ""
@@ -43,7 +43,7 @@ class Output:
 
 @contextmanager
 def robot_process(config: Path, options: str = "noise=0.0") -> Iterator[Output]:
-    """Run the virtual arm in a process of its own until the block ends, then stop it with SIGTERM."""
+    """Run the virtual arm in a separate process during the block, then stop it with SIGTERM."""
     process = subprocess.Popen(
         [sys.executable, "-c", RUN + options + ")", str(config)],
         cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -81,7 +81,7 @@ def collect(bus: RawSocket, seconds: float, sync: SyncProducer | None = None) ->
 
 
 def collect_answers(bus: RawSocket, sync: SyncProducer, syncs: int) -> NDArray[np.void]:
-    """All frames until ``syncs`` SYNC are sent and the bus is silent: a busy machine may be late, but lose nothing."""
+    """All frames until ``syncs`` SYNC are sent and the bus is silent: a busy machine may be late but loses nothing."""
     out = []
     while sync.sent < syncs:
         out.append(collect(bus, 0.1, sync))
@@ -99,7 +99,7 @@ def column(log: NDArray[np.void], can_id: int, offset: int, kind: str) -> NDArra
 
 
 def setpoint_rows(session: SessionConfig, start: list[int], seconds: float) -> NDArray[np.int32]:
-    """A slow swing of all motors about where they stand, a row a millisecond."""
+    """Slow sinusoidal motion of all motors about their position, one row per millisecond."""
     t = np.arange(round(seconds * 1000)) * 1e-3
     amplitude = np.full(len(start), 20_000.0)
     rows: NDArray[np.int32] = np.rint(
@@ -145,7 +145,7 @@ def test_every_sync_is_answered_by_every_drive_and_set_points_are_followed(confi
 
 
 def test_drives_that_are_behind_obey_at_the_same_sync(config: Path) -> None:
-    """All frames of a moment in which the arm stood still are read at once: the stop acts in the middle of them."""
+    """Frames that waited while the process was stopped are read at once; the stop takes effect between them."""
     session = load_session(config)
     before, after = 30, 20
     burst = frames(before + 1 + after)
@@ -165,7 +165,7 @@ def test_drives_that_are_behind_obey_at_the_same_sync(config: Path) -> None:
     states = [drive_state(int(word)) for word in column(log, 0x183, 6, "<u2")]
     assert len(states) == before + after
     assert set(states[:before]) == {DriveState.ENABLED}
-    # The order acts at the SYNC behind it, whose answer is on its way then.
+    # The command takes effect at the SYNC after it, whose answer is already sent.
     assert set(states[before + 1 :]) == {DriveState.QUICK_STOP_ACTIVE}
 
 

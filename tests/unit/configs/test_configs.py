@@ -1,4 +1,4 @@
-"""Configuration files: what is accepted, and that every mistake is named in one line."""
+"""Configuration files: accepted values, and one-line messages for every mistake."""
 
 import re
 from collections.abc import Callable
@@ -192,7 +192,7 @@ def test_a_file_of_another_kind_is_named_for_what_it_is(
         ("controller: 2024-13-45", "controller: input should be a valid dictionary"),
     ],
 )
-def test_what_yaml_would_take_for_something_else_is_refused(line: str, expected: str) -> None:
+def test_values_that_yaml_reads_as_another_type_are_refused(line: str, expected: str) -> None:
     text = re.sub(r"(?m)^bandwidth_hz:.*\n", "", (HERE / "robots" / "tx40.yaml").read_text())
     with pytest.raises(ConfigError) as caught:
         parse(f"{text}\n{line}\n", RobotConfig, "robot.yaml")

@@ -1,4 +1,4 @@
-"""Which buses a session may name, and what it is told where they contradict the rest of it."""
+"""Validation of the buses of a session, and messages for contradictions."""
 
 from typing import Any
 

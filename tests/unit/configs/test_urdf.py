@@ -1,4 +1,4 @@
-"""Robots from URDF: the chain that is meant becomes modified Denavit-Hartenberg parameters, all else is refused."""
+"""Robots from URDF: conversion to modified Denavit-Hartenberg parameters, and refused files."""
 
 import itertools
 from pathlib import Path
@@ -44,7 +44,7 @@ def joint(
 
 
 def urdf(folder: Path, *joints: str, links: str = "a b c d e") -> Path:
-    """A URDF with the links named and these joints."""
+    """URDF with links and joints."""
     text = "".join(f'<link name="{link}"/>' for link in links.split()) + "".join(joints)
     file = folder / "arm.urdf"
     file.write_text(f'<robot name="arm">{text}</robot>')
@@ -199,7 +199,7 @@ def test_a_part_of_a_tree_is_chosen_by_base_and_tip(tmp_path: Path) -> None:
         joint("finger", "c e", "prismatic"),
     )
     assert [j.name for j in read_chain(file, base="c")] == ["finger"]
-    # What branches off at the base stands still, what follows the tip is its load.
+    # Branches at the base are ignored, and links after the tip are its load.
     assert [j.name for j in read_chain(file, base="b", tip="c")] == ["left"]
     with pytest.raises(ConfigError, match=r"link 'b' branches into joints 'left' and 'right'"):
         read_chain(file, base="a", tip="e")

@@ -104,7 +104,7 @@ def test_the_shipped_sessions_of_several_buses_fit_physical_ones_as_they_say() -
     check_fits(two.model_copy(update={"streams": {"samples": packed}}))
 
 
-def test_what_does_not_fit_is_answered_with_the_nearest_that_does() -> None:
+def test_the_error_of_an_overload_lists_the_nearest_sessions_that_fit() -> None:
     session = on_a_physical_bus(200)
     options = alternatives(session)
     assert all(fits(option.session) for option in options)
@@ -130,7 +130,7 @@ def test_each_bus_carries_its_own_drives_and_every_sync() -> None:
 
 
 def table(*options: str) -> str:
-    """What the command prints, with its errors."""
+    """Output and errors of the command."""
     command = [sys.executable, "-m", "armident.daq.cli", "bus-load", *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     return done.stdout + done.stderr

@@ -1,4 +1,4 @@
-"""Error frames in words, as linux/can/error.h numbers them."""
+"""Texts of error frames (linux/can/error.h)."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def test_every_class_has_its_text(classes: int, detail: int, state: str | None, 
     assert text in found[1]
 
 
-def test_changes_of_state_are_told_one_by_one_and_other_errors_counted() -> None:
+def test_changes_of_state_are_reported_one_by_one_and_other_errors_counted() -> None:
     several = [error(0x20), error(0x40), error(0x20), error(0x100)]
     told = summarise(np.concatenate(several))
     assert [state for state, _ in told] == ["bus_off", "restarted", None]

@@ -1,4 +1,4 @@
-"""What the bus says when it is not there, and the array form of frames."""
+"""Messages for missing buses, and frames in arrays."""
 
 import numpy as np
 import pytest

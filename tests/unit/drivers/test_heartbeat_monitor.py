@@ -1,4 +1,4 @@
-"""Who has been silent is told by when heartbeats came, however late they are looked at."""
+"""Heartbeats are judged by their receive times, independently of the time of the update."""
 
 import pytest
 
@@ -12,20 +12,20 @@ def beats(drive: str, first: float, last: float) -> list[tuple[str, float]]:
     return [(drive, first + BEATS * k) for k in range(round((last - first) / BEATS) + 1)]
 
 
-def looked(monitor: HeartbeatMonitor, until: float, since: float = 0.0, step: float = 0.02) -> None:
-    """Look all the time, and hear nobody."""
+def update_regularly(monitor: HeartbeatMonitor, until: float, since: float = 0.0, step: float = 0.02) -> None:
+    """Update regularly without any heartbeat."""
     for k in range(1, round((until - since) / step) + 1):
         monitor.update([], since + step * k)
 
 
-def test_heartbeats_that_waited_while_nobody_looked_are_no_silence() -> None:
+def test_heartbeats_that_waited_between_updates_are_no_silence() -> None:
     monitor = HeartbeatMonitor("ab", 0.0)
     monitor.update([*beats("a", 0.1, 1.9), *beats("b", 0.05, 1.95)], 2.0)
     assert monitor.ended_silence("a") == pytest.approx(0.1, abs=0.01)
     assert monitor.silence("b") == pytest.approx(0.05)
 
 
-def test_a_drive_that_was_silent_while_others_were_heard_is_told_whoever_was_held_up() -> None:
+def test_a_drive_that_is_silent_while_others_send_is_detected_even_after_a_long_update_interval() -> None:
     monitor = HeartbeatMonitor("ab", 0.0)
     monitor.update([("a", 0.1), ("a", 0.9), *beats("b", 0.05, 1.05)], 1.1)
     assert monitor.ended_silence("a") == pytest.approx(0.8)
@@ -34,26 +34,26 @@ def test_a_drive_that_was_silent_while_others_were_heard_is_told_whoever_was_hel
     assert monitor.silence("a") == pytest.approx(1.2, abs=0.01)
 
 
-def test_a_drive_that_stays_away_is_told_in_time() -> None:
+def test_a_silent_drive_is_detected_in_time() -> None:
     monitor = HeartbeatMonitor("a", 0.0)
-    looked(monitor, 0.44)
+    update_regularly(monitor, 0.44)
     assert monitor.silence("a") == pytest.approx(0.44)
 
 
 @pytest.mark.parametrize("heard", [[], [("a", 1.0), ("b", 1.0)]])
-def test_a_machine_that_stood_still_as_a_whole_has_missed_nobody(heard: list[tuple[str, float]]) -> None:
-    """Whether the heartbeats of that time are stamped when it goes on, or have not come yet."""
+def test_a_machine_that_was_held_up_reports_no_silence(heard: list[tuple[str, float]]) -> None:
+    """In two cases: heartbeats of that time are stamped late, or have not been received yet."""
     monitor = HeartbeatMonitor("ab", 0.0)
     monitor.update([("a", 0.15), ("b", 0.2)], 0.22)
     monitor.update(heard, 1.01)
     for drive in "ab":
         assert max(monitor.ended_silence(drive), monitor.silence(drive)) < 0.2
-    # Who is really gone is missed all the same.
-    looked(monitor, 1.45, since=1.01)
+    # A drive without further heartbeats is still detected.
+    update_regularly(monitor, 1.45, since=1.01)
     assert monitor.silence("a") > 0.4
 
 
-def test_a_machine_that_stands_still_again_and_again_misses_who_is_gone() -> None:
+def test_a_machine_that_is_held_up_repeatedly_still_detects_a_silent_drive() -> None:
     monitor = HeartbeatMonitor("a", 0.0)
     for k in range(1, 5):
         monitor.update([], 0.3 * k)

@@ -1,4 +1,4 @@
-"""Threads that ask the scheduler to come first get it where that is allowed, and nobody else does."""
+"""Thread priorities are raised if permitted, and only for the requesting thread."""
 
 import os
 import threading
@@ -11,7 +11,7 @@ def niceness(thread: int) -> int:
 
 
 def may_rise() -> bool:
-    """Whether this process may make itself less nice: root, or ``CAP_SYS_NICE`` (bit 23)."""
+    """True if this process may lower its nice value: root, or ``CAP_SYS_NICE`` (bit 23)."""
     with open("/proc/self/status", encoding="ascii") as status:
         effective = next(line for line in status if line.startswith("CapEff"))
     return bool(int(effective.split()[1], 16) >> 23 & 1)
@@ -32,7 +32,7 @@ def test_one_thread_comes_before_the_others_and_goes_back() -> None:
         other.join()
 
 
-def test_real_time_is_of_one_thread_and_told() -> None:
+def test_real_time_priority_is_of_one_thread_and_reported() -> None:
     said: list[tuple[bool, int]] = []
 
     def run() -> None:

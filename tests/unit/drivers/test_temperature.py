@@ -1,4 +1,4 @@
-"""Temperatures are read where drives give them, and nobody waits for a drive that does not."""
+"""Polling of temperatures, without delay of other transfers by a drive that does not answer."""
 
 import threading
 import time
@@ -48,7 +48,7 @@ def test_a_drive_that_does_not_answer_is_forgotten_and_asked_again_later() -> No
     assert liar.asked == 3
 
 
-def test_a_drive_that_is_busy_with_somebody_else_is_left_alone() -> None:
+def test_a_drive_with_another_transfer_in_progress_is_skipped() -> None:
     liar, sdo = new_drive(temperature=PLACE)
     asked, go_on = threading.Event(), threading.Event()
     send = liar.send
@@ -69,7 +69,7 @@ def test_a_drive_that_is_busy_with_somebody_else_is_left_alone() -> None:
     assert liar.asked == 1
 
 
-def test_an_order_waits_for_a_poll_no_longer_than_an_answer_may_take() -> None:
+def test_a_command_waits_for_a_poll_no_longer_than_the_answer_time() -> None:
     liar, sdo = new_drive(temperature=PLACE, timeout_s=5.0)
     liar.script = SILENT
     begin = time.monotonic()

@@ -1,4 +1,4 @@
-"""Hardware time stamps in the machine's time: as even as the interface's clock, never later than the software's."""
+"""Hardware time stamps in the machine's time: as even as the interface's clock, never later than software stamps."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_spacing_is_that_of_the_hardware_and_the_base_that_of_the_machine(drift:
     assert np.all(times <= software)
     settled = slice(5000, None)
     error = (times - true)[settled]
-    # No better than the shortest interrupt, and within what clocks drift between two short ones.
+    # Limited by the shortest interrupt latency, and by the drift of the clocks between two short ones.
     assert error.min() >= 0
     assert error.max() < 20_000
     assert np.diff(times)[settled].std() < 0.05 * np.diff(software)[settled].std()

@@ -1,4 +1,4 @@
-"""The fallback bus over UDP multicast: the same frames, the same set points, at a low rate."""
+"""Bus over UDP multicast: frames and set points at a low rate."""
 
 import time
 from collections.abc import Iterator

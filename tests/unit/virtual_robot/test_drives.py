@@ -1,4 +1,4 @@
-"""The virtual drives without a bus: states, set points, noise, hidden effects, recordings, replay."""
+"""Virtual drives without a bus: states, set points, noise, hidden effects, recordings, replay."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Effects hidden in the virtual arm: what a scenario may say, and that each effect is the physics it is named for."""
+"""Hidden effects of the virtual arm: validation of scenarios, and basic physics of each effect."""
 
 import math
 from pathlib import Path
@@ -66,7 +66,7 @@ EXAMPLES: dict[str, dict[str, float]] = {
     "base_vibration": {"amplitude": 0.5},
     "friction_scale": {"factor": 1.3},
 }
-"""The one number that each effect needs."""
+"""A value of the required parameter of each effect."""
 
 HEALTHY = (
     0.04804163140280711, 0.14355670318505015, 1.8563242080086155,
@@ -103,7 +103,7 @@ def test_the_shipped_scenarios_can_be_hidden_in_their_arm(path: Path) -> None:
 
 
 def test_without_hidden_effects_the_arm_moves_as_it_always_did(tx40: RobotConfig) -> None:
-    """Figures of the plant as it was before there was anything to hide but six simple effects."""
+    """Reference values of the plant from its first version with six effects."""
     plant = Plant(tx40, rest_posture(tx40))
     t = np.arange(1000) * 200e-6
     for x in np.sin(2 * np.pi * 4 * t):

@@ -1,4 +1,4 @@
-"""Hidden bodies, drives, wires and encoders of the virtual arm: statics, kinematics and signals by hand."""
+"""Hidden bodies, drives, wiring and encoders: statics, kinematics and signals against hand calculations."""
 
 import math
 
@@ -21,7 +21,7 @@ Q = np.array([0.3, 0.4, 1.1, -0.5, 0.7, 0.2])
 
 
 def weight(plant: Plant, q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Torques (n,) that hold the arm at ``q``, without friction: what its acceleration at rest says."""
+    """Static torques (n,) at ``q`` without friction, from the acceleration at rest."""
     still = np.zeros(q.size)
     held = plant.resistance(q, still)
     plant.q[:] = q
@@ -30,7 +30,7 @@ def weight(plant: Plant, q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tool_point(robot: RobotConfig, q: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where a point of the last link's frame is (modified Denavit-Hartenberg table, by hand)."""
+    """Position of a point of the last link's frame (modified Denavit-Hartenberg table, by hand)."""
     pose = np.eye(4)
     for joint, angle in zip(robot.joints, q, strict=True):
         a, t = joint.mdh.alpha, joint.mdh.theta + angle
@@ -59,7 +59,7 @@ def test_a_payload_weighs_and_resists_acceleration_as_its_mass_at_its_place(tx40
     ).T
     np.testing.assert_allclose(weight(loaded, Q) - weight(healthy, Q), 9.81 * mass * jacobian[2], atol=1e-6)
     added = loaded.mass_matrix() - healthy.mass_matrix()
-    # A ball's rotation does not ask about which axis: mass radius^2 times the angular velocities' products.
+    # A ball has the same inertia about all axes: mass radius^2 times the angular velocities' products.
     data = healthy.model.createData()
     turning = pin.computeJointJacobian(healthy.model, data, Q, 6)[3:]
     np.testing.assert_allclose(added, mass * (jacobian.T @ jacobian + radius**2 * turning.T @ turning), atol=1e-6)
@@ -173,7 +173,7 @@ def test_an_eccentric_encoder_is_wrong_by_its_wave_at_its_own_motor(tx40: RobotC
 
 
 def test_a_drive_follows_its_eccentric_encoder_away_from_the_true_angle(emps: RobotConfig) -> None:
-    """The stiff loop of the EMPS keeps what it reads where it was told, so the carriage stands off by the error."""
+    """The stiff loop of the EMPS keeps the measured position at the demand, so the carriage is off by the error."""
     effect = hide("encoder_eccentricity", "joint_1", amplitude=1e-4, per_turn=5.0, phase=0.0)
     ends = []
     for hidden in (None, effect):
@@ -236,7 +236,7 @@ EXAMPLES: dict[str, float] = {
     "mains_ripple": 2.0, "slosh_payload": 1.0, "current_crosstalk": 0.2, "stick_events": 5.0,
     "quadratic_coupling": 2.0, "base_vibration": 1.0, "friction_scale": 1.3,
 }  # fmt: skip
-"""A strength that shows at once, for the parameter that each effect needs."""
+"""Clearly visible value of the required parameter of each effect."""
 ON_EMPS = EXAMPLES | {"presliding_friction": 1e-4, "backlash": 1e-4, "rotor_inertia": 10.0}
 CASES = [("tx40", effect) for effect in sorted(EXAMPLES)]
 CASES += [("emps", effect) for effect in sorted(EXAMPLES) if EFFECTS[effect].other != "required"]
@@ -244,7 +244,7 @@ CASES += [("emps", effect) for effect in sorted(EXAMPLES) if EFFECTS[effect].oth
 
 @pytest.fixture(scope="module")
 def quiet(tx40: RobotConfig, emps: RobotConfig) -> dict[str, dict[str, NDArray[np.float64]]]:
-    """What the healthy arms record without noise."""
+    """Recordings of the healthy arms without noise."""
     return {robot.name: record(robot, None, noise=0.0) for robot in (tx40, emps)}
 
 
@@ -269,7 +269,7 @@ def test_every_effect_shows_in_a_recording_and_leaves_the_arm_under_control(
     inside = slice(len(healthy["effort"]) // 5, None)
     shown = np.abs(hidden["effort"] - healthy["effort"])[inside].max(axis=0)
     assert shown.max() > 5, "per mille of the rated signal"
-    # Well within what the drives can give, and near the healthy arm's path: 1 % of the range.
+    # Below the drives' saturation, and within 1 % of the range of the healthy arm's path.
     path = np.abs(hidden["position"] - healthy["position"]).max(axis=0)
     counts = np.array([joint.drive.counts_per_unit or 0.0 for joint in robot.joints])
     reach = np.abs(np.diag(robot.transmission_matrix)) * (counts / (2 * np.pi) if robot.n == 6 else counts)

@@ -1,4 +1,4 @@
-"""Hidden torques of the virtual arm against the physics they are named for, in closed form."""
+"""Hidden torques of the virtual arm against closed-form physics."""
 
 import math
 
@@ -19,7 +19,7 @@ FV2, FC2 = 5.50, 8.24
 
 
 class Joint2:
-    """What an effect adds to the resistance of joint 2 of the TX40, alone in motion."""
+    """Torque that an effect adds to the resistance of joint 2 of the TX40, moving alone."""
 
     def __init__(self, robot: RobotConfig, effect: str, other: str | None = None, **parameters: float) -> None:
         self.healthy = Plant(robot, np.zeros(6))
@@ -154,7 +154,7 @@ def test_friction_that_grows_with_the_load_takes_its_share_of_every_acceleration
 
 
 def test_a_joint_that_holds_a_weight_has_more_friction_than_one_that_does_not(tx40: RobotConfig) -> None:
-    """Joint 2 falls from level and from upright: the friction that the load makes slows the first alone."""
+    """Joint 2 falls from horizontal and from upright: load-dependent friction slows only the first motion."""
     fallen = {}
     for name, effect in (("healthy", None), ("loaded", hide("load_dependent_friction", "joint_2", coefficient=0.3))):
         plant = Plant(tx40, [0.0, 1.2, 0.5, 0.0, 0.0, 0.0], effect)

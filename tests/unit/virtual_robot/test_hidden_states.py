@@ -1,4 +1,4 @@
-"""Hidden effects with a memory, against their own equations solved at a tight tolerance: bristles, gears, masses."""
+"""Hidden effects with states (bristles, gears, swinging masses) against accurately integrated equations."""
 
 import math
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from armident.virtual_robot.plant import Plant
 
 PERIOD = 200e-6
 HOLD = 5
-"""Periods over which a force is held: every change of it is a fresh start for the reference."""
+"""Number of periods of constant force; the reference integration restarts at each change."""
 MASS, FV, FC, OFF, SMOOTHING = 95.1089, 203.5034, 20.3935, -3.1648, 5000.0
 """The virtual EMPS: kg, N s/m, N, N, s/m."""
 Vector = NDArray[np.float64]
@@ -63,7 +63,7 @@ def solve(
 
 
 def sweep(seconds: float, amplitude: float = 150.0) -> Vector:
-    """Forces that move the axis to and fro, faster and faster."""
+    """Forces that move the axis back and forth with increasing frequency."""
     t = np.arange(round(seconds / (HOLD * PERIOD))) * HOLD * PERIOD
     return amplitude * np.sin(2 * np.pi * (2.0 * t + 8.0 * t**2)) + OFF
 
@@ -84,7 +84,7 @@ def test_an_elastic_joint_is_two_masses_with_a_spring(emps: RobotConfig) -> None
     twist = truth[:, 0] - truth[:, 1]
     assert np.ptp(truth[:, 0]) > 1e-3
     assert np.ptp(twist) > 1e-4
-    # One part in ten thousand of the twist, which is what the effect is.
+    # One part in ten thousand of the twist, the quantity of interest.
     assert np.abs(moved - truth[:, :2]).max() < 1e-4 * np.ptp(twist)
 
 
@@ -112,7 +112,7 @@ def test_backlash_leaves_the_link_at_rest_while_the_motor_crosses_the_gap(emps: 
     moved = run(plant, np.full(500, force))
     inside = moved[:, 0] < 0.45 * gap
     assert inside.sum() > 10
-    # The link has no friction of its own; that it rests is for the gap to show.
+    # The link has no friction of its own: it comes to rest by the gap alone.
     assert np.abs(moved[inside, 1]).max() < 1e-15
     alone = solve(lambda y, f: [y[1], (f - slide(y[1])) / motor], [0.0, 0.0], np.full(int(inside.sum()), force))
     assert np.abs(moved[inside, 0] - alone[:, 0]).max() < 1e-4 * gap
@@ -268,7 +268,7 @@ def test_a_sloshing_payload_is_a_pendulum_on_a_cart(emps: RobotConfig) -> None:
 
 
 def test_a_sloshing_payload_at_rest_weighs_what_it_hangs_with(tx40: RobotConfig) -> None:
-    """Braked, the arm does not move, and the mass stays where it hung."""
+    """With closed brakes the arm does not move, and the mass keeps its rest angle."""
     q = np.array([0.2, 0.5, 1.0, 0.3, -0.4, 0.2])
     plant = Plant(tx40, q, hide(entry("slosh_payload", "joint_6", mass=1.0)))
     plant.brake[:] = 1e9
@@ -279,7 +279,7 @@ def test_a_sloshing_payload_at_rest_weighs_what_it_hangs_with(tx40: RobotConfig)
 
 
 def test_energy_never_comes_from_a_passive_arm(tx40: RobotConfig) -> None:
-    """Thrown with no motor torque, an arm with gap, spring, bristles and a swinging mass comes to rest, and stays."""
+    """Without motor torque an arm with gap, spring, bristles and a swinging mass comes to rest."""
     effects = (
         entry("backlash", "joint_1", gap=5e-3),
         entry("joint_elasticity", "joint_3", stiffness=2e3),

@@ -1,4 +1,4 @@
-"""The virtual arm's mechanics: consistent link parameters, correct equations, accurate integration."""
+"""Mechanics of the virtual arm: consistent link parameters, correct equations, accurate integration."""
 
 import numpy as np
 import pytest
@@ -51,9 +51,9 @@ def test_regrouping_of_table_b3_leaves_the_motion_unchanged(tx40: RobotConfig) -
     standard = inertias.plant_parameters(tx40)
     names = [f"{k}{j}" for j in range(1, 7) for k in (*inertias.INERTIAL, "ia")]
     rows = np.array([[terms.get(name, 0.0) for name in names] for terms in inertias.regrouping().values()])
-    # Any change that the base parameters do not see: the null space of the regrouping.
+    # A change without effect on the base parameters: the null space of the regrouping.
     unseen = np.linalg.svd(rows)[2][len(rows) :]
-    # Small enough for the links to stay bodies; 1e-6 kg m^2 at 20 rad/s^2 would show as 2e-5 N m.
+    # Small enough for physically consistent links; 1e-6 kg m^2 at 20 rad/s^2 is 2e-5 N m.
     change = dict(zip(names, 1e-6 * rng.standard_normal(len(unseen)) @ unseen, strict=True))
     other = {name: value + change.get(name, 0.0) for name, value in standard.items()}
     torques = []
@@ -116,6 +116,6 @@ def test_friction_slows_by_the_coefficients_of_table_b4(tx40: RobotConfig) -> No
     assert wrist[5] == pytest.approx(0.65 * 2.0 + 0.30 + 0.61 * 1.0 + 1.90, rel=5e-3)
 
 
-def test_an_arm_nobody_knows_is_refused_by_name() -> None:
+def test_an_unknown_arm_is_refused_by_name() -> None:
     with pytest.raises(ConfigError, match=r"'panda'.*emps, tx40"):
         Plant(load_robot("panda.yaml"), np.zeros(7))

@@ -1,4 +1,4 @@
-"""The virtual EMPS: one axis in volts at 1 kHz; and drives that feed back the velocity, there and on the TX40."""
+"""Virtual EMPS (one axis, voltage, 1 kHz), and drives with velocity feedback on EMPS and TX40."""
 
 import json
 from functools import cache
@@ -30,7 +30,7 @@ from armident.virtual_robot.run import record_robot
 NAMES = ("m1", "fv1", "fc1", "off1")
 PUBLISHED = (95.1089, 203.5034, 20.3935, -3.1648)
 REPEAT = 6240
-"""Samples after which the reference of the measured EMPS comes again."""
+"""Period of the reference of the measured EMPS in samples."""
 
 
 @cache
@@ -90,7 +90,7 @@ def test_voltage_is_the_published_law_of_the_recorded_positions() -> None:
 
 
 def test_axis_moves_as_a_continuous_simulation_of_its_equation_says() -> None:
-    """Newton's law between samples, recorded force held: the carriage gets where the recording says it does."""
+    """Newton's law with the recorded force held between samples reproduces the recorded positions."""
     found = experiment(recorded(0, 0.0))
     m, fv, fc, off = PUBLISHED
     q, qd, worst, steps = float(found.q[0, 0]), 0.0, 0.0, 50
@@ -221,7 +221,7 @@ def test_current_of_the_tx40s_drives_is_the_law_of_figure_b_1(feedback: bool) ->
 
 
 def test_velocity_feedback_lags_behind_by_the_velocity_over_kp() -> None:
-    """In the middle of the move friction and gravity ask both kinds of drives for the same ``kp e``."""
+    """In the middle of the move friction and gravity require the same ``kp e`` of both kinds of drives."""
     robot, errors = load_robot("tx40"), []
     middle = slice(1500, 1750)
     for feedback in (True, False):
