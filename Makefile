@@ -79,7 +79,13 @@ test: install ## everything but the proofs, the tests on vcan included, under fi
 
 proof: install ## tests that prove a statistic or repeat the suite (tests/README.md lists them), half an hour
 	@mkdir -p .cache
-	$(PYTEST) $(PARALLEL) -m proof 2>&1 | tee .cache/proof.log
+	failed=
+	$(PYTEST) $(PARALLEL) -m "proof and not vcan" 2>&1 | tee .cache/proof.log || failed=1
+	bus=
+	if $(PY) -m armident.drivers.vcan -n 2 --setup; then bus="$(WITH_VCAN)"; fi
+	$$bus $(PYTEST) -o cache_dir=.cache/pytest-vcan -m "proof and vcan" tests/integration 2>&1 \
+		| tee .cache/proof-vcan.log || failed=1
+	[ -z "$$failed" ]
 
 coverage: install ## lines and branches that the tests off the bus run, by file; .cache/coverage/html has every line
 	@mkdir -p .cache/coverage
