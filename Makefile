@@ -87,11 +87,11 @@ proof: install ## tests that prove a statistic or repeat the suite (tests/README
 		| tee .cache/proof-vcan.log || failed=1
 	[ -z "$$failed" ]
 
-coverage: install ## lines and branches that the tests off the bus run, by file; .cache/coverage/html has every line
-	@mkdir -p .cache/coverage
+coverage: install ## lines and branches that the tests off the bus run, by file; .cache/line-coverage/html has every line
+	@mkdir -p .cache/line-coverage
 	$(PYTEST) -q $(PARALLEL) -m "not vcan and not proof" --cov --cov-branch \
-		--cov-report=term:skip-covered --cov-report=html:.cache/coverage/html --cov-report=json:.cache/coverage/total.json
-	$(PY) -m tests.tools.line_coverage .cache/coverage/total.json
+		--cov-report=term:skip-covered --cov-report=html:.cache/line-coverage/html --cov-report=json:.cache/line-coverage/total.json
+	$(PY) -m tests.tools.line_coverage .cache/line-coverage/total.json
 
 vcan: install ## fetch what the vcan guest needs, where this kernel has no SocketCAN
 	@$(PY) -m armident.drivers.vcan --setup
