@@ -721,10 +721,10 @@ def design_trajectory(
     """
     from armident.identify.excitation.design import design_trajectory as run
     from armident.identify.excitation.design import with_objective
-    from armident.identify.excitation.previous_estimate import prior_from
+    from armident.identify.excitation.previous_estimate import previous_estimate
 
     config = _robot(robot, ())
-    earlier = None if known is None else prior_from(_document(known), config, "known")
+    earlier = None if known is None else previous_estimate(_document(known), config, "known")
     theta = None if earlier is None else earlier.theta
     found = run(
         config,

@@ -1,11 +1,11 @@
-"""Commands of this package: identify, worker, diagnose, trajectory."""
+"""Commands of this package: identify, diagnose, effects, history, trajectory, worker, reproduce, diagnose-suite."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-Json = Annotated[bool, typer.Option("--json", help="Print the result document on stdout, and nothing else there.")]
+Json = Annotated[bool, typer.Option("--json", help="Print only the result document on stdout.")]
 OutDirectory = Annotated[
     Path | None, typer.Option("--out", help="Folder for the results. [default: RECORDING without .mcap, plus a suffix]")
 ]
@@ -15,7 +15,7 @@ Robot = Annotated[
 
 
 def identify(
-    recording: Annotated[Path, typer.Argument(help="Recording to identify from (.mcap).")],
+    recording: Annotated[Path, typer.Argument(help="Recording (.mcap).")],
     config: Robot = None,
     method: Annotated[str, typer.Option(help="idim-piv, idim-iv, idim-ls, didim, clie, cloe or sep-pem.")] = "idim-piv",
     derivatives: Annotated[
@@ -23,25 +23,23 @@ def identify(
     ] = None,
     nvr: Annotated[
         str | None,
-        typer.Option(help="Noise-variance ratio, or automatic, cross-validation, likelihood, tracking-error."),
+        typer.Option(help="Noise-variance ratio: a number, automatic, cross-validation, likelihood or tracking-error."),
     ] = None,
     controller: Annotated[
         str, typer.Option(help="crc (impulse response), parametric (cascade or PID) or known (configured).")
     ] = "crc",
-    noise_model: Annotated[str, typer.Option(help="Of idim-piv: black-box or grey-box.")] = "black-box",
+    noise_model: Annotated[str, typer.Option(help="Noise model of idim-piv: black-box or grey-box.")] = "black-box",
     max_ar_order: Annotated[int, typer.Option(min=0, help="Highest order of the noise models.")] = 60,
     bandwidth: Annotated[
-        float | None, typer.Option(help="Closed-loop bandwidth, Hz. [default: configured, or from the data]")
+        float | None, typer.Option(help="Closed-loop bandwidth, Hz. [default: as configured, or estimated]")
     ] = None,
     decimation: Annotated[
         str | None,
-        typer.Option(
-            help="Keep one sample of so many, or noise: as many as it remembers. [default: from the bandwidth]"
-        ),
+        typer.Option(help="Decimation factor, or noise: from the memory of the noise. [default: from the bandwidth]"),
     ] = None,
-    weighted: Annotated[bool, typer.Option(help="Weigh each joint by its noise in idim-ls.")] = True,
+    weighted: Annotated[bool, typer.Option(help="Weight each joint by its noise in idim-ls.")] = True,
     physical: Annotated[
-        bool, typer.Option("--physical", help="Find the nearest physically consistent arm, too.")
+        bool, typer.Option("--physical", help="Also compute the nearest physically consistent parameters.")
     ] = False,
     out: OutDirectory = None,
     json: Json = False,
@@ -69,12 +67,12 @@ def identify(
 
 def worker(
     config: Annotated[Path, typer.Option("--config", help="Session configuration.")],
-    once: Annotated[bool, typer.Option("--once", help="End after one experiment, with its exit code.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="End after one experiment with its exit code.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the results. [default: the session's recording directory]")
     ] = None,
 ) -> None:
-    """Identify every experiment of a cell as it is recorded, and publish the results.
+    """Identify every experiment of a cell when its recording ends, and publish the results.
 
     Example: armident worker --config configs/tx40_cell.yaml
     """
@@ -89,23 +87,23 @@ def diagnose(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings to fit.")],
     config: Robot = None,
     validate: Annotated[
-        Path | None, typer.Option(help="Recording to judge by. [default: the last part of the data, held out]")
+        Path | None, typer.Option(help="Held-out recording. [default: the last part of the data]")
     ] = None,
     baseline: Annotated[
-        Path | None, typer.Option(help="An identification.json whose numbers are to be judged too.")
+        Path | None, typer.Option(help="identification.json whose parameters are tested for change.")
     ] = None,
     false_alarms: Annotated[
-        float, typer.Option(min=1e-6, max=0.5, help="Chance that a diagnosis of a faultless model finds something.")
+        float, typer.Option(min=1e-6, max=0.5, help="Probability of a finding with a complete model.")
     ] = 0.01,
     material: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Share of a joint's residual power worth a finding.")
+        float, typer.Option(min=0.0, max=1.0, help="Least share of a joint's residual power of a finding.")
     ] = 0.01,
     out: OutDirectory = None,
     json: Json = False,
 ) -> None:
-    """Find what a model lacks: where it disagrees with the data, which effect is missing, what is left.
+    """Find the effects that a model lacks, their size and confidence, and the residual that stays unexplained.
 
-    Exit code 4 if something was found or stays unexplained. `armident effects` lists what it looks for.
+    Exit code 4 if there are findings or an unexplained residual. `armident effects` lists the candidates.
 
     Example: armident diagnose monday.mcap --validate tuesday.mcap
     """
@@ -132,27 +130,25 @@ def effects(
 
 def history(
     documents: Annotated[
-        list[Path] | None, typer.Argument(help="Results to add: identification.json. [default: none, only list]")
+        list[Path] | None, typer.Argument(help="identification.json files to add. [default: none, only list]")
     ] = None,
     database: Annotated[
         str, typer.Option(help="SQLAlchemy URL.", envvar="ARMIDENT_HISTORY")
     ] = "sqlite:///history.sqlite",
-    robot: Annotated[
-        str | None, typer.Option(help="Whose runs. [default: that of the results, or the only one]")
-    ] = None,
+    robot: Annotated[str | None, typer.Option(help="Robot. [default: that of the results, or the only one]")] = None,
     cell: Annotated[
-        str | None, typer.Option(help="Where the robot stands. [default: the cell of the results, or the only one]")
+        str | None, typer.Option(help="Cell of the robot. [default: that of the results, or the only one]")
     ] = None,
-    parameter: Annotated[list[str] | None, typer.Option(help="Parameter to show; may be given more than once.")] = None,
+    parameter: Annotated[list[str] | None, typer.Option(help="Parameter to show; can be repeated.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Plot parameters over time (.png, .svg, .pdf).")] = None,
     false_alarms: Annotated[
-        float, typer.Option(min=1e-12, max=0.5, help="Chance of calling an unchanged arm changed, per run.")
+        float, typer.Option(min=1e-12, max=0.5, help="Probability of a false alarm per run.")
     ] = 1e-4,
     json: Json = False,
 ) -> None:
-    """Keep results in a database, list them, and say whether the arm has changed since the first of them.
+    """Keep results in a database, list them, and test for a change of the arm since the first one.
 
-    Exit code 4 if the last run differs from the first by more than chance, in one parameter or in all together.
+    Exit code 4 if the last run differs significantly from the first, in one parameter or in all together.
 
     Example: armident history recordings/*.identification/identification.json --plot history.png
     """
@@ -166,55 +162,70 @@ def history(
 def trajectory(
     config: Annotated[Path, typer.Option("--config", help="Robot configuration.")],
     out: Annotated[
-        Path | None, typer.Option("--out", help="Trajectory file to write (.yaml). [needed without --look-at]")
+        Path | None, typer.Option("--out", help="Trajectory file to write (.yaml). [required without --look-at]")
     ] = None,
     duration: Annotated[float, typer.Option(min=1.0, help="Length, s.")] = 7.5,
-    seed: Annotated[int, typer.Option(help="Start of the random search.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the random search.")] = 0,
     known: Annotated[
         Path | None,
-        typer.Option(help="An identification.json of the robot: torques stay within limits, precision is predicted."),
+        typer.Option(
+            help="identification.json of the robot: keeps torques within limits, predicts standard deviations."
+        ),
     ] = None,
-    evaluations: Annotated[int, typer.Option(min=1, help="Candidates to try.")] = 2000,
-    wanted: Annotated[
-        str | None, typer.Option("--for", help="Effect of the catalogue that the trajectory is to show.")
-    ] = None,
-    joint: Annotated[str | None, typer.Option(help="Joint at which it is to show. [default: all]")] = None,
-    against: Annotated[str | None, typer.Option(help="Another effect, from which it is to be told.")] = None,
+    evaluations: Annotated[int, typer.Option(min=1, help="Number of candidates to try.")] = 2000,
+    wanted: Annotated[str | None, typer.Option("--for", help="Effect of the catalogue to make visible.")] = None,
+    joint: Annotated[str | None, typer.Option(help="Joint of that effect. [default: all]")] = None,
+    against: Annotated[str | None, typer.Option(help="Another effect to separate it from.")] = None,
     shape: Annotated[
-        str, typer.Option(help="moves (point to point, trapezoidal velocities) or fourier (finite Fourier sums).")
+        str, typer.Option(help="moves (point to point, trapezoidal velocities) or fourier (finite Fourier series).")
     ] = "moves",
     harmonics: Annotated[
-        int | None, typer.Option(min=2, help="Of fourier. [default: up to 1.6 Hz, at least five]")
+        int | None, typer.Option(min=2, help="Number of harmonics of fourier. [default: up to 1.6 Hz, at least five]")
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option(help="Picture of it against the limits (.png, .svg, .pdf). [default: beside --out]")
+        Path | None, typer.Option(help="Plot against the limits (.png, .svg, .pdf). [default: beside --out]")
     ] = None,
     look_at: Annotated[
-        Path | None, typer.Option(help="Design nothing: check this trajectory, draw it, say what it will tell.")
+        Path | None,
+        typer.Option(help="Check and plot an existing trajectory instead, and predict its standard deviations."),
     ] = None,
 ) -> None:
     """Design an exciting trajectory inside the limits of a robot, for the base parameters or for one effect.
 
-    Before anything moves it draws positions, velocities, accelerations and torques against their limits, and prints the
-    standard deviation to expect of every base parameter.
+    Plots positions, velocities, accelerations and torques against their limits, and prints the predicted standard
+    deviation of every base parameter.
 
     Example: armident trajectory --config configs/tx40.yaml --out excitation.yaml --known identification.json
     """
-    from armident.identify.excitation.cli import trajectory_command
+    from armident.identify.excitation.cli import TrajectoryOptions, trajectory_command
 
     trajectory_command(
-        config, out, duration, seed, known, evaluations, wanted, joint, against, shape, harmonics, picture, look_at
+        TrajectoryOptions(
+            config=config,
+            out=out,
+            duration=duration,
+            seed=seed,
+            known=known,
+            evaluations=evaluations,
+            wanted=wanted,
+            joint=joint,
+            against=against,
+            shape=shape,
+            harmonics=harmonics,
+            picture=picture,
+            look_at=look_at,
+        )
     )
 
 
 def reproduce(
-    tables: Annotated[str | None, typer.Option(help="Tables by number, as 5.2,6.7. [default: all]")] = None,
-    measured: Annotated[Path | None, typer.Option(help="Folder of the measured TX40 and EMPS.")] = None,
+    tables: Annotated[str | None, typer.Option(help="Table numbers, for example 5.2,6.7. [default: all]")] = None,
+    measured: Annotated[Path | None, typer.Option(help="Folder of the measured data of TX40 and EMPS.")] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder for the results and recordings.")] = Path("reproduction"),
-    quick: Annotated[bool, typer.Option("--quick", help="Without tables 4.1 to 4.3, fewer simulations.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Skip tables 4.1 to 4.3 and run fewer simulations.")] = False,
     json: Json = False,
 ) -> None:
-    """Compute the thesis's tables beside its figures, and say which of its claims hold.
+    """Compute the tables of the thesis beside the published values, and check its claims.
 
     Example: armident reproduce --tables 5.2,6.7
     """
@@ -224,10 +235,12 @@ def reproduce(
 
 
 def diagnose_suite(
-    suite: Annotated[Path, typer.Option("--suite", help="What to hide, where and how strongly.")] = Path("suite.yaml"),
-    out: Annotated[Path, typer.Option("--out", help="Directory of results and tables; a run goes on there.")] = Path(
-        "suite"
+    suite: Annotated[Path, typer.Option("--suite", help="Suite file: effects, joints and strengths.")] = Path(
+        "suite.yaml"
     ),
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder of results and tables; a stopped run continues there.")
+    ] = Path("suite"),
     quick: Annotated[bool, typer.Option("--quick", help="One arm, place, strength and run of each effect.")] = False,
     only: Annotated[
         str, typer.Option("--only", help="Effects by name, or clean, clean_baseline, pair, outside: A,B,...")
@@ -235,17 +248,17 @@ def diagnose_suite(
     strength: Annotated[str, typer.Option("--strength", help="detectable, typical, obvious: A,B,...")] = "",
     jobs: Annotated[int | None, typer.Option("--jobs", help="Cases at a time. [default: processors]", min=1)] = None,
     minutes: Annotated[
-        float | None, typer.Option("--minutes", help="Begin no case after so long; call again to go on.", min=0)
+        float | None, typer.Option("--minutes", help="Start no case after this time; call again to continue.", min=0)
     ] = None,
     any_version: Annotated[
-        bool, typer.Option("--any-version", help="Use results that another version of the code made.")
+        bool, typer.Option("--any-version", help="Use results of other versions of the code.")
     ] = False,
     list_cases: Annotated[bool, typer.Option("--list", help="Print the cases and end.")] = False,
     json: Json = False,
 ) -> None:
-    """Hide effects in virtual arms, diagnose them, and say how often they are found by name.
+    """Hide effects in virtual arms, diagnose them, and print the detection rate of each effect.
 
-    Results are kept case by case: a run that was stopped goes on where it was.
+    Results are kept case by case: a stopped run continues.
 
     Example: armident diagnose-suite --quick --out suite
     """

@@ -1,4 +1,4 @@
-"""The commands ``identify`` and ``diagnose``: read, compute, write, print."""
+"""Commands ``identify`` and ``diagnose``: read, compute, write, print."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -15,13 +15,32 @@ from armident.identify.identification.options import Options, parse_decimation, 
 from armident.identify.report.files import robot_yaml, write_identification
 
 FOUND = 4
-"""Exit code: done, and the answer is that something changed or stays unexplained."""
+"""Exit code: done, with findings or an unexplained residual."""
 
 
 def identify_command(
     path: Path, config: Path | None, chosen: Mapping[str, Any], out: Path | None, *, as_json: bool
 ) -> None:
-    """Carry out ``armident identify``; ``chosen`` are the fields of `Options` as the user wrote them."""
+    """Carry out ``armident identify``.
+
+    Parameters
+    ----------
+    path
+        Recording.
+    config
+        Robot configuration; ``None``: that of the recording.
+    chosen
+        Fields of `Options` as the user wrote them.
+    out
+        Folder of the results; ``None``: beside the recording.
+    as_json
+        Print the document on stdout instead of a table.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If an option or a file is wrong, or the recording cannot be identified.
+    """
     from armident.identify.cli_tables import identification_table, progress, warn
 
     as_written = {"nvr": parse_nvr(chosen.get("nvr")), "decimation": parse_decimation(chosen.get("decimation"))}
@@ -49,7 +68,35 @@ def diagnose_command(
     *,
     as_json: bool,
 ) -> int:
-    """Carry out ``armident diagnose``; ``chosen`` are the fields of its `Settings`; returns the exit code."""
+    """Carry out ``armident diagnose``.
+
+    Parameters
+    ----------
+    paths
+        Recordings to fit.
+    config
+        Robot configuration; ``None``: that of the first recording.
+    validate
+        Held-out recording; ``None``: the last part of the data.
+    baseline
+        Identification whose parameters are tested for change.
+    chosen
+        Fields of `armident.identify.diagnosis.state.Settings`.
+    out
+        Folder of the results; ``None``: beside the first recording.
+    as_json
+        Print the document on stdout instead of a table.
+
+    Returns
+    -------
+    int
+        Exit code: 0 if the verdict is ``no_gap``, otherwise `FOUND`.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If an option or a file is wrong, or the recordings cannot support a diagnosis.
+    """
     from armident.identify.cli_tables import diagnosis_table, progress, warn
     from armident.identify.diagnosis.diagnose import diagnose
     from armident.identify.diagnosis.state import Settings
@@ -59,7 +106,7 @@ def diagnose_command(
     recordings = [read_recording(path) for path in paths]
     robot = recordings[0].robot if config is None else load_robot(config)
     if numbers is not None and numbers.robot != robot.name:
-        raise DataError(f"{baseline}: the numbers of robot {numbers.robot!r}, the recording is of {robot.name!r}")
+        raise DataError(f"{baseline}: the baseline is of robot {numbers.robot!r}, the recording of {robot.name!r}")
     notes: list[str] = []
     training = [e for recording in recordings for e in _experiments(recording, robot, notes)]
     validation: list[Experiment] = []

@@ -1,1 +1,1 @@
-"""Design of exciting trajectories."""
+"""Optimal experiment design: exciting trajectories."""

@@ -1,5 +1,6 @@
-"""``armident trajectory``: design an exciting trajectory, or look at one; its picture, and what it will tell."""
+"""Command ``armident trajectory``: design or check an exciting trajectory, plot it, predict its precision."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,77 +20,121 @@ from armident.identify.excitation.design import (
 )
 from armident.identify.excitation.objective import EffectObjective
 from armident.identify.excitation.plot import check_name, draw
-from armident.identify.excitation.previous_estimate import PreviousEstimate, prior_from
+from armident.identify.excitation.previous_estimate import PreviousEstimate, previous_estimate
 
 SHAPES: tuple[Shape, ...] = ("moves", "fourier")
+"""Values of ``--shape``."""
 
 
-def trajectory_command(
-    config: Path,
-    out: Path | None,
-    duration: float = 7.5,
-    seed: int = 0,
-    known: Path | None = None,
-    evaluations: int = 2000,
-    wanted: str | None = None,
-    joint: str | None = None,
-    against: str | None = None,
-    shape: str = "moves",
-    harmonics: int | None = None,
-    picture: Path | None = None,
-    look_at: Path | None = None,
-) -> None:
-    """Carry out ``armident trajectory``; parameters are its options.
+@dataclass(frozen=True)
+class TrajectoryOptions:
+    """Options of ``armident trajectory``.
+
+    Parameters
+    ----------
+    config
+        Robot configuration.
+    out
+        Trajectory file to write; ``None`` with ``look_at``.
+    duration
+        Length, s.
+    seed
+        Seed of the random search.
+    known
+        ``identification.json`` of the robot: parameters and noise.
+    evaluations
+        Number of candidates to try.
+    wanted, joint, against
+        Effect to make visible, its joint, and an effect to separate it from.
+    shape, harmonics
+        ``moves`` or ``fourier``, and the number of harmonics of the latter.
+    picture
+        File of the plot; ``None``: named after ``out`` or ``look_at``.
+    look_at
+        Existing trajectory to check instead of a design.
+    """
+
+    config: Path
+    out: Path | None = None
+    duration: float = 7.5
+    seed: int = 0
+    known: Path | None = None
+    evaluations: int = 2000
+    wanted: str | None = None
+    joint: str | None = None
+    against: str | None = None
+    shape: str = "moves"
+    harmonics: int | None = None
+    picture: Path | None = None
+    look_at: Path | None = None
+
+
+def trajectory_command(options: TrajectoryOptions) -> None:
+    """Carry out ``armident trajectory``.
+
+    Parameters
+    ----------
+    options
+        As given by the user.
 
     Raises
     ------
     ConfigError
-        If an option is wrong, or a trajectory that is to be looked at leaves the limits; torques too, if known.
+        If an option is wrong, or a trajectory to check exceeds the limits (of torque, too, if parameters are known).
     DataError
         If ``known`` is of another robot or model.
     """
-    robot = load_robot(config)
-    chosen = next((each for each in SHAPES if each == shape), None)
-    if chosen is None:
-        raise ConfigError(f"--shape {shape}: expected {' or '.join(SHAPES)}")
-    if out is not None and out.suffix not in {".yaml", ".yml"}:
-        raise ConfigError(f"--out {out}: expected a file name that ends in .yaml")
-    if (out is None) == (look_at is None):
-        raise ConfigError("give --out FILE for a new trajectory, or --look-at FILE for one that there is")
+    robot, out, look_at = load_robot(options.config), options.out, options.look_at
+    shape = _checked_shape(options)
+    picture = options.picture
     if picture is None:
         picture = out.with_suffix(".png") if out is not None else Path(f"{Path(look_at or '').stem}.png")
     check_name(picture)
-    prior = None if known is None else prior_from(load_document(known, IdentificationDocument), robot, str(known))
+    prior = None
+    if options.known is not None:
+        document = load_document(options.known, IdentificationDocument)
+        prior = previous_estimate(document, robot, str(options.known))
     theta = None if prior is None else prior.theta
-    aim = with_objective(robot, wanted, joint, against, theta)
+    aim = with_objective(robot, options.wanted, options.joint, options.against, theta)
     if look_at is not None:
         design = _looked_at(robot, look_at, prior, aim)
     else:
         with progress("trajectory") as report:
             design = design_trajectory(
                 robot,
-                duration,
-                seed,
+                options.duration,
+                options.seed,
                 noise=None if prior is None else prior.noise,
-                evaluations=evaluations,
+                evaluations=options.evaluations,
                 theta=theta,
                 aim=aim,
-                shape=chosen,
-                harmonics=harmonics,
+                shape=shape,
+                harmonics=options.harmonics,
                 progress=lambda share: report("searching", share),
             )
-    assert design is not None
     if out is not None:
         content = design.trajectory.model_dump(mode="json", by_alias=True, exclude_defaults=True)
         write_atomically(out, yaml.safe_dump(content, sort_keys=False))
-    _tell(robot, design, prior)
+    _print_precision(robot, design, prior)
     name = str(out or look_at)
-    words = f"{name}: {design.trajectory.duration:.2f} s, condition number {design.condition:.0f}"
-    draw(robot, design, picture, f"{robot.name}, {words}")
-    print(words)
+    summary = f"{name}: {design.trajectory.duration:.2f} s, condition number {design.condition:.0f}"
+    draw(robot, design, picture, f"{robot.name}, {summary}")
+    print(summary)
     print(f"picture: {picture}")
     if look_at is not None:
         _refuse_torque(robot, design, name)
+
+
+def _checked_shape(options: TrajectoryOptions) -> Shape:
+    """Return the shape; ConfigError if an option is wrong or two contradict each other."""
+    shape = next((each for each in SHAPES if each == options.shape), None)
+    if shape is None:
+        raise ConfigError(f"--shape {options.shape}: expected {' or '.join(SHAPES)}")
+    if options.out is not None and options.out.suffix not in {".yaml", ".yml"}:
+        raise ConfigError(f"--out {options.out}: expected a file name that ends in .yaml")
+    if (options.out is None) == (options.look_at is None):
+        raise ConfigError("give --out FILE for a new trajectory, or --look-at FILE for an existing one")
+    return shape
 
 
 def _looked_at(robot: RobotConfig, path: Path, prior: PreviousEstimate | None, aim: EffectObjective | None) -> Design:
@@ -100,14 +145,14 @@ def _looked_at(robot: RobotConfig, path: Path, prior: PreviousEstimate | None, a
     return predict_precision(arm_model(robot), trajectory, noise, theta=theta, aim=aim)
 
 
-def _tell(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> None:
-    """Print the standard deviations to expect."""
+def _print_precision(robot: RobotConfig, design: Design, prior: PreviousEstimate | None) -> None:
+    """Print the predicted standard deviations."""
     std = design.std
     if prior is None or std is None:
         model = arm_model(robot)
         std = predict_precision(model, design.trajectory, _assumed(robot)).std
         assert std is not None
-        print(f"noise unknown (no --known): supposed to be {100 * ASSUMED_NOISE:g} % of each joint's torque limit")
+        print(f"noise unknown (no --known): assumed to be {100 * ASSUMED_NOISE:g} % of each joint's torque limit")
         design_table(robot, None, std)
     else:
         design_table(robot, prior.theta, std)
@@ -120,7 +165,7 @@ def _assumed(robot: RobotConfig) -> np.ndarray[tuple[int], np.dtype[np.float64]]
 
 
 def _refuse_torque(robot: RobotConfig, design: Design, name: str) -> None:
-    """Raise ConfigError where a trajectory needs more torque than there is; it has been drawn before."""
+    """Raise ConfigError where a trajectory needs more torque than allowed; the plot is written before."""
     if design.torque is None:
         return
     for joint, peak in zip(robot.joints, np.abs(design.torque).max(axis=0), strict=True):

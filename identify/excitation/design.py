@@ -1,14 +1,13 @@
-"""Excitation design: reference trajectories that condition the base regressor well (thesis section 2.3.5).
+"""Optimal experiment design: exciting trajectories (thesis section 2.3.5).
 
-The trajectory is a sequence of point-to-point moves within the limits, or a finite Fourier sum per joint. Waypoints and
-paces, or coefficients, are improved by random search on the information in the base regressor, weighted by the torque
-noise of each joint:
-the smallest geometric mean of the standard deviations, with a condition number under
-`armident.identify.excitation.point_to_point.CONDITION`.
-The condition number alone would choose slow moves, whose gravity torques are as small as their inertial ones.
+A trajectory is a sequence of point-to-point moves within the limits, or a finite Fourier series per joint. A random
+search improves waypoints and paces, or coefficients. The criterion is D-optimality: the smallest geometric mean of the
+standard deviations of the base parameters, with the torque noise of each joint as weight, and a condition number below
+`armident.identify.excitation.point_to_point.CONDITION`. The condition number alone would prefer slow moves, whose
+gravity torques are as small as their inertial ones.
 
-With an aim the search looks for the smallest standard deviations of the linear parameters of one effect instead, or of
-two effects beside each other, and keeps the base parameters in sight.
+With an `EffectObjective` the criterion is that of the linear parameters of one effect, or of two effects to separate;
+the base parameters have a small weight.
 """
 
 from collections.abc import Callable
@@ -39,28 +38,32 @@ Shape = Literal["moves", "fourier"]
 C = TypeVar("C")
 
 PERIOD = 1e-3
-"""A designed trajectory is judged at this period, s."""
+"""Sampling period of the predicted precision, s."""
 
 ASSUMED_NOISE = 0.02
-"""Torque noise below the cut-off that is supposed where nothing is known, relative to the torque limit."""
+"""Assumed torque noise below the cut-off where none is known, relative to the torque limit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A designed trajectory and what it promises.
+    """A trajectory and its predicted precision.
 
     Parameters
     ----------
     trajectory
-        The reference, within the limits of the robot.
+        Reference within the limits of the robot.
     condition
         Condition number of the filtered, weighted base regressor along it.
     std
         Predicted standard deviation of each base parameter, shape (b,), in its unit; ``None`` if the noise is
-        neither known nor supposed.
+        unknown.
     slow_share
         Share of the samples of each joint, shape (n,), slower than
-        `armident.identify.excitation.point_to_point.SLOW` of its velocity limit: they say little about its friction.
+        `armident.identify.excitation.point_to_point.SLOW` of its velocity limit.
+    torque
+        Predicted torques (N, n) at `PERIOD`, N m or N; ``None`` if the parameters of the robot are unknown.
+    wanted
+        Predicted standard deviations of the linear parameters of the wanted effects; ``None`` as for ``std``.
     """
 
     trajectory: Trajectory
@@ -68,9 +71,7 @@ class Design:
     std: Floats | None
     slow_share: Floats
     torque: Floats | None = None
-    """Predicted torques along it, (N, n) at `PERIOD`; ``None`` where the robot's parameters are unknown."""
     wanted: dict[str, float] | None = None
-    """Predicted standard deviations of the linear parameters of wanted effects; ``None`` as for ``std``."""
 
 
 def design_trajectory(
@@ -91,31 +92,37 @@ def design_trajectory(
 
     Parameters
     ----------
+    robot
+        Configuration with the limits.
     duration
-        Length in s, met within a millisecond.
+        Length, s, met within a millisecond.
     seed
-        Of the search: the same seed gives the same trajectory.
+        Seed of the search; the same seed gives the same trajectory.
     noise
-        Standard deviation of the torque noise of each joint after the low-pass filter, (n,), N m or N; it
-        weights the regressor. By default proportional to the torque limits.
+        Standard deviation of the torque noise of each joint after the low-pass filter, (n,), N m or N: weight of
+        the regressor. By default proportional to the torque limits.
     evaluations
         Number of candidates to try.
     margin
         Share of each limit that may be used.
     theta
-        Standard or base parameters as far as they are known: torques along the trajectory then stay within
-        their limits too.
+        Standard or base parameters; with them torques stay within their limits, too.
     aim
-        Effects that the trajectory is to show; those that depend on torques need ``theta``.
+        Effects to make visible; those that depend on torques need ``theta``.
     shape, harmonics
-        Point-to-point moves with trapezoidal velocities, or Fourier sums of so many harmonics.
+        ``moves``: point-to-point with trapezoidal velocities; ``fourier``: series of that many harmonics.
     progress
         Called with the share done, 0 to 1.
+
+    Returns
+    -------
+    Design
+        Best trajectory found, with its predicted precision.
 
     Raises
     ------
     ConfigError
-        If the robot cannot make a single move in that time.
+        If the robot cannot make a single move in that time, or an argument is wrong.
     """
     model = arm_model(robot)
     limits = [joint.limits for joint in robot.joints]
@@ -126,7 +133,7 @@ def design_trajectory(
     if shape == "fourier":
         trajectory = _search(FourierSearch(search, harmonics), evaluations, progress)
     elif harmonics is not None:
-        raise ConfigError("harmonics: only Fourier sums have them; choose the shape fourier")
+        raise ConfigError("harmonics: only for Fourier series; choose the shape fourier")
     else:
         trajectory = _search(search, evaluations, progress)
     trajectory.check(robot, "designed trajectory")
@@ -134,7 +141,7 @@ def design_trajectory(
 
 
 class _Candidates(Protocol[C]):
-    """What is searched: candidates, their neighbours, their cost."""
+    """Search space: candidates, their neighbours and cost."""
 
     def random(self) -> C: ...
 
@@ -146,11 +153,11 @@ class _Candidates(Protocol[C]):
 
 
 def _search(among: _Candidates[C], evaluations: int, progress: Callable[[float], None] | None) -> Trajectory:
-    """The best trajectory found."""
+    """Return the best trajectory found."""
     best = among.random()
     cost = among.cost(best)
     for count in range(evaluations):
-        # The first fifth looks around, the rest improves the best so far.
+        # The first fifth explores, the rest improves the best candidate.
         candidate = among.random() if count < evaluations // 5 else among.neighbour(best)
         candidate_cost = among.cost(candidate)
         if candidate_cost < cost:
@@ -163,14 +170,25 @@ def _search(among: _Candidates[C], evaluations: int, progress: Callable[[float],
 def with_objective(
     robot: RobotConfig, wanted: str | None, joint: str | None, against: str | None, theta: ArrayLike | None = None
 ) -> EffectObjective | None:
-    """The aim that a user writes with ``--for``, ``--joint`` and ``--against``; ``None`` without ``--for``.
+    """Return the objective of the options ``--for``, ``--joint`` and ``--against``; ``None`` without ``--for``.
 
-    Speeds and loads for which the effect is to be visible are those of a usual trajectory of the robot.
+    Speeds and loads at which the effect is to be visible are those of a typical trajectory of the robot.
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot.
+    wanted, against
+        Names of the effect and of the effect to separate it from.
+    joint
+        Name of the joint; ``None``: all.
+    theta
+        Standard or base parameters, if known.
 
     Raises
     ------
     ConfigError
-        See `armident.identify.excitation.objective.effect_objective`; or if ``joint`` or ``against`` stand alone.
+        See `armident.identify.excitation.objective.effect_objective`; or if ``joint`` or ``against`` are given alone.
     """
     if wanted is None:
         for option, value in (("--joint", joint), ("--against", against)):
@@ -194,16 +212,28 @@ def predict_precision(
     theta: ArrayLike | None = None,
     aim: EffectObjective | None = None,
 ) -> Design:
-    """What a trajectory promises: conditioning and standard deviations after the low-pass filter.
+    """Predict condition number and standard deviations of an identification along a trajectory.
 
     Parameters
     ----------
+    model
+        Model of the robot.
+    trajectory
+        The reference.
     noise
-        Standard deviation of the filtered torque noise of each joint, (n,).
+        Standard deviation of the filtered torque noise of each joint, (n,), N m or N.
     cutoff_hz
-        Of the zero-phase low-pass; one sample per independent interval is kept (2.3.2, ``decimate``).
+        Cut-off of the zero-phase low-pass filter, Hz; one sample per independent interval is kept (thesis section
+        2.3.2).
+    known_noise
+        False if ``noise`` is only a weight: there are no standard deviations then.
     theta, aim
-        As for `design_trajectory`.
+        As in `design_trajectory`.
+
+    Returns
+    -------
+    Design
+        The trajectory with its predicted precision.
     """
     period = PERIOD
     q, qd, qdd = sample_trajectory(trajectory, period)

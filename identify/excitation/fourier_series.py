@@ -1,4 +1,4 @@
-"""Random search over finite Fourier sums within the limits of a robot: candidates and their neighbours."""
+"""Random search over finite Fourier series within the limits of a robot."""
 
 from dataclasses import dataclass
 
@@ -10,27 +10,33 @@ from armident.identify.excitation.point_to_point import PointToPointSearch
 from armident.identify.robot.chain import Floats
 
 HIGHEST_HZ = 1.6
-"""Highest harmonic: above it a joint that keeps its velocity limit hardly moves."""
+"""Frequency of the highest harmonic, Hz: above it the velocity limits allow only small amplitudes."""
 
 FEWEST = 5
-"""Harmonics of a short trajectory; with less there are fewer unknowns than a joint's friction and inertia ask for."""
+"""Least number of harmonics: fewer give too few unknowns to excite friction and inertia of a joint."""
 
 STEPS = (0.02, 0.1, 0.4)
-"""Standard deviations of the changes of coefficients, relative to all of them."""
+"""Standard deviations of the changes of coefficients, relative to their size."""
 
 SAMPLES = 512
-"""Instants of a period at which the limits are looked at."""
+"""Instants of a period at which the limits are checked."""
 
 DIGITS = 7
-"""Digits of a coefficient in a file, behind the point."""
+"""Decimal places of a coefficient in a file."""
 
 
 @dataclass(frozen=True)
 class FourierSeries:
-    """Coefficients (2, H, n) of sine and cosine before they are fitted into the limits, and the middle (n,) wanted.
+    """Candidate of the search.
 
-    ``share`` (n,) is how much of what the limits allow is used; ``middle`` where in the free range the motion lies, 0
-    to 1.
+    Parameters
+    ----------
+    coefficients
+        Sine and cosine coefficients (2, H, n) before scaling to the limits.
+    share
+        Used share (n,) of the amplitude that the limits allow.
+    middle
+        Position (n,) of the motion in the free range, 0 to 1.
     """
 
     coefficients: Floats
@@ -39,14 +45,14 @@ class FourierSeries:
 
 
 class FourierSearch:
-    """Candidates within the limits, their neighbours and cost; limits and cost are those of the search for moves.
+    """Search space of Fourier series; limits and cost are those of the point-to-point search.
 
     Parameters
     ----------
     search
-        With limits, noise, and what is known of the robot.
+        Limits, noise, model and cost.
     harmonics
-        How many; ``None``: up to `HIGHEST_HZ`.
+        Number of harmonics; ``None``: up to `HIGHEST_HZ`.
     """
 
     def __init__(self, search: PointToPointSearch, harmonics: int | None = None) -> None:
@@ -64,12 +70,12 @@ class FourierSearch:
         ]
 
     def random(self) -> FourierSeries:
-        """Coefficients that fall with the order: as much velocity in each harmonic."""
+        """Return random coefficients with the same velocity amplitude in each harmonic."""
         coefficients = self._rng.standard_normal((2, self.harmonics, self.n)) / self._weights[0][None, :, None]
         return FourierSeries(coefficients, self._rng.uniform(0.6, 1.0, self.n), self._rng.uniform(0.0, 1.0, self.n))
 
     def neighbour(self, candidate: FourierSeries) -> FourierSeries:
-        """The candidate with a few coefficients changed, and perhaps its place."""
+        """Return the candidate with some coefficients, shares and positions changed."""
         rng, size = self._rng, self._rng.choice(STEPS)
         chosen = rng.random(candidate.coefficients.shape) < rng.choice([0.05, 0.2, 1.0])
         scale = size / self._weights[0][None, :, None]
@@ -79,7 +85,7 @@ class FourierSearch:
         return FourierSeries(np.where(chosen, candidate.coefficients + step, candidate.coefficients), share, middle)
 
     def trajectory(self, candidate: FourierSeries) -> Trajectory:
-        """The candidate at rest in the beginning, as large as the limits allow."""
+        """Return the trajectory of a candidate, at rest at both ends and scaled to the limits."""
         weights = self._weights[:, :, None]
         at_rest = candidate.coefficients - weights * (weights * candidate.coefficients).sum(axis=1, keepdims=True) / (
             weights**2
@@ -106,5 +112,5 @@ class FourierSearch:
         )
 
     def cost(self, candidate: FourierSeries) -> float:
-        """As that of moves."""
-        return self._search.worth(self.trajectory(candidate))
+        """Return the cost of a candidate, as in `PointToPointSearch`."""
+        return self._search.trajectory_cost(self.trajectory(candidate))

@@ -1,4 +1,4 @@
-"""What a trajectory is to show: an effect of the catalogue, or the difference between two."""
+"""D-optimality objective of a trajectory for an effect of the catalogue, or for the separation of two."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -16,92 +16,102 @@ from armident.identify.signals.decimate import Decimation
 Array = NDArray[np.float64]
 
 TYPICAL = (0.25, 0.5, 0.75)
-"""Where between the ends of its grid a nonlinear parameter is taken to be, when nobody knows."""
+"""Assumed values of an unknown nonlinear parameter, as positions in its grid."""
 
 CONTAINED = 1e-8
-"""Information, over that of the columns alone, under which a parameter is not seen at all."""
+"""Information relative to that of the columns alone, below which a parameter is not identifiable."""
 
 
 @dataclass(frozen=True)
 class EffectLocation:
-    """An effect at a place, at the values of its nonlinear parameters that are to be thought of."""
+    """An effect at a location, with the values of its nonlinear parameters to consider."""
 
     effect: Effect
     place: Place
     shapes: tuple[Shapes, ...]
 
     def columns(self, motion: Motion, shapes: Shapes, decimation: Decimation, sigma: Array) -> Array:
-        """Filtered columns over the noise of each joint, (M n, k)."""
+        """Return the filtered columns over the noise of each joint, (M n, k)."""
         columns = decimation(self.effect.torque(motion, self.place, dict(shapes))) / sigma[:, None]
         return columns.reshape(-1, columns.shape[2])
 
 
 @dataclass(frozen=True)
 class EffectObjective:
-    """Effects to be estimated, each with the rival that it is to be told from, or without one."""
+    """Objective of a design for effects.
+
+    Parameters
+    ----------
+    pairs
+        Effects to estimate, each with the effect to separate it from, or ``None``.
+    """
 
     pairs: tuple[tuple[EffectLocation, EffectLocation | None], ...]
 
     @property
     def predicts(self) -> bool:
-        """Whether the effects depend on the arm's own torques."""
-        return any(seat is not None and seat.effect.predicts for pair in self.pairs for seat in pair)
+        """True if an effect depends on the predicted torques."""
+        return any(location is not None and location.effect.predicts for pair in self.pairs for location in pair)
 
     def cost(self, motion: Motion, x: Array, decimation: Decimation, sigma: Array) -> float:
-        """Mean logarithm of the standard deviations of all linear parameters (D-optimality), lower being better.
+        """Return the mean log standard deviation of all linear parameters (D-optimality); lower is better.
 
         Parameters
         ----------
         motion
-            At the rate that the decimation filters.
+            Motion at the input rate of the decimation.
         x
             Weighted base regressor at the instants that the decimation keeps, (M n, b).
+        decimation
+            Filter of the regression.
         sigma
             Standard deviation of the torque noise of each joint, (n,).
         """
         values = []
-        for seat, rival in self.pairs:
-            for shapes in seat.shapes:
-                power, information = _information(seat, shapes, rival, motion, x, decimation, sigma)
+        for location, rival in self.pairs:
+            for shapes in location.shapes:
+                power, information = _information(location, shapes, rival, motion, x, decimation, sigma)
                 eigenvalues = np.maximum(np.linalg.eigvalsh(information), CONTAINED)
                 values.append(-0.5 * float(np.mean(np.log(np.maximum(power, CONTAINED)) + np.log(eigenvalues))))
         return float(np.mean(values))
 
     def std(self, motion: Motion, x: Array, decimation: Decimation, sigma: Array) -> dict[str, float]:
-        """Predicted standard deviations of the linear parameters by name and place, at the middle shapes; see `cost`.
+        """Return the predicted standard deviations of the linear parameters by name; arguments as in `cost`.
 
-        Parameters that the motion does not show, or not apart from each other, are infinite.
+        Nonlinear parameters are in the middle of their grids. Parameters that are not identifiable are infinite.
         """
         found: dict[str, float] = {}
-        for seat, rival in self.pairs:
-            shapes = seat.shapes[len(seat.shapes) // 2]
-            power, information = _information(seat, shapes, rival, motion, x, decimation, sigma)
+        for location, rival in self.pairs:
+            shapes = location.shapes[len(location.shapes) // 2]
+            power, information = _information(location, shapes, rival, motion, x, decimation, sigma)
             eigenvalues, axes = np.linalg.eigh(information)
             with np.errstate(divide="ignore"):
                 variance = axes**2 @ (1.0 / np.where(eigenvalues > CONTAINED, eigenvalues, 0.0)) / power
-            for linear, value in zip(seat.effect.linear, variance, strict=True):
-                found[f"{linear.name}{_number(seat)}"] = float(np.sqrt(value))
+            for linear, value in zip(location.effect.linear, variance, strict=True):
+                found[f"{linear.name}{_number(location)}"] = float(np.sqrt(value))
         return found
 
 
 def effect_objective(
     robot: RobotConfig, wanted: str, joint: str | None, against: str | None, motion: Motion
 ) -> EffectObjective:
-    """Aim at an effect, at one joint or wherever it can sit.
+    """Return the objective for an effect at one joint or at all joints.
 
     Parameters
     ----------
+    robot
+        Configuration of the robot.
     wanted, against
-        Names of effects; ``against`` is the one that the wanted one is to be told from.
+        Names of the effect and of the effect to separate it from.
     joint
         Name of the joint; ``None``: all.
     motion
-        A usual one of the robot, by whose speeds and loads nonlinear parameters are chosen.
+        Typical motion of the robot; its speeds and loads give the values of nonlinear parameters.
 
     Raises
     ------
     ConfigError
-        If there is no such effect or joint, or no motion in particular shows the effect.
+        If there is no such effect or joint, the robot has no location for it, or any motion shows it.
     """
     effect, rival = _designable(wanted, "--for"), None if against is None else _designable(against, "--against")
     if rival is not None and rival.name == effect.name:
@@ -112,22 +122,22 @@ def effect_objective(
     at = None if joint is None else joints.index(joint)
     if motion.theta is None and any(e is not None and e.predicts for e in (effect, rival)):
         name = effect.name if effect.predicts else against
-        raise ConfigError(f"{name} depends on the torques of the arm: give an identification of it with --known")
-    here = _seats(effect, robot, at, motion)
+        raise ConfigError(f"{name} depends on the torques of the arm: add --known identification.json")
+    here = _locations(effect, robot, at, motion)
     if not here:
-        raise ConfigError(f"--for {wanted}: {robot.name} has no place for it")
+        raise ConfigError(f"--for {wanted}: {robot.name} has no location for it")
     if rival is None:
-        return EffectObjective(tuple((seat, None) for seat in here))
-    there = _seats(rival, robot, at, motion)
+        return EffectObjective(tuple((location, None) for location in here))
+    there = _locations(rival, robot, at, motion)
     met = [(one, two) for one, two in product(here, there) if _meet(one, two)]
     if not met:
         raise ConfigError(f"--against {against}: never at the same joint as {wanted}")
-    # Both must be estimated well for either to be told from the other.
+    # Both must be estimated precisely to separate them.
     return EffectObjective(tuple(pair for one, two in met for pair in ((one, two), (two, one))))
 
 
-def weighted(x: Array, sigma: ArrayLike) -> Array:
-    """Regressor (M, n, b) over the noise of each joint, as rows (M n, b)."""
+def weighted_rows(x: Array, sigma: ArrayLike) -> Array:
+    """Return a regressor (M, n, b) over the noise ``sigma`` (n,) of each joint, as rows (M n, b)."""
     rows: Array = (x / np.asarray(sigma, dtype=np.float64)[:, None]).reshape(-1, x.shape[2])
     return rows
 
@@ -135,11 +145,11 @@ def weighted(x: Array, sigma: ArrayLike) -> Array:
 def _designable(name: str, option: str) -> Effect:
     effect = known(name)
     if effect.rewires:
-        raise ConfigError(f"{option} {name}: shows in any motion, no trajectory shows it better")
+        raise ConfigError(f"{option} {name}: visible in any motion, needs no special trajectory")
     return effect
 
 
-def _seats(effect: Effect, robot: RobotConfig, joint: int | None, motion: Motion) -> list[EffectLocation]:
+def _locations(effect: Effect, robot: RobotConfig, joint: int | None, motion: Motion) -> list[EffectLocation]:
     found = []
     for place in places(effect, robot.n):
         elsewhere = joint is not None and effect.scope != "arm" and joint not in (place.joint, place.other)
@@ -157,14 +167,18 @@ def _meet(one: EffectLocation, two: EffectLocation) -> bool:
     return bool({one.place.joint, one.place.other} & {two.place.joint, two.place.other} - {None})
 
 
-def _number(seat: EffectLocation) -> str:
-    if seat.effect.scope == "arm":
+def _number(location: EffectLocation) -> str:
+    if location.effect.scope == "arm":
         return ""
-    return f"{seat.place.joint + 1}" if seat.place.other is None else f"{seat.place.joint + 1}{seat.place.other + 1}"
+    return (
+        f"{location.place.joint + 1}"
+        if location.place.other is None
+        else f"{location.place.joint + 1}{location.place.other + 1}"
+    )
 
 
 def _information(
-    seat: EffectLocation,
+    location: EffectLocation,
     shapes: Shapes,
     rival: EffectLocation | None,
     motion: Motion,
@@ -172,14 +186,14 @@ def _information(
     decimation: Decimation,
     sigma: Array,
 ) -> tuple[Array, Array]:
-    """Information in the columns of an effect alone (k,), and over it what is left beside model and rival (k, k).
+    """Return the information in an effect's columns alone (k,), and relative to it beside model and rival (k, k).
 
-    An effect that is nothing but other numbers is judged against a baseline, so the model does not hide it.
+    An effect that only changes parameters is tested against a baseline, so the model does not absorb it.
     """
-    own = seat.columns(motion, shapes, decimation, sigma)
+    own = location.columns(motion, shapes, decimation, sigma)
     power = np.einsum("rk,rk->k", own, own)
     own = own / np.sqrt(np.where(power > 0.0, power, 1.0))
-    beside = [] if seat.effect.numbers is not None else [x]
+    beside = [] if location.effect.numbers is not None else [x]
     if rival is not None:
         beside += [rival.columns(motion, s, decimation, sigma) for s in rival.shapes]
     information = own.T @ own

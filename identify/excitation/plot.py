@@ -1,4 +1,4 @@
-"""A picture of a trajectory before anything moves: positions, velocities, accelerations, torques, and their limits."""
+"""Plot of a trajectory: positions, velocities, accelerations and torques against their limits."""
 
 from pathlib import Path
 
@@ -11,27 +11,28 @@ from armident.identify.excitation.design import PERIOD, Design
 from armident.identify.excitation.point_to_point import sample_trajectory
 
 SUFFIXES = (".png", ".svg", ".pdf")
+"""Formats of the plot."""
 LINE, LIMIT, OUTSIDE = "#2a5d8f", "#b5403a", "#f6dfdd"
 
 
 def draw(robot: RobotConfig, design: Design, path: Path, title: str) -> None:
-    """Write a picture with one row a joint.
+    """Write a plot with one row per joint.
 
     Parameters
     ----------
     robot
-        For names, units and limits.
+        Names, units and limits.
     design
-        The trajectory; torques are drawn where they are known.
+        Trajectory; torques are drawn if they are known.
     path
-        File to write, by its suffix a bitmap (.png) or a drawing (.svg, .pdf).
+        File to write; its suffix gives the format, see `SUFFIXES`.
     title
-        Stands above it.
+        Title of the plot.
 
     Raises
     ------
     ConfigError
-        If the file cannot be written, or its suffix is none of these.
+        If the file cannot be written, or its suffix is not in `SUFFIXES`.
     """
     check_name(path)
     q, qd, qdd = sample_trajectory(design.trajectory, PERIOD)
@@ -84,12 +85,17 @@ def draw(robot: RobotConfig, design: Design, path: Path, title: str) -> None:
 
 
 def check_name(path: Path) -> None:
-    """Refuse a name that says nothing of the format.
+    """Check the suffix of the file of a plot.
+
+    Parameters
+    ----------
+    path
+        File to write.
 
     Raises
     ------
     ConfigError
-        If its suffix is none of `SUFFIXES`.
+        If its suffix is not in `SUFFIXES`.
     """
     if path.suffix not in SUFFIXES:
         raise ConfigError(f"--picture {path}: expected a name that ends in {', '.join(SUFFIXES)}")

@@ -1,4 +1,4 @@
-"""Random search over point-to-point moves within the limits of a robot: candidates, their neighbours, their cost."""
+"""Random search over point-to-point trajectories within the limits of a robot."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from armident.configs import RobotConfig, Trajectory
 from armident.configs.schema.trajectory import RAMP_SHARE, Move
-from armident.identify.excitation.objective import EffectObjective, weighted
+from armident.identify.excitation.objective import EffectObjective, weighted_rows
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 from armident.identify.robot.motion import Motion
@@ -20,45 +20,53 @@ PEAK_ACCELERATION = PEAK_VELOCITY * np.pi / (2.0 * RAMP_SHARE)
 """Peak acceleration of a move of unit length and duration."""
 
 SHORTEST_MOVE = 0.3
-"""Moves shorter than this (s) excite little but the closed loop's own dynamics."""
+"""Shortest move, s: shorter ones mainly excite the dynamics of the closed loop."""
 
 REACH = (0.15, 0.6)
-"""How far a move may go, as a share of the range: short moves accelerate harder, long ones run faster."""
+"""Length of a move as a share of the range: short moves accelerate more, long ones are faster."""
 
 SLOWEST_PACE = 1.8
-"""Slowest pace, as a multiple of the shortest duration: speeds must differ to tell ``fv`` from ``fc``."""
+"""Slowest pace, as a multiple of the shortest duration: ``fv`` and ``fc`` are separated by different speeds."""
 
 CONDITION = 190.0
-"""Condition number of the weighted base regressor that is good enough: under the 200 of thesis section B.4."""
+"""Condition number of the weighted base regressor without penalty: below the 200 of thesis section B.4."""
 
 SLOW = 0.025
-"""Share of a joint's velocity limit under which a sample is slow."""
+"""Share of a joint's velocity limit below which a sample counts as slow."""
 
 SLOW_SHARE = 0.12
-"""Share of slow samples that costs nothing."""
+"""Share of slow samples without penalty."""
 
 SEARCH_RATE = 100.0
 """Sampling rate of the regressor during the search, Hz."""
 
 CUTOFF = 20.0
-"""Frequency up to which the regression is made, Hz."""
+"""Cut-off frequency of the regression, Hz."""
 
 AIM_FACTOR = 4
-"""Effects may vary faster than the motion: they are evaluated so much faster, then filtered."""
+"""Oversampling of effects, which may vary faster than the motion, before they are filtered."""
 
 AIM_REACH = (0.02, 0.9)
 AIM_SLOWEST_PACE = 6.0
-"""As `REACH` and `SLOWEST_PACE`, where an effect is wanted: it may need small, slow or lonely moves."""
+"""`REACH` and `SLOWEST_PACE` of a design for an effect, which may need small, slow or single-joint moves."""
 
 STEPS, AIM_STEPS = (0.05, 0.2, 0.5), (0.01, 0.05, 0.2, 0.5)
-"""Standard deviations of the changes of waypoints, over the range; small ones where an effect is wanted."""
+"""Standard deviations of the changes of waypoints, over the range; the latter for an effect."""
 
 BASE_WEIGHT = 0.05
-"""Weight of the base parameters' precision beside that of a wanted effect's."""
+"""Weight of the precision of the base parameters in a design for an effect."""
 
 
 def slow_share(robot: RobotConfig, qd: Floats) -> Floats:
-    """Share of the samples ``qd`` (N, n) of each joint that are slower than `SLOW` of its velocity limit."""
+    """Return the share of slow samples of each joint, (n,).
+
+    Parameters
+    ----------
+    robot
+        Velocity limits.
+    qd
+        Velocities (N, n), rad/s or m/s; slow means below `SLOW` of the limit.
+    """
     limit = SLOW * np.array([joint.limits.velocity for joint in robot.joints])
     result: Floats = (np.abs(qd) < limit).mean(axis=0)
     return result
@@ -66,14 +74,34 @@ def slow_share(robot: RobotConfig, qd: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class PointToPoint:
-    """Waypoints (K, n) and paces (K,): how much slower than the limits each move is."""
+    """Candidate: waypoints (K, n), rad or m, and paces (K,), durations over the shortest possible ones."""
 
     points: Floats
     paces: Floats
 
 
 class PointToPointSearch:
-    """Candidates within the limits, and their cost."""
+    """Search space of point-to-point trajectories, and the cost of a trajectory.
+
+    Parameters
+    ----------
+    robot
+        Limits.
+    model
+        Its model.
+    duration
+        Length, s.
+    sigma
+        Standard deviation (n,) of the torque noise, N m or N.
+    margin
+        Share of each limit that may be used.
+    theta
+        Standard or base parameters, or ``None``.
+    aim
+        Effects to make visible; ``None``: base parameters only.
+    rng
+        Source of random numbers.
+    """
 
     def __init__(
         self,
@@ -99,7 +127,7 @@ class PointToPointSearch:
         self.decimation = design(1.0 / (AIM_FACTOR * SEARCH_RATE), CUTOFF, AIM_FACTOR)
 
     def random(self) -> PointToPoint:
-        """Waypoints within reach of each other, the last one home, as many as fit the duration."""
+        """Return random waypoints within `REACH` of each other, as many as fit the duration; the last one is home."""
         reach = self.rng.uniform(*REACH) * (self.high - self.low) if self.aim is None else None
         points: list[Floats] = []
         paces: list[float] = []
@@ -118,13 +146,13 @@ class PointToPointSearch:
         return PointToPoint(np.array(points), np.array(paces))
 
     def _far(self) -> Floats:
-        """How far the joints may go in one move (n,), each its own: the wanted one slowly while others hardly move."""
+        """Return the reach (n,) of one move, drawn for each joint, so that single joints may move alone."""
         share = np.exp(self.rng.uniform(np.log(AIM_REACH[0]), np.log(AIM_REACH[1]), self.low.size))
         far: Floats = share * (self.high - self.low)
         return far
 
     def neighbour(self, candidate: PointToPoint) -> PointToPoint:
-        """The candidate with a few coordinates changed."""
+        """Return the candidate with a few coordinates changed."""
         points, paces = candidate.points.copy(), candidate.paces.copy()
         change = self.rng.random(points.shape) < self.rng.choice([0.03, 0.1, 0.3])
         sizes = STEPS if self.aim is None else AIM_STEPS
@@ -135,7 +163,7 @@ class PointToPointSearch:
         return PointToPoint(points, np.where(change_pace, self._pace(paces.size), paces))
 
     def trajectory(self, candidate: PointToPoint) -> Trajectory:
-        """The moves of a candidate, their durations in whole milliseconds and adding up."""
+        """Return the trajectory of a candidate; durations are whole milliseconds with the given sum."""
         durations = self._durations(candidate)
         ends = np.round(np.cumsum(durations), 3)
         ends[-1] = round(self.duration, 3)
@@ -147,7 +175,7 @@ class PointToPointSearch:
         return Trajectory(schema="armident/trajectory/1", start=tuple(float(v) for v in self.home), moves=moves)
 
     def cost(self, candidate: PointToPoint) -> float:
-        """Mean logarithm of the standard deviations, raised where conditioning is poor or joints are slow.
+        """Return the cost of a candidate: mean log standard deviation with penalties for conditioning and slowness.
 
         Infinite where a limit is exceeded.
         """
@@ -155,10 +183,10 @@ class PointToPointSearch:
         lengths = np.diff(np.vstack([self.home, candidate.points]), axis=0)
         if (durations < np.maximum(self._shortest(lengths), SHORTEST_MOVE)).any():
             return np.inf
-        return self.worth(self.trajectory(candidate))
+        return self.trajectory_cost(self.trajectory(candidate))
 
-    def worth(self, trajectory: Trajectory) -> float:
-        """Cost of a trajectory that keeps the limits of motion; infinite where it exceeds those of torque."""
+    def trajectory_cost(self, trajectory: Trajectory) -> float:
+        """Return the cost of a trajectory within the motion limits; infinite where a torque limit is exceeded."""
         factor = 1 if self.aim is None else AIM_FACTOR
         period = 1.0 / (factor * SEARCH_RATE)
         q, qd, qdd = sample_trajectory(trajectory, period)
@@ -167,7 +195,7 @@ class PointToPointSearch:
             if (np.abs(torque) > self.torque).any():
                 return np.inf
         if self.aim is None:
-            x = weighted(self.model.base_regressor(q, qd, qdd, dt=period), self.sigma)
+            x = weighted_rows(self.model.base_regressor(q, qd, qdd, dt=period), self.sigma)
             return self._base_cost(x, qd, slow=True)
         motion = self.anchored.motion(q, qd, qdd, period)
         x, decimation, sigma = equations_of(self.anchored, motion, self.decimation, self.sigma)
@@ -175,7 +203,7 @@ class PointToPointSearch:
         return base if np.isinf(base) else self.aim.cost(motion, x, decimation, sigma) + BASE_WEIGHT * base
 
     def _base_cost(self, x: Floats, qd: Floats, *, slow: bool) -> float:
-        """Of the base parameters alone, from their weighted regressor (R, b)."""
+        """Return the cost of the base parameters from their weighted regressor (R, b)."""
         eigenvalues = np.linalg.eigvalsh(x.T @ x)
         if not eigenvalues[0] > 0.0:
             return np.inf
@@ -184,7 +212,7 @@ class PointToPointSearch:
         return float(-0.5 * np.log(eigenvalues).mean() + max(0.0, np.log(condition / CONDITION)) + slowness)
 
     def _pace(self, count: int) -> Floats:
-        """Paces (count,): evenly spread, or in equal shares of every power where slow moves are wanted."""
+        """Return paces (count,): uniform, or log-uniform in a design for an effect."""
         if self.aim is None:
             return self.rng.uniform(1.0, SLOWEST_PACE, count)
         return np.exp(self.rng.uniform(0.0, np.log(AIM_SLOWEST_PACE), count))
@@ -205,16 +233,36 @@ class PointToPointSearch:
 def equations_of(
     model: ArmModel, motion: Motion, decimation: Decimation, sigma: Floats
 ) -> tuple[Floats, Decimation, Floats]:
-    """Weighted base regressor (R, b) at the instants of a decimation, with what an `EffectObjective` needs besides."""
+    """Return the arguments of `EffectObjective.cost`: weighted base regressor (R, b), decimation and noise.
+
+    Parameters
+    ----------
+    model
+        Model of the robot.
+    motion
+        Motion along the trajectory.
+    decimation
+        Filter of the regression.
+    sigma
+        Standard deviation (n,) of the torque noise, N m or N.
+    """
     kept = decimation.instants(motion.samples)
     x = model.rigid_regressor(motion.q[kept], motion.qd[kept], motion.qdd[kept])
     if model.terms:
         x = np.concatenate([x, decimation(model.term_regressor(motion))], axis=2)
-    return weighted(x, sigma), decimation, sigma
+    return weighted_rows(x, sigma), decimation, sigma
 
 
 def sample_trajectory(trajectory: Trajectory, period: float) -> tuple[Floats, Floats, Floats]:
-    """Positions, velocities and accelerations (N, n) along a trajectory, by differences."""
+    """Return positions, velocities and accelerations (N, n) along a trajectory by finite differences.
+
+    Parameters
+    ----------
+    trajectory
+        The reference.
+    period
+        Sampling period, s.
+    """
     q = trajectory.sample(period)
     qd = np.gradient(q, period, axis=0)
     return q, qd, np.gradient(qd, period, axis=0)

@@ -1,4 +1,4 @@
-"""What an earlier identification knows of a robot, for the design of the next experiment."""
+"""Parameters and noise of an earlier identification, for the design of the next experiment."""
 
 from dataclasses import dataclass
 
@@ -12,22 +12,39 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.identification.equations import LS_CUTOFF
 
 FREQUENCIES = 4096
-"""Points of the noise spectra."""
+"""Number of frequencies of a noise spectrum."""
 
 
 @dataclass(frozen=True)
 class PreviousEstimate:
-    """Base parameters (b,) and standard deviation (n,) of the torque noise below the usual cut-off, N m or N."""
+    """An earlier estimate and its noise.
+
+    Parameters
+    ----------
+    theta
+        Base parameters (b,).
+    noise
+        Standard deviation (n,) of the torque noise below the cut-off of the regression, N m or N.
+    """
 
     theta: NDArray[np.float64]
     noise: NDArray[np.float64]
 
 
-def prior_from(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:
-    """Parameters and noise of an identification of the same robot.
+def previous_estimate(document: IdentificationDocument, robot: RobotConfig, where: str) -> PreviousEstimate:
+    """Return parameters and noise of an identification of the same robot.
 
-    The noise is that of its noise models (6.19) below twice the closed-loop bandwidth, where the regression is made
-    (2.3.1); without a configured bandwidth, all of it.
+    The noise is that of its noise models (thesis equation 6.19) below `LS_CUTOFF` times the closed-loop bandwidth,
+    where the regression is made (thesis section 2.3.1); without a configured bandwidth, all of it.
+
+    Parameters
+    ----------
+    document
+        The identification.
+    robot
+        Configuration of the robot.
+    where
+        Source of the document, for messages.
 
     Raises
     ------
@@ -51,7 +68,7 @@ def prior_from(document: IdentificationDocument, robot: RobotConfig, where: str)
 
 
 def _deviation_below(cutoff_hz: float, rate_hz: float, variance: float, coefficients: list[float]) -> float:
-    """Standard deviation of AR noise below a frequency: its spectrum is ``variance / |C|^2``."""
+    """Return the standard deviation of AR noise below a frequency: its spectrum is ``variance / |C|^2``."""
     f, response = signal.freqz([1.0], [1.0, *coefficients], worN=FREQUENCIES, fs=rate_hz)
     inside = f <= cutoff_hz
     share = float(np.mean(np.abs(response[inside]) ** 2)) * cutoff_hz / (rate_hz / 2)

@@ -1,4 +1,4 @@
-"""Designed trajectories: within the limits, repeatable, and as informative as those of the thesis."""
+"""Designed trajectories: within the limits, reproducible, as precise as that of the thesis."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_shipped_trajectory_conditions_the_base_regressor_like_the_thesis(tx40: 
     assert design.condition <= 200.0
 
 
-def test_shipped_trajectory_promises_the_accuracy_of_table_b4(tx40: ArmModel) -> None:
+def test_shipped_trajectory_has_the_predicted_accuracy_of_table_b4(tx40: ArmModel) -> None:
     design = predict_precision(tx40, load_trajectory("trajectories/tx40_excitation.yaml"), NOISE)
     assert design.std is not None
     std = dict(zip(tx40.base.names, design.std, strict=True))

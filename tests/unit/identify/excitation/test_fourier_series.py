@@ -1,4 +1,4 @@
-"""Fourier trajectories begin and end at rest, keep the limits, and tell as much as moves; the picture shows it."""
+"""Fourier trajectories: at rest at both ends, within the limits, as precise as moves; the plot of the command."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ import pytest
 from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
 from armident.configs.schema.trajectory import Fourier
 from armident.identify.effects.terms import arm_model
-from armident.identify.excitation.cli import trajectory_command
+from armident.identify.excitation.cli import TrajectoryOptions, trajectory_command
 from armident.identify.excitation.design import design_trajectory, predict_precision
 
 NOISE = np.sqrt([1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523])
@@ -62,8 +62,8 @@ def test_a_designed_sum_is_at_rest_at_both_ends_and_keeps_the_limits(robot: Robo
     assert (peak < 0.91).all(), "the tenth that is kept free for the control loop"
 
 
-def test_sums_tell_as_much_as_moves(robot: RobotConfig, designed: Trajectory) -> None:
-    """In the geometric mean of all standard deviations, for as many candidates; conditioned like the thesis's."""
+def test_fourier_series_are_as_precise_as_moves(robot: RobotConfig, designed: Trajectory) -> None:
+    """Geometric mean of the standard deviations for as many candidates; condition number as in the thesis."""
     model = arm_model(robot)
     moves = design_trajectory(robot, 7.5, seed=1, noise=NOISE, evaluations=400)
     sums = predict_precision(model, designed, NOISE)
@@ -73,22 +73,20 @@ def test_sums_tell_as_much_as_moves(robot: RobotConfig, designed: Trajectory) ->
     assert sums.condition < 220.0
 
 
-def test_the_picture_and_the_table_come_before_anything_moves(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_a_plot_and_prints_the_precision(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "sums.yaml"
-    trajectory_command(Path("emps.yaml"), out, duration=6.0, evaluations=30, shape="fourier")
-    said = capsys.readouterr().out
+    trajectory_command(TrajectoryOptions(Path("emps.yaml"), out, duration=6.0, evaluations=30, shape="fourier"))
+    printed = capsys.readouterr().out
     picture = tmp_path / "sums.png"
-    assert f"picture: {picture}" in said
+    assert f"picture: {picture}" in printed
     assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    assert "supposed to be 2 % of each joint's torque limit" in said
+    assert "assumed to be 2 % of each joint's torque limit" in printed
     for name in arm_model(load_robot("emps.yaml")).base.names:
-        assert name in said
+        assert name in printed
     loaded = load_trajectory(out)
     assert loaded.fourier is not None
     assert loaded.moves == ()
-    trajectory_command(Path("emps.yaml"), None, look_at=out, picture=tmp_path / "again.svg")
+    trajectory_command(TrajectoryOptions(Path("emps.yaml"), look_at=out, picture=tmp_path / "again.svg"))
     assert "<svg" in (tmp_path / "again.svg").read_text()[:500]
 
 
@@ -96,19 +94,19 @@ def test_a_trajectory_outside_the_limits_is_refused_by_name(tmp_path: Path) -> N
     path = tmp_path / "far.yaml"
     path.write_text("schema: armident/trajectory/1\nstart: [0.0]\nmoves:\n- {to: [9.0], duration: 1.0}\n")
     with pytest.raises(ConfigError, match=r"far\.yaml: .* moves over \[0\.000, 9\.000\]"):
-        trajectory_command(Path("emps.yaml"), None, look_at=path, picture=tmp_path / "far.png")
+        trajectory_command(TrajectoryOptions(Path("emps.yaml"), look_at=path, picture=tmp_path / "far.png"))
     assert not (tmp_path / "far.png").exists()
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         ({"shape": "circle"}, "--shape circle: expected moves or fourier"),
-        ({"harmonics": 5}, "only Fourier sums have them"),
+        ({"harmonics": 5}, "only for Fourier series"),
         ({"picture": Path("a.gif")}, r"--picture a\.gif: expected a name that ends in"),
         ({"look_at": Path("b.yaml")}, "give --out FILE for a new trajectory, or --look-at FILE"),
     ],
 )
-def test_options_that_contradict_each_other_are_refused(tmp_path: Path, options: dict[str, Any], says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
-        trajectory_command(Path("emps.yaml"), tmp_path / "x.yaml", evaluations=1, **options)
+def test_options_that_contradict_each_other_are_refused(tmp_path: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        trajectory_command(TrajectoryOptions(Path("emps.yaml"), tmp_path / "x.yaml", evaluations=1, **options))

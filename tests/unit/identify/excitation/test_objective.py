@@ -1,4 +1,4 @@
-"""Trajectories designed for one effect show it better than those for the base parameters, within the same limits."""
+"""Trajectories designed for one effect estimate it more precisely than those for the base parameters."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ NOISE = np.sqrt([1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523])
         ("stribeck_friction", "presliding_friction", "fst1", 0.8),
     ],
 )
-def test_an_aim_makes_its_effect_surer_than_the_usual_design(
+def test_a_design_for_an_effect_estimates_it_more_precisely(
     effect: str, against: str | None, parameter: str, better: float
 ) -> None:
     robot = load_robot("emps")
@@ -39,7 +39,7 @@ def test_an_aim_makes_its_effect_surer_than_the_usual_design(
     assert design.wanted[parameter] < better * before[parameter]
 
 
-def test_six_axes_show_the_ripple_of_one_motor_when_asked_for_it() -> None:
+def test_a_six_axis_design_shows_the_ripple_of_one_motor() -> None:
     robot = load_robot("tx40")
     aim = with_objective(robot, "cogging_torque", "joint_2", None)
     design = design_trajectory(robot, 7.5, seed=0, noise=NOISE, evaluations=100, aim=aim)
@@ -53,7 +53,7 @@ def test_six_axes_show_the_ripple_of_one_motor_when_asked_for_it() -> None:
 
 
 def test_the_predicted_deviation_is_the_one_that_estimates_have() -> None:
-    """Monte Carlo on the predicted columns: least squares with white noise of the given size."""
+    """Monte Carlo on the predicted columns: least squares with white noise of the given standard deviation."""
     robot = load_robot("emps")
     model = arm_model(robot)
     aim = with_objective(robot, "joint_spring", None, None)
@@ -68,27 +68,27 @@ def test_the_predicted_deviation_is_the_one_that_estimates_have() -> None:
 
 
 @pytest.mark.parametrize(
-    ("robot", "wanted", "joint", "against", "says"),
+    ("robot", "wanted", "joint", "against", "message"),
     [
         ("tx40", "wear", None, None, "'wear' is not in the catalogue"),
         ("tx40", "joint_spring", "elbow", None, "--joint elbow: tx40 has joint_1, joint_2"),
-        ("tx40", "load_dependent_friction", None, None, "depends on the torques of the arm: give .* --known"),
+        ("tx40", "load_dependent_friction", None, None, "depends on the torques of the arm: add --known"),
         ("tx40", "joint_spring", None, "load_dependent_friction", "load_dependent_friction depends on the torques"),
         ("tx40", "joint_spring", None, "joint_spring", "--against joint_spring: expected another effect"),
-        ("tx40", "sign_error", None, None, "--for sign_error: shows in any motion"),
-        ("emps", "coupling_friction", None, None, "--for coupling_friction: emps has no place for it"),
+        ("tx40", "sign_error", None, None, "--for sign_error: visible in any motion"),
+        ("emps", "coupling_friction", None, None, "--for coupling_friction: emps has no location for it"),
         ("tx40", None, "joint_1", None, "--joint joint_1: needs --for"),
         ("tx40", None, None, "joint_spring", "--against joint_spring: needs --for"),
     ],
 )
-def test_what_cannot_be_aimed_at_is_refused_with_the_reason(
-    robot: str, wanted: str | None, joint: str | None, against: str | None, says: str
+def test_an_impossible_objective_is_refused_with_the_reason(
+    robot: str, wanted: str | None, joint: str | None, against: str | None, message: str
 ) -> None:
-    with pytest.raises(ConfigError, match=says):
+    with pytest.raises(ConfigError, match=message):
         with_objective(load_robot(robot), wanted, joint, against)
 
 
-def test_effects_that_depend_on_torques_are_aimed_at_with_known_parameters() -> None:
+def test_effects_that_depend_on_torques_need_known_parameters() -> None:
     robot = load_robot("emps")
     aim = with_objective(robot, "time_delay", None, None, [95.0, 200.0, 20.0, -3.0])
     assert aim is not None

@@ -1,4 +1,4 @@
-"""An identification as the knowledge with which the next experiment is designed."""
+"""Parameters and noise of an earlier identification in the design of the next experiment."""
 
 from functools import cache
 from pathlib import Path
@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from armident.configs import DataError, config_path, load_robot, load_trajectory
 from armident.identify.cli import trajectory as trajectory_command
 from armident.identify.document import IdentificationDocument, to_json, write_atomically
-from armident.identify.excitation.previous_estimate import _deviation_below, prior_from
+from armident.identify.excitation.previous_estimate import _deviation_below, previous_estimate
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.equations import LS_CUTOFF
 from armident.identify.identification.options import Options
@@ -24,7 +24,7 @@ def document() -> IdentificationDocument:
     return identify_recording(recording, options=Options()).document
 
 
-def test_noise_below_a_frequency_is_what_a_filter_would_leave() -> None:
+def test_noise_below_a_frequency_is_the_filtered_noise() -> None:
     rng = np.random.default_rng(3)
     noise = lfilter([1.0], [1.0, -0.9], rng.standard_normal(400_000))
     spectrum = np.abs(np.fft.rfft(noise)) ** 2 / noise.size**2 * 2
@@ -36,7 +36,7 @@ def test_noise_below_a_frequency_is_what_a_filter_would_leave() -> None:
 
 def test_parameters_and_noise_of_an_identification_are_taken_over() -> None:
     robot = load_robot("tx40")
-    prior = prior_from(document(), robot, "tx40.json")
+    prior = previous_estimate(document(), robot, "tx40.json")
     assert prior.theta.shape == (61,)
     assert prior.theta[0] == document().parameters[0].value
     # Table 6.3: variances of the noise that is left after the usual decimation.
@@ -48,16 +48,16 @@ def test_parameters_and_noise_of_an_identification_are_taken_over() -> None:
 
 def test_another_robot_or_model_is_refused_by_name() -> None:
     with pytest.raises(DataError, match=r"tx40\.json: the identification of robot 'tx40', the configuration is 'emps'"):
-        prior_from(document(), load_robot("emps"), "tx40.json")
+        previous_estimate(document(), load_robot("emps"), "tx40.json")
     other = load_robot("tx40").model_copy(update={"couplings": ()})
     with pytest.raises(DataError, match="other base parameters than the configuration of tx40: fcm6, fvm6, iam6"):
-        prior_from(document(), other, "tx40.json")
+        previous_estimate(document(), other, "tx40.json")
     positions = document().model_copy(update={"noise_model": document().noise_model | {"of": "joint position"}})
     with pytest.raises(DataError, match="noise_model: expected one model of joint torques for each of 6 joints"):
-        prior_from(positions, load_robot("tx40"), "tx40.json")
+        previous_estimate(positions, load_robot("tx40"), "tx40.json")
 
 
-def test_the_command_predicts_what_the_trajectory_will_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_predicts_the_precision(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     known = tmp_path / "identification.json"
     write_atomically(known, to_json(document()))
     out = tmp_path / "excitation.yaml"
