@@ -121,7 +121,15 @@ class Identified:
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recording, and the number and fraction of its lost samples."""
+    """Result of a capture.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    lost, lost_share
+        Number and fraction of the samples in gaps.
+    """
 
     path: Path
     lost: int
@@ -130,7 +138,15 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Diagnosed:
-    """Results of the second part: content of ``diagnosis.json``, and its report."""
+    """Results of the second part.
+
+    Parameters
+    ----------
+    document
+        Content of ``diagnosis.json``.
+    report
+        Report of the diagnosis.
+    """
 
     document: dict[str, Any]
     report: Path

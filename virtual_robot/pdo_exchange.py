@@ -225,9 +225,21 @@ class Exchange:
         )  # fmt: skip
 
     def take(self, ids: Any, lengths: Any, data: Any, start: int, stop: int, sequence: int) -> int:
-        """Take frames ``start`` to ``stop`` up to the next SYNC; returns its place, or ``stop``.
+        """Process frames up to the next SYNC; afterwards `out` holds its answers, and `act` applies its set points.
 
-        ``out`` then holds what answers the SYNC; :meth:`act` lets the set points act that are due at it.
+        Parameters
+        ----------
+        ids, lengths, data
+            Fields of an array of frames, shape (N,), (N,) and (N, 8) or (N, 64).
+        start, stop
+            Range of the frames to process.
+        sequence
+            Counter of a SYNC that carries none.
+
+        Returns
+        -------
+        int
+            Index of the SYNC, or ``stop`` if there is none.
         """
         at = int(_exchange(ids, lengths, data, start, stop, sequence, *self._arguments))
         self.out = self._out[: self._result[0]]

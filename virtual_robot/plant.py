@@ -1,6 +1,7 @@
 """Mechanics of the virtual arm: Pinocchio's rigid bodies, rotor inertias, friction and hidden effects."""
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -66,23 +67,12 @@ class Plant:
         self._gravity, self._shaking = np.array(self.model.gravity.linear), shaking(hidden, np.array(robot.gravity))
         swing = hanging(self.model, hidden, start)
         links = _symmetric(pin.crba(self.model, self._data, np.concatenate([start, swing])))[:n, :n]
-        names = [joint.name for joint in robot.joints]
-        rotor = np.diag([standard[f"ia{j + 1}"] for j in range(n)])
-        friction = np.array([[*(standard[f"{k}{j + 1}"] for k in ("fv", "fc", "off")), 0.0] for j in range(n)])
-        pairs: list[tuple[float, ...]] = []
-        for c in robot.couplings:
-            i, j = (names.index(joint) for joint in c.joints)
-            rotor[i, j] = rotor[j, i] = standard[f"ia{c.name}"]
-            pairs.append((i, j, standard[f"fv{c.name}"], standard[f"fc{c.name}"]))
+        rotor, friction, pairs = _healthy(robot, standard)
         add_rotors(rotor, hidden, links)
         table = force_table(hidden, robot, friction)
         bristles = bristle_table(hidden, robot, friction, np.diag(rotor) + np.diag(links))
         gears, moved = gear_rows(hidden, robot, rotor, links)
-        for h in hidden:
-            if h.effect == "coupling_friction":
-                viscous = h.given("viscous", 0.3 * h["coulomb"])
-                friction[[h.joint, h.other], 0] += viscous
-                pairs.append((h.joint, h.other, viscous, h["coulomb"]))
+        _add_coupling_friction(hidden, friction, pairs)
         # A bristle replaces the joint's Coulomb friction.
         friction[bristles[:, 0].astype(np.int64), 1] = 0.0
 
@@ -102,10 +92,7 @@ class Plant:
         self._state = np.zeros((4, total))
         self.coordinates, self.velocities = self._state[:2]
         self.coordinates[:] = np.concatenate([start, start[behind], swing])
-        for _ in range(SETTLING if soft else 1):
-            bias = pin.nonLinearEffects(self.model, self._data, self.coordinates[self._link], np.zeros(self._link.size))
-            for e, j in enumerate(behind):
-                self.coordinates[n + e] = start[j] - twist_under(gears[e], float(bias[j]))
+        bias = self._settle(start, gears, soft)
         self.q, self.qd = self.coordinates[:n], self.velocities[:n]
         self.bristles = np.zeros(len(bristles))
         self._time = 0.0
@@ -120,6 +107,14 @@ class Plant:
         )  # fmt: skip
         self._rigid, self._fine = total == n, bool(gears.size or bristles.size)
         self._check(robot, hidden)
+
+    def _settle(self, start: NDArray[np.float64], gears: NDArray[np.float64], soft: int) -> NDArray[np.float64]:
+        """Twist the first ``soft`` gears under the weight of their links; return the nonlinear effects at rest."""
+        for _ in range(SETTLING if soft else 1):
+            bias = pin.nonLinearEffects(self.model, self._data, self.coordinates[self._link], np.zeros(self._link.size))
+            for e, j in enumerate(gears[:soft, 0].astype(np.int64)):
+                self.coordinates[start.size + e] = start[j] - twist_under(gears[e], float(bias[j]))
+        return np.asarray(bias, np.float64)
 
     def _check(self, robot: RobotConfig, hidden: tuple[Hidden, ...]) -> None:
         if hidden and np.linalg.eigvalsh(self._inertia(self.coordinates)).min() <= 0.0:
@@ -138,7 +133,20 @@ class Plant:
         return mass
 
     def resistance(self, q: NDArray[np.float64], qd: NDArray[np.float64], t: float = 0.0) -> NDArray[np.float64]:
-        """Friction, brakes and hidden torques (n,) that resist the motion of the motors; bristles slide steadily."""
+        """Torques of friction, brakes and hidden effects against the motors; bristles slide steadily.
+
+        Parameters
+        ----------
+        q, qd
+            Positions and velocities of the motors, joint side, shape (n,).
+        t
+            Time, s.
+
+        Returns
+        -------
+        ndarray
+            Torques, N m or N, shape (n,).
+        """
         n = q.size
         out, slope = np.empty(n), np.empty((n, n))
         arguments = (q, qd, t, *self._resisting, out, slope)
@@ -213,6 +221,32 @@ class Plant:
         """Add the acceleration of the base at ``t`` to gravity."""
         rows = self._shaking
         self.model.gravity.linear = self._gravity - np.sin(rows[:, 3] * t) @ rows[:, :3]
+
+
+def _healthy(
+    robot: RobotConfig, standard: Mapping[str, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], list[tuple[float, ...]]]:
+    """Rotor inertias (n, n); fv, fc, offset and brake of each joint (n, 4); couplings (joints, fv, fc)."""
+    n, names = robot.n, [joint.name for joint in robot.joints]
+    rotor = np.diag([standard[f"ia{j + 1}"] for j in range(n)])
+    friction = np.array([[*(standard[f"{k}{j + 1}"] for k in ("fv", "fc", "off")), 0.0] for j in range(n)])
+    pairs: list[tuple[float, ...]] = []
+    for c in robot.couplings:
+        i, j = (names.index(joint) for joint in c.joints)
+        rotor[i, j] = rotor[j, i] = standard[f"ia{c.name}"]
+        pairs.append((i, j, standard[f"fv{c.name}"], standard[f"fc{c.name}"]))
+    return rotor, friction, pairs
+
+
+def _add_coupling_friction(
+    hidden: Sequence[Hidden], friction: NDArray[np.float64], pairs: list[tuple[float, ...]]
+) -> None:
+    """Add hidden friction between joints to ``friction`` (n, 4) and ``pairs``, in place."""
+    for h in hidden:
+        if h.effect == "coupling_friction":
+            viscous = h.given("viscous", 0.3 * h["coulomb"])
+            friction[[h.joint, h.other], 0] += viscous
+            pairs.append((h.joint, h.other, viscous, h["coulomb"]))
 
 
 def _symmetric(upper: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -62,12 +62,39 @@ def control(  # type: ignore[no-untyped-def]
     period, feedback, q, ratio, counts_per_rad, origin, target, age, steps, held, kp, kv, smooth, limit, noise,
     permille, past, rate, current, position, reported, demand, torque, disturbance, tau,
 ):  # fmt: skip
-    """Compute one control period of all drives (arrays (n,), motor side); state and outputs change in place.
+    """Compute one control period of all drives (`Servo`), motor side; state and outputs are changed in place.
 
-    Cascade of ``Servo``. ``past`` (n, velocity samples) holds the signal that the velocity loop differentiates, newest
-    first, and ``rate`` its filtered change over a period. ``tau`` (n,) receives the joint torques until the next period
-    by ``torque`` (n, n), N m or N per unit of the signal. ``held`` drives (not enabled) give no current, and their
-    demand follows the position.
+    Parameters
+    ----------
+    period, feedback, kp, kv, smooth
+        Control period, velocity feedback, gains, and weight of the velocity filter, as in `Servo`.
+    q
+        Measured joint positions, rad or m, shape (n,).
+    ratio
+        Transmission matrix, shape (n, n).
+    counts_per_rad
+        Encoder counts per rad or m, shape (n,).
+    origin, target, age, steps
+        Previous and present target (counts), and passed and total periods of the interpolation, shape (n,).
+    held
+        ``True`` for drives that are not enabled: no current, and their demand follows the position, shape (n,).
+    limit
+        Saturation of the signal, shape (n,).
+    noise
+        Noise of the measured signal, shape (n,).
+    permille
+        Reported numbers per unit of the signal, shape (n,).
+    past, rate
+        Input of the velocity loop in the last periods, newest first, shape (n, velocity samples), and its filtered
+        change per period, shape (n,).
+    current, position, reported, demand
+        Signal, position (counts), reported signal (per mille of rated) and demand (counts), shape (n,).
+    torque
+        Joint torque per unit of the signal, N m or N, shape (n, n).
+    disturbance
+        Disturbance torques, joint side, shape (n,).
+    tau
+        Joint torques until the next period, shape (n,).
     """
     n, samples = past.shape
     for j in range(n):

@@ -47,11 +47,11 @@ class Messages:
     n
         Maximum number of frames.
     control
-        ``True`` with room for time stamps and drop counters.
+        ``True`` with space for time stamps and drop counters.
     fd
         ``True`` for ``struct canfd_frame``.
     hardware
-        ``True`` with room for hardware time stamps.
+        ``True`` with space for hardware time stamps.
 
     Attributes
     ----------

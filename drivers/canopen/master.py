@@ -342,7 +342,7 @@ class DriveMaster:
         joint = sdo.drive.joint
         self._written[joint] = time.monotonic()
         if self.unverified_mapping.get(joint, (0, 0))[1] != NEVER:
-            self._report("mapping_changed", sdo, t_ns, f"somebody else changes its PDO mapping (object {index:04X}h)")
+            self._report("mapping_changed", sdo, t_ns, f"another master changes its PDO mapping (object {index:04X}h)")
             self._mark_unverified(sdo, t_ns)
         self._start_thread(self._reconfigure, sdo)
 
