@@ -1,1 +1,1 @@
-"""The thesis's tables, computed anew beside its figures."""
+"""Reproduction of the tables of M. Brunot's thesis (Toulouse, 2017)."""

@@ -1,7 +1,7 @@
-"""Table 4.8: an aircraft's elevator loop, where positions of the plant tell more than its input (thesis section 4.3.2).
+"""Table 4.8: elevator loop of an aircraft, whose outputs are more sensitive than its input (thesis section 4.3.2).
 
 The thesis takes the McDonnell Douglas F-4C Phantom at Mach 1.1 of Cook, Flight Dynamics Principles (2007), example
-11.6, with the loop of figure 4.6: the elevator answers to the pilot and to the pitch rate. It states the doublet (1.3
+11.6, with the loop of figure 4.6: the elevator follows the pilot and the pitch rate. It states the doublet (1.3
 Hz, 5 degrees) and the parameters, those of the short-period mode; the sampling rate and the duration are not stated.
 """
 
@@ -21,9 +21,9 @@ STATE = np.array(
         [0.0, 0.0, 1.0, 0.0],
     ]
 )
-"""Of axial velocity u, normal velocity w (m/s), pitch rate q (rad/s) and pitch angle (rad)."""
+"""State matrix: axial velocity u, normal velocity w (m/s), pitch rate q (rad/s), pitch angle (rad)."""
 ELEVATOR = np.array([-0.41, -77.0, -61.0, 0.0])
-"""Per radian."""
+"""Input vector, per radian of the elevator."""
 HEAVE, PITCH = 1, 2
 RATE_GAIN = -0.12
 """Elevator angle per pitch rate, rad per rad/s (figure 4.6): ``delta = delta_pilot - RATE_GAIN q``."""
@@ -31,25 +31,32 @@ PARAMETERS = ("zw", "zq", "mw", "mq", "z_delta", "m_delta")
 DOUBLET_HZ = 1.3
 DOUBLET = np.deg2rad(5.0)
 DURATION = 10.0
-"""s."""
+"""Duration of the simulation, s; not stated by the thesis."""
 SAMPLING_HZ = 250.0
-"""The thesis's is unknown. Singular values grow with its root, conditioning numbers do not; at this one the largest of
-CLOE is that of the thesis."""
+"""Sampling rate, not stated by the thesis. Singular values grow with its square root, condition numbers do not; at this
+rate the largest singular value of CLOE is that of the thesis."""
 
 
 @dataclass(frozen=True)
 class AircraftSensitivity:
-    """Singular values in descending order, (6,): of the elevator angle (CLIE) and of w and q together (CLOE)."""
+    """Singular values (6,) in descending order: of the elevator angle (CLIE), and of w and q together (CLOE)."""
 
     clie: Array
     cloe: Array
 
 
 def aircraft_sensitivity(sampling_hz: float = SAMPLING_HZ, duration: float = DURATION) -> AircraftSensitivity:
-    """Singular values of the closed loop's Jacobians with respect to ``PARAMETERS`` (SI, angles in rad).
+    """Return the singular values of the closed loop's Jacobians with respect to ``PARAMETERS`` (SI, angles in rad).
 
-    The sensitivities are states of their own, ``ds/dt = A_c s + (dA_c/dtheta) x + (db/dtheta) delta_pilot``, so that
-    no difference is taken; the doublet switches at samples and the step from one to the next is exact.
+    The sensitivities are additional states, ``ds/dt = A_c s + (dA_c/dtheta) x + (db/dtheta) delta_pilot``, without
+    finite differences. The doublet switches at samples; the discretisation is exact.
+
+    Parameters
+    ----------
+    sampling_hz
+        Sampling rate, Hz.
+    duration
+        Duration, s.
     """
     gain = np.zeros(4)
     gain[PITCH] = RATE_GAIN
@@ -63,7 +70,7 @@ def aircraft_sensitivity(sampling_hz: float = SAMPLING_HZ, duration: float = DUR
             by_state[row, HEAVE if name.endswith("w") else PITCH] = 1.0
         slopes.append((by_state - np.outer(by_elevator, gain), by_elevator))
     b = len(slopes)
-    # States: the aircraft, its derivative by each parameter, and the constant pilot's order.
+    # States: the aircraft, its derivative with respect to each parameter, and the constant pilot input.
     system = np.zeros((4 * (b + 1) + 1,) * 2)
     for k in range(b + 1):
         block = slice(4 * k, 4 * k + 4)

@@ -1,4 +1,4 @@
-"""Every estimate that the tables share, made once and kept: the thesis's protocol in one place."""
+"""Cached estimates shared by the tables, by the protocol of the thesis."""
 
 import time
 from collections.abc import Callable, Hashable, Sequence
@@ -39,47 +39,47 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 GOOD_BANDPASS_HZ, GOOD_CUTOFF_HZ = 50.0, 20.0
-"""Filters of an arm whose bandwidth, 10 Hz, is known (B.2): five times and twice the bandwidth."""
+"""Filters for a known bandwidth of 10 Hz (thesis section B.2): five times and twice the bandwidth."""
 PIV_CUTOFF_HZ = 50.0
 """Rough decimation before IDIM-PIV (section 7.2)."""
 WHITENING_ORDER = 250
 """Highest AR order tried without decimation; the thesis finds 141 on average (6.3.1)."""
 RESPONSE_LENGTHS = (10, 20, 3, 13, 10, 20)
-"""Of the thesis's impulse responses, samples (table 5.12)."""
+"""Lengths of the impulse responses of the thesis, samples (table 5.12)."""
 SLOWEST = 1e-3
-"""Joint speed (rad/s) that never counts as run away."""
+"""Joint speed below which a simulation never counts as diverged, rad/s."""
 
 Method = Literal["idim-ls", "idim-iv", "didim", "clie", "cloe", "sep-pem", "idim-piv", "idim-piv, grey box"]
 SIMULATED = ("didim", "clie", "cloe", "sep-pem")
-"""Methods whose error is that of the simulated torque; the others' is that of the inverse model at measured signals."""
+"""Methods whose error is that of the simulated torque; for the others that of the inverse model."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """How a recording is filtered and what simulates beside it; the defaults are those of a well-known arm.
+    """Filters and auxiliary simulation of an estimate; the defaults are those of a known bandwidth.
 
     Parameters
     ----------
     derivatives
-        ``bandpass`` (Butterworth at ``bandpass_hz`` and central differences), ``differences`` (nothing before them),
+        ``bandpass`` (Butterworth at ``bandpass_hz`` and central differences), ``differences`` (without a filter),
         ``irwsm`` or ``irwsm2``.
     nvr
-        Noise-variance ratio of the smoother, or the rule to find it, see ``differentiate``.
+        Noise-variance ratio of the smoother, or the rule that chooses it, see ``differentiate``.
     cutoff_hz
-        Of the parallel filter, which decimates to twice as many samples per second; ``None``: neither.
+        Cut-off of the parallel filter, Hz, which decimates to twice as many samples per second; ``None``: none.
     encoder_points
-        Points per turn that the recorded joint positions are rounded to; ``None``: they stay as recorded.
+        Points per turn to which joint positions are rounded; ``None``: as recorded.
     gear_ratio
-        Gear ratios of the simulator over the right ones.
+        Gear ratios of the simulator over the correct ones.
     controller
-        Of the simulator: the arm's own, or one identified, of known structure (``parametric``) or as impulse responses:
-        ``crc`` with structure and lengths by held-out data, ``cra`` as the thesis's are, from the tracking error alone
-        and with the lengths of table 5.12.
+        Controller of the simulator: ``actual``, or identified. ``parametric``: of known structure. ``crc``: impulse
+        responses with structure and lengths chosen on held-out data. ``cra``: impulse responses as in the thesis, from
+        the tracking error alone and with the lengths of table 5.12.
     midway
-        Without decimation only: the equations hold midway between the samples, where the torque as recorded belongs,
-        so that its noise stays white. Otherwise they hold at the samples, with the mean of two torques.
+        Without decimation only: the equations are midway between the samples, at the instants of the recorded torque,
+        so that its noise stays white. Otherwise they are at the samples, with the mean of two torques.
     start
-        Of the iterations: the rotor inertias and nothing else (4.1.4), or the estimate of IDIM-LS.
+        Initial parameters: rotor inertias only (thesis section 4.1.4), or the estimate of IDIM-LS.
     """
 
     derivatives: Literal["bandpass", "differences", "irwsm", "irwsm2"] = "irwsm"
@@ -95,16 +95,16 @@ class Case:
 
 @dataclass(frozen=True)
 class Run:
-    """An estimate with what the tables say about it.
+    """An estimate with its error and cost.
 
     Parameters
     ----------
     error_pct
-        Relative torque error on the equations it was estimated from: ``|y - X theta| / |y|``.
+        Relative torque error on the equations of the estimate, percent: ``|y - X theta| / |y|``.
     seconds
-        Time the estimator took, filters apart.
+        Computing time of the estimator without filters, s.
     simulations
-        Closed-loop simulations it asked for.
+        Number of closed-loop simulations.
     """
 
     estimate: Estimate
@@ -115,31 +115,31 @@ class Run:
 
 @dataclass
 class CountingModel(AuxiliaryModel):
-    """An auxiliary model that counts its simulations, those of its ``fresh`` copies included."""
+    """Auxiliary model that counts its simulations, including those of its ``fresh`` copies."""
 
     asked: list[int] = field(default_factory=list)
     midway: bool = False
 
     def instruments(self, theta: Array) -> list[Array]:
-        """As the auxiliary model does, midway between the samples where that is wanted."""
+        """Return the instruments, midway between the samples if ``midway``."""
         zeta = super().instruments(theta)
         return [between(z) for z in zeta] if self.midway else zeta
 
     def simulate(self, theta: Array) -> list[Simulation] | None:
-        """As the auxiliary model does."""
+        """Simulate the closed loop and count."""
         self.asked.append(1)
         return super().simulate(theta)
 
 
 class Laboratory:
-    """One arm, its recording, and the estimates made of it with the essential parameters of the thesis.
+    """One arm with its recording and cached estimates.
 
-    The model has the 28 essential parameters alone, as the thesis's, so that standard deviations compare.
+    The model has only the 28 essential parameters of the thesis, so that standard deviations are comparable.
 
     Parameters
     ----------
     recorded
-        Gives the recording when it is first needed.
+        Function that returns the recording; called at first use.
     """
 
     def __init__(self, recorded: Callable[[], Recorded]) -> None:
@@ -147,14 +147,14 @@ class Laboratory:
         self._kept: dict[Hashable, Any] = {}
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
-        """What ``make`` gives, made at the first call with this key."""
+        """Return the value of ``make``, computed at the first call with this key."""
         if key not in self._kept:
             self._kept[key] = make()
         value: T = self._kept[key]
         return value
 
     def recording(self, case: Case) -> Recorded:
-        """The recording of a case."""
+        """Return the recording of a case."""
         as_recorded = self.once("recording", self._recorded)
         points = case.encoder_points
         if points is None:
@@ -163,33 +163,33 @@ class Laboratory:
 
     @property
     def model(self) -> ArmModel:
-        """The arm with its essential parameters."""
+        """Model of the arm with the essential parameters."""
         return self.once("model", lambda: restricted_to(arm_model(self.recording(Case()).robot), essential_names()))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameters of the model."""
+        """Names of the parameters of the model."""
         return self.model.base.names
 
     @property
     def truth(self) -> Array:
-        """The virtual arm's own parameters (b,)."""
+        """True parameters (b,) of the virtual arm."""
         values = self.recording(Case()).truth
         return np.array([values[name] for name in self.names])
 
     def derivatives(self, case: Case) -> Derivatives:
-        """Positions, velocities and accelerations of a case."""
+        """Return positions, velocities and accelerations of a case."""
         recording = self.recording(case)
         key = ("derivatives", case.derivatives, case.bandpass_hz, case.nvr, case.encoder_points)
         return self.once(key, lambda: derive(recording, case))
 
     def decimation(self, case: Case) -> Decimation:
-        """The parallel filter of a case."""
+        """Return the parallel filter of a case."""
         dt = self.recording(case).experiment.dt
         return design(dt, GOOD_CUTOFF_HZ, 1) if case.cutoff_hz is None else design(dt, case.cutoff_hz)
 
     def equations(self, case: Case) -> list[ExperimentEquations]:
-        """Filtered equations of a case; made anew at each call, since at 5 kHz they are large."""
+        """Return the filtered equations of a case; not cached, as they are large at 5 kHz."""
         experiment = self.recording(case).experiment
         blocks = equations(self.model, [experiment], [self.derivatives(case)], self.decimation(case))
         if not case.midway:
@@ -201,11 +201,11 @@ class Laboratory:
         ]
 
     def identified(self, case: Case) -> IdentifiedController:
-        """The identified controller of a case (5.2)."""
+        """Return the identified controller of a case (thesis section 5.2)."""
         return self.first_stage(case)[0]
 
     def first_stage(self, case: Case) -> tuple[IdentifiedController, float]:
-        """The identified controller of a case, and the seconds that it took."""
+        """Return the identified controller of a case and its computing time, s."""
         kind, recording = case.controller, self.recording(case)
 
         def timed() -> tuple[IdentifiedController, float]:
@@ -216,11 +216,11 @@ class Laboratory:
         return self.once(("controller", kind, case.encoder_points), timed)
 
     def controller(self, case: Case) -> DiscreteController:
-        """The simulator's controller."""
+        """Return the controller of the simulator."""
         return self.recording(case).controller() if case.controller == "actual" else self.identified(case).controller
 
     def auxiliary(self, case: Case) -> CountingModel:
-        """The simulated closed loop of a case."""
+        """Return the simulated closed loop of a case."""
         experiment = self.recording(case).experiment
         assert experiment.q_ref is not None
         motion = self.derivatives(Case("bandpass", encoder_points=case.encoder_points))
@@ -237,7 +237,7 @@ class Laboratory:
         return loop if case.gear_ratio == 1.0 else loop.with_gear_ratios(case.gear_ratio)
 
     def run(self, method: Method, case: Case) -> Run:
-        """The estimate of a method in a case."""
+        """Return the estimate of a method in a case."""
         return self.once((method, case), lambda: self._run(method, case))
 
     def _run(self, method: Method, case: Case) -> Run:
@@ -276,42 +276,42 @@ class Laboratory:
                 raise ValueError(f"{method} does not iterate")
 
     def simulated(self, run: Run, case: Case) -> list[ExperimentEquations]:
-        """Equations of a case with the regressor simulated with the parameters of a run."""
+        """Return the equations of a case with the regressor simulated with the parameters of a run."""
         return self.auxiliary(case).equations(self.equations(case), run.estimate.theta)
 
     def positions(self, case: Case) -> list[Array]:
-        """Measured positions after the parallel filter of a case, (M, n)."""
+        """Return measured positions after the parallel filter of a case, (M, n)."""
         return [self.decimation(case)(self.recording(case).experiment.q)]
 
     def distance(self, theta: Array, std: Array) -> float:
-        """How far from the virtual arm's own parameters: root mean square in the standard deviations given.
+        """Return the RMS error of parameters (b,) in given standard deviations (b,).
 
-        An unbiased estimate with these standard deviations is at about 1.
+        An unbiased estimate with these standard deviations has about 1.
         """
         return float(np.sqrt(np.mean(((theta - self.truth) / std) ** 2)))
 
     def column(self, name: str, run: Run, source: Source = "virtual") -> Column:
-        """Estimates as a column of a table."""
+        """Return the estimates of a run as a column of a table."""
         return Column(source, name, estimate_cells(self.names, run.estimate))
 
     def own(self) -> Column:
-        """The virtual arm's own parameters as a column."""
+        """Return the true parameters of the virtual arm as a column."""
         return Column("arm", "own", {n: Cell(float(v)) for n, v in zip(self.names, self.truth, strict=True)})
 
 
 def between(x: Array) -> Array:
-    """Means of neighbouring samples along the first axis, (N, ...) to (N - 1, ...)."""
+    """Return means of neighbouring samples along the first axis, (N, ...) to (N - 1, ...)."""
     return np.asarray((x[1:] + x[:-1]) / 2, dtype=np.float64)
 
 
 def estimate_cells(names: Sequence[str], estimate: Estimate) -> dict[str, Cell]:
-    """Value and relative standard deviation of every parameter."""
+    """Return value and relative standard deviation of every parameter."""
     percent = 100 * estimate.std / np.maximum(np.abs(estimate.theta), np.finfo(np.float64).tiny)
     return {n: Cell(float(v), float(p)) for n, v, p in zip(names, estimate.theta, percent, strict=True)}
 
 
 def derive(recording: Recorded, case: Case) -> Derivatives:
-    """Derivatives of the measured positions as a case says."""
+    """Return derivatives of the measured positions by the method of a case."""
     experiment = recording.experiment
     q, dt = experiment.q, experiment.dt
     if case.derivatives in ("irwsm", "irwsm2"):
@@ -323,7 +323,7 @@ def derive(recording: Recorded, case: Case) -> Derivatives:
 
 
 def identify_controller(recording: Recorded, kind: str) -> IdentifiedController:
-    """The controller from reference, position and torque of each motor, by the kinds of ``Case`` (5.2.2, 5.2.3)."""
+    """Identify the controller from reference, position and torque of each motor (thesis sections 5.2.2, 5.2.3)."""
     robot, experiment = recording.robot, recording.experiment
     assert experiment.q_ref is not None
     ratios = robot.transmission_matrix

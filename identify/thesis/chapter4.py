@@ -1,4 +1,4 @@
-"""Chapter 4: which signal to compare, and what a wrong simulator does."""
+"""Chapter 4: sensitivity of outputs and inputs, robustness to errors of the simulator."""
 
 from dataclasses import replace
 
@@ -16,30 +16,30 @@ Array = NDArray[np.float64]
 GOOD = Case("bandpass")
 UNDECIMATED = Case("bandpass", cutoff_hz=None)
 WRONG = replace(GOOD, gear_ratio=0.8)
-"""Gear ratios of the simulator at 80 % (4.2.3)."""
+"""Gear ratios of the simulator at 80 % (thesis section 4.2.3)."""
 
 AT_DIDIM = "Jacobians at the estimate of DIDIM, unweighted"
 
 
 def table_4_1(bench: Bench) -> Table:
     """CLIE and CLOE without decimation."""
-    note = "standard deviations take the residuals for white, which without decimation they are not"
+    note = "standard deviations assume white residuals; without decimation they are not white"
     return estimates(bench, "4.1", [("CLIE", "clie", UNDECIMATED), ("CLOE", "cloe", UNDECIMATED)], [note])
 
 
 def table_4_2(bench: Bench) -> Table:
-    """Singular values of their Jacobians."""
+    """Singular values of the Jacobians of CLIE and CLOE without decimation."""
     return figures("4.2", spread(bench, UNDECIMATED), [AT_DIDIM])
 
 
 def table_4_3(bench: Bench) -> Table:
-    """How far their simulations are from the measurement."""
+    """Relative errors of the simulated positions and torques of CLIE and CLOE."""
     runs = [bench.virtual.run(method, UNDECIMATED) for method in ("clie", "cloe")]
     errors = [simulation_errors(bench.virtual, run) for run in runs]
     return figures(
         "4.3",
         {"position": [e[0] for e in errors], "torque": [e[1] for e in errors]},
-        ["ours contain the noise of table 6.3 before decimation, part of which moves the virtual arm"],
+        ["ours contain the noise of table 6.3 before decimation, which acts partly on the virtual arm"],
     )
 
 
@@ -49,17 +49,17 @@ def table_4_4(bench: Bench) -> Table:
 
 
 def table_4_5(bench: Bench) -> Table:
-    """Singular values of their Jacobians, times and simulations."""
+    """Singular values of the Jacobians with decimation, computing times and simulations."""
     runs = [bench.virtual.run(method, GOOD) for method in ("clie", "cloe", "didim")]
     rows: dict[str, list[float | None]] = dict(spread(bench, GOOD, with_didim=True))
     rows["time, s"] = [run.seconds for run in runs]
     rows["iterations"] = [iterations(run) for run in runs]
     rows["simulations"] = [float(run.simulations) for run in runs]
-    return figures("4.5", rows, [AT_DIDIM, "times are of two different machines"])
+    return figures("4.5", rows, [AT_DIDIM, "times are from two different machines"])
 
 
 def table_4_6(bench: Bench) -> Table:
-    """IDIM-IV and DIDIM with gear ratios right and wrong."""
+    """IDIM-IV and DIDIM with correct and wrong gear ratios."""
     return estimates(
         bench,
         "4.6",
@@ -73,7 +73,7 @@ def table_4_6(bench: Bench) -> Table:
 
 
 def table_4_7(bench: Bench) -> Table:
-    """Their relative errors and iterations."""
+    """Relative errors and iterations of IDIM-IV and DIDIM."""
     lab = bench.virtual
     runs = [lab.run(method, case) for case in (GOOD, WRONG) for method in ("idim-iv", "didim")]
     return figures(
@@ -84,7 +84,7 @@ def table_4_7(bench: Bench) -> Table:
 
 
 def table_4_8(_: Bench) -> Table:
-    """Singular values where the plant has fewer inputs than outputs."""
+    """Singular values for a plant with fewer inputs than outputs."""
     found = aircraft_sensitivity()
     values = (found.clie, found.cloe)
     return figures(
@@ -97,19 +97,19 @@ def table_4_8(_: Bench) -> Table:
         [
             "no robot: the F-4C Phantom at Mach 1.1 of Cook (2007), example 11.6, with the loop of figure 4.6",
             f"the thesis states neither sampling rate nor duration: {SAMPLING_HZ:g} Hz give its largest value of CLOE, "
-            f"for {DURATION:g} s; singular values grow with the root of the rate, conditioning numbers do not",
+            f"for {DURATION:g} s; singular values grow with the square root of the rate, condition numbers do not",
         ],
     )
 
 
 def singular_values(lab: Laboratory, case: Case) -> Sensitivity:
-    """Of the Jacobians of simulated torque and position and of DIDIM's regressor, at the estimate of DIDIM."""
+    """Return singular values of the Jacobians of CLIE, CLOE and DIDIM at the estimate of DIDIM."""
     theta = lab.run("didim", case).estimate.theta
     return lab.once(("singular values", case), lambda: sensitivity(lab.auxiliary(case), theta))
 
 
 def spread(bench: Bench, case: Case, *, with_didim: bool = False) -> dict[str, list[float | None]]:
-    """Largest and smallest singular value, and their ratio."""
+    """Return the largest and smallest singular value and their ratio, one column per method."""
     values = singular_values(bench.virtual, case)
     chosen = [values.clie, values.cloe, *([values.didim] if with_didim else [])]
     return {
@@ -120,7 +120,7 @@ def spread(bench: Bench, case: Case, *, with_didim: bool = False) -> dict[str, l
 
 
 def simulation_errors(lab: Laboratory, run: Run) -> tuple[float, float]:
-    """Relative errors of simulated positions and torques at the samples, %."""
+    """Return the relative errors of simulated positions and torques, percent."""
     experiment = lab.recording(UNDECIMATED).experiment
     runs = lab.auxiliary(UNDECIMATED).simulate(run.estimate.theta)
     assert runs is not None
@@ -128,7 +128,7 @@ def simulation_errors(lab: Laboratory, run: Run) -> tuple[float, float]:
 
 
 def relative(measured: Array, simulated: Array) -> float:
-    """``|measured - simulated| / |measured|`` in percent, all joints together."""
+    """Return ``|measured - simulated| / |measured|`` of arrays (N, n), all joints together, percent."""
     return 100 * float(np.linalg.norm(measured - simulated) / np.linalg.norm(measured))
 
 

@@ -1,4 +1,4 @@
-"""Chapter 5: derivatives without knowledge of the bandwidth, and an unknown controller."""
+"""Chapter 5: derivatives without knowledge of the bandwidth, unknown controller."""
 
 from dataclasses import replace
 from typing import Literal
@@ -13,21 +13,21 @@ from armident.identify.thesis.tables import Column, Table
 from armident.identify.thesis.two_stages import TwoStages, structure_given, two_stages
 
 GOOD = Case("bandpass")
-"""The bandwidth is known: 50 Hz and 20 Hz (5.3.1)."""
+"""Known bandwidth: filters of 50 Hz and 20 Hz (thesis section 5.3.1)."""
 POOR_LS = Case("bandpass", bandpass_hz=200.0, cutoff_hz=100.0)
-"""It is taken for twice what it is, and IDIM-LS gets careless filters (5.3.1)."""
+"""Bandwidth overestimated by a factor of two, filters of IDIM-LS (thesis section 5.3.1)."""
 POOR_IV = Case("bandpass", bandpass_hz=180.0, cutoff_hz=150.0)
-"""It is taken for three times what it is, before IDIM-IV (5.3.2)."""
+"""Bandwidth overestimated by a factor of three, filters of IDIM-IV (thesis section 5.3.2)."""
 NOTHING = Case("differences", cutoff_hz=None)
-"""No filter at all (5.3.2.1)."""
+"""No filters (thesis section 5.3.2.1)."""
 BY_HAND = 1e-5
-"""The thesis's NVR where it is not estimated (5.3.1)."""
+"""Noise-variance ratio of the thesis where it is not estimated (thesis section 5.3.1)."""
 
 ACTUAL = Case()
 IMPULSE_RESPONSES = Case(controller="cra", start="idim-ls")
-"""The thesis's, from the tracking error (5.3.3). From rotor inertias alone the loop can diverge with them."""
+"""Responses from the tracking error (thesis section 5.3.3); the loop may diverge from a start with rotors only."""
 OWN_RESPONSES = Case(controller="crc", start="idim-ls")
-"""Ours, which have a response from the velocity as well where held-out data ask for it."""
+"""Our responses, with one from the velocity if held-out data support it."""
 KNOWN_STRUCTURE = Case(controller="parametric")
 
 FEEDBACK = ", velocity feedback"
@@ -37,8 +37,8 @@ CONTROLLERS = (
 )
 IN_NUMBERS = ("distance, std", "closed loop, %", "gains, %", "simulations", "time, s")
 DISTANCE = (
-    "distance from the virtual arm's own parameters in standard deviations of IDIM-IV with the actual controller, "
-    "about 1 for an unbiased estimate"
+    "distance from the true parameters of the virtual arm, in standard deviations of IDIM-IV with the actual "
+    "controller: about 1 for an unbiased estimate"
 )
 SERIAL = "standard deviations without a well-tuned parallel filter are too small: residuals are serially correlated"
 
@@ -65,13 +65,13 @@ def table_5_1(bench: Bench) -> Table:
     return figures(
         "5.1",
         rows,
-        ["IRWSM 1: of the first pass", "the thesis's text leaves open which of its rows is which"],
+        ["IRWSM 1: of the first pass", "the thesis does not state which of its rows is which"],
         measured=measured,
     )
 
 
 def smoothed(case: Case) -> tuple[Case, Case]:
-    """The case with IRWSM 1 and with IRWSM 2 in place of its bandpass, their NVR by likelihood if not by hand."""
+    """Return a case with IRWSM 1 and with IRWSM 2 instead of the bandpass, with NVR by likelihood unless given."""
     nvr = "likelihood" if case.nvr == "automatic" else case.nvr
     return replace(case, derivatives="irwsm", nvr=nvr), replace(case, derivatives="irwsm2", nvr=nvr)
 
@@ -96,7 +96,7 @@ def table_5_2(bench: Bench) -> Table:
 
 
 def table_5_3(bench: Bench) -> Table:
-    """Two-stage methods, by what the corresponding pair of ours comes to on the virtual arm."""
+    """Two-stage methods: figures of the corresponding pairs of our methods on the virtual arm."""
     pairs: dict[str, tuple[Case, Literal["idim-iv", "didim"]]] = {
         "PEM2": (KNOWN_STRUCTURE, "didim"),
         "PROJ": (IMPULSE_RESPONSES, "didim"),
@@ -114,10 +114,10 @@ def table_5_3(bench: Bench) -> Table:
         "5.3",
         rows,
         [
-            "the thesis's methods are for linear systems; ours of the same steps: PEM2 a parametric controller by "
+            "the methods of the thesis are for linear systems; ours have the same steps: PEM2 parametric controller by "
             "refined IV, then DIDIM; PROJ impulse responses, then DIDIM; RIV2 that parametric controller, then IDIM-IV",
-            "VCM has no column of ours: its four filters are designed by hand, and the thesis does not use it",
-            "nothing: no closed loop that can be simulated, or no convergence",
+            "VCM is not reproduced: its four filters are designed by hand, and the thesis does not use it",
+            "empty: no closed loop that can be simulated, or no convergence",
             DISTANCE,
             CONTROLLERS,
         ],
@@ -126,7 +126,7 @@ def table_5_3(bench: Bench) -> Table:
 
 
 def table_5_4(bench: Bench) -> Table:
-    """Approaches by what is known and wanted, by what they come to on the virtual arm."""
+    """Approaches by prior knowledge and aim: their errors on the virtual arm."""
     rows: dict[str, list[float | None]] = {"structure known": [], "structure unknown": []}
     for lab in (bench.virtual, bench.feedback):
         responses = _in_numbers(two_stages(lab, "idim-iv", IMPULSE_RESPONSES))
@@ -152,7 +152,7 @@ def table_5_4(bench: Bench) -> Table:
 
 
 def table_5_5(bench: Bench) -> Table:
-    """IDIM-LS where the bandwidth is known."""
+    """IDIM-LS with a known bandwidth."""
     first, second = smoothed(GOOD)
     columns: list[tuple[str, Method, Case]] = [
         ("bandpass", "idim-ls", GOOD),
@@ -180,7 +180,7 @@ def table_5_6(bench: Bench) -> Table:
 
 
 def table_5_7(bench: Bench) -> Table:
-    """IDIM-LS where the bandwidth is poorly known."""
+    """IDIM-LS with a poorly known bandwidth."""
     by_hand = replace(POOR_LS, nvr=BY_HAND)
     columns: list[tuple[str, Method, Case]] = [
         ("bandpass", "idim-ls", POOR_LS),
@@ -194,7 +194,7 @@ def table_5_7(bench: Bench) -> Table:
 
 
 def table_5_8(bench: Bench) -> Table:
-    """IDIM-IV where the bandwidth is poorly known."""
+    """IDIM-IV with a poorly known bandwidth."""
     columns: list[tuple[str, Method, Case]] = [
         ("IDIM-LS bandpass", "idim-ls", POOR_IV),
         ("IDIM-IV bandpass", "idim-iv", POOR_IV),
@@ -215,7 +215,7 @@ def table_5_9(bench: Bench) -> Table:
 
 
 def table_5_10(bench: Bench) -> Table:
-    """Relative errors with poor and with no knowledge."""
+    """Relative errors with poor and without knowledge of the bandwidth."""
     rows = {"poor knowledge": POOR_IV, "no knowledge": NOTHING}
     found: dict[str, list[float | None]] = {}
     for label, case in rows.items():
@@ -229,7 +229,7 @@ def table_5_10(bench: Bench) -> Table:
 
 
 def table_5_11(bench: Bench) -> Table:
-    """No filters at all."""
+    """Estimates without filters."""
     columns: list[tuple[str, Method, Case]] = [
         ("IDIM-LS differences", "idim-ls", NOTHING),
         ("IDIM-IV IRWSM 1", "idim-iv", smoothed(NOTHING)[0]),
@@ -239,14 +239,14 @@ def table_5_11(bench: Bench) -> Table:
 
 
 def table_5_12(bench: Bench) -> Table:
-    """Sizes of the correlation analysis."""
+    """Lengths and orders of the correlation analysis."""
     found = bench.virtual.identified(OWN_RESPONSES).responses
     rows: dict[str, list[float]] = {
         "length": [float(r.error_taps.size) for r in found],
         "prewhitening order": [float(r.prewhitening_order) for r in found],
     }
     for drives, lab in (("", bench.virtual), (FEEDBACK, bench.feedback)):
-        for sizes, case in (("", OWN_RESPONSES), (", tracking error alone, the thesis's lengths", IMPULSE_RESPONSES)):
+        for sizes, case in (("", OWN_RESPONSES), (", tracking error alone, lengths of the thesis", IMPULSE_RESPONSES)):
             responses = lab.identified(case).responses
             rows[f"explained torque, %{drives}{sizes}"] = [r.fit_pct for r in responses]
     notes = [
@@ -257,7 +257,7 @@ def table_5_12(bench: Bench) -> Table:
 
 
 def table_5_13(bench: Bench) -> Table:
-    """The controller is unknown."""
+    """Estimates with an unknown controller."""
     columns: list[tuple[str, Method, Case]] = [
         ("IDIM-LS", "idim-ls", ACTUAL),
         ("IDIM-IV (CRC)", "idim-iv", IMPULSE_RESPONSES),
@@ -276,7 +276,7 @@ def table_5_13(bench: Bench) -> Table:
 
 
 def table_5_14(bench: Bench) -> Table:
-    """Relative errors where the controller is unknown."""
+    """Relative errors with an unknown controller."""
     rows: dict[str, list[float | None]] = {}
     for drives, lab in (("", bench.virtual), (FEEDBACK, bench.feedback)):
         least = lab.run("idim-ls", ACTUAL)
@@ -287,7 +287,7 @@ def table_5_14(bench: Bench) -> Table:
 
 
 def _in_numbers(found: TwoStages | None) -> list[float | None]:
-    """In the order of ``IN_NUMBERS``; nothing where the second stage did not converge."""
+    """Return the figures in the order of ``IN_NUMBERS``; empty if the second stage did not converge."""
     if found is None:
         return [None] * len(IN_NUMBERS)
     return [found.distance, found.loop_pct, found.gain_pct, float(found.simulations), found.seconds]

@@ -15,18 +15,18 @@ from armident.identify.thesis.reference import REFERENCE, reference_tables
 from armident.identify.thesis.tables import Table
 
 UNDECIMATED = Case(cutoff_hz=None, midway=True)
-"""The residual as it is, for its noise model (6.2.1)."""
+"""No decimation, for the noise model of the residual (thesis section 6.2.1)."""
 ROUGH = Case(cutoff_hz=PIV_CUTOFF_HZ)
-"""Before IDIM-PIV (7.2)."""
+"""Decimation before IDIM-PIV (thesis section 7.2)."""
 POINTS = 3600
-"""Points per turn of the degraded encoders (6.3.3)."""
+"""Points per turn of the degraded encoders (thesis section 6.3.3)."""
 COARSE = Case("bandpass", encoder_points=POINTS)
 COARSE_HZ = (20.0, 30.0, 40.0, 50.0, 75.0, 100.0)
-"""Parallel filters tried for the IDIM-LS column of table 6.7, whose own is not stated."""
+"""Parallel filters tried for the IDIM-LS column of table 6.7, Hz; the thesis does not state it."""
 COARSE_CARELESS = replace(POOR_IV, encoder_points=POINTS)
 COARSE_ROUGH = Case(cutoff_hz=PIV_CUTOFF_HZ, encoder_points=POINTS)
 LONGEST_RESPONSE = 20_000
-"""Samples after which the impulse response of a noise model has died out."""
+"""Length of the impulse response of a noise model, samples."""
 
 ROUGHLY = (
     f"IDIM-PIV: rough decimation ({PIV_CUTOFF_HZ:.0f} Hz) before the prefilter as section 7.2 advises, start from "
@@ -34,7 +34,7 @@ ROUGHLY = (
 )
 ROUNDED = f"recorded joint positions rounded to {POINTS} points per turn"
 SMEARED = (
-    "with instruments Coulomb friction comes out too large, here as in the thesis: the smoothed sign of a noisy "
+    "instrumental variables overestimate Coulomb friction, here as in the thesis: the smoothed sign of a noisy "
     "velocity is too small on average"
 )
 
@@ -77,7 +77,7 @@ def table_6_3(bench: Bench) -> Table:
             "DIDIM residual, not decimated": simulated_variances(lab, refined, UNDECIMATED),
             "DIDIM residual, decimated": simulated_variances(lab, plain, GOOD),
         },
-        ["the noise of the virtual arm is made after the last two rows of the thesis"],
+        ["the noise of the virtual arm is set by the last two rows of the thesis"],
     )
 
 
@@ -103,12 +103,12 @@ def table_6_5(bench: Bench) -> Table:
 
 
 def table_6_6(bench: Bench) -> Table:
-    """Variances of the position noise that would explain the residuals."""
+    """Variances of position noise equivalent to the residuals."""
     noise = bench.virtual.run("idim-piv, grey box", ROUGH).estimate.noise
     return figures(
         "6.6",
         {"n_q, rad^2": [process_variance(ar) for ar in noise], "e, rad^2": [ar.variance for ar in noise]},
-        ["at the motors, and of what the rough decimation leaves"],
+        ["at the motors, after the rough decimation"],
     )
 
 
@@ -138,15 +138,15 @@ def table_6_7(bench: Bench) -> Table:
 
 @dataclass(frozen=True)
 class Degraded:
-    """IDIM-LS with degraded encoders under one parallel filter, and how like the thesis's column it is.
+    """IDIM-LS with degraded encoders and one parallel filter, compared with the published column.
 
     Parameters
     ----------
     distance
-        Between our errors and the thesis's, those against table B.4: root mean square over the parameters, each in
-        standard deviations of IDIM-LS with good encoders.
+        RMS difference between our errors and the published ones (against table B.4), in standard deviations of IDIM-LS
+        with good encoders.
     correlation
-        Of the two over the parameters.
+        Correlation of both over the parameters.
     """
 
     case: Case
@@ -156,7 +156,7 @@ class Degraded:
 
 
 def degraded(lab: Laboratory) -> list[Degraded]:
-    """IDIM-LS with degraded encoders under each of the parallel filters."""
+    """Run IDIM-LS with degraded encoders and each of the parallel filters."""
     tables = reference_tables()
     printed, right = (np.array([tables[n].estimates[name][0] for name in lab.names]) for n in ("6.7", REFERENCE))
     std = lab.run("idim-ls", GOOD).estimate.std
@@ -172,7 +172,7 @@ def degraded(lab: Laboratory) -> list[Degraded]:
 
 
 def nearest(found: Sequence[Degraded]) -> Degraded:
-    """The one most like the thesis's column."""
+    """Return the run that is closest to the published column."""
     return min(found, key=lambda one: one.distance)
 
 
@@ -194,24 +194,24 @@ def table_6_8(bench: Bench) -> Table:
 
 
 def process_variance(ar: ArModel) -> float:
-    """Variance of what an AR model describes: that of its white input times the energy of its impulse response."""
+    """Return the variance of an AR process: that of its white input times the energy of its impulse response."""
     impulse = np.zeros(LONGEST_RESPONSE)
     impulse[0] = 1.0
     return ar.variance * float(np.sum(signal.lfilter([1.0], np.append(1.0, ar.coefficients), impulse) ** 2))
 
 
 def inverse_error(lab: Laboratory, run: Run, case: Case) -> float:
-    """Relative error of a run, %, on the equations of another case."""
+    """Return the relative error of a run on the equations of another case, percent."""
     return relative_errors(lab.equations(case), run.estimate.theta)[0]
 
 
 def simulated_error(lab: Laboratory, run: Run, case: Case) -> float:
-    """The same with the simulated regressor."""
+    """Return the relative error of a run with the simulated regressor of a case, percent."""
     return relative_errors(lab.simulated(run, case), run.estimate.theta)[0]
 
 
 def simulated_variances(lab: Laboratory, run: Run, case: Case) -> list[float]:
-    """Variance of the measured less the simulated torque of each joint, (N m)^2."""
+    """Return the variance of measured minus simulated torque of each joint, (N m)^2."""
     (block,) = lab.simulated(run, case)
     return [float(v) for v in np.var(block.y - block.x @ run.estimate.theta, axis=0)]
 

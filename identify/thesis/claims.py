@@ -1,4 +1,4 @@
-"""What the thesis claims, and whether it holds here, with the numbers it rests on."""
+"""Claims of the thesis, tested on the reproduced tables."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -27,27 +27,27 @@ from armident.identify.thesis.emps_controller import controllers_on_emps
 Array = NDArray[np.float64]
 
 SAME = 1.0
-"""Two estimates agree if they differ by less than this many standard deviations, root mean square over parameters."""
+"""RMS difference in standard deviations below which two estimates agree."""
 FAR = 4.0
-"""Standard deviations from the truth to which noise takes one of 28 parameters once in six hundred times."""
+"""Error in standard deviations that noise causes in one of 28 parameters with a probability of 1/600."""
 ORDER = 10**0.5
-"""Ratio from which one number is, rounded, an order of magnitude above another."""
+"""Ratio from which a number is, rounded, an order of magnitude above another."""
 INSENSITIVE = 1000.0
-"""Smallest singular values of the CLIE and the CLOE Jacobian: "thousands of times"."""
+"""Least ratio of the smallest singular values of the CLIE and CLOE Jacobians: "thousands of times"."""
 GEAR_ERROR = 0.2
-"""Error of the simulator's gear ratios, and so of what DIDIM makes of it."""
+"""Relative error of the simulator's gear ratios, and expected relative error of DIDIM."""
 ABOUT = 0.5
-"""A number is about another one if it differs by less than this share of it."""
+"""Relative difference below which a number is about another one."""
 WHITE = 0.1
-"""Share of autocorrelations outside their 2-sigma band up to which residuals pass for white; expected is 0.05, and the
-mean over 6 joints and 20 lags scatters by 0.02."""
+"""Fraction of autocorrelations outside their 2-sigma band up to which residuals count as white; 0.05 is expected, and
+the mean over 6 joints and 20 lags has a standard deviation of 0.02."""
 PROPORTIONAL = ("zz", "xx", "ia", "fv")
-"""Parameters that multiply velocities and accelerations: wrong gear ratios scale them."""
+"""Parameters that multiply velocities and accelerations, which wrong gear ratios scale."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One part of a claim: what was found, in numbers, and whether that is as claimed."""
+    """One part of a claim: ``text`` with the figures, ``holds`` if they are as claimed."""
 
     holds: bool
     text: str
@@ -60,11 +60,11 @@ class Claim:
     Parameters
     ----------
     number, text
-        What is claimed.
+        Number and wording.
     findings
         Its parts; it holds if all of them do.
     remark
-        What explains a part that does not hold.
+        Explanation of a part that does not hold.
     """
 
     number: int
@@ -74,12 +74,12 @@ class Claim:
 
     @property
     def holds(self) -> bool:
-        """Whether all parts hold."""
+        """True if all parts hold."""
         return all(finding.holds for finding in self.findings)
 
 
 def sensitivity(bench: Bench) -> list[Finding]:
-    """Positions tell less than torques; DIDIM is CLIE for fewer simulations (4.1)."""
+    """Test the sensitivity of positions and torques, and the cost of DIDIM and CLIE (thesis section 4.1)."""
     lab = bench.virtual
     clie, didim = lab.run("clie", GOOD), lab.run("didim", GOOD)
     values = singular_values(lab, GOOD)
@@ -94,14 +94,14 @@ def sensitivity(bench: Bench) -> list[Finding]:
         _same("CLIE", clie, "DIDIM", didim.estimate),
         Finding(
             each < 2 and clie.simulations > b,
-            f"DIDIM asks for {each:.1f} simulations per iteration, {didim.simulations} in all; CLIE, with {b + 1} per "
-            f"Jacobian, for {clie.simulations} in all",
+            f"DIDIM needs {each:.1f} simulations per iteration, {didim.simulations} in all; CLIE, with {b + 1} per "
+            f"Jacobian, {clie.simulations} in all",
         ),
     ]
 
 
 def derivatives(bench: Bench) -> list[Finding]:
-    """Errors of velocity and acceleration on the simulated EMPS (5.1.4)."""
+    """Test the errors of velocity and acceleration on the simulated EMPS (thesis section 5.1.4)."""
     errors = {row.label: row.ours for row in bench.emps_derivatives()}
     found = []
     for k, signal in ((1, "velocity"), (2, "acceleration")):
@@ -118,7 +118,7 @@ def derivatives(bench: Bench) -> list[Finding]:
 
 
 def robustness(bench: Bench) -> list[Finding]:
-    """Wrong gear ratios move DIDIM and leave IDIM-IV where it is (4.2.3)."""
+    """Test the robustness of DIDIM and IDIM-IV to wrong gear ratios (thesis section 4.2.3)."""
     lab = bench.virtual
     wrong = replace(GOOD, gear_ratio=1.0 - GEAR_ERROR)
     iv, didim = lab.run("idim-iv", GOOD).estimate, lab.run("didim", GOOD).estimate
@@ -127,39 +127,40 @@ def robustness(bench: Bench) -> list[Finding]:
     chosen = [k for k, name in enumerate(lab.names) if name.startswith(PROPORTIONAL)]
     moved = float(np.median(np.abs(shifted / didim.theta - 1)[chosen]))
     return [
-        Finding(moved_iv < SAME, f"IDIM-IV moves by {moved_iv:.2f} of its standard deviations (less than {SAME:g})"),
+        Finding(moved_iv < SAME, f"IDIM-IV changes by {moved_iv:.2f} of its standard deviations (less than {SAME:g})"),
         Finding(
             abs(moved - GEAR_ERROR) < ABOUT * GEAR_ERROR,
-            f"DIDIM moves inertias and viscous friction by {100 * moved:.0f} % (median; about {100 * GEAR_ERROR:.0f}), "
+            f"DIDIM changes inertias and viscous friction by {100 * moved:.0f} % (median; about {100 * GEAR_ERROR:.0f}), "
             f"all parameters by {apart(shifted, didim):.1f} of its standard deviations",
         ),
     ]
 
 
 def knowledge(bench: Bench) -> list[Finding]:
-    """Badly chosen filters break IDIM-LS, not IDIM-IV with IRWSM (5.3)."""
+    """Test IDIM-LS and IDIM-IV with IRWSM with badly chosen filters (thesis section 5.3)."""
     lab = bench.virtual
     std = lab.run("idim-iv", GOOD).estimate.std
     found = []
     for label, case in (("poor knowledge", POOR_IV), ("no filter at all", NOTHING)):
         instrumental = [lab.run("idim-iv", smooth) for smooth in smoothed(case)]
-        # What noise does to both on the same data cancels; the bias stays.
+        # The effect of noise on both cancels on the same data; the bias remains.
         contrast = farthest(lab.names, lab.run("idim-ls", case), instrumental[0].estimate.theta, std)
         found.append(
-            Finding(contrast.score > FAR, f"{label}: IDIM-LS takes {contrast} from IDIM-IV (more than {FAR:g})")
+            Finding(contrast.score > FAR, f"{label}: IDIM-LS differs by {contrast} from IDIM-IV (more than {FAR:g})")
         )
         for name, run in zip(("IRWSM 1", "IRWSM 2"), instrumental, strict=True):
             error = farthest(lab.names, run, lab.truth, std)
             found.append(
                 Finding(
-                    error.score < FAR, f"{label}: IDIM-IV with {name} takes {error} from the truth (less than {FAR:g})"
+                    error.score < FAR,
+                    f"{label}: IDIM-IV with {name} differs by {error} from the truth (less than {FAR:g})",
                 )
             )
     return found
 
 
 def controller(bench: Bench) -> list[Finding]:
-    """Impulse responses from the tracking error serve IDIM-IV for a controller; DIDIM where they are exact (5.3.3)."""
+    """Test impulse responses as controllers of IDIM-IV and DIDIM (thesis section 5.3.3)."""
     found = _responses("drives on the tracking error alone", bench.virtual, exact=True)
     found += _responses("drives that feed back the velocity", bench.feedback, exact=False)
     axes = [] if bench.axis is None else [("virtual", bench.axis.recording(Case()))]
@@ -179,13 +180,13 @@ def controller(bench: Bench) -> list[Finding]:
 
 
 def _responses(drives: str, lab: Laboratory, *, exact: bool) -> list[Finding]:
-    """IDIM-IV with the thesis's impulse responses, and DIDIM, which works with them only where they are ``exact``."""
+    """Test IDIM-IV and DIDIM with the impulse responses of the thesis; DIDIM needs ``exact`` ones."""
     actual = {method: lab.run(method, Case()).estimate for method in ("idim-iv", "didim")}
     near = apart(lab.run("idim-iv", IMPULSE_RESPONSES).estimate.theta, actual["idim-iv"])
     try:
         responses = lab.run("didim", IMPULSE_RESPONSES)
     except DataError:
-        works, text = False, "finds no closed loop that can be simulated"
+        works, text = False, "has no closed loop that can be simulated"
     else:
         moved = apart(responses.estimate.theta, actual["didim"])
         works = responses.estimate.converged and moved < SAME
@@ -214,14 +215,14 @@ def _responses(drives: str, lab: Laboratory, *, exact: bool) -> list[Finding]:
         *found,
         Finding(
             own < SAME,
-            f"{drives}: with responses from the velocity as well, as ours have them, DIDIM differs by {own:.2f} "
+            f"{drives}: with our responses, from the velocity too, DIDIM differs by {own:.2f} "
             f"standard deviations (less than {SAME:g})",
         ),
     ]
 
 
 def noise(bench: Bench) -> list[Finding]:
-    """Noise models whiten the residuals, change no parameter, and pay where encoders are bad (6.3)."""
+    """Test noise models: white residuals, equal parameters, gain with degraded encoders (thesis section 6.3)."""
     lab = bench.virtual
     didim, sep = lab.run("didim", GOOD).estimate, lab.run("sep-pem", UNDECIMATED)
     iv, piv = lab.run("idim-iv", Case()).estimate, lab.run("idim-piv", ROUGH)
@@ -243,58 +244,70 @@ def noise(bench: Bench) -> list[Finding]:
 
 
 def _biased(what: str, lab: Laboratory) -> list[Finding]:
-    """Where IDIM-LS is biased by degraded encoders, and where not."""
+    """Test the bias of IDIM-LS with degraded encoders for several parallel filters."""
     known, *others = tried = degraded(lab)
     near = nearest(others)
     hz = near.case.cutoff_hz
     runs = near.run, known.run, lab.run("idim-ls", COARSE_CARELESS)
-    # In its own standard deviations, which the rounding has made larger.
+    # In its own standard deviations, which include the rounding.
     bias, rest, careless = (farthest(lab.names, run, lab.truth, run.estimate.std) for run in runs)
     return [
         Finding(
             bias.score > FAR and nearest(tried) is near,
-            f"{what}, parallel filter of {hz:.0f} Hz, with which it comes nearest to the thesis's column (correlation "
-            f"of the errors {near.correlation:.2f}): IDIM-LS takes {bias} from the truth (more than {FAR:g})",
+            f"{what}, parallel filter of {hz:.0f} Hz, the closest to the published column (correlation "
+            f"of the errors {near.correlation:.2f}): IDIM-LS differs by {bias} from the truth (more than {FAR:g})",
         ),
         Finding(
             rest.score < FAR,
             f"{what}, the {known.case.cutoff_hz:.0f} Hz of a known bandwidth (correlation {known.correlation:.2f}): "
-            f"IDIM-LS takes {rest} from the truth (less than {FAR:g})",
+            f"IDIM-LS differs by {rest} from the truth (less than {FAR:g})",
         ),
         Finding(
             careless.score > FAR,
-            f"{what} and poor knowledge: IDIM-LS takes {careless} from the truth (more than {FAR:g})",
+            f"{what} and poor knowledge: IDIM-LS differs by {careless} from the truth (more than {FAR:g})",
         ),
     ]
 
 
 @dataclass(frozen=True)
 class Farthest:
-    """The parameter farthest from where it should be, and how far in standard deviations."""
+    """Parameter with the largest error in standard deviations."""
 
     name: str
     error_pct: float
     score: float
 
     def __str__(self) -> str:
-        """For a sentence."""
+        """Return name, error in percent and error in standard deviations."""
         return f"{self.name} {self.error_pct:+.0f} %, {self.score:.1f} standard deviations"
 
 
 def farthest(names: Sequence[str], run: Run, wanted: Array, std: Array) -> Farthest:
-    """Of all parameters the one that is the most of the standard deviations given away from where it should be."""
+    """Return the parameter with the largest error in given standard deviations.
+
+    Parameters
+    ----------
+    names
+        Names of the parameters.
+    run
+        Estimate.
+    wanted
+        Correct parameters (b,).
+    std
+        Standard deviations (b,).
+    """
     score = np.abs(run.estimate.theta - wanted) / std
     k = int(np.argmax(score))
     return Farthest(names[k], 100 * float(run.estimate.theta[k] / wanted[k] - 1), float(score[k]))
 
 
 def apart(theta: Array, other: Estimate) -> float:
-    """Root mean square difference from another estimate in its standard deviations."""
+    """Return the RMS difference of parameters (b,) from another estimate in its standard deviations."""
     return float(np.sqrt(np.mean(((theta - other.theta) / other.std) ** 2)))
 
 
 def serial(estimate: Estimate) -> float:
-    """Share of the residual autocorrelations outside their 2-sigma band, mean over the joints."""
+    """Return the fraction of residual autocorrelations outside their 2-sigma band, mean over the joints."""
     return float(np.mean([whiteness(series).fraction_outside for series in estimate.residuals]))
 
 
@@ -316,7 +329,7 @@ def _white(name: str, run: Run, plain: Estimate, other: str) -> Finding:
 
 @dataclass(frozen=True)
 class Judgement:
-    """How a claim is judged: its text, the tables it rests on, and the function that looks."""
+    """A claim, the tables that it needs, and the function that tests it."""
 
     number: int
     text: str
@@ -335,7 +348,7 @@ JUDGEMENTS = (
     ),
     Judgement(
         2,
-        "with wrong gear ratios in the simulator IDIM-IV stays put and DIDIM moves by about as much",
+        "with wrong gear ratios in the simulator IDIM-IV does not change and DIDIM changes by about as much",
         ("4.6", "4.7"),
         robustness,
     ),
@@ -344,39 +357,38 @@ JUDGEMENTS = (
         "IRWSM beats the bandpass by orders of magnitude on velocity and acceleration of the simulated EMPS",
         ("5.2",),
         derivatives,
-        "the bandpass here is aligned to its samples; the thesis's errors of it, 0.55 % and 1.15 %, stand as 1 to 2.1, "
-        "as differences make them that come half a sample late (velocity) and a whole one (acceleration); with "
-        "such differences the protocol beside table 5.2, fitted to its figures, puts it one to two orders of magnitude "
-        "behind IRWSM 1",
+        "the bandpass here has no delay; the published errors of 0.55 % and 1.15 % have the ratio 1 to 2.1 of forward "
+        "differences, half a sample late (velocity) and one sample late (acceleration); with such differences the "
+        "protocol inferred from table 5.2 has errors one to two orders of magnitude above those of IRWSM 1",
     ),
     Judgement(
         4,
-        "IDIM-LS breaks with badly chosen filters, IDIM-IV with IRWSM does not, not even without any filter",
+        "IDIM-LS fails with badly chosen filters, IDIM-IV with IRWSM does not, even without any filter",
         ("5.8", "5.10", "5.11"),
         knowledge,
     ),
     Judgement(
         5,
-        "IDIM-IV works with impulse responses for the controller, DIDIM does not: so where the drives feed back the "
-        "velocity; where they act on the tracking error alone such a response is exact, and both work",
+        "IDIM-IV works with impulse responses for the controller, DIDIM does not: true for drives with velocity "
+        "feedback; for drives on the tracking error alone such a response is exact, and both work",
         ("5.13", "5.14"),
         controller,
     ),
     Judgement(
         6,
         "SEP-PEM equals DIDIM, IDIM-PIV equals IDIM-IV, both whiten the residuals; with degraded encoders IDIM-PIV "
-        "has smaller standard deviations while IDIM-LS is biased: so where the parallel filter lets pass more than "
-        "twice the bandwidth, as what is printed of IDIM-LS says that the thesis's did",
+        "has smaller standard deviations while IDIM-LS is biased: true if the cut-off of the parallel filter is above "
+        "twice the bandwidth, as the published IDIM-LS column implies",
         ("6.1", "6.7"),
         noise,
-        "with the filters of a well-known arm little of the rounding passes into the accelerations, and IDIM-LS has no "
-        "bias to show",
+        "with the filters of a known bandwidth little of the rounding errors passes into the accelerations, and "
+        "IDIM-LS is not biased",
     ),
 )
 
 
 def judged(bench: Bench, numbers: Sequence[str]) -> list[Claim]:
-    """The claims all of whose tables are among ``numbers``."""
+    """Return the claims whose tables are all among ``numbers``."""
     return [
         Claim(j.number, j.text, tuple(j.look(bench)), j.remark) for j in JUDGEMENTS if set(j.tables) <= set(numbers)
     ]

@@ -1,4 +1,4 @@
-"""What ``armident reproduce`` does."""
+"""Command ``armident reproduce``: compute the chosen tables and check the claims."""
 
 import sys
 from pathlib import Path
@@ -16,8 +16,9 @@ from armident.identify.thesis.tables import Table
 
 TABLES: dict[str, TableFunction] = {**chapter4.TABLES, **chapter5.TABLES, **chapter6.TABLES}
 SLOW = ("4.1", "4.2", "4.3")
-"""Left out by ``--quick``: output errors without decimation, with hundreds of simulations at 5 kHz."""
+"""Tables skipped by ``--quick``: output errors without decimation, hundreds of simulations at 5 kHz."""
 FOLDER = Path("reproduction")
+"""Default folder of the results."""
 
 
 def reproduce_command(
@@ -32,16 +33,16 @@ def reproduce_command(
     Parameters
     ----------
     tables
-        Numbers with commas between them; ``None``: all, with ``quick`` all but the slow ones.
+        Table numbers separated by commas; ``None``: all, with ``quick`` all but the slow ones.
     measured
-        Folder with the measured TX40, whose columns stand beside those of the virtual one where it can have any, and
-        perhaps the measured EMPS, for claim 5; see ``measured_recording`` and ``measured_emps``.
+        Folder of measured data: the TX40 for additional columns, and the EMPS for claim 5; see ``measured_recording``
+        and ``measured_emps``.
     out
         Folder for ``reproduce.json``, ``reproduce.md`` and the recordings; ``None``: ``reproduction``.
     quick
-        Fewer simulations, and without the slow tables.
+        Fewer simulations, without the slow tables.
     as_json
-        Print the JSON document and nothing else.
+        Print only the JSON document.
 
     Raises
     ------
@@ -58,7 +59,7 @@ def reproduce_command(
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from error
+        raise ConfigError(f"{folder}: cannot be created: {error.strerror}") from error
     text = document(found, claims, quick=quick)
     write_atomically(folder / "reproduce.json", text)
     write_atomically(folder / "reproduce.md", markdown(found, claims))
@@ -70,12 +71,19 @@ def reproduce_command(
 
 
 def chosen_tables(tables: str | None, *, quick: bool) -> list[str]:
-    """The numbers asked for, in the order of the thesis.
+    """Return the chosen table numbers in the order of the thesis.
+
+    Parameters
+    ----------
+    tables
+        Numbers separated by commas; ``None``: all.
+    quick
+        Without the slow tables, if all are chosen.
 
     Raises
     ------
     ConfigError
-        If one is not among those that can be reproduced.
+        If there is no such table.
     """
     if tables is None:
         return [number for number in TABLES if not (quick and number in SLOW)]
@@ -87,7 +95,17 @@ def chosen_tables(tables: str | None, *, quick: bool) -> list[str]:
 
 
 def make_bench(folder: Path, measured: Path | None = None, *, quick: bool = False) -> Bench:
-    """The arms; nothing is recorded or read before it is needed, except the measured arm's files."""
+    """Return the arms of the tables; recordings are made when they are needed, measured files are read at once.
+
+    Parameters
+    ----------
+    folder
+        Folder of the virtual recordings.
+    measured
+        Folder of measured data, or ``None``.
+    quick
+        Fewer simulations.
+    """
     real = None
     if measured is not None:
         recorded = measured_recording(measured)
@@ -105,7 +123,17 @@ def make_bench(folder: Path, measured: Path | None = None, *, quick: bool = Fals
 def reproduce(
     bench: Bench, numbers: list[str], report: Report = lambda stage, share: None
 ) -> tuple[list[Table], list[Claim]]:
-    """Tables by their numbers, and the claims that rest on them."""
+    """Return the tables of the given numbers, and the claims that depend only on them.
+
+    Parameters
+    ----------
+    bench
+        Arms with their cached estimates.
+    numbers
+        Table numbers.
+    report
+        Called with a stage and the share done.
+    """
     found = []
     for k, number in enumerate(numbers):
         report(f"table {number}", k / len(numbers))

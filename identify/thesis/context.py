@@ -1,4 +1,4 @@
-"""What a table function is given, and the shapes that most tables have."""
+"""Arms of the tables (`Bench`), and builders of tables of estimates and of figures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,25 +10,25 @@ from armident.identify.thesis.reference import reference_tables
 from armident.identify.thesis.tables import Cell, Column, Source, Table
 
 SIMULATIONS, SIMULATIONS_QUICK = 100, 3
-"""Noise realisations of table 5.2, the thesis's number and what is enough for two digits."""
+"""Noise realisations of table 5.2: as in the thesis, and enough for two digits."""
 
 
 @dataclass(frozen=True)
 class Bench:
-    """The arms.
+    """Arms whose recordings the tables use.
 
     Parameters
     ----------
     virtual
-        The virtual TX40, whose drives act on the tracking error alone.
+        Virtual TX40; its drives act on the tracking error alone.
     feedback
-        The same arm with drives that feed back the velocity.
+        Virtual TX40 with velocity feedback in its drives.
     measured
-        The measured one, without reference and controller; ``None``: not at hand.
+        Measured TX40, without reference and controller; ``None``: not available.
     emps
-        The measured EMPS; ``None``: not at hand.
+        Measured EMPS; ``None``: not available.
     axis
-        The virtual one; ``None``: not asked for.
+        Virtual EMPS; ``None``: not needed.
     simulations
         Noise realisations of the simulated EMPS.
     """
@@ -41,11 +41,11 @@ class Bench:
     axis: Laboratory | None = None
 
     def emps_derivatives(self) -> list[Row]:
-        """Errors of the derivatives on the simulated EMPS, by method."""
+        """Return the errors of the derivatives on the simulated EMPS by method."""
         return self.virtual.once(("EMPS", self.simulations), lambda: table_5_2(self.simulations))
 
     def arms(self, method: Method) -> list[tuple[Source, Laboratory]]:
-        """The arms whose recordings let a method run."""
+        """Return the arms whose recordings suffice for a method."""
         arms: list[tuple[Source, Laboratory]] = [("virtual", self.virtual)]
         if self.measured is not None and method == "idim-ls":
             arms.append(("measured", self.measured))
@@ -58,7 +58,19 @@ TableFunction = Callable[[Bench], Table]
 def estimates(
     bench: Bench, number: str, columns: Sequence[tuple[str, Method, Case]], notes: Sequence[str] = ()
 ) -> Table:
-    """A table of estimates: the thesis's columns, ours by method and case, and the virtual arm's own parameters."""
+    """Return a table of estimates: columns of the thesis, ours, and the true parameters of the virtual arm.
+
+    Parameters
+    ----------
+    bench
+        Arms with their cached estimates.
+    number
+        Number of the table.
+    columns
+        Name, method and case of each of our columns.
+    notes
+        Notes below the table.
+    """
     printed = reference_tables()[number]
     ours = [
         lab.column(name, lab.run(method, case), source)
@@ -76,7 +88,21 @@ def figures(
     names: Sequence[str] | None = None,
     measured: Mapping[str, Sequence[float | None]] | None = None,
 ) -> Table:
-    """A table of figures by row label, one per column of the thesis (or of ``names``)."""
+    """Return a table of figures.
+
+    Parameters
+    ----------
+    number
+        Number of the table.
+    values
+        Our figures by row label, one per column.
+    notes
+        Notes below the table.
+    names
+        Names of our columns; by default those of the thesis.
+    measured
+        Figures from the measured arm, like ``values``.
+    """
     printed = reference_tables()[number]
     columns = list(printed.printed())
     sources: list[tuple[Source, Mapping[str, Sequence[float | None]]]] = [("virtual", values)]
@@ -90,5 +116,5 @@ def figures(
 
 
 def iterations(run: Run) -> float | None:
-    """Iterations of a run; ``None`` where it did not converge."""
+    """Return the iterations of a run; ``None`` if it did not converge."""
     return run.estimate.iterations if run.estimate.converged else None

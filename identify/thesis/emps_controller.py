@@ -1,4 +1,4 @@
-"""Section 5.3.3 on an axis whose drive feeds back the velocity: what an impulse response is good for there."""
+"""Thesis section 5.3.3 on an axis with velocity feedback: IDIM-IV and DIDIM with an impulse response."""
 
 from dataclasses import dataclass
 
@@ -19,16 +19,16 @@ from armident.identify.signals.differentiate import differentiate
 from armident.identify.thesis.recordings import Recorded
 
 MODE_HZ = 20.0
-"""Highest mode of the closed loop (5.1.4)."""
+"""Highest mode of the closed loop, Hz (thesis section 5.1.4)."""
 LENGTH = 10
-"""Of the impulse response, samples; as many explain as much as 20, with which the virtual axis's loop is unstable."""
+"""Length of the impulse response, samples: explains as much as 20, with which the virtual loop is unstable."""
 
 
 @dataclass(frozen=True)
 class Controllers:
     """Estimates with the identified law (``C``) and with the impulse response from the tracking error (``CRC``).
 
-    ``fit_pct`` says how much of the torque the impulse response explains on held-out data, percent.
+    ``fit_pct`` is the share of the torque that the impulse response explains on held-out data, percent.
     """
 
     idim_iv: tuple[Estimate, Estimate]
@@ -37,7 +37,7 @@ class Controllers:
 
 
 def controllers_on_emps(recorded: Recorded) -> Controllers:
-    """IDIM-IV and DIDIM on EMPS with both identified controllers (5.2.2, 5.2.3)."""
+    """Run IDIM-IV and DIDIM on EMPS with both identified controllers (thesis sections 5.2.2 and 5.2.3)."""
     experiment = recorded.experiment
     assert experiment.q_ref is not None
     model, dt = arm_model(recorded.robot), experiment.dt

@@ -1,10 +1,9 @@
-"""Table 5.2: how well positions of the simulated EMPS are differentiated (thesis section 5.1.4).
+"""Table 5.2: errors of derivatives of positions of the simulated EMPS (thesis section 5.1.4).
 
-What the thesis states is used as printed: model 5.28, controller 5.29 with their parameters, 100 dB of signal to noise,
-Butterworth of order 4 at 40 Hz, relative errors in per cent averaged over 100 simulations. It states neither the motion
-nor the sampling rate. The motion here is rest to rest along polynomials of degree five over the axis's quarter of a
-metre. The sampling rate is that of the TX40: the position of the bandpass, whose error is the noise that 40 Hz let
-through and nothing else, says that it was several kilohertz.
+As stated by the thesis: model 5.28, controller 5.29 with their parameters, a signal-to-noise ratio of 100 dB,
+Butterworth filter of order 4 at 40 Hz, relative errors in percent averaged over 100 simulations. Motion and sampling
+rate are not stated. The motion here is rest to rest along polynomials of degree five over 0.25 m. The sampling rate is
+that of the TX40: the position error of the bandpass, noise below 40 Hz only, implies several kilohertz.
 """
 
 from collections.abc import Sequence
@@ -19,34 +18,34 @@ from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.differentiate import NVR_BY_HAND, Derivatives, differentiate
 
 MASS = 96.0
-"""kg."""
+"""Mass, kg."""
 VISCOUS = 205.0
-"""N s/m."""
+"""Viscous friction, N s/m."""
 COULOMB = 20.0
-"""N."""
+"""Coulomb friction, N."""
 KP = 160.2
-"""1/s."""
+"""Position gain, 1/s."""
 KV = 242.5
-"""V s/m."""
+"""Velocity gain, V s/m."""
 GAIN = 35.2
-"""N/V."""
+"""Drive gain, N/V."""
 SIGN_SMOOTHING = 150.0
-"""``sign(x)`` is ``(2/pi) atan(150 x)`` in the thesis's simulations (after 2.7)."""
+"""``sign(x)`` is ``(2/pi) atan(150 x)`` in the simulations of the thesis (after equation 2.7)."""
 SNR_DB = 100.0
 CUTOFF_HZ = 40.0
 MODE_HZ = 8.0
-"""The bandwidth for which ``differentiate`` chooses the thesis's 40 Hz."""
+"""Bandwidth for which ``differentiate`` chooses the 40 Hz of the thesis."""
 
 STROKE = 0.25
-"""m."""
+"""Length of a move, m."""
 DURATIONS = (1.0, 1.5, 2.0)
-"""Of the moves, each there and back, s: all keep the axis's 0.5 m/s."""
+"""Durations of the moves, each there and back, s: all stay below 0.5 m/s."""
 STEP = 1e-5
-"""Longest integration step, s; the loop has 19 Hz, so RK4 is exact to 1e-9 of the position."""
+"""Longest integration step, s: with a loop of 19 Hz the relative position error of RK4 is 1e-9."""
 
 Array = NDArray[np.float64]
 Errors = tuple[float, float, float]
-"""Relative errors of position, velocity and acceleration, per cent."""
+"""Relative errors of position, velocity and acceleration, percent."""
 
 THESIS: dict[str, Errors] = {
     "bandpass": (6.38e-5, 5.49e-1, 1.15),
@@ -57,14 +56,14 @@ THESIS: dict[str, Errors] = {
 
 @dataclass(frozen=True)
 class Row:
-    """One method: relative errors in per cent of position, velocity and acceleration.
+    """Relative errors of position, velocity and acceleration of one method, percent.
 
     Parameters
     ----------
     label
-        The method; the thesis's name where the table has it.
+        Name of the method, as in the thesis if it is there.
     thesis
-        The table's figures, ``None`` where it has no such method.
+        Published figures; ``None`` if the table has no such method.
     ours
         Means over the simulations.
     """
@@ -86,10 +85,10 @@ class EmpsRun:
 
 
 def table_5_2(simulations: int = 100, sampling_hz: float = 5000.0, seed: int = 0) -> list[Row]:
-    """Mean relative errors of the estimated signals, the table's three methods first.
+    """Return mean relative errors of the estimated signals, first of the three methods of the table.
 
-    IRWSM 1 and 2 choose their noise-variance ratio as the product does by default; the rows that follow show the
-    thesis's other choices, and the bandpass with plain forward differences that are not moved back to their samples.
+    IRWSM 1 and 2 use the default rule for the noise-variance ratio. Further rows show the other rules of the thesis,
+    and the bandpass with forward differences without compensation of their delay.
 
     Parameters
     ----------
@@ -98,7 +97,7 @@ def table_5_2(simulations: int = 100, sampling_hz: float = 5000.0, seed: int = 0
     sampling_hz
         Sampling rate of the simulated position, Hz.
     seed
-        Of the noise.
+        Seed of the noise.
 
     Raises
     ------
@@ -121,18 +120,18 @@ def table_5_2(simulations: int = 100, sampling_hz: float = 5000.0, seed: int = 0
 
 
 def mean(errors: Sequence[Errors]) -> Errors:
-    """Means over the simulations."""
+    """Return the means over the simulations."""
     q, qd, qdd = np.mean(errors, axis=0)
     return float(q), float(qd), float(qdd)
 
 
 def simulate_emps(dt: float) -> EmpsRun:
-    """Closed loop of equations 5.28 and 5.29 along the moves, sampled every ``dt`` seconds."""
+    """Simulate the closed loop of equations 5.28 and 5.29 along the moves, sampled every ``dt`` seconds."""
     return follow(polynomial_moves(DURATIONS, dt), dt)
 
 
 def follow(q_ref_dd: Array, dt: float) -> EmpsRun:
-    """Closed loop of equations 5.28 and 5.29 from rest along a reference given by its acceleration, (N,) m/s^2."""
+    """Simulate the closed loop of equations 5.28 and 5.29 from rest; reference by its acceleration (N,), m/s^2."""
     signals = np.empty((4, q_ref_dd.size))
     parameters = np.array([MASS, VISCOUS, COULOMB, SIGN_SMOOTHING, GAIN * KV, KP])
     _integrate(q_ref_dd, dt, int(np.ceil(dt / STEP - 1e-9)), parameters, signals)
@@ -141,7 +140,7 @@ def follow(q_ref_dd: Array, dt: float) -> EmpsRun:
 
 
 def polynomial_moves(durations: Sequence[float], dt: float) -> Array:
-    """Accelerations (N,) m/s^2, constant over each sample, of moves there and back along polynomials of degree five."""
+    """Return accelerations (N,), m/s^2, constant over each sample, of moves there and back of degree five."""
     moves = []
     for duration in durations:
         samples = round(duration / dt)
@@ -153,7 +152,7 @@ def polynomial_moves(durations: Sequence[float], dt: float) -> Array:
 
 def _methods(run: EmpsRun, measured: Array, deviation: float) -> dict[str, Derivatives]:
     y, dt = measured[:, None], run.dt
-    # Equations 5.26 and 5.27 want the resolution; a uniform error of that size has the variance of the noise.
+    # Equations 5.26 and 5.27 need the resolution; a uniform error of that size has the variance of the noise.
     known = {"q_ref": run.q_ref[:, None], "resolution": deviation * np.sqrt(12.0)}
     return {
         "bandpass": differentiate(y, dt, "bandpass", bandwidth_hz=MODE_HZ),
@@ -170,13 +169,13 @@ def _methods(run: EmpsRun, measured: Array, deviation: float) -> dict[str, Deriv
 
 
 def forward(smooth: Array, dt: float) -> Derivatives:
-    """Forward differences as they come: half a sample late for the velocity, a whole one for the acceleration."""
+    """Return forward differences: velocities half a sample late, accelerations one sample late."""
     qd = np.diff(smooth, axis=0, append=smooth[-1:]) / dt
     return Derivatives(smooth, qd, np.diff(qd, axis=0, append=qd[-1:]) / dt, None)
 
 
 def relative_errors(run: EmpsRun, found: Derivatives, border: int = 0) -> Errors:
-    """Relative errors without ``border`` samples at either end."""
+    """Return relative errors without ``border`` samples at either end, percent."""
     inner = slice(border, run.q.size - border)
 
     def relative(estimate: Array, truth: Array) -> float:

@@ -1,23 +1,23 @@
-"""Table 5.2 by the protocol that its figures suggest, where the thesis does not state it (section 5.1.4).
+"""Table 5.2 by a protocol inferred from its figures, where the thesis states none (section 5.1.4).
 
-Unknown are motion, sampling rate, noise-variance ratio, how differences are taken and how the two states of IRWSM 1
-are used. The figures narrow them down:
+Unknown are motion, sampling rate, noise-variance ratio, kind of differences, and use of the two states of IRWSM 1. The
+figures constrain them:
 
 - Were velocity and acceleration of the bandpass exact derivatives of its position, then by Cauchy-Schwarz (summation by
   parts from rest to rest) ``|q| |qdd| / |qd|^2`` of the motion would exceed 4000, see :func:`least_product`; the
   motions here have less than ten. So the error lies in the differences. An acceleration twice as wrong as the velocity
   is what forward differences make of a motion of a single frequency: half a sample late, and a whole one. Section
   2.3.1 says central ones, which are not late at all.
-- At 0.55 %, half a sample late says that sampling rate over angular frequency is about 90.
-- IRWSM has velocities within thousandths of a per cent, so its states were compared at their own instants, and Coulomb
-  friction, whose reversals a smoother rounds off, did not show: the motion is slow enough for the smoothed sign.
-- 100 dB of signal to noise and the position of the bandpass at such a sampling rate fit together if the noise is
-  relative to the motion while errors are relative to positions counted from farther away.
-- Ratios by likelihood or cross-validation leave the velocities of IRWSM farther off than one given ratio for both
-  models does.
+- An error of 0.55 % by half a sample of delay means that sampling rate over angular frequency is about 90.
+- IRWSM has velocity errors of thousandths of a percent. So its states were compared at their own instants, and the
+  reversals of Coulomb friction, which a smoother rounds off, had no effect: the motion is slow.
+- A signal-to-noise ratio of 100 dB and the position error of the bandpass at such a sampling rate agree if the noise is
+  relative to the motion and errors are relative to positions with a distant origin.
+- Noise-variance ratios by likelihood or cross-validation give larger velocity errors of IRWSM than one given ratio for
+  both models.
 
-These wishes do not agree in full. ``INFERRED`` is a compromise in round numbers, chosen to come close to all nine
-figures at once; the thesis states none of it.
+These constraints are not fully compatible. ``INFERRED`` is a compromise in round numbers that is close to all nine
+figures; the thesis states none of it.
 """
 
 from collections.abc import Callable, Mapping
@@ -48,31 +48,31 @@ from armident.identify.thesis.emps_derivatives import (
 Array = NDArray[np.float64]
 
 SUFFIX = ", inferred"
-"""Behind the name of a method that follows the inferred protocol."""
+"""Suffix of the names of methods with the inferred protocol."""
 VARIANT_SIMULATIONS = 1
-"""Noise realisations of a variant: errors of so many samples scatter by a few per cent, and factors are told."""
+"""Noise realisations of a variant: errors scatter by a few percent, small against the factors."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """What the thesis leaves open.
+    """Conditions that the thesis does not state.
 
     Parameters
     ----------
     sampling_hz
-        Of the simulated position.
+        Sampling rate of the simulated position, Hz.
     frequency_hz, stroke, duration
-        The reference is ``stroke (1 - cos) / 2`` for so many seconds, m; ``None``: the moves of ``emps_derivatives``.
+        Reference ``stroke (1 - cos) / 2``, m, for ``duration``, s; ``None``: the moves of ``emps_derivatives``.
     origin
-        Distance of the origin of the positions from where the motion begins, m.
+        Distance of the origin of the positions from the start of the motion, m.
     differences
-        Of the bandpass.
+        Differences of the bandpass.
     nvr
-        Noise-variance ratio of both models and both passes, or the rule to find it.
+        Noise-variance ratio of both models and both passes, or the rule that chooses it.
     velocity
-        Of IRWSM 1: the slope of the first pass, or as the second pass smooths it.
+        Velocity of IRWSM 1: slope of the first pass, or the same after the second pass.
     border
-        Samples at either end that do not count, as in the scripts published with the measured EMPS.
+        Samples omitted at either end, as in the scripts published with the measured EMPS.
     """
 
     sampling_hz: float = 500.0
@@ -101,11 +101,21 @@ VARIANTS: Mapping[str, Protocol] = {
     "moves of 0.25 m from rest to rest": replace(INFERRED, frequency_hz=None, origin=0.0),
     "ends included": replace(INFERRED, border=0),
 }
-"""One thing otherwise than in ``INFERRED``."""
+"""Protocols that differ from ``INFERRED`` in one condition."""
 
 
 def inferred_rows(simulations: int, protocol: Protocol = INFERRED, seed: int = 0) -> list[Row]:
-    """Mean relative errors of the table's three methods with a protocol."""
+    """Return mean relative errors of the three methods of the table with a protocol.
+
+    Parameters
+    ----------
+    simulations
+        Number of noise realisations.
+    protocol
+        Conditions.
+    seed
+        Seed of the noise.
+    """
     run = motion(protocol)
     random = np.random.default_rng(seed)
     deviation = float(np.std(run.q)) * 10 ** (-SNR_DB / 20)
@@ -119,7 +129,7 @@ def inferred_rows(simulations: int, protocol: Protocol = INFERRED, seed: int = 0
 
 
 def motion(protocol: Protocol) -> EmpsRun:
-    """The noise-free motion of a protocol."""
+    """Return the noise-free motion of a protocol."""
     run = _from_rest(1.0 / protocol.sampling_hz, protocol.frequency_hz, protocol.stroke, protocol.duration)
     return replace(run, q=run.q + protocol.origin, q_ref=run.q_ref + protocol.origin)
 
@@ -134,7 +144,7 @@ def _from_rest(dt: float, frequency_hz: float | None, stroke: float, duration: f
 
 
 def worst_factor(rows: list[Row]) -> tuple[float, str]:
-    """The factor above 1 by which the figure that is farthest from the thesis's differs from it, and which it is."""
+    """Return the largest ratio between our and the published figures, above 1, and the name of that figure."""
     signals = ("position", "velocity", "acceleration")
     factors = [
         (max(ours / thesis, thesis / ours), f"{signal} of {row.label.removesuffix(SUFFIX)}")
@@ -146,32 +156,32 @@ def worst_factor(rows: list[Row]) -> tuple[float, str]:
 
 
 def same_ranking(rows: list[Row]) -> bool:
-    """Whether the methods are in the thesis's order in all three signals."""
+    """Return True if the methods have the published ranking in all three signals."""
     thesis, ours = np.array([row.thesis for row in rows]), np.array([row.ours for row in rows])
     return bool((np.argsort(thesis, axis=0) == np.argsort(ours, axis=0)).all())
 
 
 def least_product(errors: Errors) -> float:
-    """Least ``|q| |qdd| / |qd|^2`` of a motion if the errors of its derivatives are derivatives of the position's."""
+    """Return the least ``|q| |qdd| / |qd|^2`` of a motion whose errors are derivatives of the position error."""
     q, qd, qdd = errors
     return qd**2 / (q * qdd)
 
 
 def product(run: EmpsRun) -> float:
-    """``|q| |qdd| / |qd|^2`` of a motion."""
+    """Return ``|q| |qdd| / |qd|^2`` of a motion."""
     return float(np.linalg.norm(run.q) * np.linalg.norm(run.qdd) / np.linalg.norm(run.qd) ** 2)
 
 
 def evidence(rows: list[Row]) -> list[str]:
-    """What speaks for the protocol that gave these rows, in numbers, one line each."""
+    """Return the evidence for the inferred protocol in figures, one line each."""
     factor, which = worst_factor(rows)
     p, moves = INFERRED, VARIANTS["moves of 0.25 m from rest to rest"]
     lines = [
         f"inferred, chosen to fit the nine figures and not stated by the thesis: {p.sampling_hz:g} Hz, reference of "
-        f"{p.frequency_hz} Hz and {1e3 * p.stroke:g} mm begun {1e3 * p.origin:g} mm from the origin, forward "
+        f"{p.frequency_hz} Hz and {1e3 * p.stroke:g} mm starting {1e3 * p.origin:g} mm from the origin, forward "
         f"differences, NVR {p.nvr:g} for both models, {p.border} samples left out at either end",
-        f"it has all nine figures within a factor of {factor:.2g} (largest: {which}), ranking {_kept(rows)}",
-        "no filter explains the thesis's bandpass: were its velocity and acceleration derivatives of its position, "
+        f"all nine figures are within a factor of {factor:.2g} (largest: {which}), ranking {_kept(rows)}",
+        "no filter explains the published bandpass: if its velocity and acceleration were derivatives of its position, "
         f"|q||qdd|/|qd|^2 would be {least_product(THESIS['bandpass']):.0f} or more; the motions here have "
         f"{product(motion(p)):.0f} and {product(motion(moves)):.1f}",
     ]

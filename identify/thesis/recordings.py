@@ -1,4 +1,4 @@
-"""The recordings that the tables are computed from: of the virtual TX40, and of a measured one."""
+"""Recordings of the tables: virtual TX40 and EMPS, measured TX40 and EMPS."""
 
 import hashlib
 import json
@@ -29,22 +29,22 @@ COMMAND = (sys.executable, "-m", "armident.daq.cli", "robot")
 MEASURED_POSITIONS, MEASURED_TORQUES = "pos_read_data.csv", "curr_data.csv"
 MEASURED_PERIOD = 2e-4
 MEASURED_END_S = 7.5
-"""The measured arm stands still from here on."""
+"""End of the motion of the measured arm, s."""
 EMPS_FILE, EMPS_PERIOD = "DATA_EMPS.mat", 1e-3
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What was recorded of an arm, and what only a virtual one can tell.
+    """Recording of an arm, with the true parameters of a virtual one.
 
     Parameters
     ----------
     robot
-        As recorded.
+        Configuration in the recording.
     experiment
         Positions, torques, and the reference of the virtual arm.
     truth
-        Standard and base parameters of the virtual arm by name, and gains of its drives; of a measured one nothing.
+        Standard and base parameters of the virtual arm by name, and gains of its drives; empty for a measured one.
     """
 
     robot: RobotConfig
@@ -52,15 +52,15 @@ class Recorded:
     truth: dict[str, float]
 
     def coarsened(self, points: int) -> Self:
-        """The same with joint positions rounded to so many points per turn.
+        """Return the recording with joint positions rounded to a number of points per turn.
 
-        Rounded after recording, as data of an arm that is given can be: its drives have seen their own encoders.
+        Rounded after recording, so that the drives had their own encoders.
         """
         step = 2 * np.pi / points
         return replace(self, experiment=replace(self.experiment, q=np.round(self.experiment.q / step) * step))
 
     def controller(self) -> DiscreteController:
-        """The drives' own controller: a velocity loop around a position loop (figure B.1).
+        """Return the controller of the drives: position and velocity loop (thesis figure B.1).
 
         ``nu = kv (kp eps + s)`` where ``s`` is, through a first-order low-pass if there is one, the derivative of
         ``eps``, or of ``-q`` where the drives feed back the velocity.
@@ -85,16 +85,18 @@ class Recorded:
 
 
 def virtual_recording(folder: Path, seed: int = 0, velocity_feedback: bool = False, session: str = SESSION) -> Recorded:
-    """Record the virtual arm of a session, in a process of its own, or take it from ``folder``.
+    """Record the virtual arm of a session in a separate process, or read the recording from ``folder``.
 
     Parameters
     ----------
     folder
-        Keeps recordings under a digest of what they were made with.
+        Folder of recordings, named by a digest of their inputs.
     seed
-        Of the noise, whose size is that measured, for the TX40 in table 6.3.
+        Seed of the noise, which has the measured size (TX40: table 6.3).
     velocity_feedback
-        Of the drives; without it their velocity loop acts on the tracking error.
+        True: the drives feed back the velocity. False: their velocity loop acts on the tracking error.
+    session
+        Session of the virtual cell.
 
     Raises
     ------
@@ -111,7 +113,7 @@ def virtual_recording(folder: Path, seed: int = 0, velocity_feedback: bool = Fal
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigError(f"{folder}: cannot be made: {error.strerror}") from error
+            raise ConfigError(f"{folder}: cannot be created: {error.strerror}") from error
         _record(arguments, recording, truth)
     read = read_recording(recording)
     (experiment,), _ = experiments_from_recording(read, read.robot)
@@ -119,7 +121,7 @@ def virtual_recording(folder: Path, seed: int = 0, velocity_feedback: bool = Fal
 
 
 def _digest(session: str, arguments: list[str]) -> str:
-    """Of the arguments, the files they name, and the version of the program."""
+    """Return a digest of the arguments, their files, and the version of the program."""
     cell = load_session(session)
     digest = hashlib.sha256("\0".join([version("armident"), *arguments]).encode())
     files = [config_path(session), cell.robot]
@@ -135,24 +137,25 @@ def _record(arguments: list[str], recording: Path, truth: Path) -> None:
     command = [*COMMAND, *arguments, "--to-file", str(scratch), "--truth", str(truth)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        said = done.stderr.strip().splitlines()
-        raise ArmidentError(f"the virtual arm did not record: {said[-1] if said else f'exit code {done.returncode}'}")
+        lines = done.stderr.strip().splitlines()
+        reason = lines[-1] if lines else f"exit code {done.returncode}"
+        raise ArmidentError(f"the virtual arm did not record: {reason}")
     scratch.replace(recording)
 
 
 def measured_recording(folder: Path) -> Recorded:
-    """The measured TX40: motor positions and torques at 5 kHz, no reference.
+    """Read the measured TX40: motor positions and torques at 5 kHz, no reference.
 
     Parameters
     ----------
     folder
-        Holds ``pos_read_data.csv`` (rad at the motors) and ``curr_data.csv`` (N m at the motors), or a folder ``tx40``
-        that does.
+        Folder with ``pos_read_data.csv`` (rad at the motors) and ``curr_data.csv`` (N m at the motors), or its parent,
+        where they are in ``tx40``.
 
     Raises
     ------
     DataError
-        If the files are missing, not numbers, or do not fit together.
+        If a file is missing or has no numbers, or the lengths differ.
     """
     folder = folder / "tx40" if (folder / "tx40").is_dir() else folder
     robot = load_robot("tx40")
@@ -166,12 +169,17 @@ def measured_recording(folder: Path) -> Recorded:
 
 
 def measured_emps(folder: Path) -> Recorded | None:
-    """The measured EMPS, an axis with reference, or ``None`` where ``folder/emps/DATA_EMPS.mat`` is absent.
+    """Read the measured EMPS, an axis with reference; ``None`` if ``folder/emps/DATA_EMPS.mat`` is absent.
+
+    Parameters
+    ----------
+    folder
+        Folder of measured data.
 
     Raises
     ------
     DataError
-        If the file is not what was published.
+        If the file cannot be read.
     """
     file = folder / "emps" / EMPS_FILE
     if not is_file(file):

@@ -1,4 +1,4 @@
-"""The figures that the thesis prints."""
+"""Published figures of the thesis."""
 
 from functools import cache
 from typing import Literal, Self
@@ -11,13 +11,14 @@ from armident.configs.schema.base import FrozenModel
 from armident.identify.thesis.tables import Cell, Column
 
 FILE = "reference/thesis_tables.yaml"
+"""File with the published tables."""
 
 REFERENCE = "B.4"
-"""The table whose parameters, the essential ones, all others speak of."""
+"""Table of the essential parameters, which all other tables list."""
 
 
 class ReferenceTable(FrozenModel):
-    """One table: estimates (value and relative standard deviation in percent, column by column), figures, or words."""
+    """One table: estimates (value and relative standard deviation in percent per column), figures, or text."""
 
     title: str
     columns: tuple[str, ...]
@@ -44,7 +45,7 @@ class ReferenceTable(FrozenModel):
         return (*self.estimates, *self.figures, *self.words)
 
     def printed(self) -> tuple[Column, ...]:
-        """The columns as the thesis prints them."""
+        """Return the columns as published."""
         columns = []
         for k, name in enumerate(self.columns):
             cells = {label: Cell(row[2 * k], row[2 * k + 1]) for label, row in self.estimates.items()}
@@ -55,7 +56,7 @@ class ReferenceTable(FrozenModel):
 
 
 class ReferenceTables(FrozenModel):
-    """All tables by their numbers."""
+    """All published tables by number."""
 
     schema_: Literal["armident/reference/1"] = Field(alias="schema")
     tables: dict[str, ReferenceTable]
@@ -63,11 +64,11 @@ class ReferenceTables(FrozenModel):
 
 @cache
 def reference_tables() -> dict[str, ReferenceTable]:
-    """The tables of the thesis by their numbers, in its order."""
+    """Return the published tables by number, in the order of the thesis."""
     path = config_path(FILE)
     return parse(path.read_text(encoding="utf-8"), ReferenceTables, str(path)).tables
 
 
 def essential_names() -> tuple[str, ...]:
-    """The 28 essential base parameters of the TX40 (table B.4)."""
+    """Return the 28 essential base parameters of the TX40 (table B.4)."""
     return tuple(reference_tables()[REFERENCE].estimates)

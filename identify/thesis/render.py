@@ -1,4 +1,4 @@
-"""Tables and claims on the terminal, as Markdown and as JSON."""
+"""Output of tables and claims: terminal, Markdown and JSON."""
 
 import json
 import math
@@ -16,18 +16,18 @@ SCHEMA = "armident/reproduction/1"
 SOURCES: tuple[Source, ...] = ("thesis", "virtual", "measured", "arm")
 HEADINGS = {"thesis": "thesis", "virtual": "ours", "measured": "ours, measured arm", "arm": "virtual arm"}
 PLAIN_WIDTH = 250
-"""Characters per line where no terminal says how many there are."""
+"""Characters per line where stdout is no terminal."""
 
 
 def side_by_side(table: Table) -> list[Column]:
-    """The columns of a table, method by method: the thesis's, then ours."""
+    """Return the columns of a table by method: that of the thesis, then ours."""
     names = list(dict.fromkeys(column.name for column in table.columns if column.source != "arm"))
     order = {name: k for k, name in enumerate(names)}
     return sorted(table.columns, key=lambda c: (order.get(c.name, len(order)), SOURCES.index(c.source)))
 
 
 def text_of(cell: Cell | None) -> str:
-    """A figure with four digits, its relative standard deviation behind it; or words."""
+    """Return a figure with four digits and its relative standard deviation, or the text of a cell."""
     if cell is None or cell.value is None:
         return cell.text if cell is not None else ""
     value = f"{cell.value:.4g}"
@@ -35,7 +35,7 @@ def text_of(cell: Cell | None) -> str:
 
 
 def print_tables(tables: Sequence[Table], claims: Sequence[Claim]) -> None:
-    """Show tables, then claims."""
+    """Print tables, then claims."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=PLAIN_WIDTH)
@@ -59,8 +59,8 @@ def print_tables(tables: Sequence[Table], claims: Sequence[Claim]) -> None:
 
 
 def markdown(tables: Sequence[Table], claims: Sequence[Claim]) -> str:
-    """The same as a Markdown page."""
-    lines = ["# The tables of the thesis, and ours", ""]
+    """Return tables and claims as a Markdown page."""
+    lines = ["# Tables of the thesis and their reproduction", ""]
     lines += ["Estimates: value (relative standard deviation); SI, joint side.", ""]
     if claims:
         lines += ["## Claims", ""]
@@ -81,7 +81,7 @@ def markdown(tables: Sequence[Table], claims: Sequence[Claim]) -> str:
 
 
 def document(tables: Sequence[Table], claims: Sequence[Claim], *, quick: bool) -> str:
-    """The same as JSON; figures that are not finite become null."""
+    """Return tables and claims as JSON; figures that are not finite become null."""
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "version": version("armident"),

@@ -1,18 +1,18 @@
-"""What a reproduced table is."""
+"""Data of a reproduced table."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 Source = Literal["thesis", "virtual", "measured", "arm"]
-"""Printed by the thesis; computed from the virtual arm; from a measured one; the virtual arm's own parameters."""
+"""Origin of a column: thesis, virtual arm, measured arm, or the true parameters of the virtual arm."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A figure, and its relative standard deviation in percent where it is an estimate; ``None``: not there.
+    """A figure, with its relative standard deviation in percent if it is an estimate; ``None``: absent.
 
-    ``text`` is what a table says in words in place of a figure.
+    ``text`` replaces a figure.
     """
 
     value: float | None
@@ -22,7 +22,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Column:
-    """Figures of one method from one source, by the label of their row."""
+    """Figures of one method from one source, by row label."""
 
     source: Source
     name: str
@@ -31,18 +31,18 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the thesis, its columns and ours.
+    """A table with the columns of the thesis and ours.
 
     Parameters
     ----------
     number, title
-        The thesis's number; what the table shows.
+        Number in the thesis; title.
     labels
         Rows, in order.
     columns
         Columns of the thesis first.
     notes
-        What a reader must know to compare them, one line each.
+        Conditions of the comparison, one line each.
     """
 
     number: str

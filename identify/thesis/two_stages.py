@@ -1,4 +1,4 @@
-"""First the controller, then the arm: what the approaches of tables 5.3 and 5.4 come to in numbers (section 5.2.1)."""
+"""Two-stage identification of controller and arm: figures for tables 5.3 and 5.4 (thesis section 5.2.1)."""
 
 import time
 from dataclasses import dataclass, replace
@@ -19,20 +19,20 @@ from armident.identify.thesis.cached_estimates import Case, Laboratory, Run
 
 @dataclass(frozen=True)
 class TwoStages:
-    """What a controller, then an arm, identified from one recording come to.
+    """Errors and cost of identifying controller and arm from one recording.
 
     Parameters
     ----------
     distance
-        Of the parameters from the virtual arm's own, root mean square in standard deviations of IDIM-IV beside the
-        actual controller; about 1 where the controller is as good as the actual one.
+        RMS error of the parameters in standard deviations of IDIM-IV with the actual controller; about 1 if the
+        identified controller is as good as the actual one.
     loop_pct
-        Relative error of the torques that identified controller and identified arm give together, in simulation along
-        the recorded reference; ``None`` where that simulation runs away.
+        Relative torque error of the simulated closed loop of both along the recorded reference; ``None`` if that
+        simulation diverges.
     gain_pct
-        Largest relative error of a drive's gains; ``None`` where the controller has none.
+        Largest relative error of a drive's gains, percent; ``None`` if the controller has no gains.
     simulations, seconds
-        Closed-loop simulations, and time with both stages, filters apart.
+        Closed-loop simulations, and computing time of both stages without filters, s.
     """
 
     distance: float
@@ -43,7 +43,7 @@ class TwoStages:
 
 
 def two_stages(lab: Laboratory, method: Literal["idim-iv", "didim"], case: Case) -> TwoStages | None:
-    """The controller of a case, then the arm beside it; ``None`` where the second stage does not converge."""
+    """Identify the controller of a case, then the arm; ``None`` if the second stage does not converge."""
     identified, took = lab.first_stage(case)
     try:
         run = lab.run(method, case)
@@ -53,7 +53,7 @@ def two_stages(lab: Laboratory, method: Literal["idim-iv", "didim"], case: Case)
 
 
 def structure_given(lab: Laboratory) -> TwoStages:
-    """The gains of a controller whose structure is known, then the arm by IDIM-IV."""
+    """Identify the gains of a controller of known structure, then the arm by IDIM-IV."""
     recording = lab.recording(Case())
     robot, experiment = recording.robot, recording.experiment
     assert experiment.q_ref is not None
@@ -78,13 +78,13 @@ def structure_given(lab: Laboratory) -> TwoStages:
 
 
 def actual_structure(lab: Laboratory) -> Structure:
-    """Of the virtual arm's drives: their velocity, through a first-order low-pass, is of the arm or of the error."""
+    """Return the controller structure of the virtual drives: low-passed velocity of the arm or of the error."""
     feedback = bool(lab.recording(Case()).truth["velocity_feedback"])
     return Structure(velocity="position" if feedback else "error", filtered="velocity")
 
 
 def gain_error(lab: Laboratory, identified: IdentifiedController) -> float | None:
-    """Largest relative error, %, of position and velocity gains; ``None`` for impulse responses."""
+    """Return the largest relative error of position and velocity gains, percent; ``None`` for impulse responses."""
     recording = lab.recording(Case())
     errors = []
     for j, law in enumerate(identified.responses):

@@ -1,4 +1,4 @@
-"""No table of the thesis from 4.1 to 6.8 goes without the thesis's columns and ours."""
+"""Every table of the thesis from 4.1 to 6.8 has published columns and ours."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_aircrafts_short_period_is_the_one_the_thesis_excites() -> None:
 
 
 def test_sensitivity_of_the_aircraft_is_the_difference_of_its_simulations() -> None:
-    """By scipy's simulation of the same loop with a parameter moved up and down."""
+    """Central differences of a scipy simulation of the same loop."""
     hz, duration = 250.0, 3.0
     samples = round(duration * hz) + 1
     half = round(hz / (2 * DOUBLET_HZ))

@@ -1,4 +1,4 @@
-"""The thesis's tables beside ours: protocol, bookkeeping, and two tables with the claim that rests on them."""
+"""Reproduction of the thesis: protocol, documents, and two tables with their claim."""
 
 import json
 import sys
@@ -264,7 +264,7 @@ def test_didim_moves_with_the_gear_ratios_and_idim_iv_does_not(
 
 
 def test_claims_are_computed_from_the_estimates(bench: Bench) -> None:
-    """Estimates that do not move cannot support the claim that they do; estimates that do, cannot that they do not."""
+    """A claim of a change fails on equal estimates, and a claim of no change on different ones."""
     lab = bench.virtual
     nominal, moved = lab.run("idim-iv", GOOD), lab.run("didim", WRONG)
 
@@ -312,7 +312,7 @@ def test_didim_that_cannot_be_simulated_does_not_work(bench: Bench, monkeypatch:
     monkeypatch.setattr(lab, "_run", diverges)
     _, direct, *_ = claims._responses("drives", lab, exact=True)
     assert not direct.holds
-    assert "finds no closed loop that can be simulated" in direct.text
+    assert "has no closed loop that can be simulated" in direct.text
 
 
 def test_degraded_encoders_bias_idim_ls_where_the_parallel_filter_is_rough(bench: Bench) -> None:
