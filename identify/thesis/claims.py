@@ -130,7 +130,8 @@ def robustness(bench: Bench) -> list[Finding]:
         Finding(moved_iv < SAME, f"IDIM-IV changes by {moved_iv:.2f} of its standard deviations (less than {SAME:g})"),
         Finding(
             abs(moved - GEAR_ERROR) < ABOUT * GEAR_ERROR,
-            f"DIDIM changes inertias and viscous friction by {100 * moved:.0f} % (median; about {100 * GEAR_ERROR:.0f}), "
+            f"DIDIM changes inertias and viscous friction by {100 * moved:.0f} % (median; about "
+            f"{100 * GEAR_ERROR:.0f}), "
             f"all parameters by {apart(shifted, didim):.1f} of its standard deviations",
         ),
     ]
