@@ -1,9 +1,9 @@
-"""Faults of buses, drives, disk and host by the hundred: ``python -m tests.faults.bus --rounds 200 --seed 1``.
+"""Random faults of buses, drives, disk and host: ``python -m tests.faults.bus --rounds 200 --seed 1``.
 
-Each round is a short capture at 1 kHz of six drives whose samples say which SYNC they answer, on one bus or two, with
-one to three faults at random times (the first of them by turns). An independent socket counts the SYNCs of the
-bus. Afterwards every SYNC has to be received or in the gap list, none twice, every value of its SYNC, and the faults
-named. Runs under ``python -m armident.drivers.vcan``.
+Each round is a short capture at 1 kHz of six drives on one bus or two, with one to three faults at random times. The
+first fault goes through the list by rounds. The values of a sample encode its SYNC. An independent socket counts the
+SYNCs of the bus. Every SYNC must be received or in the gap list, and none twice. Every value must be of its SYNC, and
+the recording must report the faults. Runs under ``python -m armident.drivers.vcan``.
 """
 
 import argparse
@@ -31,20 +31,21 @@ from armident.daq.recording.model import join_parts
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.faults.check import violations
 from tests.faults.farm import Farm
-from tests.faults.plan import FAULTS, HANDFUL, ORDERED, ROTATE_S, Outcome, Plan, Room, chosen
-from tests.faults.recorder import Capture, Recorders, result, said, warm
+from tests.faults.plan import EVERY_FAULT, FAULTS, ORDERED, ROTATE_S, Outcome, Plan, RoundSetup, random_plan
+from tests.faults.recorder import Capture, Recorders, log_text, result, warm
 
 PERIOD_US = 1000
 DISK_BYTES = 3 << 20
 ATTEMPTS = 4
-"""Most times that one round is done."""
+"""Most attempts of a round."""
 OF_ANOTHER = "are not of their SYNC"
 UNFINISHED = "could not be finished: No space left on device"
 SMALL_BUFFER = 96 << 10
-"""Bytes of the kernel's buffer where it shall overrun."""
+"""Size of the receive buffer that a fault overruns, bytes."""
 LONGEST_S = 40.0
+"""Longest duration of a round, s."""
 SWITCH_S = 0.0005
-"""How long a thread may keep the others of its process waiting."""
+"""Switch interval of the threads of a process, s."""
 SLOW = {
     "reboot": 0.9,
     "mapped_shorter": 1.0,
@@ -56,12 +57,12 @@ SLOW = {
     "kernel_drop": 0.6,
     "held_up": 0.4,
 }
-"""What takes longer than others, s."""
+"""Additional duration of rounds with these faults, s."""
 
 
 @dataclass(frozen=True)
 class Round:
-    """How a round went."""
+    """Result of a round."""
 
     number: int
     faults: list[str]
@@ -71,12 +72,12 @@ class Round:
     in_gaps: int
     gaps: int
     violations: list[str]
-    unnamed: list[str]
-    said: str = ""
+    unreported: list[str]
+    log_text: str = ""
     undone: Sequence[str] = ()
-    """Faults that did not happen: the drives were too late themselves, or the disk was asked nothing."""
+    """Faults that did not occur: the drives were late anyway, or nothing was written to the disk."""
     dropped: Sequence[str] = ()
-    """What was wrong in attempts that were not the round that was planned."""
+    """Violations in attempts that were repeated, because the host disturbed the planned faults."""
 
 
 def session_file(
@@ -88,7 +89,7 @@ def session_file(
     period_us: int = PERIOD_US,
     demand: bool = True,
 ) -> Path:
-    """A session of six drives on some buses."""
+    """Write a session of six drives on some buses."""
     source = config_path("tx40_replay.yaml")
     data = yaml.safe_load(source.read_text())
     data |= {"cell": name, "robot": str(config_path(data["robot"])), "heartbeat_ms": 50, "sdo_timeout_s": 1.0}
@@ -105,8 +106,8 @@ def session_file(
     return path
 
 
-class Lane:
-    """Rounds one after the other, on buses and a small disk of their own."""
+class Worker:
+    """Runs rounds one after the other, with own buses and a small disk."""
 
     def __init__(self, name: str, seed: int) -> None:
         self._seed, self._name = seed, name
@@ -129,7 +130,7 @@ class Lane:
         return self._channels[:1] if buses == 1 else self._channels[1:]
 
     def close(self) -> None:
-        """Leave nothing behind."""
+        """Remove buses, disk and files."""
         for farm in self._farms.values():
             farm.close()
         self._recorders.close()
@@ -139,10 +140,10 @@ class Lane:
         shutil.rmtree(self._folder)
 
     def run(self, number: int, plan: Plan | None = None, only: Sequence[str] = ()) -> Round:
-        """One round: as planned, or at random; once more where it was another round than planned, and this explains it.
+        """Run one round, as planned or at random; repeat it if the host disturbed the planned faults.
 
-        Drives that became late meanwhile explain values of another SYNC, and no SYNC that is not accounted for. A disk
-        that was full to the end explains a capture that says that its file could not be finished.
+        The disturbance must explain every violation. Drives that became late explain values of another SYNC, but no
+        missing SYNC. A disk that was full to the end explains a file that could not be finished.
         """
         dropped: list[str] = []
         for attempt in range(ATTEMPTS):
@@ -154,16 +155,16 @@ class Lane:
         return replace(found, dropped=dropped)
 
     def _attempt(self, number: int, attempt: int, plan: Plan | None, only: Sequence[str]) -> tuple[Round, str | None]:
-        """A round, and what is wrong in it because it was another one than planned."""
+        """Run a round once; return its result, and the violation that a disturbance by the host explains."""
         rng = np.random.default_rng([self._seed, number])
-        faults, producing, buses = chosen(rng, number, only) if plan is None else plan
+        faults, producing, buses = random_plan(rng, number, only) if plan is None else plan
         farm = self._farms[buses]
         farm.master = not producing
         seconds = 1.0 + max([SLOW.get(name, 0.0) for name in faults])
         pids: list[int] = []
-        room = Room(rng, farm, seconds, self._disk, lambda: pids[0])
-        expected = {name: FAULTS[name](room) for name in faults}
-        farm.prepare(room.orders, room.actions, None if producing else room.syncs)
+        setup = RoundSetup(rng, farm, seconds, self._disk, lambda: pids[0])
+        expected = {name: FAULTS[name](setup) for name in faults}
+        farm.prepare(setup.answer_faults, setup.actions, None if producing else setup.syncs)
         path = session_file(self._folder, f"{self._name}r{number}", self._of(buses), producing, "rotation" in faults)
         out, log = self._disk / f"r{number}a{attempt}", self._folder / f"r{number}a{attempt}"
         out.mkdir()
@@ -175,24 +176,24 @@ class Lane:
         finally:
             process.kill()
             process.join()
-            seen, ledgers = farm.finish(), [list(lane.ledger) for lane in farm.lanes]
-        words = said(log)
-        explained = OF_ANOTHER if room.orders.spoilt else None
-        undone = [name for name in faults if name in ORDERED and ORDERED[name] not in room.orders.done]
+            seen, syncs_by_bus = farm.finish(), [list(state.syncs) for state in farm.buses]
+        words = log_text(log)
+        explained = OF_ANOTHER if setup.answer_faults.spoilt else None
+        undone = [name for name in faults if name in ORDERED and ORDERED[name] not in setup.answer_faults.done]
         faults = [name for name in faults if name not in undone]
         if process.exitcode != 0:
             what = [f"the capture ended with {process.exitcode}"]
-            if room.orders.full_at_end and UNFINISHED in words and _torn_only(out):
+            if setup.answer_faults.full_at_end and UNFINISHED in words and _torn_only(out):
                 what, explained = [f"{what[0]}: {UNFINISHED}"], UNFINISHED
             shutil.rmtree(out)
             return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words), explained
         try:
             paths, counters = result(log)
             done = Outcome(join_parts([read_recording(p) for p in paths]), counters, words, len(paths))
-            wrong = violations(done, ledgers, seen, producing, "sync_stops" in faults)
-            unnamed = [name for name in faults if not expected[name](done)]
-            if "disk_full" in unnamed and "full" not in room.orders.done:
-                for some in (unnamed, faults):
+            wrong = violations(done, syncs_by_bus, seen, producing, "sync_stops" in faults)
+            unreported = [name for name in faults if not expected[name](done)]
+            if "disk_full" in unreported and "full" not in setup.answer_faults.done:
+                for some in (unreported, faults):
                     some.remove("disk_full")
                 undone.append("disk_full")
             if done.recording.missing:
@@ -204,17 +205,17 @@ class Lane:
         covered = {k for g in gaps for k in range(g.first, g.last + 1)}
         rows = done.recording.samples.sync.size
         shutil.rmtree(out)
-        report = words if wrong or unnamed else ""
+        report = words if wrong or unreported else ""
         if report:
             report += f"\n{counters}\n" + "\n".join(map(str, done.recording.gaps[:30]))
         found = Round(
-            number, faults, _shape(producing, buses), len(set().union(*ledgers)), rows, len(covered), len(gaps), wrong,
-            unnamed, report, undone,
+            number, faults, _shape(producing, buses), len(set().union(*syncs_by_bus)), rows, len(covered), len(gaps),
+            wrong, unreported, report, undone,
         )  # fmt: skip
         return found, explained
 
     def _wait(self, process: Capture, farm: Farm, log: Path, producing: bool) -> None:
-        """Until the capture is over; a foreign master begins when it is ready, and ends before it."""
+        """Wait for the end of the capture; a foreign master starts when it is ready, and ends before it."""
         deadline = time.monotonic() + LONGEST_S
         stopped = producing
         since = None
@@ -222,7 +223,7 @@ class Lane:
             if farm.failed is not None:
                 raise farm.failed
             if not producing and not farm.begun:
-                ready = farm.operational and "recording to" in said(log)
+                ready = farm.operational and "recording to" in log_text(log)
                 since = (since or time.monotonic()) if ready else None
                 if since is not None and time.monotonic() - since > 0.05:
                     farm.released.set()
@@ -234,7 +235,7 @@ class Lane:
 
 
 def _torn_only(folder: Path) -> bool:
-    """Whether every file can be read, and the one that was not finished says so."""
+    """Return whether all files are readable, and the unfinished one is reported as such."""
     return any([bool(read_recording(path).missing) for path in folder.glob("*.mcap")])
 
 
@@ -242,27 +243,27 @@ def _shape(producing: bool, buses: int) -> str:
     return f"{'own' if producing else 'foreign'} SYNC, {buses} bus{'es' if buses > 1 else ''}"
 
 
-def in_lanes(rounds: int, seed: int, lanes: int, plans: Sequence[Plan] = (), only: Sequence[str] = ()) -> list[Round]:
-    """Rounds in several processes at once: most of their time is spent waiting."""
+def run_rounds(rounds: int, seed: int, jobs: int, plans: Sequence[Plan] = (), only: Sequence[str] = ()) -> list[Round]:
+    """Run rounds in several processes at once, since most of their time is spent waiting."""
     warm()
     sys.setswitchinterval(SWITCH_S)
     context = multiprocessing.get_context("fork")
     numbers, done = context.Queue(), context.Queue()
     for number in range(rounds):
         numbers.put(number)
-    for _ in range(lanes):
+    for _ in range(jobs):
         numbers.put(None)
 
     def work(name: str) -> None:
-        lane = Lane(name, seed)
+        worker = Worker(name, seed)
         try:
             while (number := numbers.get()) is not None:
-                done.put(lane.run(number, plans[number] if plans else None, only))
+                done.put(worker.run(number, plans[number] if plans else None, only))
         finally:
-            lane.close()
+            worker.close()
 
-    # Forked here, where there are no threads yet.
-    running = [context.Process(target=work, args=(f"f{os.getpid() % 10**6}x{i}",)) for i in range(lanes)]
+    # Forked before any thread exists.
+    running = [context.Process(target=work, args=(f"f{os.getpid() % 10**6}x{i}",)) for i in range(jobs)]
     for process in running:
         process.start()
     found: list[Round] = []
@@ -277,53 +278,55 @@ def in_lanes(rounds: int, seed: int, lanes: int, plans: Sequence[Plan] = (), onl
 
 
 def show(rounds: Sequence[Round]) -> int:
-    """Print the table by fault, and what was wrong; how many rounds that concerns."""
+    """Print the table by fault and the violations; return the number of rounds with any."""
     by_fault: dict[str, list[Round]] = defaultdict(list)
     for one in rounds:
         for name in one.faults:
             by_fault[name].append(one)
-    line = "{:18} {:>7} {:>9} {:>9} {:>9} {:>7} {:>11} {:>9}"
-    print(line.format("fault", "rounds", "SYNCs", "rows", "in gaps", "gaps", "violations", "unnamed"))
+    line = "{:18} {:>7} {:>9} {:>9} {:>9} {:>7} {:>11} {:>11}"
+    print(line.format("fault", "rounds", "SYNCs", "rows", "in gaps", "gaps", "violations", "unreported"))
     for name in [*FAULTS, "all"]:
         part = list(rounds) if name == "all" else by_fault[name]
         sums = [sum(getattr(r, what) for r in part) for what in ("syncs", "rows", "in_gaps", "gaps")]
         wrong = sum(1 for r in part if r.violations)
         print(
             line.format(
-                name, len(part), *sums, wrong, sum(len(r.unnamed) if name == "all" else name in r.unnamed for r in part)
+                name,
+                len(part),
+                *sums,
+                wrong,
+                sum(len(r.unreported) if name == "all" else name in r.unreported for r in part),
             )
         )
     for r in rounds:
         if r.undone:
-            why = "the drives were late themselves, or the disk was asked nothing"
-            print(f"round {r.number}: {', '.join(r.undone)} not done: {why}")
+            why = "the drives were late anyway, or nothing was written to the disk"
+            print(f"round {r.number}: {', '.join(r.undone)} did not occur: {why}")
         for text in r.dropped:
-            print(f"round {r.number}: done again, as it was not the round that was planned: {text}")
-    bad = [r for r in rounds if r.violations or r.unnamed]
+            print(f"round {r.number}: repeated, because the host disturbed the planned faults: {text}")
+    bad = [r for r in rounds if r.violations or r.unreported]
     for r in bad:
         print(f"\nround {r.number} ({r.shape}; {', '.join(r.faults)}):")
-        print(*(f"  {text}" for text in r.violations), *(f"  not named: {name}" for name in r.unnamed), sep="\n")
-        print("    " + r.said.replace("\n", "\n    "))
+        print(*(f"  {text}" for text in r.violations), *(f"  not reported: {name}" for name in r.unreported), sep="\n")
+        print("    " + r.log_text.replace("\n", "\n    "))
     return len(bad)
 
 
 def main() -> int:
-    """Run the rounds and print the table; 1 if anything is wrong."""
+    """Run the rounds and print the table; return 1 if there are violations."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.bus", description=__doc__)
     parser.add_argument("--rounds", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--lanes", type=int, default=2, help="captures at once")
-    parser.add_argument("--handful", action="store_true", help="a few rounds that have every fault once")
-    parser.add_argument("--only", action="append", default=[], choices=list(FAULTS), help="these faults alone")
+    parser.add_argument("--jobs", type=int, default=2, help="number of simultaneous captures")
+    parser.add_argument("--every-fault", action="store_true", help="few rounds that contain every fault once")
+    parser.add_argument("--only", action="append", default=[], choices=list(FAULTS), help="only these faults")
     options = parser.parse_args()
     begin = time.monotonic()
-    plans = HANDFUL if options.handful else ()
+    plans = EVERY_FAULT if options.every_fault else ()
     wanted = len(plans) or options.rounds
-    rounds = in_lanes(wanted, options.seed, options.lanes, plans, options.only)
+    rounds = run_rounds(wanted, options.seed, options.jobs, plans, options.only)
     bad = show(rounds)
-    print(
-        f"\n{len(rounds)} rounds in {time.monotonic() - begin:.0f} s, seed {options.seed}; {bad} with something wrong"
-    )
+    print(f"\n{len(rounds)} rounds in {time.monotonic() - begin:.0f} s, seed {options.seed}; {bad} with violations")
     return int(bad > 0 or len(rounds) != wanted)
 
 

@@ -1,4 +1,4 @@
-"""What a recording must be after a round, held against what was on the bus."""
+"""Check of a recording against the frames on the bus."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,32 +10,32 @@ from tests.faults.plan import Outcome
 
 
 def violations(
-    done: Outcome, ledgers: list[list[int]], seen: list[NDArray[np.int64]], producing: bool, turns: bool
+    done: Outcome, syncs_by_bus: list[list[int]], seen: list[NDArray[np.int64]], producing: bool, turns: bool
 ) -> list[str]:
-    """What is wrong with a recording; nothing, it should be.
+    """Return the violations of a recording; there should be none.
 
     Parameters
     ----------
     done
-        The recording and what else the capture left.
-    ledgers
-        Per bus the number of every SYNC that went over it, as those who answered or sent it know.
+        Recording, counters and log of the capture.
+    syncs_by_bus
+        Per bus the numbers of all SYNCs, as the drives or the master counted them.
     seen
-        Per bus time and counter of every SYNC, (N, 2), as an independent socket received them.
+        Per bus time (ns) and counter of every SYNC, (N, 2), as an independent socket received them.
     producing
-        Whether the capture sent the SYNCs.
+        True if the capture sent the SYNCs.
     turns
-        Whether whole turns of the counter may be taken for missing SYNCs: nothing tells them from a master that rests.
+        True if the numbers may differ by turns of the counter: those cannot be distinguished from a paused master.
     """
     found = []
-    for b, (ledger, heard) in enumerate(zip(ledgers, seen, strict=True)):
-        if len(ledger) != len(heard):
-            found.append(f"bus {b}: {len(heard)} SYNCs heard, {len(ledger)} answered")
+    for b, (syncs, received) in enumerate(zip(syncs_by_bus, seen, strict=True)):
+        if len(syncs) != len(received):
+            found.append(f"bus {b}: {len(received)} SYNCs received, {len(syncs)} answered")
     if found:
         return found
     number: dict[int, int] = {}
-    for ledger, heard in zip(reversed(ledgers), reversed(seen), strict=True):
-        number |= dict(zip(heard[:, 0].tolist(), ledger, strict=True))
+    for syncs, received in zip(reversed(syncs_by_bus), reversed(seen), strict=True):
+        number |= dict(zip(received[:, 0].tolist(), syncs, strict=True))
     counters, samples = done.counters, done.recording.samples
     found += _accounted(done.recording, samples, counters["samples.expected"])
     try:
@@ -47,10 +47,10 @@ def violations(
         found.append(f"row of SYNC {k[shift != 0][0]} is numbered {samples.sync[shift != 0][0]}")
     if np.any(np.diff(shift) < 0):
         found.append("SYNC numbers go back")
-    last = max((ledger[-1] for ledger in ledgers if ledger), default=-1)
+    last = max((syncs[-1] for syncs in syncs_by_bus if syncs), default=-1)
     if counters["samples.expected"] < last + 1 + (int(shift[-1]) if shift.size else 0):
         found.append(f"{last + 1} SYNCs went over the bus, {counters['samples.expected']} are accounted for")
-    # What the kernel dropped behind the last frame may have been as many SYNCs, or none.
+    # The frames that the kernel dropped behind the last one may all be SYNCs, or none of them.
     surplus = counters["samples.expected"] - last - 1
     if not turns and not producing and not 0 <= surplus <= counters["sync_unseen"]:
         found.append(f"{last + 1} SYNCs were sent, {counters['samples.expected']} are accounted for")

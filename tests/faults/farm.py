@@ -1,4 +1,4 @@
-"""Six drives whose samples say which SYNC they answer, on buses and with faults of our making."""
+"""Six simulated drives with injected faults; the values of a sample encode its SYNC."""
 
 import fcntl
 import heapq
@@ -39,21 +39,21 @@ SIOCGIFFLAGS, SIOCSIFFLAGS, IFF_UP = 0x8913, 0x8914, 1
 COUNTER = 240
 PRIORITY = 5
 PROMPT = 0.5
-"""An answer is prompt that is sent so many periods after its SYNC at the latest."""
+"""Largest delay of a prompt answer after its SYNC, in SYNC periods."""
 
 
 def position_of(sync: Any, joint: Any) -> Any:
-    """Position that tells SYNC (up to 16383) and joint, in bits that a disk cannot compress."""
+    """Return the position that encodes SYNC (up to 16383) and joint, in bits that do not compress."""
     return sync * 8 + joint + ((sync * 40_503 + joint * 7_919) % 16_381 << 17)
 
 
 def current_of(sync: Any, joint: Any) -> Any:
-    """Current that tells SYNC and joint, below 2^15."""
+    """Return the current that encodes SYNC and joint, below 2^15."""
     return (sync * 31 + joint * 1009) % 32749
 
 
 def demand_of(sync: Any, joint: Any) -> Any:
-    """Demand that tells SYNC and joint."""
+    """Return the demand that encodes SYNC and joint."""
     return -1 - sync * 8 - joint
 
 
@@ -67,35 +67,35 @@ def set_link(channel: str, up: bool) -> None:
 
 
 Sent = tuple[int, int, int, list[tuple[int, int, int]]]
-"""A TPDO as it is mapped: joint, COB-ID, every how many SYNCs, and of each object index, bytes and constant value."""
+"""A mapped TPDO: joint, COB-ID, interval in SYNCs, and of each object index, bytes and constant value."""
 
 
-class Still:
-    """Nothing moves behind the drives: what they report comes from the SYNC number."""
+class NoMotion:
+    """A motion without movement: the reported values come from the SYNC number."""
 
     def __init__(self, n: int) -> None:
         self.position, self.demand = np.zeros(n, np.int32), np.zeros(n, np.int32)
         self.current = np.zeros(n, np.int16)
 
     def enable(self, joint: int, enabled: bool) -> None:
-        """Enabled or not, it is the same."""
+        """Ignore the state of the drive."""
 
     def set_targets(self, targets: NDArray[np.int32], fresh: NDArray[np.bool_]) -> None:
-        """Set points are not followed."""
+        """Ignore set points."""
 
     def advance(self) -> None:
-        """Nothing moves."""
+        """Do nothing."""
 
 
 @dataclass
-class Orders:
-    """What shall go wrong with answers: by SYNC number and joint, how often each is sent, or when.
+class AnswerFaults:
+    """Faults of answers, by SYNC number and joint.
 
-    ``lost`` are not sent, ``twice`` sent twice, ``again`` once more behind the next SYNC, ``late`` sent behind the SYNC
-    of that number. ``skipped`` SYNCs are not sent where the farm is their master. ``done`` has the names of the first
-    three where they happened: they do not while the farm itself is late. ``spoilt``: it became late while they did.
-    ``done`` also has ``full`` where a disk refused something; ``full_at_end``: it did so until the capture
-    was to end.
+    ``lost`` are not sent, ``twice`` sent twice, ``again`` sent once more behind the next SYNC, and ``late`` sent behind
+    the SYNC of that number. ``skipped`` SYNCs are not sent by the farm as the master. ``done`` has the names of the
+    first three if they occurred; they do not while the farm itself is late. ``spoilt`` is set if it became late
+    meanwhile. ``done`` also has ``full`` if the disk refused a write; ``full_at_end`` is set if it did so to the end of
+    the capture.
     """
 
     lost: set[tuple[int, int]] = field(default_factory=set)
@@ -109,12 +109,12 @@ class Orders:
 
     @cached_property
     def touched(self) -> set[int]:
-        """SYNCs with whose answers something is wrong."""
+        """SYNCs with a faulty answer."""
         return {k for k, _ in (*self.lost, *self.twice, *self.again, *self.late)}
 
 
-class _Plain:
-    """The answers of drives whose TPDOs are mapped as the session wants, in arrays."""
+class _PlainAnswers:
+    """The answers of drives whose TPDOs are mapped as in the session, in arrays."""
 
     def __init__(self, layout: list[Sent]) -> None:
         rows = [(COB_SYNC, 1, 0), *((cob, 8 if every == 1 else 4, every) for _, cob, every, _ in layout)]
@@ -124,13 +124,13 @@ class _Plain:
         self._all, self._most = self._of(rows, self._every >= 0), self._of(rows, self._every <= 1)
 
     def _of(self, rows: list[tuple[int, int, int]], wanted: NDArray[np.bool_]) -> Any:
-        """Frames of the rows wanted, their data as numbers, and what they are made of."""
+        """Return the frames of some rows, with views and columns from which their data are computed."""
         out = frames(int(wanted.sum()))
         out["can_id"], out["length"] = np.array([(cob, length) for cob, length, _ in rows])[wanted].T
         return out, out["data"].view("<i4"), self._joint[wanted], self._word[wanted], self._every[wanted] > 1
 
     def answers(self, k: int, counter: int, with_sync: bool) -> Frames:
-        """What answers SYNC ``k``, with the SYNC itself or without."""
+        """Return the answers to SYNC ``k``, with the SYNC itself or without."""
         out, data, joint, word, demand = self._most if counter % 5 else self._all
         data[:, 0] = np.where(demand, demand_of(k, joint), position_of(k, joint))
         data[:, 1] = word | current_of(k, joint)
@@ -139,19 +139,19 @@ class _Plain:
         return answers
 
 
-def _plain(sent: Sent) -> bool:
+def _is_plain(sent: Sent) -> bool:
     _, _, every, entries = sent
     indexes = [index for index, *_ in entries]
     return (every, indexes) in ((1, [POSITION_ACTUAL, CURRENT_ACTUAL, STATUSWORD]), (5, [POSITION_DEMAND]))
 
 
-class _Lane:
-    """One bus of the farm, its drives, and who listens there independently."""
+class _FarmBus:
+    """One bus of the farm, its drives, and an independent socket on it."""
 
     def __init__(self, line: DriveBus) -> None:
         self.line = line
-        self.ledger: list[int] = []
-        """Number of every SYNC that went over the bus, in order."""
+        self.syncs: list[int] = []
+        """Numbers of all SYNCs on the bus, in order."""
         self.counter = self.stamp = self.last = -1
         self.sent_ns = 0
         self.prompt = True
@@ -160,43 +160,45 @@ class _Lane:
         self.held: list[tuple[int, int, Any]] = []
         self.repeats: list[Any] = []
         self.layout: list[Sent] | None = None
-        self.plain: _Plain | bool | None = None
+        self.plain: _PlainAnswers | bool | None = None
         self.out = frames(1024)
         self.witness: RawSocket | None = None
 
 
 class Farm:
-    """Drives of a session in a thread of their own; with ``sync.role: consumer`` also the master who sends SYNC.
+    """Drives of a session in a thread of their own; with ``sync.role: consumer`` also the master that sends SYNC.
 
     Parameters
     ----------
-    session, robot
-        Buses, nodes, SYNC.
+    session
+        Gives buses, nodes and SYNC.
+    robot
+        Gives the joints.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
         self.session = session
         self._period = session.sync_period
-        motion = Still(robot.n)
+        motion = NoMotion(robot.n)
         names = [joint.name for joint in robot.joints]
         self.drives: list[Drive] = []
         for node in session.drives:
             j = names.index(node.joint)
-            told = self._changed, self._changed
-            self.drives.append(Drive(node.node_id, node.eds, j, robot.joints[j], motion, *told))
-        self.lanes: list[_Lane] = []
+            callbacks = self._changed, self._changed
+            self.drives.append(Drive(node.node_id, node.eds, j, robot.joints[j], motion, *callbacks))
+        self.buses: list[_FarmBus] = []
         self.deaf: set[int] = set()
-        """Joints whose drives answer no SYNC."""
+        """Joints whose drives do not answer SYNC."""
         for bus in session.all_buses:
             here = [d for d, n in zip(self.drives, session.drives, strict=True) if session.bus_of(n) == bus]
-            self.lanes.append(_Lane(DriveBus(bus, here, motion, self._period)))
-        self.orders = Orders()
+            self.buses.append(_FarmBus(DriveBus(bus, here, motion, self._period)))
+        self.answer_faults = AnswerFaults()
         self.failed: BaseException | None = None
         self.master = session.sync.role == "consumer"
         self.released = threading.Event()
-        """The foreign master may begin."""
+        """Set to let the foreign master begin."""
         self.begun = 0.0
-        """When the first SYNC of the round went out; 0: not yet."""
+        """Monotonic time of the first SYNC of the round, s; 0 before it."""
         self._resting_until = 0.0
         self._counter_offset = 0
         self._next = 0
@@ -207,84 +209,86 @@ class Farm:
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="farm", daemon=True)
-        for lane in self.lanes:
-            lane.line.boot()
+        for bus_state in self.buses:
+            bus_state.line.boot()
         self._thread.start()
 
     def _changed(self) -> None:
-        for lane in getattr(self, "lanes", ()):
-            lane.layout = None
+        for bus_state in getattr(self, "buses", ()):
+            bus_state.layout = None
 
-    def prepare(self, orders: Orders, actions: list[tuple[float, Callable[[], None]]], until: int | None) -> None:
-        """Begin a round: ``actions`` happen so many seconds after its first SYNC; a master ends with SYNC ``until``."""
+    def prepare(
+        self, answer_faults: AnswerFaults, actions: list[tuple[float, Callable[[], None]]], until: int | None
+    ) -> None:
+        """Begin a round; actions run at their time (s) after its first SYNC, a master ends with SYNC ``until``."""
         with self._lock:
-            self.orders, self._until = orders, until
+            self.answer_faults, self._until = answer_faults, until
             self._plan = sorted(actions, key=lambda a: a[0])
             self._actions = []
             self.begun, self._next, self._resting_until, self._counter_offset = 0.0, 0, 0.0, 0
             self.released.clear()
             self.deaf.clear()
-            for lane in self.lanes:
-                lane.ledger, lane.held, lane.repeats = [], [], []
-                lane.counter = lane.last = -1
-                lane.was_down, lane.prompt, lane.sent_ns = False, True, 0
-                if lane.witness is not None:
-                    lane.witness.close()
-                lane.witness = RawSocket(lane.line.config.channel, filters=[(COB_SYNC, 0x7FF)])
+            for bus_state in self.buses:
+                bus_state.syncs, bus_state.held, bus_state.repeats = [], [], []
+                bus_state.counter = bus_state.last = -1
+                bus_state.was_down, bus_state.prompt, bus_state.sent_ns = False, True, 0
+                if bus_state.witness is not None:
+                    bus_state.witness.close()
+                bus_state.witness = RawSocket(bus_state.line.config.channel, filters=[(COB_SYNC, 0x7FF)])
 
     def finish(self) -> list[NDArray[np.int64]]:
-        """End a round; what the independent listener of each bus has: time (ns) and counter of every SYNC, (N, 2)."""
+        """End a round; return time (ns) and counter of every SYNC, (N, 2), from the independent socket of each bus."""
         while self._helpers:
             self._helpers.pop().join()
         with self._lock:
             for _, _, action in sorted(self._actions):
                 action()
             self._actions, self.begun = [], 0.0
-            self.orders = Orders()
+            self.answer_faults = AnswerFaults()
             seen = []
-            for lane in self.lanes:
-                assert lane.witness is not None
-                seen.append(drained(lane.witness))
-                lane.witness.close()
-                lane.witness = None
+            for bus_state in self.buses:
+                assert bus_state.witness is not None
+                seen.append(read_syncs(bus_state.witness))
+                bus_state.witness.close()
+                bus_state.witness = None
             return seen
 
     @property
     def done(self) -> bool:
-        """Whether the master has sent its last SYNC, and all that was planned has happened."""
+        """True if the master has sent its last SYNC, and all actions have run."""
         over = self._until is not None and self._next > self._until
         return over and not self._actions and not any(helper.is_alive() for helper in self._helpers)
 
     def rest(self, seconds: float, restart: bool = False) -> None:
-        """The master sends nothing for a while; with ``restart`` its counter begins anew afterwards."""
+        """Pause SYNC for some seconds; with ``restart`` its counter starts again at 1."""
         self._resting_until = time.monotonic() + seconds
         if restart:
             self._counter_offset = self._next
 
     def down(self, bus: int) -> None:
-        """A bus goes down."""
-        lane = self.lanes[bus]
-        lane.up, lane.was_down = False, True
-        set_link(lane.line.config.channel, False)
+        """Set a bus down."""
+        bus_state = self.buses[bus]
+        bus_state.up, bus_state.was_down = False, True
+        set_link(bus_state.line.config.channel, False)
 
     def up(self, bus: int) -> None:
-        """And comes back, with the drives on it."""
-        lane = self.lanes[bus]
-        if lane.up:
+        """Set a bus up again."""
+        bus_state = self.buses[bus]
+        if bus_state.up:
             return
-        set_link(lane.line.config.channel, True)
-        lane.up = True
-        if isinstance(lane.line.bus, RawSocket):
-            # The first to send would be told once more that it was down.
-            lane.line.bus._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        set_link(bus_state.line.config.channel, True)
+        bus_state.up = True
+        if isinstance(bus_state.line.bus, RawSocket):
+            # Clears the pending error: the next send would fail otherwise.
+            bus_state.line.bus._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
 
     def inject(self, bus: int, out: Frames) -> None:
-        """Somebody else sends frames."""
-        with suppress(BusDown), RawSocket(self.lanes[bus].line.config.channel, filters=()) as other:
+        """Send frames from another socket."""
+        with suppress(BusDown), RawSocket(self.buses[bus].line.config.channel, filters=()) as other:
             other.send(out)
 
     def reboot(self, joint: int, seconds: float) -> None:
-        """A drive loses its power for a moment."""
+        """Switch a drive off for some seconds and boot it."""
         drive = self._drive(joint)
         self.deaf.add(joint)
         drive.nmt.halt()
@@ -301,13 +305,13 @@ class Farm:
         self.later(seconds, boot)
 
     def silent(self, joint: int, seconds: float) -> None:
-        """A drive's heartbeat stops for a while, its answers do not."""
+        """Stop the heartbeat of a drive for some seconds; its answers continue."""
         drive = self._drive(joint)
         drive.nmt.halt()
         self.later(seconds, drive.nmt.resume)
 
     def emcy(self, joint: int, code: int) -> bool:
-        """A drive reports an error; whether its bus was there to take it."""
+        """Send an EMCY of a drive; return whether its bus was up."""
         try:
             self._drive(joint).emcy.send(code, 0x81, b"\x01\x02")
         except (can.CanError, OSError):
@@ -315,41 +319,41 @@ class Farm:
         return True
 
     def beside(self, work: Callable[[], object]) -> None:
-        """Do something that takes a while."""
+        """Run a function in a thread of its own."""
         self._helpers.append(threading.Thread(target=work, daemon=True))
         self._helpers[-1].start()
 
     def later(self, seconds: float, action: Callable[[], None]) -> None:
-        """Have something happen."""
+        """Run an action after some seconds."""
         heapq.heappush(self._actions, (time.monotonic() + seconds, next(self._number), action))
 
     def bus_of(self, joint: int) -> int:
-        """Number of the bus a joint's drive is on."""
-        return next(b for b, lane in enumerate(self.lanes) if any(d.index == joint for d in lane.line.drives))
+        """Return the number of the bus of a joint's drive."""
+        return next(b for b, bus_state in enumerate(self.buses) if any(d.index == joint for d in bus_state.line.drives))
 
     def _drive(self, joint: int) -> Drive:
         return next(d for d in self.drives if d.index == joint)
 
     def close(self) -> None:
-        """Take the drives off the buses."""
+        """End the thread and close the buses."""
         self._stop.set()
         self._thread.join()
-        for lane in self.lanes:
-            lane.line.close()
+        for bus_state in self.buses:
+            bus_state.line.close()
 
     def _run(self) -> None:
         with suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
         poll = select.poll()
-        for lane in self.lanes:
-            assert isinstance(lane.line.bus, RawSocket)
-            poll.register(lane.line.bus.fileno(), select.POLLIN)
+        for bus_state in self.buses:
+            assert isinstance(bus_state.line.bus, RawSocket)
+            poll.register(bus_state.line.bus.fileno(), select.POLLIN)
         try:
             while not self._stop.is_set():
                 with self._lock:
                     pause = self._send_sync() if self.master else self._take()
                     self._act()
-                if self.master or not all(lane.up for lane in self.lanes):
+                if self.master or not all(bus_state.up for bus_state in self.buses):
                     time.sleep(min(pause, 0.0005))
                 else:
                     poll.poll(1000 * pause)
@@ -368,49 +372,51 @@ class Farm:
             self.later(at, action)
 
     def _take(self) -> float:
-        """Answer what has come; how long to wait for more."""
-        for lane in self.lanes:
-            if not lane.up:
+        """Answer the received SYNCs; return the time to wait for more, s."""
+        for bus_state in self.buses:
+            if not bus_state.up:
                 continue
             try:
-                got = lane.line.bus.receive(lane.line.batch)
+                got = bus_state.line.bus.receive(bus_state.line.batch)
             except BusDown:
                 continue
-            batch = lane.line.batch[:got]
+            batch = bus_state.line.batch[:got]
             for one in batch[batch["can_id"] == COB_SYNC]:
                 stamp = int(one["t_ns"])
-                self._number_of(lane, int(one["data"][0]), stamp)
-                # What is lost, or sent twice, beside an answer that is late in earnest cannot be told by anybody.
-                lane.prompt = lane.sent_ns < stamp and time.time_ns() - stamp < PROMPT * self._period * 1e9
-                if not self.begun and lane.witness is not None:
+                self._number_of(bus_state, int(one["data"][0]), stamp)
+                # Next to an answer that is really late, a lost or repeated one cannot be identified.
+                bus_state.prompt = bus_state.sent_ns < stamp and time.time_ns() - stamp < PROMPT * self._period * 1e9
+                if not self.begun and bus_state.witness is not None:
                     self._begin()
-                disorderly = bool(lane.repeats) or (lane.prompt and lane.last in self.orders.touched)
-                self._answer(lane, lane.last, int(one["data"][0]))
-                lane.sent_ns = time.time_ns()
-                if self.orders.done and disorderly:
-                    self.orders.spoilt |= lane.sent_ns - stamp >= PROMPT * self._period * 1e9
+                disorderly = bool(bus_state.repeats) or (
+                    bus_state.prompt and bus_state.last in self.answer_faults.touched
+                )
+                self._answer(bus_state, bus_state.last, int(one["data"][0]))
+                bus_state.sent_ns = time.time_ns()
+                if self.answer_faults.done and disorderly:
+                    self.answer_faults.spoilt |= bus_state.sent_ns - stamp >= PROMPT * self._period * 1e9
         return 0.005
 
-    def _number_of(self, lane: _Lane, counter: int, stamp: int) -> None:
-        """The number of a SYNC by its counter; whole turns of it can be missing only where the bus was down."""
-        if lane.last < 0:
+    def _number_of(self, bus_state: _FarmBus, counter: int, stamp: int) -> None:
+        """Number a SYNC by its counter; whole turns of it can be missing only if the bus was down."""
+        if bus_state.last < 0:
             step = counter
         else:
-            step = (counter - lane.counter) % COUNTER
-            if lane.was_down:
-                elapsed = (stamp - lane.stamp) / (self._period * 1e9)
+            step = (counter - bus_state.counter) % COUNTER
+            if bus_state.was_down:
+                elapsed = (stamp - bus_state.stamp) / (self._period * 1e9)
                 step += COUNTER * max(0, round((elapsed - step) / COUNTER))
-                # What had come before it went down is read when it is back.
-                lane.was_down = step == 1
-        lane.last += step
-        lane.counter, lane.stamp = counter, stamp
-        lane.ledger.append(lane.last)
+                # SYNCs from before it went down are read when it is back.
+                bus_state.was_down = step == 1
+        bus_state.last += step
+        bus_state.counter, bus_state.stamp = counter, stamp
+        bus_state.syncs.append(bus_state.last)
 
     def _send_sync(self) -> float:
-        """Be the master: send the SYNC that is due, and the answers behind it; how long until the next."""
+        """Send the SYNC that is due, and the answers behind it; return the time to the next one, s."""
         now = time.monotonic()
         if not self.begun:
-            if not self.released.is_set() or self.lanes[0].witness is None:
+            if not self.released.is_set() or self.buses[0].witness is None:
                 return 0.005
             self._begin()
             self._base = now
@@ -423,12 +429,12 @@ class Farm:
         if wait > 0:
             return min(wait, 0.005)
         k = self._next
-        if k in self.orders.skipped:
+        if k in self.answer_faults.skipped:
             self._next += 1
             return 0.0
         if -wait > 10 * self._period:
-            if k - 1 in self.orders.skipped:
-                # Held up meanwhile: the counter has gone on, by turns that nobody could tell but by the time.
+            if k - 1 in self.answer_faults.skipped:
+                # The host delayed the master: the counter advances by whole turns, which only the time shows.
                 turns = math.ceil(-wait / self._period / COUNTER)
                 self._next += turns * COUNTER
                 self._until = None if self._until is None else self._until + turns * COUNTER
@@ -436,64 +442,64 @@ class Farm:
             self._base -= wait
         self._next += 1
         counter = (k - self._counter_offset) % COUNTER + 1
-        for lane in self.lanes:
-            if lane.up:
-                lane.last = k
-                lane.ledger.append(k)
-                self._answer(lane, k, counter, with_sync=True)
+        for bus_state in self.buses:
+            if bus_state.up:
+                bus_state.last = k
+                bus_state.syncs.append(k)
+                self._answer(bus_state, k, counter, with_sync=True)
         return 0.0
 
-    def _answer(self, lane: _Lane, k: int, counter: int, with_sync: bool = False) -> None:
-        """Send what the drives of a bus have to say to SYNC ``k``."""
-        out, n = lane.out, 0
+    def _answer(self, bus_state: _FarmBus, k: int, counter: int, with_sync: bool = False) -> None:
+        """Send the answers of the drives of a bus to SYNC ``k``."""
+        out, n = bus_state.out, 0
         if with_sync:
             n = self._put(out, n, COB_SYNC, bytes([counter]))
-        orders = self.orders
+        answer_faults = self.answer_faults
         if (
-            k not in orders.touched
-            and not lane.held
-            and not lane.repeats
-            and self._plainly(lane, k, counter, with_sync)
+            k not in answer_faults.touched
+            and not bus_state.held
+            and not bus_state.repeats
+            and self._send_plain(bus_state, k, counter, with_sync)
         ):
             return
-        for item in lane.repeats:
+        for item in bus_state.repeats:
             n = self._put(out, n, *item)
-        lane.repeats = []
-        due = [held for held in lane.held if held[0] <= k]
-        lane.held = [held for held in lane.held if held[0] > k]
+        bus_state.repeats = []
+        due = [held for held in bus_state.held if held[0] <= k]
+        bus_state.held = [held for held in bus_state.held if held[0] > k]
         for _, _, item in due:
             n = self._put(out, n, *item)
-        for j, cob_id, every, entries in self._layout(lane):
+        for j, cob_id, every, entries in self._layout(bus_state):
             if counter % every or j in self.deaf:
                 continue
-            if (k, j) in orders.lost and lane.prompt:
-                orders.done.add("lost")
+            if (k, j) in answer_faults.lost and bus_state.prompt:
+                answer_faults.done.add("lost")
                 continue
             item = cob_id, b"".join(_value(index, k, j, size, word) for index, size, word in entries)
-            waits = max([orders.late.get((k, j), 0), *(h[0] for h in lane.held if h[1] == j)])
+            waits = max([answer_faults.late.get((k, j), 0), *(h[0] for h in bus_state.held if h[1] == j)])
             if waits > k:
-                lane.held.append((waits, j, item))
+                bus_state.held.append((waits, j, item))
                 continue
             n = self._put(out, n, *item)
-            if (k, j) in orders.twice and lane.prompt:
-                orders.done.add("twice")
+            if (k, j) in answer_faults.twice and bus_state.prompt:
+                answer_faults.done.add("twice")
                 n = self._put(out, n, *item)
-            if (k, j) in orders.again and lane.prompt:
-                orders.done.add("again")
-                lane.repeats.append(item)
+            if (k, j) in answer_faults.again and bus_state.prompt:
+                answer_faults.done.add("again")
+                bus_state.repeats.append(item)
         if n:
             with suppress(BusDown):
-                lane.line.bus.send(out[:n])
+                bus_state.line.bus.send(out[:n])
 
-    def _plainly(self, lane: _Lane, k: int, counter: int, with_sync: bool) -> bool:
-        """Send the answers to SYNC ``k`` from arrays, where nothing is wrong with them."""
-        layout = self._layout(lane)
-        if lane.plain is None:
-            lane.plain = _Plain(layout) if all(_plain(sent) for sent in layout) else False
-        if not isinstance(lane.plain, _Plain) or self.deaf:
+    def _send_plain(self, bus_state: _FarmBus, k: int, counter: int, with_sync: bool) -> bool:
+        """Send the answers to SYNC ``k`` from arrays if there are no faults; return whether they were sent."""
+        layout = self._layout(bus_state)
+        if bus_state.plain is None:
+            bus_state.plain = _PlainAnswers(layout) if all(_is_plain(sent) for sent in layout) else False
+        if not isinstance(bus_state.plain, _PlainAnswers) or self.deaf:
             return False
         with suppress(BusDown):
-            lane.line.bus.send(lane.plain.answers(k, counter, with_sync))
+            bus_state.line.bus.send(bus_state.plain.answers(k, counter, with_sync))
         return True
 
     @staticmethod
@@ -502,11 +508,11 @@ class Farm:
         out["data"][n, : len(data)] = np.frombuffer(data, np.uint8)
         return n + 1
 
-    def _layout(self, lane: _Lane) -> list[Sent]:
-        """What the drives of a bus send as they are mapped now: joint, COB-ID, every how many SYNCs, objects."""
-        if lane.layout is None:
+    def _layout(self, bus_state: _FarmBus) -> list[Sent]:
+        """Return the TPDOs of the drives of a bus by their current mapping."""
+        if bus_state.layout is None:
             found: list[Sent] = []
-            for drive in lane.line.drives:
+            for drive in bus_state.line.drives:
                 if not drive.nmt.operational:
                     continue
                 for cob_id, kind, mapped in drive.pdos(TPDO_COMMUNICATION):
@@ -514,22 +520,22 @@ class Farm:
                         words = {STATUSWORD: drive.status}
                         entries = [(index, size, words.get(index, 0)) for index, _, size in mapped]
                         found.append((drive.index, cob_id, kind, entries))
-            lane.layout, lane.plain = found, None
-        return lane.layout
+            bus_state.layout, bus_state.plain = found, None
+        return bus_state.layout
 
     @property
     def operational(self) -> bool:
-        """Whether all drives exchange PDOs."""
+        """True if all drives are in the NMT state operational."""
         return all(drive.nmt.operational for drive in self.drives)
 
     @property
     def enabled(self) -> bool:
-        """Whether all drives are in operation."""
+        """True if all drives are in the state operation enabled."""
         return all(drive.state is DriveState.ENABLED for drive in self.drives)
 
 
 def _value(index: int, k: int, j: int, size: int, word: int) -> bytes:
-    """Bytes of one object in the answer to SYNC ``k``; ``word`` where it does not depend on that."""
+    """Return the bytes of one object in the answer to SYNC ``k``; ``word`` if it is constant."""
     if index == POSITION_ACTUAL:
         value = position_of(k, j)
     elif index == CURRENT_ACTUAL:
@@ -541,8 +547,8 @@ def _value(index: int, k: int, j: int, size: int, word: int) -> bytes:
     return int(value).to_bytes(size, "little", signed=value < 0)
 
 
-def drained(witness: RawSocket) -> NDArray[np.int64]:
-    """All that a socket has: time and counter of each SYNC (N, 2)."""
+def read_syncs(witness: RawSocket) -> NDArray[np.int64]:
+    """Return time (ns) and counter of each SYNC that a socket has received, (N, 2)."""
     batch, found = frames(4096), []
     while True:
         try:

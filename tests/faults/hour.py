@@ -1,8 +1,7 @@
-"""An hour in minutes: ``python -m tests.faults.hour --hours 1``.
+"""Long capture at accelerated time: ``python -m tests.faults.hour --hours 1``.
 
-A capture gets the frames of six drives at 5 kHz many times as fast as time goes by, from a bus that makes them up:
-recorder, matching, files (turned over, and deleted when they are finished), Zenoh and health are the real ones. Prints
-its memory all along. Needs no vcan.
+A simulated bus generates the frames of six drives at 5 kHz faster than real time. Recorder, matching, files (rotated,
+and deleted when finished), Zenoh and health are the real ones. Prints the memory during the capture. Needs no vcan.
 """
 
 import argparse
@@ -33,13 +32,13 @@ from tests.faults.soak import memory_mb
 
 RATE_HZ = 5000
 BLOCK = 500
-"""SYNCs in one go: with six answers each less than a batch."""
+"""Number of SYNCs at once; with six answers each less than a batch."""
 
 
-class MadeUp:
-    """A bus on which six drives answer ``count`` SYNCs, ``pace`` times as fast as time goes by."""
+class GeneratedBus:
+    """A bus on which six drives answer ``count`` SYNCs, ``pace`` times as fast as real time."""
 
-    channel, dropped, fd, stamps, up, bound = "made-up", 0, False, "software", True, True
+    channel, dropped, fd, timestamp_source, up, bound = "made-up", 0, False, "software", True, True
 
     def __init__(self, count: int, pace: float) -> None:
         self.sent, self._count = 0, count
@@ -51,7 +50,7 @@ class MadeUp:
         self._asked = 0
 
     def receive(self, batch: Frames) -> int:
-        """The frames of the next SYNCs; none every now and then, as a bus that has been read empty."""
+        """Return the number of frames of the next SYNCs; 0 at every second call, like a bus that was read empty."""
         self._asked += 1
         n = min(BLOCK, self._count - self.sent)
         ahead_s = self.sent / self._per_s - (time.monotonic() - self._begin)
@@ -70,19 +69,19 @@ class MadeUp:
         return 7 * n
 
     def poll(self, timeout: float) -> bool:
-        """There always is something."""
+        """Return True: there always are frames."""
         return True
 
     def drops(self) -> int:
-        """Nothing is lost."""
+        """Return 0: no frame is dropped."""
         return 0
 
     def send(self, frames: Frames) -> int:
-        """Nobody listens."""
+        """Discard the frames."""
         return frames.size
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing."""
 
     def __enter__(self) -> Self:
         return self
@@ -92,10 +91,10 @@ class MadeUp:
 
 
 def main() -> int:
-    """Run it; 1 if anything is missing, or memory grew by more than 5 % after the first quarter."""
+    """Run the capture; return 1 if rows are missing, or memory grew by more than 5 % after the first quarter."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.hour", description=__doc__)
     parser.add_argument("--hours", type=float, default=1.0)
-    parser.add_argument("--pace", type=float, default=10.0, help="times as fast as time goes by")
+    parser.add_argument("--pace", type=float, default=10.0, help="factor of acceleration")
     options = parser.parse_args()
     count = round(options.hours * 3600 * RATE_HZ)
     memory = Path("/dev/shm")
@@ -105,22 +104,22 @@ def main() -> int:
         text = session.read_text().replace("recording: {}", "recording: {rotate_mb: 20, drain_ms: 1}")
         session.write_text(text)
         plan = replace(load_plan(session, folder / "out", None, True))
-        return watched(plan, MadeUp(count, options.pace), count, folder)
+        return watched(plan, GeneratedBus(count, options.pace), count, folder)
     finally:
         shutil.rmtree(folder)
 
 
-def watched(plan: armident.daq.capture.capture.CapturePlan, bus: MadeUp, count: int, folder: Path) -> int:
-    """Capture in this process while another thread looks at memory and makes room."""
+def watched(plan: armident.daq.capture.capture.CapturePlan, bus: GeneratedBus, count: int, folder: Path) -> int:
+    """Capture in this process while another thread measures memory and deletes finished files."""
 
-    def open_bus(config: Bus, **_: object) -> MadeUp:
+    def open_bus(config: Bus, **_: object) -> GeneratedBus:
         return bus
 
     stop, ended = threading.Event(), threading.Event()
     memory: list[tuple[float, float]] = []
     deleted: set[Path] = set()
 
-    def look() -> None:
+    def watch() -> None:
         step = count / 40
         while not ended.wait(0.05):
             if bus.sent >= len(memory) * step:
@@ -134,10 +133,10 @@ def watched(plan: armident.daq.capture.capture.CapturePlan, bus: MadeUp, count: 
                 time.sleep(0.5)
                 stop.set()
 
-    # The one thing that is not real: where the frames come from, among them no EMCY.
-    setattr(armident.daq.capture.capture, "open_bus", open_bus)  # noqa: B010
-    setattr(armident.drivers.can.filtered_socket, "open_bus", lambda config, **_: MadeUp(0, 1.0))  # noqa: B010
-    watcher = threading.Thread(target=look)
+    # Only the source of the frames is simulated; it sends no EMCY.
+    setattr(armident.daq.capture.capture, "open_source", open_bus)  # noqa: B010
+    setattr(armident.drivers.can.filtered_socket, "open_bus", lambda config, **_: GeneratedBus(0, 1.0))  # noqa: B010
+    watcher = threading.Thread(target=watch)
     watcher.start()
     begin, cpu = time.monotonic(), time.process_time()
     try:

@@ -1,10 +1,10 @@
 """Captures killed at random moments: ``python -m tests.faults.kill --rounds 200``.
 
-Each round captures what six drives send at 1 to 5 kHz and is ended by SIGKILL, every fifth with files that are turned
-over all the time, every third with a drive that does not answer now and then. By the kill an independent socket on the
-bus has heard some SYNCs; those that the files do not account for afterwards are what it cost, at most 100 ms of them.
-Every file opens torn, is healed by ``recover_recording``, and says the same as before; other MCAP readers then open it
-too. Runs under ``python -m armident.drivers.vcan``.
+Each round captures six drives at 1 to 5 kHz and is ended by SIGKILL. Every fifth round rotates its files quickly, in
+every third a drive omits some answers. The loss is the time of the SYNCs that an independent socket has received and
+the files do not contain; 100 ms at most. Every file is readable without its summary. ``recover_recording`` writes the
+summary and changes nothing else; other MCAP readers then open the file, too. Runs under
+``python -m armident.drivers.vcan``.
 """
 
 import argparse
@@ -32,8 +32,8 @@ from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen.objects import COB_SYNC
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.faults.bus import session_file
-from tests.faults.farm import drained
-from tests.faults.recorder import Recorders, said, warm
+from tests.faults.farm import read_syncs
+from tests.faults.recorder import Recorders, log_text, warm
 from tests.faults.sender import Sender, current_of, position_of
 
 RATES_HZ = (1000, 2000, 5000)
@@ -43,21 +43,21 @@ LONGEST_WAIT_S = 20.0
 
 @dataclass(frozen=True)
 class Kill:
-    """What one kill cost."""
+    """Result of a round."""
 
     number: int
     rate_hz: int
     files: int
     lossy: bool
-    heard: int
+    received: int
     """SYNCs that an independent socket had received when the signal was sent."""
     kept: int
     lost_ms: float
     violations: list[str]
 
 
-class Lane:
-    """Rounds one after the other on a bus of their own."""
+class Worker:
+    """Runs rounds one after the other on an own bus."""
 
     def __init__(self, name: str, seed: int) -> None:
         self._name, self._seed = name, seed
@@ -66,13 +66,13 @@ class Lane:
         ensure_vcan(name)
 
     def close(self) -> None:
-        """Leave nothing behind."""
+        """Remove bus and files."""
         self._recorders.close()
         remove_vcan(self._name)
         shutil.rmtree(self._folder)
 
     def run(self, number: int) -> Kill:
-        """One round."""
+        """Run one round."""
         rng = np.random.default_rng([self._seed, number])
         rate = int(rng.choice(RATES_HZ))
         lossy = rate // 7 if number % 3 == 2 else 0
@@ -86,41 +86,41 @@ class Lane:
         ):
             capture = self._recorders.start(path, out, log, listen_only=True)
             deadline = time.monotonic() + LONGEST_WAIT_S
-            while "recording to" not in said(log) and capture.exitcode is None and time.monotonic() < deadline:
+            while "recording to" not in log_text(log) and capture.exitcode is None and time.monotonic() < deadline:
                 time.sleep(0.01)
             time.sleep(0.1)
             sender.go()
             time.sleep(float(rng.uniform(0.15, 1.2)))
-            # What the bus had carried by the moment of the kill; what comes after it is nobody's loss.
+            # SYNCs after the kill are no loss.
             at_ns = time.time_ns()
             capture.kill()
             capture.join()
             sender.stop()
-            heard = drained(witness)
-        heard = heard[heard[:, 0] <= at_ns, 0]
-        wrong = [] if capture.exitcode == -signal.SIGKILL else [f"ended with {capture.exitcode}: {said(log)}"]
+            received = read_syncs(witness)
+        received = received[received[:, 0] <= at_ns, 0]
+        wrong = [] if capture.exitcode == -signal.SIGKILL else [f"ended with {capture.exitcode}: {log_text(log)}"]
         files, kept = sorted(out.glob("*.mcap")), 0
         try:
-            kept = self._checked(files, heard, wrong)
+            kept = self._checked(files, received, wrong)
         except Exception as error:
             wrong.append(f"{type(error).__name__}: {error}")
-        lost_ms = _lost_ms(np.append(heard[max(kept, 1) - 1 :], at_ns), 10**9 // rate) if kept else np.inf
+        lost_ms = _lost_ms(np.append(received[max(kept, 1) - 1 :], at_ns), 10**9 // rate) if kept else np.inf
         if lost_ms > MOST_LOST_MS:
             wrong.append(f"{lost_ms:.1f} ms lost")
         shutil.rmtree(out)
-        return Kill(number, rate, len(files), lossy > 0, heard.size, kept, lost_ms, wrong)
+        return Kill(number, rate, len(files), lossy > 0, received.size, kept, lost_ms, wrong)
 
-    def _checked(self, files: list[Path], heard: NDArray[np.int64], wrong: list[str]) -> int:
-        """How many of the SYNCs heard the files account for, as found torn, and the same when healed."""
+    def _checked(self, files: list[Path], received: NDArray[np.int64], wrong: list[str]) -> int:
+        """Return the number of received SYNCs that the files contain; check them before and after recovery."""
         torn = [read_recording(path) for path in files]
         if all(part.missing is None for part in torn):
-            wrong.append("nothing is said to be missing")
+            wrong.append("no file is reported as incomplete")
         for path in files:
             recover_recording(path)
         whole = [read_recording(path) for path in files]
         for path, before, after in zip(files, torn, whole, strict=True):
             if before.sha256 != after.sha256 or before.gaps != after.gaps or before.missing != after.missing:
-                wrong.append(f"{path.name}: healing has changed what it says")
+                wrong.append(f"{path.name}: recovery has changed its contents")
             with path.open("rb") as file:
                 summary = make_reader(file).get_summary()
             if summary is None or summary.statistics is None:
@@ -131,41 +131,42 @@ class Lane:
         together = np.union1d(samples.sync, np.array(sorted(gaps), np.int64))
         if not np.array_equal(together, np.arange(together.size)):
             wrong.append("a SYNC in the middle is neither received nor in a gap")
-        here = samples.sync < heard.size
-        if not np.array_equal(samples.t_ns[here], heard[samples.sync[here]]):
+        here = samples.sync < received.size
+        if not np.array_equal(samples.t_ns[here], received[samples.sync[here]]):
             wrong.append("rows are not numbered as the SYNCs were sent")
         k, joints = samples.sync[:, None], np.arange(6)
         right = samples.raw["position"] == position_of(k, joints)
         if not (right & (samples.raw["current"] == current_of(k, joints))).all():
             wrong.append("values are not of their SYNC")
-        return int(min(together.size, heard.size))
+        return int(min(together.size, received.size))
 
 
 def _lost_ms(times: NDArray[np.int64], period_ns: int) -> float:
-    """Time that the samples cover between the first of ``times``, that of the last SYNC kept, and the last, the kill.
+    """Return the time of the lost samples, ms.
 
-    What comes until the next SYNC belongs to the last. A machine that stood still as a whole lost no samples meanwhile.
+    ``times`` (ns) begin with the last SYNC that is in the files and end with the kill. An interval counts for at most
+    one period: no samples are lost while the whole machine stands still.
     """
     return float(np.minimum(np.diff(times), period_ns).sum()) / 1e6 if times.size > 2 else 0.0
 
 
-def in_lanes(rounds: int, seed: int, lanes: int) -> list[Kill]:
-    """Rounds in several processes at once."""
+def run_rounds(rounds: int, seed: int, jobs: int) -> list[Kill]:
+    """Run rounds in several processes at once."""
     warm()
     context = multiprocessing.get_context("fork")
     numbers, done = context.Queue(), context.Queue()
-    for number in [*range(rounds), *[None] * lanes]:
+    for number in [*range(rounds), *[None] * jobs]:
         numbers.put(number)
 
     def work(name: str) -> None:
-        lane = Lane(name, seed)
+        worker = Worker(name, seed)
         try:
             while (number := numbers.get()) is not None:
-                done.put(lane.run(number))
+                done.put(worker.run(number))
         finally:
-            lane.close()
+            worker.close()
 
-    running = [context.Process(target=work, args=(f"k{os.getpid() % 10**6}x{i}",)) for i in range(lanes)]
+    running = [context.Process(target=work, args=(f"k{os.getpid() % 10**6}x{i}",)) for i in range(jobs)]
     for process in running:
         process.start()
     found: list[Kill] = []
@@ -178,7 +179,7 @@ def in_lanes(rounds: int, seed: int, lanes: int) -> list[Kill]:
 
 
 def show(kills: Sequence[Kill]) -> int:
-    """Print what was lost, by rate, and what was wrong; how many rounds that concerns."""
+    """Print losses by rate, and violations; return the number of rounds with any."""
     line = "{:>8} {:>7} {:>7} {:>11} {:>11} {:>9} {:>9} {:>11}"
     print(line.format("rate", "rounds", "files", "SYNCs", "median ms", "p90 ms", "max ms", "violations"))
     for rate in (*RATES_HZ, "lossy", "all"):
@@ -186,8 +187,8 @@ def show(kills: Sequence[Kill]) -> int:
         if part:
             lost = np.array([kill.lost_ms for kill in part])
             figures = [f"{x:.1f}" for x in (np.median(lost), np.quantile(lost, 0.9), lost.max())]
-            heard, files = sum(k.heard for k in part), sum(k.files for k in part)
-            print(line.format(rate, len(part), files, heard, *figures, sum(1 for k in part if k.violations)))
+            received, files = sum(k.received for k in part), sum(k.files for k in part)
+            print(line.format(rate, len(part), files, received, *figures, sum(1 for k in part if k.violations)))
     bad = [kill for kill in kills if kill.violations]
     for kill in bad:
         kind = f"{kill.rate_hz} Hz, {kill.files} files{', lossy' if kill.lossy else ''}"
@@ -196,16 +197,16 @@ def show(kills: Sequence[Kill]) -> int:
 
 
 def main() -> int:
-    """Run the rounds and print the table; 1 if anything is wrong."""
+    """Run the rounds and print the table; return 1 if there are violations."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.kill", description=__doc__)
     parser.add_argument("--rounds", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--lanes", type=int, default=1, help="captures at once")
+    parser.add_argument("--jobs", type=int, default=1, help="number of simultaneous captures")
     options = parser.parse_args()
     begin = time.monotonic()
-    kills = in_lanes(options.rounds, options.seed, options.lanes)
+    kills = run_rounds(options.rounds, options.seed, options.jobs)
     bad = show(kills)
-    print(f"{len(kills)} kills in {time.monotonic() - begin:.0f} s, seed {options.seed}; {bad} with something wrong")
+    print(f"{len(kills)} kills in {time.monotonic() - begin:.0f} s, seed {options.seed}; {bad} with violations")
     return int(bad > 0 or len(kills) != options.rounds)
 
 

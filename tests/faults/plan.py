@@ -1,4 +1,4 @@
-"""What can go wrong in a round: each fault as something done, and as what the recording has to say of it."""
+"""The faults of a round: each is an injection, and the evidence that the recording must contain."""
 
 import os
 import signal
@@ -21,53 +21,55 @@ from armident.drivers.canopen.objects import (
     TPDO_MAPPING,
     NmtCommand,
 )
-from tests.faults.farm import Farm, Orders
+from tests.faults.farm import AnswerFaults, Farm
 
 SDO_STEP_S = 0.004
+"""Interval of SDO requests, s."""
 BEHIND = 50
+"""Number of late answers from which on the drives count as lagging."""
 DISK_LEFT = 1 << 18
-"""Bytes left on a disk that will be full: what a round writes until then, and more."""
+"""Free bytes of the disk before it is filled: more than a round writes until then."""
 NEAR_END = 50
-"""SYNCs before the last one from which on a capture counts as ending."""
+"""Number of SYNCs before the last one that count as the end of a capture."""
 ROTATE_S = 0.25
-"""Age at which a file of a round that rotates is full."""
+"""Time span of a file in a round with rotation, s."""
 FIRST_S = 0.15
-"""Faults begin so long after the first SYNC at the earliest."""
+"""Earliest time of a fault after the first SYNC, s."""
 
 
 @dataclass
 class Outcome:
-    """What a capture left."""
+    """Recording, counters and log of a capture."""
 
     recording: Recording
     counters: dict[str, int]
-    said: str
+    log: str
     files: int
 
     def marked(self, *texts: str) -> bool:
-        """Whether marks in the recording have all of the texts."""
+        """Return whether the marks of the recording contain all texts."""
         return all(any(text in mark.text for mark in self.recording.marks) for text in texts)
 
     def gap(self, joint: str | None, *reasons: str) -> bool:
-        """Whether there is a gap of a joint (``None``: of any), for one of the reasons."""
+        """Return whether there is a gap of a joint (``None``: of any), for one of the reasons."""
         return any((joint is None or g.joint == joint) and g.reason in reasons for g in self.recording.gaps)
 
     def within(self, text: str, reason: str) -> bool:
-        """Whether a mark with this text is in a gap for this reason, or at the SYNC before it."""
+        """Return whether a mark with a text is in a gap for a reason, or at the SYNC before it."""
         at = [mark.sync for mark in self.recording.marks if text in mark.text]
         return any(g.reason == reason and any(g.first - 1 <= k <= g.last for k in at) for g in self.recording.gaps)
 
 
 @dataclass
-class Room:
-    """One round while it is planned."""
+class RoundSetup:
+    """One round that is being planned."""
 
     rng: np.random.Generator
     farm: Farm
     seconds: float
     disk: Path
     pid: Callable[[], int]
-    orders: Orders = field(default_factory=Orders)
+    answer_faults: AnswerFaults = field(default_factory=AnswerFaults)
     actions: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
     joints: list[int] = field(default_factory=lambda: list(range(6)))
 
@@ -75,31 +77,31 @@ class Room:
         self.rng.shuffle(self.joints)
 
     def at(self, until_end: float = 0.4) -> float:
-        """A random time that leaves some seconds to the end."""
+        """Return a random time at least ``until_end`` before the end, s."""
         return float(self.rng.uniform(FIRST_S, max(FIRST_S + 0.05, self.seconds - until_end)))
 
     def sync_at(self, until_end: float = 0.4) -> int:
-        """The SYNC at a random time."""
+        """Return the SYNC at a random time."""
         return int(self.at(until_end) / self.farm.session.sync_period)
 
     @property
     def syncs(self) -> int:
-        """How many SYNCs the round has."""
+        """Number of SYNCs of the round."""
         return round(self.seconds / self.farm.session.sync_period)
 
     def joint(self) -> int:
-        """A drive that nothing else happens to."""
+        """Return a drive that has no other fault."""
         return self.joints.pop()
 
 
-Expected = Callable[[Outcome], bool]
+Evidence = Callable[[Outcome], bool]
 
 ORDERED = {"lost": "lost", "all_lost": "lost", "twice": "twice", "again": "again"}
-"""Faults that do not happen while the drives are late themselves, and the order that they become."""
+"""Faults that do not occur while the drives are late anyway, and their names in ``AnswerFaults``."""
 
 
 def _was_down(done: Outcome) -> bool:
-    """Whether a bus was down: what others send meanwhile does not happen."""
+    """Return whether a bus was down: nothing is sent on it then."""
     return done.counters["bus_down"] > 0
 
 
@@ -107,56 +109,56 @@ def _name(joint: int) -> str:
     return f"joint_{joint + 1}"
 
 
-def lost(room: Room) -> Expected:
-    """Single answers and runs of them are not sent."""
-    j = room.joint()
-    for _ in range(int(room.rng.integers(1, 4))):
-        k = room.sync_at()
-        room.orders.lost |= {(k + i, j) for i in range(int(room.rng.integers(1, 20)))}
+def lost(setup: RoundSetup) -> Evidence:
+    """Single answers and sequences of them are not sent."""
+    j = setup.joint()
+    for _ in range(int(setup.rng.integers(1, 4))):
+        k = setup.sync_at()
+        setup.answer_faults.lost |= {(k + i, j) for i in range(int(setup.rng.integers(1, 20)))}
     return lambda done: done.gap(_name(j), "lost", "ambiguous order")
 
 
-def all_lost(room: Room) -> Expected:
-    """Nobody answers for a while."""
-    k, count = room.sync_at(), int(room.rng.integers(1, 50))
-    room.orders.lost |= {(k + i, j) for i in range(count) for j in range(6)}
+def all_lost(setup: RoundSetup) -> Evidence:
+    """No drive answers for some SYNCs."""
+    k, count = setup.sync_at(), int(setup.rng.integers(1, 50))
+    setup.answer_faults.lost |= {(k + i, j) for i in range(count) for j in range(6)}
     return lambda done: done.gap(None, "lost", "ambiguous order")
 
 
-def late(room: Room) -> Expected:
-    """A drive holds its answers back and then sends them in one go."""
-    j, k = room.joint(), room.sync_at()
-    count, delay = int(room.rng.integers(1, 15)), int(room.rng.integers(1, 20))
-    room.orders.late |= {(k + i, j): k + count + delay for i in range(count)}
+def late(setup: RoundSetup) -> Evidence:
+    """A drive delays its answers and then sends them at once."""
+    j, k = setup.joint(), setup.sync_at()
+    count, delay = int(setup.rng.integers(1, 15)), int(setup.rng.integers(1, 20))
+    setup.answer_faults.late |= {(k + i, j): k + count + delay for i in range(count)}
     return lambda done: done.counters["tpdo_late"] > 0
 
 
-def all_late(room: Room) -> Expected:
-    """All drives hold their answers back and then send them in one go."""
-    k, count = room.sync_at(), int(room.rng.integers(1, 30))
-    room.orders.late |= {(k + i, j): k + count + 5 for i in range(count) for j in range(6)}
+def all_late(setup: RoundSetup) -> Evidence:
+    """All drives delay their answers and then send them at once."""
+    k, count = setup.sync_at(), int(setup.rng.integers(1, 30))
+    setup.answer_faults.late |= {(k + i, j): k + count + 5 for i in range(count) for j in range(6)}
     return lambda done: done.counters["tpdo_late"] > 0
 
 
-def twice(room: Room) -> Expected:
+def twice(setup: RoundSetup) -> Evidence:
     """Answers are sent twice, one behind the other."""
-    j = room.joint()
-    room.orders.twice |= {(room.sync_at(), j) for _ in range(int(room.rng.integers(1, 6)))}
+    j = setup.joint()
+    setup.answer_faults.twice |= {(setup.sync_at(), j) for _ in range(int(setup.rng.integers(1, 6)))}
     return lambda done: done.counters["tpdo_duplicate"] > 0 or done.gap(None, "ambiguous order", "SYNC not received")
 
 
-def again(room: Room) -> Expected:
+def again(setup: RoundSetup) -> Evidence:
     """An answer is sent once more behind the next SYNC, before that one's own."""
-    j = room.joint()
-    room.orders.again |= {(room.sync_at(), j) for _ in range(int(room.rng.integers(1, 4)))}
+    j = setup.joint()
+    setup.answer_faults.again |= {(setup.sync_at(), j) for _ in range(int(setup.rng.integers(1, 4)))}
     return lambda done: done.counters["tpdo_duplicate"] > 0
 
 
-def bus_down(room: Room) -> Expected:
+def bus_down(setup: RoundSetup) -> Evidence:
     """A bus goes down and comes back (ENETDOWN)."""
-    bus = int(room.rng.integers(len(room.farm.lanes)))
-    begin, length = room.at(0.9), float(room.rng.uniform(0.1, 0.4))
-    room.actions += [(begin, lambda: room.farm.down(bus)), (begin + length, lambda: room.farm.up(bus))]
+    bus = int(setup.rng.integers(len(setup.farm.buses)))
+    begin, length = setup.at(0.9), float(setup.rng.uniform(0.1, 0.4))
+    setup.actions += [(begin, lambda: setup.farm.down(bus)), (begin + length, lambda: setup.farm.up(bus))]
     return lambda done: done.counters["bus_down"] > 0 and done.marked("went down", "is back")
 
 
@@ -166,64 +168,64 @@ def _errors(classes: list[int]) -> Frames:
     return out
 
 
-def error_frames(room: Room) -> Expected:
+def error_frames(setup: RoundSetup) -> Evidence:
     """The controller reports errors."""
-    bus, count = int(room.rng.integers(len(room.farm.lanes))), int(room.rng.integers(1, 40))
-    room.actions.append((room.at(), lambda: room.farm.inject(bus, _errors([0x20] * count))))
+    bus, count = int(setup.rng.integers(len(setup.farm.buses))), int(setup.rng.integers(1, 40))
+    setup.actions.append((setup.at(), lambda: setup.farm.inject(bus, _errors([0x20] * count))))
 
-    def told(done: Outcome) -> bool:
-        heard, dropped = done.counters["error_frames"], done.counters["kernel_drops"]
-        # Those that the kernel dropped are counted among what it dropped, and nobody knows what they said.
-        return _was_down(done) or (heard + dropped >= count and (not heard or done.marked("nobody acknowledges")))
+    def evidence(done: Outcome) -> bool:
+        received, dropped = done.counters["error_frames"], done.counters["kernel_drops"]
+        # Error frames may be among the frames that the kernel dropped.
+        return _was_down(done) or (received + dropped >= count and (not received or done.marked("nobody acknowledges")))
 
-    return told
+    return evidence
 
 
-def bus_off(room: Room) -> Expected:
-    """The controller reports that it is off the bus, and is restarted."""
-    bus, begin = int(room.rng.integers(len(room.farm.lanes))), room.at(0.6)
-    room.actions.append((begin, lambda: room.farm.inject(bus, _errors([0x40]))))
-    room.actions.append((begin + 0.1, lambda: room.farm.inject(bus, _errors([0x100]))))
+def bus_off(setup: RoundSetup) -> Evidence:
+    """The controller reports bus-off, and is restarted."""
+    bus, begin = int(setup.rng.integers(len(setup.farm.buses))), setup.at(0.6)
+    setup.actions.append((begin, lambda: setup.farm.inject(bus, _errors([0x40]))))
+    setup.actions.append((begin + 0.1, lambda: setup.farm.inject(bus, _errors([0x100]))))
     return lambda done: (
         _was_down(done) or (done.counters["bus_off"] > 0 and done.marked("bus-off)", "restarted after bus-off"))
     )
 
 
-def emcy(room: Room) -> Expected:
-    """A drive reports an error."""
-    j = room.joint()
+def emcy(setup: RoundSetup) -> Evidence:
+    """A drive sends an EMCY."""
+    j = setup.joint()
     sent: list[bool] = []
-    room.actions.append((room.at(), lambda: sent.append(room.farm.emcy(j, 0x4210))))
+    setup.actions.append((setup.at(), lambda: sent.append(setup.farm.emcy(j, 0x4210))))
     return lambda done: sent == [False] or (done.counters["emcy"] > 0 and done.marked("EMCY 4210h"))
 
 
-def heartbeat(room: Room) -> Expected:
+def heartbeat(setup: RoundSetup) -> Evidence:
     """A drive's heartbeat stops and returns."""
-    j = room.joint()
-    room.actions.append((room.at(0.8), lambda: room.farm.silent(j, 0.45)))
-    # Nobody is silent for as long as the only bus is down.
+    j = setup.joint()
+    setup.actions.append((setup.at(0.8), lambda: setup.farm.silent(j, 0.45)))
+    # A lost heartbeat is not reported while the only bus is down.
     return lambda done: (
         _was_down(done)
         or (done.counters["heartbeat_lost"] > 0 and done.marked("no heartbeat for", "heartbeat is back"))
     )
 
 
-def reboot(room: Room) -> Expected:
-    """A drive loses its power for a moment and boots."""
-    j, seconds = room.joint(), float(room.rng.uniform(0.03, 0.2))
-    room.actions.append((room.at(1.1), lambda: room.farm.reboot(j, seconds)))
+def reboot(setup: RoundSetup) -> Evidence:
+    """A drive is switched off for a moment and boots."""
+    j, seconds = setup.joint(), float(setup.rng.uniform(0.03, 0.2))
+    setup.actions.append((setup.at(1.1), lambda: setup.farm.reboot(j, seconds)))
 
-    def told(done: Outcome) -> bool:
-        # While no SYNC came it owed no answer: then the gap in which it booted is everybody's.
+    def evidence(done: Outcome) -> bool:
+        # Without SYNC there is no answer to lose: the gap of the reboot is of all joints then.
         missed = done.gap(_name(j), "lost") or done.within("has booted again", "SYNC not received")
         return done.counters["rebooted"] > 0 and done.marked("has booted again") and missed
 
-    return told
+    return evidence
 
 
-def _remap(room: Room, j: int, entries: list[int], nmt: bool) -> None:
-    """Another tool on the bus maps the first TPDO of a drive anew; with ``nmt`` in pre-operational, as most do."""
-    node, bus = room.farm.drives[j].node_id, room.farm.bus_of(j)
+def _remap(setup: RoundSetup, j: int, entries: list[int], nmt: bool) -> None:
+    """Another tool changes the mapping of a drive's TPDO1; with ``nmt`` in pre-operational, as most tools do."""
+    node, bus = setup.farm.drives[j].node_id, setup.farm.bus_of(j)
     steps = [(TPDO_COMMUNICATION, 1, (0x180 + node) | PDO_NOT_VALID, 4), (TPDO_MAPPING, 0, 0, 1)]
     steps += [(TPDO_MAPPING, i + 1, entry, 4) for i, entry in enumerate(entries)]
     steps += [(TPDO_MAPPING, 0, len(entries), 1), (TPDO_COMMUNICATION, 1, 0x180 + node, 4)]
@@ -232,87 +234,87 @@ def _remap(room: Room, j: int, entries: list[int], nmt: bool) -> None:
         states = NmtCommand.PRE_OPERATIONAL, NmtCommand.START
         before, after = (frame(COB_NMT, bytes([state, node])) for state in states)
         sent = [before, *sent, after]
-    begin = room.at(1.2)
+    begin = setup.at(1.2)
     for i, one in enumerate(sent):
-        room.actions.append((begin + i * SDO_STEP_S, lambda one=one: room.farm.inject(bus, one)))  # type: ignore[misc]
+        setup.actions.append((begin + i * SDO_STEP_S, lambda one=one: setup.farm.inject(bus, one)))  # type: ignore[misc]
 
 
 def _download(index: int, sub: int, value: int, size: int) -> bytes:
-    """The request of an expedited SDO download (CiA 301 section 7.2.4.3.3)."""
+    """Return the request of an expedited SDO download (CiA 301 section 7.2.4.3.3)."""
     command = 0x23 | (4 - size) << 2
     return bytes([command]) + index.to_bytes(2, "little") + bytes([sub]) + value.to_bytes(4, "little")
 
 
-def mapped_shorter(room: Room) -> Expected:
-    """Somebody maps less than the session wants."""
-    j = room.joint()
-    _remap(room, j, [0x60640020, 0x60780010], bool(room.rng.integers(2)))
+def mapped_shorter(setup: RoundSetup) -> Evidence:
+    """Another tool maps fewer objects than the session."""
+    j = setup.joint()
+    _remap(setup, j, [0x60640020, 0x60780010], bool(setup.rng.integers(2)))
     return lambda done: _was_down(done) or (done.counters["mapping_changed"] > 0 and done.marked("PDO mapping"))
 
 
-def mapped_otherwise(room: Room) -> Expected:
-    """Somebody maps the same objects in another order: as many bytes as before."""
-    j = room.joint()
-    _remap(room, j, [0x60640020, 0x60410010, 0x60780010], bool(room.rng.integers(2)))
+def mapped_otherwise(setup: RoundSetup) -> Evidence:
+    """Another tool maps the same objects in another order, so that the length stays."""
+    j = setup.joint()
+    _remap(setup, j, [0x60640020, 0x60410010, 0x60780010], bool(setup.rng.integers(2)))
     return lambda done: _was_down(done) or (done.counters["mapping_changed"] > 0 and done.marked("PDO mapping"))
 
 
-def kernel_drop(room: Room) -> Expected:
-    """The capture is not run for a while, and the kernel's buffer overruns."""
-    _stopped(room)
+def kernel_drop(setup: RoundSetup) -> Evidence:
+    """The capture is stopped for a moment, and the receive buffer overruns."""
+    _stopped(setup)
     return lambda done: done.counters["kernel_drops"] > 0 and bool(done.recording.gaps)
 
 
-def held_up(room: Room) -> Expected:
-    """The capture, and so SYNC, is not run for a while."""
-    _stopped(room)
+def held_up(setup: RoundSetup) -> Evidence:
+    """The capture, and with it SYNC, is stopped for a moment."""
+    _stopped(setup)
     return lambda done: done.counters["sync_skipped_periods"] > 0
 
 
 def _state(pid: int) -> str:
-    """What the kernel says a process does; ``X`` if it is no more."""
+    """Return the state of a process from /proc; ``X`` if it has ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):
         return "X"
 
 
-def _stopped(room: Room) -> None:
-    begin, length = room.at(1.2), float(room.rng.uniform(0.1, 0.3))
+def _stopped(setup: RoundSetup) -> None:
+    begin, length = setup.at(1.2), float(setup.rng.uniform(0.1, 0.3))
 
     def stop() -> None:
-        # A capture that failed is no more.
+        # The capture may have failed.
         with suppress(ProcessLookupError):
-            os.kill(room.pid(), signal.SIGSTOP)
-            # One that has not been obeyed yet would be called off by what follows.
-            while _state(room.pid()) not in "TZX":
+            os.kill(setup.pid(), signal.SIGSTOP)
+            # SIGCONT would cancel a SIGSTOP that is still pending.
+            while _state(setup.pid()) not in "TZX":
                 time.sleep(0.001)
             time.sleep(length)
-            os.kill(room.pid(), signal.SIGCONT)
+            os.kill(setup.pid(), signal.SIGCONT)
 
-    room.actions.append((begin, lambda: room.farm.beside(stop)))
+    setup.actions.append((begin, lambda: setup.farm.beside(stop)))
 
 
-def sync_missing(room: Room) -> Expected:
-    """The master of others leaves SYNCs out, its counter goes on."""
-    k = room.sync_at(0.6)
-    room.orders.skipped |= set(range(k, k + int(room.rng.integers(1, 350))))
+def sync_missing(setup: RoundSetup) -> Evidence:
+    """The foreign master omits SYNCs; its counter continues."""
+    k = setup.sync_at(0.6)
+    setup.answer_faults.skipped |= set(range(k, k + int(setup.rng.integers(1, 350))))
     return lambda done: done.counters["sync_missing"] > 0 and done.gap(None, "SYNC not received")
 
 
-def sync_stops(room: Room) -> Expected:
-    """The master of others stops for a while; afterwards its counter goes on, or begins anew."""
-    length, restart = float(room.rng.uniform(0.3, 0.6)), bool(room.rng.integers(2))
-    room.actions.append((room.at(1.0), lambda: room.farm.rest(length, restart)))
+def sync_stops(setup: RoundSetup) -> Evidence:
+    """The foreign master pauses; afterwards its counter continues, or starts again."""
+    length, restart = float(setup.rng.uniform(0.3, 0.6)), bool(setup.rng.integers(2))
+    setup.actions.append((setup.at(1.0), lambda: setup.farm.rest(length, restart)))
     return lambda done: done.counters["sync_stopped"] > 0 and done.marked("no SYNC for", "SYNC is back")
 
 
-def disk_full(room: Room) -> Expected:
-    """The disk is full for a while."""
-    filler = room.disk / "filler"
-    length = float(room.rng.uniform(0.3, 0.5))
-    # Most of it before the round, so that the rest is done in a moment.
-    free = os.statvfs(room.disk)
+def disk_full(setup: RoundSetup) -> Evidence:
+    """The disk is full for a moment."""
+    filler = setup.disk / "filler"
+    length = float(setup.rng.uniform(0.3, 0.5))
+    # Fill most of it before the round, so that the rest is quick.
+    free = os.statvfs(setup.disk)
     filler.write_bytes(bytes(max(0, free.f_bavail * free.f_frsize - DISK_LEFT)))
 
     def fill() -> None:
@@ -321,50 +323,50 @@ def disk_full(room: Room) -> Expected:
                 with suppress(OSError):
                     while file.write(bytes(block)) == block:
                         pass
-        if _while_full(room, length):
-            room.orders.done.add("full")
+        if _while_full(setup, length):
+            setup.answer_faults.done.add("full")
         filler.unlink()
-        # A capture that still has SYNCs to record ends later than this.
-        ledger = room.farm.lanes[0].ledger
-        room.orders.full_at_end = bool(ledger) and ledger[-1] >= room.syncs - NEAR_END
+        # With more SYNCs to record, the capture ends later than this.
+        syncs = setup.farm.buses[0].syncs
+        setup.answer_faults.full_at_end = bool(syncs) and syncs[-1] >= setup.syncs - NEAR_END
 
-    room.actions.append((room.at(1.1), lambda: room.farm.beside(fill)))
-    # While drives are behind rows wait in memory, and there is nothing to write.
+    setup.actions.append((setup.at(1.1), lambda: setup.farm.beside(fill)))
+    # While drives lag, rows wait in memory and nothing is written.
     return lambda done: (
         done.counters["tpdo_late"] > BEHIND or (done.counters["writer.rows_lost"] > 0 and done.gap(None, NOT_WRITTEN))
     )
 
 
-def _while_full(room: Room, length: float) -> bool:
-    """For so long, and until the disk has refused something: a host that is busy may keep the capture from trying.
+def _while_full(setup: RoundSetup, length: float) -> bool:
+    """Wait for a time, and until the disk has refused a write, since a busy host may delay the capture.
 
-    Whether it has refused something in the end.
+    Return whether it has refused a write.
     """
 
-    def looks() -> dict[Path, tuple[int, int]]:
+    def file_states() -> dict[Path, tuple[int, int]]:
         return {path: (stat.st_size, stat.st_mtime_ns) for path in files for stat in [path.stat()]}
 
-    files = list(room.disk.glob("r*/*.mcap"))
+    files = list(setup.disk.glob("r*/*.mcap"))
     until, last, before, refused = (
         time.monotonic() + length,
-        0.8 * room.syncs,
-        looks(),
+        0.8 * setup.syncs,
+        file_states(),
         False,
     )
-    while time.monotonic() < until or (not refused and len(room.farm.lanes[0].ledger) < last):
+    while time.monotonic() < until or (not refused and len(setup.farm.buses[0].syncs) < last):
         time.sleep(0.005)
-        now = looks()
-        # What was not written whole is taken back: the file is touched, and no larger.
+        now = file_states()
+        # An incomplete write is undone: the file is modified, and has its former size.
         refused |= any(now[path][0] == size and now[path][1] != at for path, (size, at) in before.items())
         before = now
     return refused
 
 
-def rotation(room: Room) -> Expected:
-    """New files are begun meanwhile (the session says so)."""
-    first = round(ROTATE_S / room.farm.session.sync_period)
-    # What waits for a lost answer is written at once when it is given up, into one file. A disk that refuses the second
-    # file is asked for it again long after the round.
+def rotation(setup: RoundSetup) -> Evidence:
+    """New files begin during the round, as the session configures."""
+    first = round(ROTATE_S / setup.farm.session.sync_period)
+    # Rows that wait for a lost answer are written at once, into one file. If the disk refuses the second file, the next
+    # attempt is long after the round.
     return lambda done: (
         done.files >= 2
         or done.gap(None, "lost", "ambiguous order")
@@ -381,7 +383,7 @@ CONSUMER = (kernel_drop, sync_missing, sync_stops)
 FAULTS = {fault.__name__: fault for fault in (*ANY, *PRODUCER, *CONSUMER)}
 EXCLUSIVE = (
     {"sync_stops", "kernel_drop", "held_up", "bus_down"},
-    # A drive that owes an answer keeps rows in memory: the disk is not asked.
+    # While a drive owes an answer, rows stay in memory: nothing is written to the disk.
     *(
         {"disk_full", name}
         for name in (
@@ -401,16 +403,16 @@ EXCLUSIVE = (
             "held_up",
         )
     ),
-    # Answers that are late and answers that are lost in the same moment cannot be told apart by anybody.
+    # Late and lost answers of the same moment cannot be distinguished.
     {"all_lost", "all_late", "late", "again", "kernel_drop", "bus_down", "sync_missing", "sync_stops"},
 )
-"""Sets of faults of which a round has one at most."""
+"""Sets of faults; a round has at most one of each set."""
 
 
 Plan = tuple[list[str], bool, int]
-"""The faults of a round, whether we produce SYNC, and on how many buses."""
+"""Faults of a round, whether the capture produces SYNC, and the number of buses."""
 
-HANDFUL: tuple[Plan, ...] = (
+EVERY_FAULT: tuple[Plan, ...] = (
     (["lost", "twice", "emcy"], True, 1),
     (["late", "error_frames", "bus_off"], True, 2),
     (["bus_down", "heartbeat"], True, 2),
@@ -423,11 +425,11 @@ HANDFUL: tuple[Plan, ...] = (
     (["sync_stops", "mapped_otherwise"], False, 1),
     (["all_lost"], False, 2),
 )
-"""Every fault once."""
+"""Rounds that contain every fault once."""
 
 
-def chosen(rng: np.random.Generator, number: int, only: Sequence[str] = ()) -> Plan:
-    """A round at random; its first fault by turns."""
+def random_plan(rng: np.random.Generator, number: int, only: Sequence[str] = ()) -> Plan:
+    """Return a random plan; its first fault follows from the number of the round."""
     names = list(only) or list(FAULTS)
     first = names[number % len(names)]
     fault = FAULTS[first]

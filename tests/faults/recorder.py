@@ -1,4 +1,4 @@
-"""The capture as a process of its own, begun at once: forked from one that has loaded and compiled everything."""
+"""Captures as processes that start at once: forked from a process that has loaded and compiled everything."""
 
 import json
 import os
@@ -17,12 +17,16 @@ from armident.configs import ArmidentError
 from armident.daq.capture.capture import run_capture
 from armident.daq.matching.assembler import Assembler, TpdoStream
 from armident.drivers.can.frames import frames
+from armident.drivers.can.packet_ring import PacketRing
 from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen import sync_loop
 
+FRAME_BYTES = 900
+"""Size of one frame in the receive buffer of a raw socket, bytes."""
+
 
 def warm() -> None:
-    """Load what a capture compiles."""
+    """Load the compiled functions of a capture."""
     for buses in (1, 2):
         streams = [TpdoStream("samples", 1, (0x181, 0x182), 8), TpdoStream("demand", 5, (0x281, 0x282), 4)]
         where = (0, buses - 1)
@@ -33,7 +37,7 @@ def warm() -> None:
 
 
 class Capture:
-    """A capture that runs, or has ended."""
+    """A capture process."""
 
     def __init__(self, pid: int, ask: Callable[[int], int | None]) -> None:
         self.pid = pid
@@ -42,26 +46,26 @@ class Capture:
 
     @property
     def exitcode(self) -> int | None:
-        """Its exit code, less than 0 the signal that ended it; ``None`` while it runs."""
+        """Exit code, or the negative number of the signal that ended it; ``None`` while it runs."""
         if self._code is None:
             self._code = self._ask(self.pid)
         return self._code
 
     def join(self) -> None:
-        """Wait for its end."""
+        """Wait for the end of the process."""
         while self.exitcode is None:
             time.sleep(0.01)
 
     def kill(self) -> None:
-        """End it at once."""
+        """Send SIGKILL."""
         if self.exitcode is None:
             os.kill(self.pid, signal.SIGKILL)
 
 
 class Recorders:
-    """Captures as processes, forked from one that has loaded and compiled everything and has no threads.
+    """Starts capture processes by forking a server process that has loaded everything and has no threads.
 
-    To be made where there are none either.
+    Create it before the calling process has threads.
     """
 
     def __init__(self) -> None:
@@ -84,7 +88,7 @@ class Recorders:
         receive_buffer: int | None = None,
         listen_only: bool = False,
     ) -> Capture:
-        """Begin a capture; what it prints goes to ``log`` with ``.out`` and ``.err`` added."""
+        """Start a capture; its stdout and stderr go to ``log`` with the suffixes ``.out`` and ``.err``."""
         return Capture(self._ask((session, out, log, duration, receive_buffer, listen_only)), self._ask)
 
     def _ask(self, what: Any) -> Any:
@@ -120,8 +124,8 @@ def _serve(connection: Any) -> None:
         connection.send(pid)
 
 
-def said(log: Path) -> str:
-    """What a capture has said so far."""
+def log_text(log: Path) -> str:
+    """Return the stderr of a capture so far."""
     try:
         return log.with_suffix(".err").read_text(errors="replace")
     except FileNotFoundError:
@@ -129,7 +133,7 @@ def said(log: Path) -> str:
 
 
 def result(log: Path) -> tuple[list[Path], dict[str, int]]:
-    """Files and counters of a capture that has ended."""
+    """Return files and counters of a capture that has ended."""
     document = json.loads(log.with_suffix(".out").read_text())
     return [Path(path) for path in document["recordings"]], document["counters"]
 
@@ -145,6 +149,8 @@ def _record(
         # A short stop overruns a small buffer.
         assert RawSocket.__init__.__kwdefaults__ is not None
         RawSocket.__init__.__kwdefaults__["receive_buffer"] = receive_buffer
+        assert PacketRing.__init__.__kwdefaults__ is not None
+        PacketRing.__init__.__kwdefaults__["slots"] = receive_buffer // FRAME_BYTES
     try:
         run_capture(str(session), out, duration, listen_only, True)
     except ArmidentError as error:

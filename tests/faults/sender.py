@@ -1,4 +1,4 @@
-"""Sends SYNC and the TPDOs of six drives from a compiled loop in a process of its own: prepared frames, cheaply."""
+"""Sender of SYNC and prepared TPDOs of six drives, in a compiled loop and a process of its own."""
 
 import multiprocessing
 import time
@@ -18,16 +18,16 @@ READY, GO, STOP, SENT, WORST_NS, SHIFTED, FAILED = range(7)
 COUNTER = 240
 ATTEMPTS = 5000
 SHIFT_PERIODS = 50
-"""A sender that is later than this moves its grid instead of catching up."""
+"""Delay from which on the sender shifts its time grid instead of catching up, in periods."""
 
 
 def position_of(sync: Any, joint: Any) -> Any:
-    """Position that tells SYNC and joint."""
+    """Return the position that encodes SYNC and joint."""
     return (sync * 8 + joint) & 0x7FFF_FFFF
 
 
 def current_of(sync: Any, joint: Any) -> Any:
-    """Current that tells SYNC and joint, below 2^15."""
+    """Return the current that encodes SYNC and joint, below 2^15."""
     return (sync * 31 + joint * 1009) % 32_749
 
 
@@ -60,18 +60,18 @@ def _send(descriptors, address, body, first, joints, period, count, lossy, contr
 
 
 class Sender:
-    """SYNC and TPDOs (position, current, status) of six drives, nodes 1 to 6, on some buses.
+    """Sends SYNC and TPDOs (position, current, status) of six drives, nodes 1 to 6, on some buses.
 
     Parameters
     ----------
     channels
-        The buses; drives are on them in equal parts.
+        The buses; the drives are distributed evenly.
     period_us
-        SYNC period.
+        SYNC period, us.
     count
-        How many SYNCs.
+        Number of SYNCs.
     lossy
-        Every so many SYNCs the last drive does not answer; 0: it always does.
+        Interval in SYNCs at which the last drive omits an answer; 0 for never.
     """
 
     def __init__(self, channels: Sequence[str], period_us: int, count: int = 2**40, lossy: int = 0) -> None:
@@ -94,28 +94,28 @@ class Sender:
         self._process.join()
 
     def go(self) -> None:
-        """Begin."""
+        """Begin to send."""
         self.control[GO] = 1
 
     @property
     def sent(self) -> int:
-        """SYNCs sent so far."""
+        """Number of SYNCs sent so far."""
         return int(self.control[SENT])
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Process id."""
         assert self._process.pid is not None
         return self._process.pid
 
     def stop(self) -> int:
-        """End; the number of SYNCs sent in all."""
+        """End the process; return the number of SYNCs sent."""
         self.control[STOP] = 1
         self._process.join()
         return self.sent
 
     def wait(self) -> None:
-        """Until all is sent."""
+        """Wait until all SYNCs are sent."""
         self._process.join()
 
 

@@ -1,10 +1,9 @@
 """A long capture under full load: ``python -m tests.faults.soak --seconds 600``.
 
-Six buses with SYNC and a drive each at 5 kHz, sent by one process from prepared frames (a virtual arm beside it is more
-than a guest with one CPU can do), recorded by ``armident capture --listen-only``. Afterwards every SYNC that was
-sent has to be a row with the values of its SYNC. Prints rows, gaps, drops, CPU and memory over time. Runs under
-``python -m armident.drivers.vcan``; a guest takes long to read what it has recorded: with ``--out FOLDER`` there,
-``--judge FOLDER`` does it outside.
+One process sends prepared frames of SYNC and a drive on each of six buses at 5 kHz; a virtual arm would need more than
+the one CPU of a guest. ``armident capture --listen-only`` records them. Every SYNC must be a row with the values of its
+SYNC. Prints rows, gaps, drops, CPU time and memory. Runs under ``python -m armident.drivers.vcan``. Reading the
+recording takes long in a guest: record there with ``--out FOLDER``, and check outside with ``--judge FOLDER``.
 """
 
 import argparse
@@ -31,19 +30,19 @@ TICKS = os.sysconf("SC_CLK_TCK")
 
 
 def memory_mb(pid: int) -> float:
-    """Resident memory of a process, MB."""
+    """Return the resident memory of a process, MB."""
     (line,) = [line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmRSS")]
     return int(line.split()[1]) / 1024
 
 
 def cpu_s(pid: int) -> float:
-    """CPU time of a process so far, s."""
+    """Return the CPU time of a process, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 def record(seconds: float, rate_hz: int, folder: Path, channels: list[str]) -> int:
-    """Record for so long into a folder and print what the capture says of itself; 1 if that is not all."""
+    """Record into a folder and print the counters of the capture; return 1 if rows are missing."""
     period_us = 10**6 // rate_hz
     session = session_file(folder, "soak", channels, False, False, period_us, demand=False)
     count = round(seconds * rate_hz)
@@ -88,7 +87,7 @@ def record(seconds: float, rate_hz: int, folder: Path, channels: list[str]) -> i
 
 
 def judge(folder: Path) -> int:
-    """Hold what was recorded in a folder against what was sent; 1 if a row is missing or a value wrong."""
+    """Compare the recording in a folder with the sent values; return 1 if a row is missing or a value wrong."""
     document = json.loads((folder / "soak.json").read_text())
     samples = read_recording(folder / Path(document["recording"]).name).samples
     joints, wrong = np.arange(6), 0
@@ -102,13 +101,13 @@ def judge(folder: Path) -> int:
 
 
 def main() -> int:
-    """Run it; 1 if anything is missing."""
+    """Record, check, and return 1 if anything is missing."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.soak", description=__doc__)
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--rate", type=int, default=5000, help="SYNCs per second")
     parser.add_argument("--buses", type=int, default=6)
-    parser.add_argument("--out", type=Path, help="leave the recording in this folder, for --judge")
-    parser.add_argument("--judge", type=Path, help="only hold the recording in this folder against what was sent")
+    parser.add_argument("--out", type=Path, help="keep the recording in this folder, for --judge")
+    parser.add_argument("--judge", type=Path, help="only check the recording in this folder")
     options = parser.parse_args()
     if options.judge is not None:
         return judge(options.judge)
