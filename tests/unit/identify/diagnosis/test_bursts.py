@@ -1,4 +1,4 @@
-"""Torques that come for moments are told from noise, whatever its spectrum and wherever it is strong."""
+"""Kurtosis test for transient disturbances: false-alarm rate for coloured and speed-dependent noise, detection."""
 
 import numpy as np
 import pytest
@@ -15,13 +15,13 @@ SPEED = np.abs(np.sin(2 * np.pi * 0.3 * DT * np.arange(LENGTH)))
 
 
 def noise(seed: int, length: int = LENGTH) -> Array:
-    """Gaussian noise of the colour that loops give it, of unit power."""
+    """Gaussian noise of unit power, coloured as in a control loop."""
     x = signal.lfilter([1.0], [1.0, -1.3, 0.5], np.random.default_rng(seed).normal(size=length + 200))[200:]
     return np.asarray(x / x.std())
 
 
 def events(seed: int, share: float) -> Array:
-    """A tenth of a second of torque once a second at random times, of a share of the power of unit noise."""
+    """Torque pulses of 0.1 s once a second at random times, with a share of the power of unit noise."""
     every, long = round(1.0 / DT), round(0.1 / DT)
     x = np.zeros(LENGTH)
     for k, at in enumerate(np.random.default_rng(seed).integers(0, every - long, LENGTH // every)):

@@ -1,4 +1,4 @@
-"""The fast noise models, whitening and products of a search are those of the plain formulas."""
+"""Fast noise models, whitening and products against plain formulas."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Columns of every effect against its defining equation, computed another way on a motion that is known in full."""
+"""Columns of every effect against its defining equation, computed independently on an analytic motion."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""Which parameters physics forbids an effect."""
+"""Physical constraints on the parameters of effects."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Exchanged signals are raw numbers: undone, the recording is that of the arm as it should be wired."""
+"""Correction of exchanged signals: raw values are exchanged, scaling belongs to the drive."""
 
 import numpy as np
 import pytest
