@@ -18,7 +18,7 @@ Scope = Literal["joint", "motor", "pair", "arm"]
 """Location of an effect: one joint, one motor (a coupled transmission acts on several joints), a pair of joints, or the
 whole arm (its entry in the configuration then names the first joint, that of a payload the last one)."""
 
-DOUBT = 2.0
+SIGN_TOLERANCE = 2.0
 """Standard deviations by which a parameter must violate its sign or bounds to be rejected."""
 
 
@@ -176,13 +176,14 @@ class Effect:
     def allows(self, values: Array, std: Array, shapes: Mapping[str, float]) -> bool:
         """Return True if linear parameters (k,) with standard deviations (k,) are physically possible.
 
-        Signs and bounds may be violated by `DOUBT` standard deviations: single parameters may be zero.
+        Signs and bounds may be violated by `SIGN_TOLERANCE` standard deviations: single parameters may be zero.
         """
         if self.physical is not None and not self.physical(values, shapes):
             return False
         return all(
-            p.sign * value >= -DOUBT * doubt and p.bounds[0] - DOUBT * doubt <= value <= p.bounds[1] + DOUBT * doubt
-            for p, value, doubt in zip(self.linear, values, std, strict=True)
+            p.sign * value >= -SIGN_TOLERANCE * deviation
+            and p.bounds[0] - SIGN_TOLERANCE * deviation <= value <= p.bounds[1] + SIGN_TOLERANCE * deviation
+            for p, value, deviation in zip(self.linear, values, std, strict=True)
         )
 
     @property
