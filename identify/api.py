@@ -514,7 +514,7 @@ def diagnose(
     numbers = None if baseline is None else _document(baseline)
     if numbers is not None and numbers.robot != config.name:
         name = baseline if isinstance(baseline, str | Path) else "baseline"
-        raise DataError(f"{name}: the numbers of robot {numbers.robot!r}, the recording is of {config.name!r}")
+        raise DataError(f"{name}: the baseline is of robot {numbers.robot!r}, the recording of {config.name!r}")
     training, notes = experiments_of(read, config, name_files=True)
     held_out: list[Experiment] = []
     if validate is not None:
