@@ -292,11 +292,7 @@ class _DemoProcess(CommandProcess):
     """Command of the demo with its output in ``logs/NAME.log``."""
 
     def __init__(self, name: str, words: Sequence[str], out: Path, niceness: int) -> None:
-        environment = {}
-        if cache := os.environ.get("NUMBA_CACHE_DIR"):
-            # In the guest, this is the only cache folder that Matplotlib can write its font list to.
-            environment["MPLCONFIGDIR"] = os.environ.get("MPLCONFIGDIR", str(Path(cache) / "matplotlib"))
-        start = partial(start_command, niceness=niceness, environment=environment)
+        start = partial(start_command, niceness=niceness)
         file = out / "logs" / f"{name}.log"
         file.unlink(missing_ok=True)
         super().__init__(words, name=name, log=file, merge=True, start=start)

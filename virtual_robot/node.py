@@ -267,7 +267,7 @@ class Drive(canopen.LocalNode):
         """
         super().set_data(index, subindex, data, check_writable)
         if index == CONTROLWORD:
-            self.obey(int.from_bytes(data, "little"))
+            self.apply_controlword(int.from_bytes(data, "little"))
             return
         if index == INTERPOLATION_PERIOD:
             self._set_interpolation_time()
@@ -285,7 +285,7 @@ class Drive(canopen.LocalNode):
         """Statusword (6041h)."""
         return statusword(self.state)
 
-    def obey(self, control: int) -> None:
+    def apply_controlword(self, control: int) -> None:
         """Apply a controlword (6040h).
 
         Parameters

@@ -261,7 +261,7 @@ class Exchange:
             for drive in self._drives:
                 word = int(self._control[drive.index])
                 if word >= 0 and word != drive.control:
-                    drive.obey(word)
+                    drive.apply_controlword(word)
                 self._control[drive.index] = -1
 
 

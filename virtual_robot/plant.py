@@ -12,7 +12,7 @@ from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.scenario import Scenario
 from armident.virtual_robot import dynamics
 from armident.virtual_robot.effects import Hidden, hidden_effects
-from armident.virtual_robot.effects.bodies import add_rotors, change_bodies, hanging, hinge_damping, shaking
+from armident.virtual_robot.effects.bodies import add_rotors, base_vibrations, change_bodies, hinge_damping, rest_angles
 from armident.virtual_robot.effects.bristles import bristle_table, sliding_level
 from armident.virtual_robot.effects.forces import force_table
 from armident.virtual_robot.effects.gears import gear_rows, twist_under
@@ -64,8 +64,11 @@ class Plant:
         self.model = build_model(robot, standard)
         change_bodies(self.model, hidden)
         self._data = self.model.createData()
-        self._gravity, self._shaking = np.array(self.model.gravity.linear), shaking(hidden, np.array(robot.gravity))
-        swing = hanging(self.model, hidden, start)
+        self._gravity, self._vibrations = (
+            np.array(self.model.gravity.linear),
+            base_vibrations(hidden, np.array(robot.gravity)),
+        )
+        swing = rest_angles(self.model, hidden, start)
         links = _symmetric(pin.crba(self.model, self._data, np.concatenate([start, swing])))[:n, :n]
         rotor, friction, pairs = _healthy(robot, standard)
         add_rotors(rotor, hidden, links)
@@ -179,8 +182,8 @@ class Plant:
         force, slope = np.zeros(total), np.zeros((total, total))
         force[:n] = self.resistance(q[:n], qd[:n], t) - tau
         dynamics.gear_torques(q, qd, self._gears, force, slope, slope)
-        if self._shaking.size:
-            self._shake(t)
+        if self._vibrations.size:
+            self._add_base_vibration(t)
         force[self._link] += pin.nonLinearEffects(self.model, self._data, q[self._link], qd[self._link])
         return np.asarray(np.linalg.solve(self._inertia(q), -force), np.float64)
 
@@ -194,8 +197,8 @@ class Plant:
         period
             Control period, s.
         """
-        if self._shaking.size:
-            self._shake(self._time + 0.5 * period)
+        if self._vibrations.size:
+            self._add_base_vibration(self._time + 0.5 * period)
         middle, speed = self._state[2], self._state[3]
         steps = dynamics.SUBSTEPS
         if not self._rigid:
@@ -217,9 +220,9 @@ class Plant:
         mass[rows, columns] += _symmetric(pin.crba(self.model, self._data, q[self._link]))
         return mass
 
-    def _shake(self, t: float) -> None:
+    def _add_base_vibration(self, t: float) -> None:
         """Add the acceleration of the base at ``t`` to gravity."""
-        rows = self._shaking
+        rows = self._vibrations
         self.model.gravity.linear = self._gravity - np.sin(rows[:, 3] * t) @ rows[:, :3]
 
 
@@ -244,7 +247,7 @@ def _add_coupling_friction(
     """Add hidden friction between joints to ``friction`` (n, 4) and ``pairs``, in place."""
     for h in hidden:
         if h.effect == "coupling_friction":
-            viscous = h.given("viscous", 0.3 * h["coulomb"])
+            viscous = h.value_or("viscous", 0.3 * h["coulomb"])
             friction[[h.joint, h.other], 0] += viscous
             pairs.append((h.joint, h.other, viscous, h["coulomb"]))
 

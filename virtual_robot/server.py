@@ -119,8 +119,8 @@ class Server:
                 here = [drive for drive, node in both if session.bus_of(node) == bus]
                 self._buses.append(DriveBus(bus, here, motion, session.sync_period))
         except BaseException:
-            for line in self._buses:
-                line.close()
+            for drive_bus in self._buses:
+                drive_bus.close()
             raise
 
     def _changed(self) -> None:
@@ -129,26 +129,26 @@ class Server:
     def _status_changed(self) -> None:
         self._status_dirty = True
 
-    def _catch_up(self) -> None:
+    def _update_exchange(self) -> None:
         if self._dirty:
             self._dirty = self._status_dirty = False
-            for line in self._buses:
-                line.exchange.rebuild()
+            for drive_bus in self._buses:
+                drive_bus.exchange.rebuild()
         elif self._status_dirty:
             self._status_dirty = False
-            for line in self._buses:
-                line.exchange.refresh_status()
+            for drive_bus in self._buses:
+                drive_bus.exchange.refresh_status()
 
     def __enter__(self) -> Self:
         """Boot the drives: boot-up message, pre-operational, heartbeat."""
-        for line in self._buses:
-            line.boot()
+        for drive_bus in self._buses:
+            drive_bus.boot()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Stop the drives and release their buses."""
-        for line in self._buses:
-            line.close()
+        for drive_bus in self._buses:
+            drive_bus.close()
 
     def run(self, stopped: Callable[[], bool], duration: float | None = None) -> ServerReport:
         """Answer every SYNC.
@@ -178,15 +178,15 @@ class Server:
         self._cpu += time.process_time() - cpu
         return self.report()
 
-    def _serve_one(self, line: DriveBus, over: Callable[[], bool]) -> None:
-        stamps, exchange, bus = line.batch["t_ns"], line.exchange, line.bus
+    def _serve_one(self, drive_bus: DriveBus, over: Callable[[], bool]) -> None:
+        stamps, exchange, bus = drive_bus.batch["t_ns"], drive_bus.exchange, drive_bus.bus
         outbox, queued = frames(BATCH, fd=bus.fd), 0
         while not over():
-            count = line.receive(wait=True)
-            self._catch_up()
+            count = drive_bus.receive(wait=True)
+            self._update_exchange()
             at = backlog = 0
             while at < count:
-                at = line.take(at, count, self._counter)
+                at = drive_bus.take(at, count, self._counter)
                 if at >= count:
                     break
                 answers = exchange.out.size
@@ -200,10 +200,10 @@ class Server:
                     bus.send(outbox[:queued])
                     queued = 0
                 if backlog or self._syncs % DELAY_SYNCS == 0:
-                    self._note(time.time_ns() - int(stamps[at]))
+                    self._record_delay(time.time_ns() - int(stamps[at]))
                 exchange.act()
                 # Drives that are behind apply commands at the same SYNC as those that are not.
-                self._catch_up()
+                self._update_exchange()
                 self._advance()
                 backlog += 1
                 at += 1
@@ -215,30 +215,30 @@ class Server:
     def _serve_several(self, over: Callable[[], bool]) -> None:
         """Answer SYNC k on every bus before the arm advances to k + 1."""
         poll = select.poll()
-        for line in self._buses:
-            assert isinstance(line.bus, RawSocket)
-            poll.register(line.bus.fileno(), select.POLLIN)
+        for drive_bus in self._buses:
+            assert isinstance(drive_bus.bus, RawSocket)
+            poll.register(drive_bus.bus.fileno(), select.POLLIN)
         half_turn_ns = round(self._session.sync_period * 1e9 * self._session.sync.counter / 2)
         since: float | None = None
         while not over():
-            due = [(line, line.next_sync()) for line in self._buses]
-            waiting = [(line, *sync) for line, sync in due if sync is not None]
-            missing = any(sync is None and not line.down for line, sync in due)
-            self._catch_up()
+            due = [(drive_bus, drive_bus.next_sync()) for drive_bus in self._buses]
+            waiting = [(drive_bus, *sync) for drive_bus, sync in due if sync is not None]
+            missing = any(sync is None and not drive_bus.down for drive_bus, sync in due)
+            self._update_exchange()
             if not waiting or (missing and (since is None or time.monotonic() - since < TOGETHER_S)):
                 since = (since or time.monotonic()) if waiting else None
-                for line in self._buses:
-                    line.flush()
+                for drive_bus in self._buses:
+                    drive_bus.flush()
                 poll.poll(1000 * (TOGETHER_S if waiting else RECEIVE_TIMEOUT))
                 continue
             since = None
             _, counter, stamp = min(waiting, key=lambda one: one[2])
-            for line, other, at in waiting:
+            for drive_bus, other, at in waiting:
                 # A bus that missed a SYNC is ahead of the others: its next one waits for theirs.
                 if other == counter and abs(at - stamp) < half_turn_ns:
-                    line.answer(counter or self._counter)
+                    drive_bus.answer(counter or self._counter)
             if self._syncs % DELAY_SYNCS == 0:
-                self._note(time.time_ns() - stamp)
+                self._record_delay(time.time_ns() - stamp)
             self._advance()
 
     @property
@@ -252,7 +252,7 @@ class Server:
         if self._syncs % SUPERVISION_SYNCS == 0:
             self._supervise()
 
-    def _note(self, late_ns: int) -> None:
+    def _record_delay(self, late_ns: int) -> None:
         late = max(late_ns // 1000, 0)
         self._histogram[min(late, DELAY_BINS)] += 1
         self._latest = max(self._latest, float(late))
@@ -262,17 +262,16 @@ class Server:
         for drive in self.drives:
             if drive.state is DriveState.ENABLED and error[drive.index] > self._limit[drive.index]:
                 drive.fault(EMCY_FOLLOWING_ERROR, MOTION_ERROR)
-        for index in [index for line in self._buses for index in line.exchange.take_short()]:
+        for index in [index for drive_bus in self._buses for index in drive_bus.exchange.take_short()]:
             next(d for d in self.drives if d.index == index).emcy.send(EMCY_PDO_LENGTH, COMMUNICATION_ERROR)
 
     def report(self) -> ServerReport:
         """Timing of the drives' answers so far."""
         counts = np.cumsum(self._histogram)
         p50, p99 = (float(np.searchsorted(counts, share * counts[-1])) for share in (0.5, 0.99))
-        return ServerReport(
-            self._syncs, p50, p99, self._latest, self._backlog, self._seconds,
-            self._cpu / self._seconds if self._seconds else 0.0, sum(line.bus.dropped for line in self._buses),
-        )  # fmt: skip
+        cpu_share = self._cpu / self._seconds if self._seconds else 0.0
+        dropped = sum(drive_bus.bus.dropped for drive_bus in self._buses)
+        return ServerReport(self._syncs, p50, p99, self._latest, self._backlog, self._seconds, cpu_share, dropped)
 
 
 def _following_limit(robot: RobotConfig) -> NDArray[np.float64]:

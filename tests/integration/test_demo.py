@@ -1,4 +1,4 @@
-"""The demo: real processes from beginning to end, and one clear line where one of them fails."""
+"""The demo: the real processes from beginning to end, and one clear line if one of them fails."""
 
 import re
 import subprocess
@@ -44,7 +44,7 @@ def test_processes_do_not_outlive_the_demo(tmp_path: Path) -> None:
 @pytest.mark.vcan
 @pytest.mark.slow
 @pytest.mark.timeout(LONGEST_S + 20)
-def test_the_first_chapter_ends_with_a_report_and_a_table(tmp_path: Path) -> None:
+def test_the_first_part_ends_with_a_table_the_next_commands_and_a_report_without_warnings(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "armident.daq.cli", "demo", "--quick", "--out", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -55,3 +55,8 @@ def test_the_first_chapter_ends_with_a_report_and_a_table(tmp_path: Path) -> Non
     assert len(distances) >= 20
     # Of some 25 parameters none may be further from the plant's own than five of its standard deviations.
     assert max(abs(d) for d in distances) < 5.0
+    assert "armident identify my_robot.mcap" in done.stdout
+    noise = [
+        line for line in done.stderr.splitlines() if re.search("warning|fontconfig|matplotlib", line, re.IGNORECASE)
+    ]
+    assert noise == []

@@ -40,7 +40,7 @@ def change_bodies(model: Any, hidden: Sequence[Hidden]) -> None:
             model.appendBodyToJoint(number, _ball(h["mass"], 0.1 * h["length"]), bob)
 
 
-def hanging(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) -> NDArray[np.float64]:
+def rest_angles(model: Any, hidden: Sequence[Hidden], q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rest angles of the swinging masses.
 
     Parameters
@@ -141,7 +141,7 @@ def tilted(gravity: NDArray[np.float64], tilt: float, azimuth: float) -> NDArray
     return out
 
 
-def shaking(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
+def base_vibrations(hidden: Sequence[Hidden], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
     """Vibrations of the base.
 
     Parameters

@@ -85,9 +85,9 @@ def bristle_table(
         for h in sorted((h for h in mine if h.joint == j), key=lambda h: h.effect):
             if coulomb <= 0.0:
                 raise ConfigError(f"{h.where}: {robot.joints[j].name} has no Coulomb friction to make a bristle of")
-            deflection, damping = h.given("deflection", deflection), max(damping, h["damping"])
+            deflection, damping = h.value_or("deflection", deflection), max(damping, h["damping"])
             if h.effect == "stribeck_friction":
-                extra, velocity, exponent = h["extra"], h.given("velocity", velocity), h["exponent"]
+                extra, velocity, exponent = h["extra"], h.value_or("velocity", velocity), h["exponent"]
         stiffness = coulomb / deflection
         critical = 2.0 * math.sqrt(stiffness * inertia[j])
         rows.append(np.array([j, coulomb, extra, velocity, exponent, stiffness, damping * critical]))

@@ -126,9 +126,9 @@ def _row(h: Hidden, robot: RobotConfig, fv: float, fc: float) -> tuple[float, ..
             return (h["ratio"] * fv,)
         case "asymmetric_coulomb_friction":
             # tanh^2 reaches three quarters at 1.317.
-            return h["ratio"] * fc, h.given("velocity", 0.01 * joint.limits.velocity) / math.atanh(math.sqrt(0.75))
+            return h["ratio"] * fc, h.value_or("velocity", 0.01 * joint.limits.velocity) / math.atanh(math.sqrt(0.75))
         case "nonlinear_viscous_friction":
-            speed = h.given("velocity", 0.5 * joint.limits.velocity)
+            speed = h.value_or("velocity", 0.5 * joint.limits.velocity)
             return fv, speed * (1.0 / h["thinning"] - 1.0) ** (1.0 / h["exponent"]), h["exponent"]
         case "load_dependent_friction":
             return (h["coefficient"],)
@@ -147,7 +147,7 @@ def _row(h: Hidden, robot: RobotConfig, fv: float, fc: float) -> tuple[float, ..
             return (h["factor"] - 1.0) * fv, (h["factor"] - 1.0) * fc
         case "torque_bump":
             low, high = joint.limits.position
-            return h["torque"], h["position"], h.given("width", 0.02 * (high - low))
+            return h["torque"], h["position"], h.value_or("width", 0.02 * (high - low))
         case "stick_events":
             return h["torque"], h["every"], h["duration"], h["seed"]
         case _:
@@ -165,6 +165,6 @@ def waves(h: Hidden, joint: Joint) -> float:
         Its joint.
     """
     if joint.type == "revolute":
-        return h.given("per_turn", 1.0)
+        return h.value_or("per_turn", 1.0)
     low, high = joint.limits.position
-    return 2.0 * math.pi * h.given("per_turn", 2.0 / (high - low))
+    return 2.0 * math.pi * h.value_or("per_turn", 2.0 / (high - low))

@@ -104,7 +104,7 @@ def gear_rows(
         entries = {h.effect: h for h in mine if h.joint == j}
         first = next(iter(entries.values()))
         own, total = float(rotor[j, j]), float(rotor[j, j] + mass[j, j])
-        motor = first.given("motor_inertia", own if own > 0.0 else MOTOR_SHARE * total)
+        motor = first.value_or("motor_inertia", own if own > 0.0 else MOTOR_SHARE * total)
         if motor >= total:
             raise ConfigError(
                 f"{first.where}.parameters.motor_inertia: expected less than the {total:.4g} of "
@@ -115,7 +115,7 @@ def gear_rows(
         if elastic is not None:
             stiffness = elastic["stiffness"]
         else:
-            stiffness = first.given("stiffness", reduced * (2.0 * math.pi * CONTACT_HZ) ** 2)
+            stiffness = first.value_or("stiffness", reduced * (2.0 * math.pi * CONTACT_HZ) ** 2)
         damping = first["damping"] * 2.0 * math.sqrt(stiffness * reduced)
         play = 0.0 if gap is None else gap["gap"]
         rows.append([j, robot.n + e, stiffness, damping, play, ROUNDING * play])

@@ -41,7 +41,7 @@ class Hidden:
     def __getitem__(self, name: str) -> float:
         return self.values[name]
 
-    def given(self, name: str, otherwise: float) -> float:
+    def value_or(self, name: str, otherwise: float) -> float:
         """Value of a parameter, or a default derived from the robot.
 
         Parameters

@@ -127,7 +127,7 @@ class Signals:
             if h.effect == "drive_gain_error":
                 self._level[h.joint] += h["error"]
             elif h.effect == "drive_gain_saturation":
-                torque = h.given("torque", 0.5 * robot.joints[h.joint].limits.torque)
+                torque = h.value_or("torque", 0.5 * robot.joints[h.joint].limits.torque)
                 signal = abs(torque / joint_gain[h.joint])
                 self._knee[h.joint] = signal / math.sqrt((1.0 - h["drop"]) ** -2 - 1.0)
             elif h.effect == "actuator_bandwidth":
@@ -246,7 +246,7 @@ def _encoder(h: Hidden, robot: RobotConfig) -> Vector:
     if h["motor"] <= 0.5:
         wave[h.joint] = waves(h, joint)
     elif joint.type == "revolute":
-        wave = h.given("per_turn", 1.0) * robot.transmission_matrix[h.joint]
+        wave = h.value_or("per_turn", 1.0) * robot.transmission_matrix[h.joint]
     else:
-        wave[h.joint] = 2.0 * math.pi * h.given("per_turn", 1.0) / h["pitch"]
+        wave[h.joint] = 2.0 * math.pi * h.value_or("per_turn", 1.0) / h["pitch"]
     return np.concatenate([[h.joint, h["amplitude"], h["phase"]], wave])
