@@ -171,10 +171,10 @@ def diagnosis_table(document: DiagnosisDocument) -> None:
                 f"{k} {v:.4g}" + (f" ± {std[k]:.2g}" if k in std else "") for k, v in f.parameters.items()
             )
             where = f.joint if f.other is None else f"{f.joint}, {f.other}"
-            gap = f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
+            closed = f"{f.gap_before:.2f} % → {f.gap_after:.2f} %"
             if f.gap_without_derivative_noise is not None:
-                gap += f" ({f.gap_without_derivative_noise:.2f} % without derivative noise)"
-            table.add_row(where, f.effect, values, f"{100 * f.confidence:.0f} %", gap)
+                closed += f" ({f.gap_without_derivative_noise:.2f} % without derivative noise)"
+            table.add_row(where, f.effect, values, f"{100 * f.confidence:.0f} %", closed)
         console.print(table)
         for f in document.findings:
             rivals = f.evidence.get("ambiguous_with", [])

@@ -1,4 +1,4 @@
-"""Has an arm changed since its baseline: two identifications beside each other, with their covariances."""
+"""Chi-square test of parameter change between two identifications of an arm."""
 
 import re
 from collections.abc import Sequence
@@ -16,42 +16,42 @@ from armident.identify.regression.multiple_testing import holm
 Array = NDArray[np.float64]
 
 FALSE_ALARMS = 1e-4
-"""Chance of an alarm without a change, per comparison: one in 200 years of weekly runs."""
+"""Probability of a false alarm per comparison: one in 200 years of weekly runs."""
 
 RANK_TOLERANCE = 1e-9
-"""Eigenvalues of the correlation of the difference, relative to the greatest, that count as rounding."""
+"""Eigenvalues of the difference's correlation, relative to the largest, that count as rounding errors."""
 
 
 MUCH_WORSE = 10.0
-"""An identification whose deviations are so many times those of the other (median) can neither confirm nor deny."""
+"""Median ratio of standard deviations of the two identifications from which the test is inconclusive."""
 
 
 class Inconclusive(DataError):
-    """An identification that can neither confirm nor deny a change."""
+    """Two identifications cannot confirm or exclude a change."""
 
 
 FRICTION = ("fv", "fc", "off")
-"""Parameters that make up the friction of a joint, or of a shaft that two joints share; the rest is of its masses."""
+"""Kinds of friction parameters of a joint or of a coupling; the others belong to its masses."""
 
 _NAME = re.compile(r"([a-z]+?)(m?\d+)r?(?:_\d+)?$")
 
 
 @dataclass(frozen=True)
 class Group:
-    """Parameters of one place that change together, and that the data may tell apart badly.
+    """Parameters of one joint or coupling, tested together because their estimates are correlated.
 
     Parameters
     ----------
     kind
         ``friction`` or ``masses``.
     place
-        What their names end in: the number of the joint, or the name of a coupling.
+        End of their names: number of the joint, or name of the coupling.
     members
         Their names.
     chi_square, degrees
-        Of their differences, with all other parameters free.
+        Chi-square statistic of their differences with all other parameters free, and its degrees of freedom.
     p_value
-        That an unchanged arm differs so much in them, as in `ParameterChangeTest`.
+        Probability of such a statistic without a change, corrected as in `ParameterChangeTest`.
     """
 
     kind: Literal["friction", "masses"]
@@ -64,7 +64,7 @@ class Group:
 
 @dataclass(frozen=True)
 class ParameterChangeTest:
-    """Differences of the parameters of two identifications.
+    """Result of the test: differences of the parameters of two identifications.
 
     Parameters
     ----------
@@ -78,10 +78,10 @@ class ParameterChangeTest:
     chi_square, degrees, p_joint
         ``d' C^-1 d`` with the covariance C of the difference, its degrees of freedom, and the chance of one so large.
     false_alarms
-        What was allowed; half of it goes to the joint test and half to those of single parameters and groups.
+        False-alarm rate; one half is for the joint test, the other for single parameters and groups.
     groups
-        The friction of each joint, and its masses: viscous and Coulomb friction are hard to tell apart, so that each
-        of them may have changed beyond doubt together and neither alone.
+        Friction and masses of each joint: viscous and Coulomb friction are correlated, so that a change may be
+        significant in both together and in neither alone.
     """
 
     parameters: tuple[Parameter, ...]
@@ -97,24 +97,24 @@ class ParameterChangeTest:
 
     @property
     def changed(self) -> tuple[str, ...]:
-        """Parameters that changed by themselves, the clearest first."""
+        """Names of the parameters with a significant change, the most significant first."""
         order = np.argsort(self.p_values, kind="stable")
         return tuple(self.parameters[k].name for k in order if self.p_values[k] < self.false_alarms / 2)
 
     @property
     def changed_groups(self) -> tuple[Group, ...]:
-        """Groups that changed, the clearest first."""
+        """Groups with a significant change, the most significant first."""
         clear = [group for group in self.groups if group.p_value < self.false_alarms / 2]
         return tuple(sorted(clear, key=lambda group: group.p_value))
 
     @property
     def drifted(self) -> bool:
-        """Whether the arm has changed: in single parameters, in groups, or in all together."""
+        """True if a single parameter, a group, or all parameters together changed significantly."""
         return bool(self.changed or self.changed_groups) or self.p_joint < self.false_alarms / 2
 
     @property
     def entry(self) -> dict[str, object]:
-        """The verdict as a part of a document."""
+        """Result as a part of a document."""
         return {
             "drifted": self.drifted,
             "changed": list(self.changed),
@@ -126,7 +126,7 @@ class ParameterChangeTest:
 
     @property
     def words(self) -> str:
-        """The verdict in a sentence."""
+        """Result in one sentence."""
         if not self.drifted:
             return f"no change (chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom)"
         by_name = {p.name: k for k, p in enumerate(self.parameters)}
@@ -139,31 +139,36 @@ class ParameterChangeTest:
         for group in self.changed_groups:
             if not known & set(group.members):
                 parts.append(f"{group.kind} {group.place} ({', '.join(group.members)} together)")
-        what = ", ".join(parts) or "no single parameter clearly"
+        what = ", ".join(parts) or "no single parameter significantly"
         return f"changed: {what} (chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom)"
 
 
 def compare(
     baseline: IdentificationDocument, now: IdentificationDocument, false_alarms: float = FALSE_ALARMS
 ) -> ParameterChangeTest:
-    """Test whether two identifications can be of the same arm.
+    """Test two identifications of an arm for a change of its parameters.
 
-    The runs are independent, so the covariance of the difference is the sum of both. All base parameters count: those
-    that are not essential weigh by their large deviations.
+    The runs are independent, so the covariance of the difference is the sum of both. All base parameters are tested;
+    those that are not essential have little weight due to their large standard deviations.
 
     Parameters
     ----------
     baseline, now
         Two identifications of one robot with the same model.
     false_alarms
-        Chance of a verdict "changed" without a change.
+        Probability of the result "changed" without a change.
+
+    Returns
+    -------
+    ParameterChangeTest
+        Differences, p-values corrected by Holm's method, and the joint test.
 
     Raises
     ------
     DataError
         If they are of different robots or models.
     Inconclusive
-        If one of them says nothing: it did not converge, or is far less precise than the other.
+        If one of them did not converge, or is far less precise than the other.
     """
     for name, document in (("the baseline", baseline), ("the identification", now)):
         if not document.converged:
@@ -176,7 +181,7 @@ def compare(
     new = {p.name: k for k, p in enumerate(now.parameters)}
     if old.keys() != new.keys():
         odd = ", ".join(sorted(old.keys() ^ new.keys())[:5])
-        raise DataError(f"{now.robot}: baseline and identification have other base parameters: {odd}")
+        raise DataError(f"{now.robot}: baseline and identification have different base parameters: {odd}")
     order = [old[p.name] for p in now.parameters]
     before = np.array([baseline.parameters[k].value for k in order])
     difference = np.array([p.value for p in now.parameters]) - before
@@ -216,7 +221,7 @@ def compare(
 
 
 def _chi_square(difference: Array, covariance: Array) -> tuple[float, int]:
-    """``d' C^-1 d`` and its degrees of freedom, rounding left out."""
+    """Return ``d' C^-1 d`` and its degrees of freedom, without eigenvalues of rounding size."""
     std = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
     kept = values > RANK_TOLERANCE * values[-1]
@@ -224,7 +229,7 @@ def _chi_square(difference: Array, covariance: Array) -> tuple[float, int]:
 
 
 def _places(names: Sequence[str]) -> dict[tuple[Literal["friction", "masses"], str], list[int]]:
-    """Which parameters make up a group of at least two."""
+    """Return the parameter indices of every group of at least two."""
     found: dict[tuple[Literal["friction", "masses"], str], list[int]] = {}
     for k, name in enumerate(names):
         match = _NAME.match(name)

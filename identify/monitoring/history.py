@@ -1,4 +1,4 @@
-"""What was identified so far, in a database: SQLite in a file, or any other that SQLAlchemy reaches by URL."""
+"""Database of identifications: a SQLite file, or any other database that SQLAlchemy supports."""
 
 import datetime
 import hashlib
@@ -16,6 +16,7 @@ from armident.identify.document import IdentificationDocument, from_json, to_jso
 from armident.identify.monitoring.change_test import ParameterChangeTest
 
 DEFAULT = "sqlite:///history.sqlite"
+"""SQLAlchemy URL of the default database."""
 _STAMP = re.compile(r"(\d{8}T\d{6})-\d{3}Z")
 
 _tables = sa.MetaData()
@@ -73,7 +74,7 @@ _comparisons = sa.Table(
 
 @dataclass(frozen=True)
 class Run:
-    """An identification in the history, and when its recording was made (UTC)."""
+    """An identification in the history; ``recorded`` is the time of its recording (UTC)."""
 
     number: int
     recorded: datetime.datetime
@@ -81,12 +82,12 @@ class Run:
 
 
 class History:
-    """Identifications in a database; its tables are made where they are missing.
+    """Identifications in a database; missing tables are created.
 
     Parameters
     ----------
     url
-        As SQLAlchemy understands it: ``sqlite:///history.sqlite``, ``postgresql://USER:PASSWORD@HOST/NAME``.
+        SQLAlchemy URL, for example ``sqlite:///history.sqlite``, ``postgresql://USER:PASSWORD@HOST/NAME``.
 
     Raises
     ------
@@ -104,14 +105,24 @@ class History:
             raise ConfigError(f"{_shown(url)}: cannot be used as history: {_one_line(error)}{hint}") from error
 
     def add(self, document: IdentificationDocument, recorded: datetime.datetime) -> bool:
-        """Keep an identification; whether it is new, since the same one is kept once.
+        """Add an identification.
 
         Parameters
         ----------
         document
             The result.
         recorded
-            When its recording was made; see :func:`recorded_at`.
+            Time of its recording; see `recorded_at`.
+
+        Returns
+        -------
+        bool
+            False if the history already has it.
+
+        Raises
+        ------
+        ConfigError
+            If the database cannot be written.
         """
         text = to_json(document)
         digest = _digest(document)
@@ -153,7 +164,7 @@ class History:
 
     @staticmethod
     def facts(recording: Recording) -> dict[str, Any]:
-        """What is known of a recording beside its samples, for `describe`."""
+        """Return the metadata of a recording, for `describe`."""
         return {
             "sha256": recording.sha256,
             "path": None if recording.path is None else str(recording.path),
@@ -166,18 +177,36 @@ class History:
 
     @staticmethod
     def began(facts: Mapping[str, Any], document: IdentificationDocument, file: Path) -> datetime.datetime:
-        """When a recording was begun: what it says itself, else by its name or the time of the result's file."""
-        said = facts["facts"].get("started_utc")
-        return recorded_at(document, file) if said is None else datetime.datetime.fromisoformat(said)
+        """Return the start of a recording.
+
+        Parameters
+        ----------
+        facts
+            Metadata of the recording; its start is there unless it was imported.
+        document, file
+            Identification and its file, otherwise see `recorded_at`.
+        """
+        started = facts["facts"].get("started_utc")
+        return recorded_at(document, file) if started is None else datetime.datetime.fromisoformat(started)
 
     def describe(self, facts: Mapping[str, Any]) -> None:
-        """Keep what is known of a recording; once."""
+        """Add the metadata of a recording unless the history has them."""
         self._insert_once(_recordings, facts)
 
     def judge(
         self, document: IdentificationDocument, baseline: IdentificationDocument, drift: ParameterChangeTest
     ) -> None:
-        """Keep what came of the comparison of an identification, added before, with a baseline."""
+        """Add the result of a comparison.
+
+        Parameters
+        ----------
+        document
+            Identification, added before.
+        baseline
+            Identification that it was compared with.
+        drift
+            Result of the test.
+        """
         number = sa.select(_runs.c.id).where(_runs.c.digest == _digest(document)).scalar_subquery()
         row = {
             "identification": number,
@@ -202,32 +231,32 @@ class History:
             raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
 
     def first(self, robot: str, cell: str | None = None) -> Run | None:
-        """The identification of an arm whose recording is the oldest, of those that converged; see `runs`."""
+        """Return the oldest converged identification of an arm, or ``None``; arguments as in `runs`."""
         found = self._read(_of(robot, cell).where(_runs.c.converged).limit(1))
         return found[0] if found else None
 
     def runs(self, robot: str | None = None, cell: str | None = None) -> list[Run]:
-        """Identifications in the order in which their recordings were made.
+        """Return identifications in the order of their recordings.
 
         Parameters
         ----------
         robot
             Name of the robot; ``None``: all.
         cell
-            Where it stands, as arms of one make often share a name; ``None``: anywhere. Runs of which the history
-            does not know the recording, and so the cell, may be of any.
+            Cell of the robot, as arms of one type often share a name; ``None``: all. Runs whose cell the history does
+            not know are included.
         """
         return self._read(_of(robot, cell))
 
     def arms(self) -> list[tuple[str, str | None]]:
-        """Robots and their cells, ``None`` where the history does not know them."""
+        """Return robots and their cells; ``None`` for an unknown cell."""
         query = sa.select(_runs.c.robot, _recordings.c.cell).select_from(_WHERE).distinct()
         with self._engine.connect() as connection:
             found = [(robot, cell) for robot, cell in connection.execute(query).all()]
         return sorted(found, key=lambda arm: (arm[0], arm[1] or ""))
 
     def cell(self, document: IdentificationDocument) -> str | None:
-        """Cell of an identification's recording, if the history knows it."""
+        """Return the cell of an identification's recording, ``None`` if the history does not know it."""
         query = sa.select(_recordings.c.cell).where(_recordings.c.sha256 == document.recording.sha256)
         with self._engine.connect() as connection:
             return connection.execute(query).scalar_one_or_none()
@@ -248,7 +277,7 @@ _WHERE = _runs.outerjoin(_recordings, _runs.c.sha256 == _recordings.c.sha256)
 
 
 def _of(robot: str | None, cell: str | None) -> sa.Select[Any]:
-    """Runs of an arm in the order of their recordings."""
+    """Return the query of the runs of an arm in the order of their recordings."""
     query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document).select_from(_WHERE)
     if robot is not None:
         query = query.where(_runs.c.robot == robot)
@@ -262,7 +291,7 @@ def _digest(document: IdentificationDocument) -> str:
 
 
 def recorded_at(document: IdentificationDocument, file: Path) -> datetime.datetime:
-    """When a recording was made: by the time in its name, or else by that of the result's file."""
+    """Return the time of a recording: from its name, otherwise that of the result's file."""
     found = _STAMP.search(document.recording.path or "")
     if found is not None:
         return datetime.datetime.strptime(found[1] + "+0000", "%Y%m%dT%H%M%S%z")
@@ -270,12 +299,12 @@ def recorded_at(document: IdentificationDocument, file: Path) -> datetime.dateti
 
 
 def _driven(url: str) -> str:
-    """The URL with the driver that our extra installs, where it names none."""
+    """Return the URL with the driver of the extra ``postgresql`` unless it names one."""
     return re.sub(r"^postgres(ql)?://", "postgresql+psycopg://", url)
 
 
 def _shown(url: str) -> str:
-    """The URL without a password in it."""
+    """Return the URL with its password masked."""
     return re.sub(r"(://[^:/@]*):[^@]*@", r"\1:***@", url)
 
 

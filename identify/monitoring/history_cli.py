@@ -1,4 +1,4 @@
-"""``armident history``: what was identified so far, whether the arm has changed, and how its parameters went."""
+"""Command ``armident history``: list identifications, test for change, plot parameters over time."""
 
 import json
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from armident.identify.monitoring.change_test import Inconclusive, ParameterChan
 from armident.identify.monitoring.history import History, Run, recorded_at
 
 DRIFTED = 4
-"""Exit code: done, and the last run is of a changed arm."""
+"""Exit code: done, and the last run differs significantly from the first."""
 
 
 def history_command(
@@ -26,14 +26,36 @@ def history_command(
     *,
     as_json: bool,
 ) -> int:
-    """Add documents, list the runs of an arm beside its first one, plot parameters; the exit code.
+    """Carry out ``armident history``: add documents, compare runs with the first one, plot parameters.
+
+    Parameters
+    ----------
+    documents
+        ``identification.json`` files to add.
+    database
+        SQLAlchemy URL.
+    robot, cell
+        Arm to list; ``None``: that of the documents, or the only one.
+    parameters
+        Names of parameters to show.
+    plot
+        File of a plot over time, or ``None``.
+    false_alarms
+        Probability of a false alarm per run.
+    as_json
+        Print JSON instead of a table.
+
+    Returns
+    -------
+    int
+        Exit code: 0, or `DRIFTED`.
 
     Raises
     ------
     ConfigError
         If the database, robot, cell, a parameter or the plot is wrong.
     DataError
-        If a document is, or the runs are of different models.
+        If a document is wrong, or the runs are of different models.
     """
     loaded = [(load_document(path, IdentificationDocument), path) for path in documents]
     history = History(database)
@@ -70,12 +92,12 @@ def _robot(history: History, wanted: str | None, added: Sequence[str]) -> str:
         names = set(known)
     if len(names) != 1 or not names <= set(known):
         have = ", ".join(known) or "none yet"
-        raise ConfigError(f"--robot: say which of the robots in the history: {have}")
+        raise ConfigError(f"--robot: choose one of the robots in the history: {have}")
     return names.pop()
 
 
 def _cell(history: History, robot: str, wanted: str | None, added: Sequence[IdentificationDocument]) -> str | None:
-    """Cell of the arm that is meant; ``None`` where the history knows none of its robots' cells."""
+    """Return the cell of the arm; ``None`` if the history knows no cell of this robot."""
     known = sorted({cell for name, cell in history.arms() if name == robot and cell is not None})
     if wanted is not None:
         if wanted not in known:
@@ -83,7 +105,7 @@ def _cell(history: History, robot: str, wanted: str | None, added: Sequence[Iden
         return wanted
     cells = {cell for cell in map(history.cell, added) if cell is not None} or set(known)
     if len(cells) > 1:
-        raise ConfigError(f"--cell: say in which cell; {robot} is known in {', '.join(known)}")
+        raise ConfigError(f"--cell: choose a cell; {robot} is known in {', '.join(known)}")
     return cells.pop() if cells else None
 
 
@@ -95,7 +117,7 @@ def _check(parameters: Sequence[str], runs: Sequence[Run]) -> None:
 
 
 def _most_changed(drifts: Sequence[ParameterChangeTest | None], runs: Sequence[Run], most: int = 6) -> list[str]:
-    """Parameters that are farthest from the first run in any later one, in deviations."""
+    """Return the parameters with the largest difference from the first run, in standard deviations."""
     names = [p.name for p in runs[0].document.parameters if p.essential]
     compared = [drift for drift in drifts if drift is not None]
     if not compared:
@@ -127,8 +149,8 @@ def _table(
     from rich.table import Table
 
     table = Table(title=title)
-    for heading in ("recorded (UTC)", "recording", "error", *parameters, "beside the first"):
-        table.add_column(heading, justify="left" if heading in ("recording", "beside the first") else "right")
+    for heading in ("recorded (UTC)", "recording", "error", *parameters, "compared with the first"):
+        table.add_column(heading, justify="left" if heading in ("recording", "compared with the first") else "right")
     first = next((run for run in runs if run.document.converged), None)
     for run, drift in zip(runs, drifts, strict=True):
         values = {p.name: f"{p.value:.4g} +- {p.std:.1g}" for p in run.document.parameters}
@@ -137,13 +159,13 @@ def _table(
             Path(run.document.recording.path or "-").name,
             f"{run.document.relative_error_pct:.2f} %",
             *(values[name] for name in parameters),
-            drift.words if drift is not None else "baseline" if run is first else "says nothing",
+            drift.words if drift is not None else "baseline" if run is first else "inconclusive",
         )
     Console().print(table)
 
 
 def _plot(path: Path, title: str, runs: Sequence[Run], parameters: Sequence[str]) -> None:
-    """One row a parameter, against the time of the recordings, with two standard deviations."""
+    """Plot parameters over the time of the recordings, one row each, with two standard deviations."""
     import matplotlib.pyplot as plt
 
     if path.suffix not in {".png", ".svg", ".pdf"}:

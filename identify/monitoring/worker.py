@@ -1,4 +1,4 @@
-"""The identification worker: from the samples and events on Zenoh to a published result."""
+"""Identification worker: identifies every experiment from the samples and events on Zenoh, publishes the result."""
 
 import json
 import math
@@ -25,29 +25,25 @@ from armident.identify.identification.options import Options
 from armident.identify.report.files import write_identification
 
 MAX_WAITING_S = 10.0
-"""How long after its end event an experiment waits for blocks that are still on their way."""
+"""Longest wait for missing blocks after the end event of an experiment, s."""
 MOST_BYTES = 1 << 30
-"""Of samples that wait in memory for the end of their capture, an hour of six axes at 5 kHz: a longer one is read from
-its file."""
+"""Most bytes of samples in memory, an hour of six axes at 5 kHz; a longer capture is read from its file."""
 HISTORY_BLOCKS = 100_000
-"""How much a late worker asks the capture's cache for: all there is."""
+"""Blocks that a worker requests from the capture's cache when it starts: all of it."""
 
 
 @dataclass
 class Assembly:
-    """One capture as it comes in, events and blocks in any order.
-
-    ``add`` takes blocks, ``complete`` says whether nothing more needs waiting for, ``recording`` is the result.
+    """Events and blocks of one capture, in any order of arrival.
 
     Parameters
     ----------
     capture
-        Its name.
+        Name of the capture.
     start, end
-        Its events.
+        Start and end event, when received.
     most_bytes
-        Samples in memory from which on none are kept: what a capture that goes on for months sends, or somebody who
-        pretends to be one.
+        Most bytes of samples in memory; above it no block is kept (captures of months, or a malicious sender).
     """
 
     capture: str
@@ -60,7 +56,7 @@ class Assembly:
     _bytes: int = 0
 
     def add(self, block: Block) -> None:
-        """Keep a block, unless there are too many."""
+        """Store a block, unless the memory limit is exceeded."""
         self.last_ns = max(self.last_ns, int(block.t_ns[-1])) if block.t_ns.size else self.last_ns
         if self.too_long or block.sequence in self.blocks:
             return
@@ -72,22 +68,24 @@ class Assembly:
 
     @property
     def complete(self) -> bool:
-        """Whether both events and every block have arrived, or need not."""
+        """True if both events and all blocks have arrived, or the samples will be read from the file."""
         if self.start is None or self.end is None:
             return False
         return self.too_long or len(self.blocks) >= int(self.end["blocks"])
 
     def recording(self) -> Recording:
-        """Return the recording from the stream, or from its file where the stream lacks blocks.
+        """Return the recording from the stream, or from its file if blocks are missing.
 
         Raises
         ------
         DataError
-            If blocks are missing and the file cannot be reached; says how many.
+            If blocks are missing and the file cannot be read.
         """
         if self.start is None or self.end is None:
-            raise DataError(f"capture {self.capture}: its {'start' if self.start is None else 'end'} was never heard")
-        missing: str | None = "it is too long to be kept in memory"
+            raise DataError(
+                f"capture {self.capture}: its {'start' if self.start is None else 'end'} event was not received"
+            )
+        missing: str | None = "the capture exceeds the memory limit"
         if not self.too_long:
             recording = assemble(self.start, self.blocks.values(), self.end)
             missing = recording.missing
@@ -102,7 +100,7 @@ class Assembly:
 
 
 class Worker:
-    """Listens to one robot of one cell and identifies every experiment in a thread of its own.
+    """Subscribes to one robot of one cell and identifies every experiment in a separate thread.
 
     Parameters
     ----------
@@ -111,7 +109,7 @@ class Worker:
     robot
         Configuration of its robot.
     out
-        Folder for the results; each capture gets a folder of its own.
+        Folder of the results; each capture has a subfolder.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig, out: Path) -> None:
@@ -133,7 +131,7 @@ class Worker:
         self._thread = threading.Thread(target=self._identify_all, name="identify", daemon=True)
 
     def __enter__(self) -> "Worker":
-        """Subscribe, answer queries, and say that the worker is alive."""
+        """Subscribe, answer queries, and declare the liveliness token."""
         self._thread.start()
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=HISTORY_BLOCKS)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
@@ -149,7 +147,7 @@ class Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the bus; an identification under way is abandoned."""
+        """Close the session; a running identification is abandoned."""
         if self._timer is not None:
             self._timer.cancel()
         self._ready.put(None)
@@ -157,7 +155,7 @@ class Worker:
         self._session.close()
 
     def result(self, timeout: float | None = None) -> int | None:
-        """Wait for the exit code of the next experiment; ``None`` if ``timeout`` (s) runs out."""
+        """Wait for the exit code of the next experiment; ``None`` after ``timeout``, s."""
         try:
             return self._results.get(timeout=timeout)
         except queue.Empty:
@@ -200,7 +198,7 @@ class Worker:
             self._hand_over_if_complete()
 
     def _refuse(self, error: DataError) -> None:
-        """Say that something else than samples or events came, and the tenth and hundredth time how often."""
+        """Report an invalid message: the first one, the tenth, the hundredth, and so on."""
         self._refused += 1
         if math.log10(self._refused).is_integer():
             times = f" ({self._refused} times)" if self._refused > 1 else ""
@@ -226,7 +224,7 @@ class Worker:
             self._timer.cancel()
             self._timer = None
         self._done.add(assembly.capture)
-        # A straggler of this capture must not be taken for a block of the next: blocks carry times, not names.
+        # Blocks carry times, not names: a late one must not count for the next capture.
         self._finished_ns = assembly.last_ns
         self._current = None
         self._ready.put(assembly)
@@ -247,7 +245,7 @@ class Worker:
                 print(f"armident: {error}", file=sys.stderr, flush=True)
                 self._status("failed", capture=assembly.capture, message=str(error))
             except Exception as error:
-                # A worker that dies of one experiment would miss the next.
+                # The worker must survive any failure of one experiment.
                 print(f"armident: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
                 self._status("failed", capture=assembly.capture, message=f"{type(error).__name__}: {error}")
             self._results.put(code)
@@ -280,7 +278,21 @@ class Worker:
 
 
 def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
-    """Carry out ``armident worker`` until it is told to stop; returns the exit code.
+    """Carry out ``armident worker`` until SIGTERM or SIGINT.
+
+    Parameters
+    ----------
+    config
+        Session configuration.
+    once
+        End after one experiment with its exit code.
+    out
+        Folder of the results; ``None``: the recording directory of the session.
+
+    Returns
+    -------
+    int
+        Exit code.
 
     Raises
     ------

@@ -69,7 +69,7 @@ def test_an_arm_is_the_same_and_then_it_is_worn(vcan_bus: str, tmp_path: Path) -
     config = cell_file(tmp_path, vcan_bus, "weekly", sync={"period_us": 1000})
     with arm(config, "--seed", "1"):
         first, err = finished(job(config, tmp_path), 0)
-        assert "first run of tx40: it is the baseline from now on" in first["words"]
+        assert "first run of tx40: it is now the baseline" in first["words"]
         assert first["drift"] is None
         second, _ = finished(job(config, tmp_path), 0)
     assert second["drift"]["drifted"] is False

@@ -27,7 +27,7 @@ import numpy as np
 import yaml
 
 from armident.configs import ArmidentError, config_path
-from armident.identify.monitoring.reidentify.record_run import play
+from armident.identify.monitoring.reidentify.record_run import record_run
 
 PERIOD_US = 2000
 """SYNC period: six axes on a bus of a guest with one CPU, beside guard, capture and arm."""
@@ -139,7 +139,7 @@ def lane(number: int, out: Path, runs: Sequence[int], scenario: Path | None, nam
         for run in runs:
             begin, said = time.monotonic(), list[str]()
             try:
-                recording = play(config, out / f"lane{number}", said.append, start_forked)
+                recording = record_run(config, out / f"lane{number}", said.append, start_forked)
             except ArmidentError as error:
                 print(f"{name} {run}: {error}", flush=True)
                 continue

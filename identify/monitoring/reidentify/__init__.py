@@ -1,1 +1,1 @@
-"""The scheduled job: excite an arm, record it, identify it, and say whether it has changed since its baseline."""
+"""Scheduled re-identification: excite, record, identify, and test for change since the baseline."""

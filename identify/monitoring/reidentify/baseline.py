@@ -1,4 +1,4 @@
-"""What an arm is compared with: a file, or the first run of it that the history knows."""
+"""Baseline of an arm: a file, or its first run in the history."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,27 +10,36 @@ from armident.identify.monitoring.history import History
 
 @dataclass(frozen=True)
 class Baseline:
-    """A baseline and how it is called; without ``document`` the run to come is to be it, as ``file`` if given."""
+    """Baseline with its name; without ``document`` the next run becomes the baseline, saved as ``file`` if given."""
 
     document: IdentificationDocument | None
     name: str
     file: Path | None = None
 
     def become(self, document: IdentificationDocument) -> str:
-        """Make a run the baseline; what was done, in words."""
+        """Make a run the baseline and return a message that says so."""
         if self.file is None:
-            return f"first run of {document.robot}: it is the baseline from now on"
+            return f"first run of {document.robot}: it is now the baseline"
         write_atomically(self.file, to_json(document))
-        return f"first run of {document.robot}: it is the baseline from now on, kept as {self.file}"
+        return f"first run of {document.robot}: it is now the baseline, saved as {self.file}"
 
 
 def baseline_of(file: Path | None, history: History, robot: str, cell: str) -> Baseline:
-    """The baseline of the robot in a cell.
+    """Return the baseline of the robot in a cell.
+
+    Parameters
+    ----------
+    file
+        Baseline given by the user; ``None``: the first run in the history.
+    history
+        Database of identifications.
+    robot, cell
+        Names of robot and cell.
 
     Raises
     ------
     ConfigError
-        If ``file`` is missing although the history knows runs of this arm: a name misspelt, and not a first run.
+        If ``file`` is missing although the history has runs of this arm: probably a misspelt name.
     DataError
         If it is of another robot.
     """

@@ -1,4 +1,4 @@
-"""The command ``armident reidentify``."""
+"""Command ``armident reidentify``."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +11,7 @@ from armident.identify.monitoring.reidentify.options import ReidentifyOptions
 def reidentify(
     config: Annotated[
         Path | None,
-        typer.Option("--config", help="Session configuration; with --recordings a robot configuration, if any."),
+        typer.Option("--config", help="Session configuration; with --recordings an optional robot configuration."),
     ] = None,
     baseline: Annotated[
         Path | None,
@@ -21,27 +21,25 @@ def reidentify(
         str, typer.Option(help="SQLAlchemy URL of the history.", envvar="ARMIDENT_HISTORY")
     ] = "sqlite:///history.sqlite",
     out: Annotated[
-        Path | None, typer.Option(help="Folder of recordings and results. [default: the session's, or RECORDING's]")
+        Path | None, typer.Option(help="Folder of recordings and results. [default: that of the session or recording]")
     ] = None,
     false_alarms: Annotated[
-        float, typer.Option(min=1e-12, max=0.5, help="Chance of calling an unchanged arm changed, per run.")
+        float, typer.Option(min=1e-12, max=0.5, help="Probability of a false alarm per run.")
     ] = 1e-4,
     recordings: Annotated[
-        str | None, typer.Option(help="Identify these recordings (a pattern, in quotes) instead of moving an arm.")
+        str | None, typer.Option(help="Identify these recordings (a quoted pattern) instead of moving an arm.")
     ] = None,
     scheduler: Annotated[str | None, typer.Option(help="Dask scheduler for --recordings, as tcp://HOST:8786.")] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="With --recordings and no scheduler: so many processes on this machine.")
+        int | None, typer.Option(min=1, help="With --recordings and no scheduler: number of local processes.")
     ] = None,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the result document on stdout, and nothing else there.")
-    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print only the result document on stdout.")] = False,
 ) -> None:
-    """Move an arm along its exciting trajectory, identify it, and say whether it has changed since its baseline.
+    """Move an arm along its exciting trajectory, identify it, and test for a change since its baseline.
 
-    Plays the set points of the session under the limits of the robot, with a guard that stops the drives, records,
-    identifies, compares, keeps the result in the history and publishes it. Without a baseline the first run becomes
-    it. Where the arm has changed the exit code is 4, and a diagnosis says what. For a timer: see configs/systemd.
+    Plays the set points of the session within the limits of the robot, with a guard that stops the drives. Records,
+    identifies, compares, stores the result in the history and publishes it. The first run becomes the baseline unless
+    one is given. If the arm has changed, the exit code is 4 and a diagnosis follows. Timers: see configs/systemd.
 
     Example: armident reidentify --config cell.yaml --store sqlite:///history.sqlite
     """

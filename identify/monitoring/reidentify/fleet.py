@@ -1,4 +1,4 @@
-"""``armident reidentify --recordings``: many recordings, identified in parallel by a Dask cluster, judged in order."""
+"""Command ``armident reidentify --recordings``: identify in parallel by Dask, compare in order."""
 
 import glob
 import json
@@ -18,23 +18,24 @@ from armident.identify.identification.options import Options
 from armident.identify.monitoring.change_test import ParameterChangeTest, compare
 from armident.identify.monitoring.history import History
 from armident.identify.monitoring.reidentify.options import ReidentifyOptions
-from armident.identify.monitoring.reidentify.summary import told
+from armident.identify.monitoring.reidentify.summary import change_lines
 from armident.identify.report.files import write_identification
 
 if TYPE_CHECKING:
     from distributed import Client
 
 DRIFTED, FAILED = 4, 1
-"""Exit codes: an arm has changed; none has, and a recording could not be identified."""
+"""Exit codes: an arm has changed; no arm has changed, but a recording could not be identified."""
 CONNECT_S = 10.0
+"""Longest wait for the scheduler, s."""
 
 _Arm = tuple[str, str | None]
-"""Names of robot and cell, as arms of one make often share a name."""
+"""Names of robot and cell, as arms of one type often share a name."""
 
 
 @dataclass(frozen=True)
 class Identified:
-    """What a worker of the cluster sends back: the result's text and file, and what is known of the recording."""
+    """Result of a cluster worker: document text, its file, robot, and metadata of the recording."""
 
     text: str
     path: str
@@ -44,7 +45,7 @@ class Identified:
 
 @dataclass(frozen=True)
 class Row:
-    """What came of one recording."""
+    """Result of one recording."""
 
     recording: str
     error: str | None = None
@@ -54,10 +55,24 @@ class Row:
 
 
 def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> int:
-    """Carry out ``armident reidentify --recordings``; the exit code.
+    """Carry out ``armident reidentify --recordings``.
 
-    Recordings are judged in the order of their names. Each is compared with the baseline, or with the first run of its
-    arm (robot and cell) in the history; one that fails does not stop the others.
+    Recordings are compared in the order of their names: with the baseline, or with the first run of the arm (robot and
+    cell) in the history. A failed recording does not stop the others.
+
+    Parameters
+    ----------
+    pattern
+        Glob pattern of the recordings.
+    asked
+        Options of the command.
+    as_json
+        Print JSON on stdout.
+
+    Returns
+    -------
+    int
+        Exit code: 0, `DRIFTED` or `FAILED`.
 
     Raises
     ------
@@ -71,7 +86,7 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
     known = None if asked.baseline is None else load_document(asked.baseline, IdentificationDocument)
     history = History(asked.store)
     rows: list[Row] = []
-    # Of each arm one baseline for all: an older recording that comes later must not take its place.
+    # One baseline per arm: an older recording that follows must not replace it.
     baselines: dict[_Arm, IdentificationDocument] = {}
     with cluster(asked.scheduler, asked.workers) as client:
         futures = [
@@ -81,7 +96,7 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
             row = _judged(path, future, history, known, baselines, asked.false_alarms)
             future.release()
             rows.append(row)
-            # One line as soon as it is known: a fleet takes hours.
+            # Printed at once: a fleet takes hours.
             print(_line(row), file=sys.stderr if as_json else sys.stdout, flush=True)
     if as_json:
         print(json.dumps({"runs": [_entry(row) for row in rows]}, indent=1))
@@ -92,12 +107,19 @@ def fleet_command(pattern: str, asked: ReidentifyOptions, *, as_json: bool) -> i
 
 @contextmanager
 def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
-    """A client of the scheduler at an address, or of one on this machine with so many processes.
+    """Yield a client of a Dask scheduler, or of a local cluster.
+
+    Parameters
+    ----------
+    scheduler
+        Address of a scheduler.
+    workers
+        Number of local processes, without a scheduler.
 
     Raises
     ------
     ConfigError
-        If Dask is not installed, the scheduler does not answer, or it is not said which.
+        If Dask is not installed, the scheduler does not answer, or both or none are given.
     """
     if scheduler is None and workers is None:
         raise ConfigError("--recordings: needs --scheduler ADDRESS, or --workers N for processes on this machine")
@@ -107,7 +129,7 @@ def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise ConfigError("--recordings: Dask is not installed: pip install 'armident[fleet]'") from error
-    # What goes wrong with a recording is in its line; what goes wrong with the cluster is raised.
+    # Failures of a recording are in its line, those of the cluster are raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if scheduler is None:
         local = LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0")
@@ -123,7 +145,22 @@ def cluster(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
 
 
 def identify_one(path: str, robot: RobotConfig | None, out: str) -> Identified:
-    """Identify one recording where this runs, on a worker; a failure is sent back as `ArmidentError`."""
+    """Identify one recording on a worker of the cluster.
+
+    Parameters
+    ----------
+    path
+        Recording.
+    robot
+        Configuration; ``None``: that of the recording.
+    out
+        Folder of the result.
+
+    Raises
+    ------
+    ArmidentError
+        For any failure, as other exceptions may not be picklable.
+    """
     try:
         recording = read_recording(Path(path))
         done = identify_recording(recording, robot, _options(recording))
@@ -136,7 +173,7 @@ def identify_one(path: str, robot: RobotConfig | None, out: str) -> Identified:
 
 
 def _options(recording: Recording) -> Options:
-    """As the worker of its session would identify it."""
+    """Return the identification options of the recording's session."""
     session = recording.session
     return Options() if session is None else Options(**session.identification.model_dump())
 
@@ -165,7 +202,7 @@ def _judged(
         history.judge(document, first, drift)
     except (ArmidentError, OSError, RuntimeError) as error:
         return Row(str(path), error=" ".join(str(error).split()))
-    words = tuple(told(drift, found.robot)) if drift.drifted else (drift.words,)
+    words = tuple(change_lines(drift, found.robot)) if drift.drifted else (drift.words,)
     return Row(str(path), drift=drift, words=words, identification=found.path)
 
 

@@ -6,20 +6,20 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ReidentifyOptions:
-    """The options of the command, as given.
+    """Options of the command, as given.
 
     Parameters
     ----------
     config
-        Session configuration; with recordings a robot configuration, if any.
+        Session configuration; with recordings an optional robot configuration.
     baseline
-        Identification to compare with, if not the first run in the store.
+        Identification to compare with; ``None``: the first run in the history.
     store
         SQLAlchemy URL of the history.
     out
-        Folder of recordings and results, if not the usual one.
+        Folder of recordings and results; ``None``: that of the session or recording.
     false_alarms
-        Chance of calling an unchanged arm changed, per run.
+        Probability of a false alarm per run.
     scheduler, workers
         Address of a Dask scheduler, or number of processes on this machine, for recordings.
     """

@@ -1,4 +1,4 @@
-"""The job on Zenoh: what it is doing, and its result, under the same keys as the worker's."""
+"""Publisher of status and results on Zenoh, with the keys of the worker."""
 
 import json
 import time
@@ -11,13 +11,20 @@ from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.daq.streaming import Keys, open_session
 
 LINGER_S = 1.0
-"""How long a result stays on offer after it was published: peers that connect late ask for it."""
+"""Time for which queries for a result are answered after it was published, s."""
 
 
 class StatusPublisher:
-    """Publishes status and result of one job.
+    """Publishes status and results of one job.
 
-    It takes the worker's place on Zenoh where no worker runs, and is one of those who listen to it otherwise.
+    It takes the worker's role on Zenoh if no worker runs, and that of an observer otherwise.
+
+    Parameters
+    ----------
+    session
+        Configuration of the cell.
+    robot
+        Configuration of its robot.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig) -> None:
@@ -37,12 +44,12 @@ class StatusPublisher:
                 query.reply(self._keys.identification, self._last)
 
     def status(self, state: str, **more: Any) -> None:
-        """Say what the job is doing."""
+        """Publish the state of the job, with further keys."""
         content = {"component": "reidentify", "state": state, **more}
         self._session.put(self._keys.status, json.dumps(content).encode())
 
     def result(self, text: str) -> None:
-        """Publish an identification document, and answer queries with it from now on."""
+        """Publish an identification document and answer queries with it."""
         self._last = text.encode()
         self._session.put(self._keys.identification, self._last)
 
@@ -51,13 +58,13 @@ class StatusPublisher:
         self._session.put(self._keys.diagnosis, text.encode())
 
     def __enter__(self) -> Self:
-        """Use it in a ``with`` block."""
+        """Return the publisher."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave, after a moment for those who are late."""
+        """Close the session, after `LINGER_S` if a result was published."""
         if self._last is not None and kind is None:
             time.sleep(LINGER_S)
         self._session.close()

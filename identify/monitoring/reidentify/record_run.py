@@ -1,4 +1,4 @@
-"""Moves and records the arm of a session: a guard and a capture, each a process of its own, as in a plant."""
+"""Motion and recording of the arm of a session by two processes, guard and capture."""
 
 import json
 import signal
@@ -14,14 +14,17 @@ from armident.daq.recording import Recording, join_parts, read_recording
 from armident.processes import CommandProcess, Process, ProcessEnded, Start, start_command
 
 READY_S = 120.0
-"""How long the guard may take to be ready: its loop may have to be compiled."""
+"""Longest start of the guard, s: its loop may have to be compiled."""
 CAPTURE_ENDS_S = 180.0
-"""How long a capture that was told to end may take: drives that are behind are waited for."""
+"""Longest end of a capture after its signal, s: it waits for late drives."""
 GUARD_ENDS_S = 10.0
-LOOK_S = 0.05
+"""Longest end of the guard after its signal, s."""
+POLL_S = 0.05
+"""Polling period of both processes, s."""
 _ERRORS: dict[int, type[ArmidentError]] = {2: ConfigError, 3: DataError}
 
 Say = Callable[[str], None]
+"""Takes a line of progress."""
 
 
 def start_process(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Process:
@@ -40,35 +43,35 @@ def start_process(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Proce
 
 
 class Interrupted(ArmidentError):
-    """SIGINT or SIGTERM came while the arm moved; the drives were stopped."""
+    """SIGINT or SIGTERM during the motion; the drives were stopped."""
 
     exit_code = 130
 
 
-def play(config: Path, out: Path, say: Say, start: Start = start_process) -> Recording:
-    """Play the set points of a session once, watched by a guard; the recording of it.
+def record_run(config: Path, out: Path, say: Say, start: Start = start_process) -> Recording:
+    """Play the set points of a session once under a guard and return the recording.
 
     Parameters
     ----------
     config
-        Session, checked.
+        Session configuration, checked.
     out
         Folder of the recording.
     say
-        Takes lines that tell how it goes.
+        Takes lines of progress.
     start
-        How guard and capture are started.
+        Starts guard and capture.
 
     Raises
     ------
     ConfigError
-        If bus or drives are not there, or not as configured.
+        If bus or drives are missing, or not as configured.
     ArmidentError
-        If the guard stopped the arm, or a drive failed; says why. The recording is kept.
+        If the guard stopped the arm, or a drive failed. The recording is kept.
     Interrupted
         On SIGINT and SIGTERM.
     """
-    # The guard comes before the first motion, and leaves after the last.
+    # The guard runs from before the first motion until after the last.
     with _interruptible(), _command(["guard", "--config", str(config)], start) as guard:
         _until_ready(guard)
         say("guard: ready")
@@ -76,7 +79,7 @@ def play(config: Path, out: Path, say: Say, start: Start = start_process) -> Rec
         with _command(options, start) as capture:
             try:
                 while capture.running and guard.running:
-                    time.sleep(LOOK_S)
+                    time.sleep(POLL_S)
             except BaseException:
                 guard.send_signal(signal.SIGINT)
                 raise
@@ -85,7 +88,7 @@ def play(config: Path, out: Path, say: Say, start: Start = start_process) -> Rec
                 raise ArmidentError(_kept(guard.last_error(), capture))
             guard.stop(GUARD_ENDS_S, signal.SIGUSR1)
             if guard.exit_code == 1:
-                # It was faster than the capture, which then ended because of it.
+                # The guard stopped the drives, and the capture ended for that reason.
                 raise ArmidentError(_kept(guard.last_error(), capture))
             if capture.exit_code:
                 raise _ERRORS.get(capture.exit_code, ArmidentError)(capture.last_error())
@@ -97,7 +100,7 @@ def _recordings(capture: CommandProcess) -> list[str]:
     try:
         paths = json.loads(capture.output())["recordings"]
     except (ValueError, KeyError) as error:
-        raise ArmidentError(f"capture: said nothing of its recording: {capture.output()[:200]!r}") from error
+        raise ArmidentError(f"capture: printed no recording: {capture.output()[:200]!r}") from error
     if not paths:
         raise DataError("capture: nothing was recorded; does the session have recording.trigger?")
     return list(paths)
@@ -127,7 +130,7 @@ def _command(words: Sequence[str], start: Start) -> Iterator[CommandProcess]:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGINT and SIGTERM as an exception, meanwhile."""
+    """Raise `Interrupted` on SIGINT and SIGTERM inside the block."""
 
     def interrupt(number: int, _frame: FrameType | None) -> None:
         raise Interrupted(f"interrupted ({signal.Signals(number).name}); the drives were stopped")

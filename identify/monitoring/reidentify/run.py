@@ -31,21 +31,22 @@ from armident.identify.monitoring.history import History
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
 from armident.identify.monitoring.reidentify.options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
-from armident.identify.monitoring.reidentify.record_run import Say, play, start_process
-from armident.identify.monitoring.reidentify.summary import found, told
+from armident.identify.monitoring.reidentify.record_run import Say, record_run, start_process
+from armident.identify.monitoring.reidentify.summary import change_lines, finding_lines
 from armident.identify.report.files import write_identification
 from armident.processes import Start
 
 DRIFTED = 4
 """Exit code: done, and the arm has changed."""
 CHECK_PERIOD = 1e-3
-"""Torques along the trajectory are predicted at this period, s."""
+"""Sampling period of predicted torques, s."""
 DIAGNOSIS_S = 3600.0
+"""Longest duration of a diagnosis, s."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be done, checked before anything moves."""
+    """Checked inputs of a job."""
 
     config: Path
     session: SessionConfig
@@ -58,7 +59,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a job; ``drift`` is ``None`` of a first run."""
+    """Result of a job; ``drift`` is ``None`` for a first run."""
 
     document: IdentificationDocument
     path: Path
@@ -69,13 +70,25 @@ class Outcome:
 
 
 def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
-    """Carry out ``armident reidentify`` without ``--recordings``; the exit code.
+    """Carry out ``armident reidentify`` without ``--recordings``.
+
+    Parameters
+    ----------
+    asked
+        Options of the command.
+    as_json
+        Print the result as JSON.
+
+    Returns
+    -------
+    int
+        Exit code: 0, or `DRIFTED`.
 
     Raises
     ------
     ConfigError, DataError, ArmidentError
-        Before anything moves: if configuration, trajectory, baseline or history are wrong. Later: if bus, drives or
-        guard end the motion, or the recording cannot be identified.
+        Before the motion: if configuration, trajectory, baseline or history are wrong. Later: if bus, drives or guard
+        end the motion, or the recording cannot be identified.
     """
     for option, given in (("--scheduler", asked.scheduler), ("--workers", asked.workers)):
         if given is not None:
@@ -97,23 +110,40 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
 
 
 def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, false_alarms: float) -> Job:
-    """Load and check all that a job needs.
+    """Load and check the inputs of a job.
+
+    Parameters
+    ----------
+    config
+        Session configuration.
+    baseline
+        Identification to compare with; ``None``: the first run in the history.
+    store
+        SQLAlchemy URL of the history.
+    out
+        Folder of recordings and results; ``None``: that of the session.
+    false_alarms
+        Probability of a false alarm.
 
     Raises
     ------
     ConfigError
-        If the session plays nothing, or the trajectory leaves the limits of the robot.
+        If the session has no set points, or the trajectory exceeds the limits of the robot.
     DataError
         If the baseline is of another robot or model.
     """
     session = load_session(config)
     robot = load_robot(session.robot)
     if session.setpoints is None:
-        raise ConfigError(f"{config}: setpoints: a session without them moves nothing; name an exciting trajectory")
+        raise ConfigError(f"{config}: setpoints: missing, so nothing would move; name an exciting trajectory")
     if session.sync.role != "producer":
-        raise ConfigError(f"{config}: sync.role: {session.sync.role}; only who sends SYNC can move the arm")
+        raise ConfigError(
+            f"{config}: sync.role: {session.sync.role}; expected producer, which sends SYNC and can move the arm"
+        )
     if session.recording.trigger is not None:
-        raise ConfigError(f"{config}: recording.trigger: writes only events, the job needs all of the motion")
+        raise ConfigError(
+            f"{config}: recording.trigger: records only events; remove it, the job needs the whole motion"
+        )
     history = History(store)
     chosen = baseline_of(baseline, history, robot.name, session.cell)
     check_trajectory(session, robot, chosen)
@@ -121,14 +151,23 @@ def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, f
 
 
 def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Baseline) -> None:
-    """Refuse a trajectory beyond the limits: those of position, velocity, acceleration, and of torque if it is known.
+    """Check a trajectory against the limits of position, velocity, acceleration and, with a baseline, of torque.
 
-    Torques are those that the baseline's parameters predict; without one the guard alone watches them.
+    Torques are predicted with the parameters of the baseline; without one only the guard checks them.
+
+    Parameters
+    ----------
+    session
+        Names the trajectory.
+    robot
+        Limits.
+    baseline
+        Parameters.
 
     Raises
     ------
     ConfigError
-        Naming the joint, the limit, and by how much it is exceeded.
+        If a limit is exceeded; the message names joint and limit.
     DataError
         If the baseline is of another model.
     """
@@ -149,23 +188,33 @@ def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Basel
 
 
 def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = start_process) -> Outcome:
-    """Do the job; everything that it leaves is kept in the history, and published.
+    """Carry out a job, store its result in the history, and publish it.
 
     Parameters
     ----------
     job
-        What `prepare` has checked.
+        Result of `prepare`.
     announcer
-        For Zenoh.
+        Publisher on Zenoh.
     say
-        Takes lines that tell how it goes.
+        Takes lines of progress.
     start
-        How guard and capture are started.
+        Starts guard and capture.
+
+    Returns
+    -------
+    Outcome
+        Identification, comparison and diagnosis.
+
+    Raises
+    ------
+    ArmidentError
+        If the motion was stopped, or the recording cannot be identified or compared.
     """
     say(f"{job.robot.name} in cell {job.session.cell}; baseline: {job.baseline.name}")
     announcer.status("moving")
     job.out.mkdir(parents=True, exist_ok=True)
-    recording = play(job.config, job.out, say, start)
+    recording = record_run(job.config, job.out, say, start)
     say(f"recorded {recording.path}")
     announcer.status("identifying", recording=str(recording.path))
     options = Options(**job.session.identification.model_dump())
@@ -196,7 +245,7 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
     else:
         say("changed; diagnosing")
         announcer.status("diagnosing", words=drift.words)
-        outcome = _diagnosed(job, recording, Outcome(document, path, drift, tuple(told(drift, job.robot))), say)
+        outcome = _diagnosed(job, recording, Outcome(document, path, drift, tuple(change_lines(drift, job.robot))), say)
         if outcome.diagnosis is not None:
             announcer.diagnosis(outcome.diagnosis.read_text(encoding="utf-8"))
     announcer.status("done", drifted=drift is not None and drift.drifted, words=list(outcome.words))
@@ -211,7 +260,17 @@ def keep(
     baseline: IdentificationDocument | None,
     drift: ParameterChangeTest | None,
 ) -> None:
-    """Put a run, its recording's facts and its comparison into the history."""
+    """Add a run, the metadata of its recording and its comparison to the history.
+
+    Parameters
+    ----------
+    history
+        Database.
+    recording, document, path
+        Recording, its identification, and the file of that.
+    baseline, drift
+        Baseline and result of the comparison, if there was one.
+    """
     facts = History.facts(recording)
     history.describe(facts)
     history.add(document, History.began(facts, document, path))
@@ -220,7 +279,7 @@ def keep(
 
 
 def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Outcome:
-    """The outcome with what ``armident diagnose --baseline`` says; a diagnosis that fails does not undo the verdict."""
+    """Return the outcome with a diagnosis against the baseline; a failed diagnosis only prints a warning."""
     assert job.baseline.document is not None
     folder = _beside(recording, job.out, "diagnosis")
     folder.mkdir(parents=True, exist_ok=True)
@@ -241,7 +300,7 @@ def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Ou
     except (subprocess.TimeoutExpired, ArmidentError) as error:
         say(f"warning: no diagnosis: {error}")
         return outcome
-    findings = tuple(found(document))
+    findings = tuple(finding_lines(document))
     path = folder / "diagnosis.json"
     return Outcome(outcome.document, outcome.path, outcome.drift, outcome.words, path, findings)
 
@@ -252,7 +311,13 @@ def _beside(recording: Recording, out: Path, suffix: str) -> Path:
 
 
 def entry(job: Job, outcome: Outcome) -> dict[str, Any]:
-    """The result as a document."""
+    """Return the result as a document.
+
+    Parameters
+    ----------
+    job, outcome
+        Inputs and result of the job.
+    """
     drift = outcome.drift
     return {
         "robot": job.robot.name,
@@ -268,7 +333,13 @@ def entry(job: Job, outcome: Outcome) -> dict[str, Any]:
 
 
 def show(job: Job, outcome: Outcome) -> None:
-    """Print the result."""
+    """Print the result.
+
+    Parameters
+    ----------
+    job, outcome
+        Inputs and result of the job.
+    """
     drift = outcome.drift
     if drift is None or not drift.drifted:
         print("\n".join(outcome.words))

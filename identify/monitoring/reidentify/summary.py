@@ -1,4 +1,4 @@
-"""What a comparison and a diagnosis say in words: which joint, what, from what to what, how sure."""
+"""Text lines of a comparison and of a diagnosis: joint, parameter, values, significance."""
 
 import re
 
@@ -10,45 +10,47 @@ from armident.identify.monitoring.change_test import ParameterChangeTest
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
 CLEAR = 2.0
-"""Parameters of a group that changed are told if they are so many standard deviations off."""
+"""Difference in standard deviations from which a parameter of a changed group is listed."""
 
 _SHARED = ("ia", "fv", "fc")
-"""Parameters that a coupling of two joints has."""
+"""Kinds of parameters of a coupling of two joints."""
 
 _MEANINGS = {
     "fv": "viscous friction",
     "fc": "Coulomb friction",
     "ia": "rotor inertia",
     "off": "torque offset",
-    "mx": "mass moment",
-    "my": "mass moment",
-    "mz": "mass moment",
+    "mx": "first moment of mass",
+    "my": "first moment of mass",
+    "mz": "first moment of mass",
 }
 
 
-def told(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
-    """One line per parameter that has changed, the clearest first, and per group; one if only all together have.
+def change_lines(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
+    """Return one line per changed parameter and group, the most significant first.
+
+    A single line if only all parameters together have changed; none without a change.
 
     Parameters
     ----------
     drift
         The comparison.
     robot
-        For the names of the joints.
+        Names of the joints.
     """
-    lines = [_line(drift, name, robot) + f", chance {_chance(_p_value(drift, name))}" for name in drift.changed]
+    lines = [_line(drift, name, robot) + f", p = {_p_text(_p_value(drift, name))}" for name in drift.changed]
     for group in drift.changed_groups:
         rest = [name for name in group.members if name not in drift.changed]
         if len(rest) == len(group.members):
             where = place_of(rest[0], robot)
             clear = [name for name in rest if _deviations(drift, name) >= CLEAR] or rest
             values = "; ".join(_line(drift, name, robot).removeprefix(f"{where}: ") for name in clear)
-            lines.append(f"{where}: {group.kind} ({values}), together with chance {_chance(group.p_value)}")
+            lines.append(f"{where}: {group.kind} ({values}), together p = {_p_text(group.p_value)}")
     if not lines and drift.drifted:
         z = np.abs(drift.difference) / drift.std
         most = ", ".join(drift.parameters[k].name for k in np.argsort(-z)[:3])
         lines.append(
-            f"no single parameter clearly, all together do (chance {_chance(drift.p_joint)}); farthest are {most}"
+            f"no single parameter changed significantly, all together did (p = {_p_text(drift.p_joint)}); most: {most}"
         )
     return lines
 
@@ -59,7 +61,7 @@ def _deviations(drift: ParameterChangeTest, name: str) -> float:
 
 
 def _line(drift: ParameterChangeTest, name: str, robot: RobotConfig) -> str:
-    """Where, what, from what to what, and by how many standard deviations."""
+    """Return joint, meaning, values and difference in standard deviations of a parameter."""
     k = next(k for k, p in enumerate(drift.parameters) if p.name == name)
     parameter, before = drift.parameters[k], float(drift.before[k])
     share = f" ({100 * (parameter.value - before) / abs(before):+.1f} %)" if before else ""
@@ -73,23 +75,31 @@ def _p_value(drift: ParameterChangeTest, name: str) -> float:
     return next(float(p) for each, p in zip(drift.parameters, drift.p_values, strict=True) if each.name == name)
 
 
-def found(diagnosis: DiagnosisDocument) -> list[str]:
-    """One line per finding of a diagnosis, and one per joint that stays unexplained."""
+def finding_lines(diagnosis: DiagnosisDocument) -> list[str]:
+    """Return one line per finding of a diagnosis, and one per unexplained dependence."""
     lines = []
     for finding in diagnosis.findings:
         values = ", ".join(f"{name} {value:.4g}" for name, value in finding.parameters.items())
         where = finding.joint if finding.other is None else f"{finding.joint} and {finding.other}"
-        words = finding.evidence.get("description")
-        said = words if isinstance(words, str) else f"{finding.effect.replace('_', ' ')} ({values})"
+        text = finding.evidence.get("description")
+        effect = text if isinstance(text, str) else f"{finding.effect.replace('_', ' ')} ({values})"
         lines.append(
-            f"{where}: {said}; confidence {100 * finding.confidence:.0f} %, torque error "
+            f"{where}: {effect}; confidence {100 * finding.confidence:.0f} %, torque error "
             f"{finding.gap_before:.2f} % -> {finding.gap_after:.2f} %"
         )
     return lines + [f"{each.joint}: {each.hint}" for each in diagnosis.unexplained]
 
 
 def place_of(name: str, robot: RobotConfig) -> str:
-    """The joint, or the coupling of two, that a base parameter belongs to."""
+    """Return the joint, or the two joints of a coupling, of a base parameter.
+
+    Parameters
+    ----------
+    name
+        Base parameter.
+    robot
+        Names of joints and couplings.
+    """
     for coupling in robot.couplings:
         if name in {kind + coupling.name for kind in _SHARED}:
             return " and ".join(coupling.joints)
@@ -99,9 +109,9 @@ def place_of(name: str, robot: RobotConfig) -> str:
 
 
 def meaning_of(name: str) -> str:
-    """What a parameter is, by the letters that its name begins with."""
+    """Return the meaning of a parameter from the first letters of its name."""
     return next((meaning for kind, meaning in _MEANINGS.items() if name.startswith(kind)), "inertia")
 
 
-def _chance(p: float) -> str:
+def _p_text(p: float) -> str:
     return f"{p:.1g}" if p >= 1e-12 else "below 1e-12"

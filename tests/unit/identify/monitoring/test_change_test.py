@@ -1,4 +1,4 @@
-"""Is it the same arm: as few false alarms as promised, and changes found by name."""
+"""Chi-square test of parameter change: false-alarm rate and power."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ TRUTH = np.linspace(0.5, 20.0, 30)
 
 
 def covariance(seed: int = 0) -> np.ndarray:
-    """Of correlated parameters of widely different sizes, about 2 % each."""
+    """Covariance of correlated parameters of different sizes, about 2 % each."""
     rng = np.random.default_rng(seed)
     mixed = rng.standard_normal((30, 30)) + 3 * np.eye(30)
     scale = 0.02 * TRUTH
@@ -91,7 +91,7 @@ def test_a_change_that_no_single_parameter_shows_is_found_jointly() -> None:
     assert drift.changed == ()
     assert drift.p_joint < FALSE_ALARMS / 2
     assert drift.drifted
-    assert "no single parameter clearly" in drift.words
+    assert "no single parameter significantly" in drift.words
 
 
 def test_the_order_of_the_parameters_does_not_matter() -> None:
@@ -107,7 +107,7 @@ def test_the_order_of_the_parameters_does_not_matter() -> None:
 def test_another_robot_or_model_is_refused() -> None:
     with pytest.raises(DataError, match="the baseline is of robot 'arm', the identification of 'other'"):
         compare(identified(TRUTH), identified(TRUTH, robot="other"))
-    with pytest.raises(DataError, match="other base parameters: p29, q"):
+    with pytest.raises(DataError, match="different base parameters: p29, q"):
         compare(identified(TRUTH), identified(TRUTH, names=[*NAMES[:29], "q"]))
 
 

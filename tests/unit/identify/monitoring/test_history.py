@@ -90,7 +90,7 @@ def test_robots_are_kept_apart(url: str, tmp_path: Path) -> None:
         assert call(path, "--database", url)[0] == 0
     code, _, err = call("--database", url)
     assert code == 2
-    assert "--robot: say which of the robots in the history: arm, other" in err
+    assert "--robot: choose one of the robots in the history: arm, other" in err
     assert call("--database", url, "--robot", "other")[0] == 0
 
 
@@ -120,7 +120,7 @@ def test_arms_of_one_name_in_two_cells_are_kept_apart(url: str, tmp_path: Path) 
     assert history.first("arm", "middle") is None
     code, _, err = call("--database", url)
     assert code == 2
-    assert "--cell: say in which cell; arm is known in left, right" in err
+    assert "--cell: choose a cell; arm is known in left, right" in err
     assert "--cell: no 'middle'; arm is known in left, right" in call("--database", url, "--cell", "middle")[2]
     code, out, err = call("--database", url, "--cell", "right", "--plot", str(tmp_path / "p.svg"))
     assert code == 0, err

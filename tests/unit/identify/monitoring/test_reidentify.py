@@ -1,4 +1,4 @@
-"""The job's decisions without an arm: what is refused before anything moves, words, baseline, fleet."""
+"""Re-identification without an arm: checks before the motion, text lines, baseline, fleet."""
 
 import datetime
 import json
@@ -23,7 +23,7 @@ from armident.identify.monitoring.history import History
 from armident.identify.monitoring.reidentify.baseline import baseline_of
 from armident.identify.monitoring.reidentify.fleet import cluster
 from armident.identify.monitoring.reidentify.run import prepare
-from armident.identify.monitoring.reidentify.summary import meaning_of, place_of, told
+from armident.identify.monitoring.reidentify.summary import change_lines, meaning_of, place_of
 from armident.virtual_robot.offline import simulate_recording
 from tests.statistics.weeks import WORN
 
@@ -69,15 +69,15 @@ def store(folder: Path) -> str:
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "message"),
     [
-        ({"setpoints": None}, "a session without them moves nothing"),
-        ({"sync": {"role": "consumer"}}, "only who sends SYNC can move the arm"),
-        ({"recording": {"trigger": {}}}, "writes only events"),
+        ({"setpoints": None}, "missing, so nothing would move"),
+        ({"sync": {"role": "consumer"}}, "expected producer, which sends SYNC"),
+        ({"recording": {"trigger": {}}}, "records only events"),
     ],
 )
-def test_a_session_that_cannot_do_the_job_is_refused(tmp_path: Path, changes: dict[str, Any], says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
+def test_a_session_that_cannot_do_the_job_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         prepare(cell(tmp_path, **changes), None, store(tmp_path), None, 1e-4)
 
 
@@ -128,18 +128,18 @@ def test_the_first_run_becomes_the_baseline_and_a_name_misspelt_later_does_not(
     assert baseline_of(None, history, "emps", "cell").document is None
 
 
-def test_a_tenth_more_friction_is_told_as_such(documents: dict[str, IdentificationDocument]) -> None:
-    """Which joint, what, from what to what, how sure."""
+def test_ten_percent_more_friction_is_reported(documents: dict[str, IdentificationDocument]) -> None:
+    """The line names joint, parameter, values and significance."""
     robot = load_robot("tx40.yaml")
     same = compare(documents["a_monday"], documents["b_tuesday"])
     assert not same.drifted
-    assert told(same, robot) == []
+    assert change_lines(same, robot) == []
     worn = compare(documents["a_monday"], documents["d_worn"])
     assert worn.drifted
-    words = told(worn, robot)
+    words = change_lines(worn, robot)
     assert all(line.startswith("joint_2: ") for line in words)
     assert any("viscous friction fv2 5." in line and "standard deviations" in line for line in words)
-    assert any("chance" in line for line in words)
+    assert any(", p = " in line for line in words)
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_a_tenth_more_friction_is_told_as_such(documents: dict[str, Identificati
         ("fcm6", "joint_5 and joint_6", "Coulomb friction"),
         ("iam6", "joint_5 and joint_6", "rotor inertia"),
         ("zz1r", "joint_1", "inertia"),
-        ("mx2r", "joint_2", "mass moment"),
+        ("mx2r", "joint_2", "first moment of mass"),
         ("off4", "joint_4", "torque offset"),
     ],
 )
@@ -166,8 +166,8 @@ def fleet(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_fleet_is_judged_in_order_and_one_that_fails_stops_nobody(recordings: Path, tmp_path: Path) -> None:
-    """One line each, the same history; a file that is no recording stands between the others."""
+def test_a_fleet_is_compared_in_order_and_survives_a_failed_recording(recordings: Path, tmp_path: Path) -> None:
+    """One line per recording and one history; one file is not a recording."""
     for path in recordings.glob("*.mcap"):
         shutil.copy(path, tmp_path)
     (tmp_path / "c_broken.mcap").write_bytes(b"not a recording")
@@ -203,15 +203,15 @@ def test_a_scheduler_by_address_does_the_same_work(recordings: Path, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("scheduler", "workers", "says"),
+    ("scheduler", "workers", "message"),
     [
         (None, None, "needs --scheduler ADDRESS, or --workers N"),
         ("tcp://127.0.0.1:1", 2, "not with --scheduler"),
         ("nonsense://x", None, "no Dask scheduler answers there"),
     ],
 )
-def test_a_cluster_that_is_not_there_is_one_line(scheduler: str | None, workers: int | None, says: str) -> None:
-    with pytest.raises(ConfigError, match=says), cluster(scheduler, workers):
+def test_a_cluster_that_is_not_there_is_one_line(scheduler: str | None, workers: int | None, message: str) -> None:
+    with pytest.raises(ConfigError, match=message), cluster(scheduler, workers):
         pytest.fail("there is a cluster")
 
 
