@@ -1,11 +1,11 @@
-"""What a diagnosis finds in the virtual arm, and what it leaves alone."""
+"""Diagnosis of the virtual arm: findings, their parameters, no finding in a healthy arm."""
 
 import numpy as np
 import pytest
 
-from armident.configs import ConfigError, RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.configs import ConfigError, RobotConfig, load_robot
 from armident.configs.schema.robot import Effect
-from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
 from armident.identify.effects.effect import Place
 from armident.identify.effects.registry import catalogue
@@ -14,7 +14,8 @@ from armident.identify.identification.api import identify_recording
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.report.files import robot_yaml
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import recording
+from tests.fixtures.store import shared
 
 REPEATS = 3
 
@@ -24,29 +25,24 @@ def robot() -> RobotConfig:
     return load_robot("tx40.yaml")
 
 
-@pytest.fixture(scope="module")
-def trajectory() -> Trajectory:
-    once = load_trajectory("trajectories/tx40_excitation.yaml")
-    return once.model_copy(update={"moves": once.moves * REPEATS})
-
-
-def diagnosed(robot: RobotConfig, trajectory: Trajectory, seed: int, *effects: HiddenEffect) -> Diagnosis:
-    scenario = Scenario(schema="armident/scenario/1", effects=effects) if effects else None
-    recording = simulate_recording(robot, trajectory, seed, scenario=scenario)
-    experiments, notes = experiments_from_recording(recording, robot)
+@shared
+def diagnosed(seed: int, *effects: HiddenEffect) -> Diagnosis:
+    robot = load_robot("tx40")
+    data = recording("tx40", "tx40_excitation", seed, *effects, repeats=REPEATS)
+    experiments, notes = experiments_from_recording(data, robot)
     return diagnose(experiments, [], robot, notes=notes)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_plant_without_hidden_effects_has_no_gap(robot: RobotConfig, trajectory: Trajectory, seed: int) -> None:
-    document = diagnosed(robot, trajectory, seed).document
+def test_a_plant_without_hidden_effects_has_no_gap(seed: int) -> None:
+    document = diagnosed(seed).document
     assert document.verdict == "no_gap"
     assert document.gap.validation.before == document.gap.validation.after
 
 
-def test_a_worn_joint_is_named_and_its_size_is_right(robot: RobotConfig, trajectory: Trajectory) -> None:
+def test_a_worn_joint_is_named_and_its_size_is_right() -> None:
     worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
-    found = diagnosed(robot, trajectory, 0, worn)
+    found = diagnosed(0, worn)
     (finding,) = found.document.findings
     assert (finding.effect, finding.joint) == ("asymmetric_viscous_friction", "joint_2")
     assert finding.gap_after < finding.gap_before
@@ -55,16 +51,16 @@ def test_a_worn_joint_is_named_and_its_size_is_right(robot: RobotConfig, traject
     assert found.document.verdict == "explained"
 
 
-def test_a_cogging_motor_is_named_with_its_harmonic(robot: RobotConfig, trajectory: Trajectory) -> None:
+def test_a_cogging_motor_is_named_with_its_harmonic() -> None:
     cogging = HiddenEffect(effect="cogging_torque", joint="joint_3", parameters={"amplitude": 1.2, "harmonic": 1.0})
-    finding = diagnosed(robot, trajectory, 1, cogging).document.findings[0]
+    finding = diagnosed(1, cogging).document.findings[0]
     assert (finding.effect, finding.joint) == ("cogging_torque", "joint_3")
     assert finding.parameters["harmonic"] == 1.0
 
 
-def test_held_out_error_of_the_joint_falls_with_every_finding(robot: RobotConfig, trajectory: Trajectory) -> None:
+def test_held_out_error_of_the_joint_falls_with_every_finding() -> None:
     worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.4})
-    document = diagnosed(robot, trajectory, 2, worn).document
+    document = diagnosed(2, worn).document
     assert document.findings
     assert all(f.gap_after < f.gap_before for f in document.findings)
     assert document.gap.validation.after.all < document.gap.validation.before.all
@@ -82,7 +78,7 @@ def test_a_diagnosed_model_is_a_robot_configuration_again(robot: RobotConfig) ->
 
 
 ELSEWHERE = ("encoder_eccentricity", "backlash", "joint_elasticity")
-"""A wrong position of one joint is felt by all of them."""
+"""Effects that act on all joints: an error of one position changes every torque."""
 JOINT_EFFECTS = sorted(
     name for name, e in catalogue().items() if not e.rewires and e.scope == "joint" and name not in ELSEWHERE
 )
@@ -113,16 +109,12 @@ def test_a_stanza_with_a_parameter_of_another_effect_is_refused(robot: RobotConf
         arm_model(robot.model_copy(update={"effects": (stanza,)}))
 
 
-def test_identifying_with_the_effect_inside_brings_the_torque_error_down(
-    robot: RobotConfig, trajectory: Trajectory
-) -> None:
+def test_identifying_with_the_effect_inside_brings_the_torque_error_down(robot: RobotConfig) -> None:
     worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.4})
-    scenario = Scenario(schema="armident/scenario/1", effects=(worn,))
-    recording = simulate_recording(robot, trajectory, 3, scenario=scenario)
-    experiments, _ = experiments_from_recording(recording, robot)
-    model = diagnose(experiments, [], robot).robot
-    plain = identify_recording(recording, robot, Options(method="idim-ls")).document
-    better = identify_recording(recording, model, Options(method="idim-ls")).document
+    data = recording("tx40", "tx40_excitation", 3, worn, repeats=REPEATS)
+    model = diagnosed(3, worn).robot
+    plain = identify_recording(data, robot, Options(method="idim-ls")).document
+    better = identify_recording(data, model, Options(method="idim-ls")).document
     assert better.relative_error_pct_by_joint["joint_2"] < plain.relative_error_pct_by_joint["joint_2"]
     (added,) = [p for p in better.parameters if p.name == "fva2"]
     # 0.4 of the 5.5 N m s/rad of table B.4.
@@ -130,12 +122,10 @@ def test_identifying_with_the_effect_inside_brings_the_torque_error_down(
     assert added.unit == "N m s/rad"
 
 
-def test_a_slow_drive_is_found_where_the_simulated_loop_does_not_tell(
-    robot: RobotConfig, trajectory: Trajectory
-) -> None:
-    """The wrist's drives hardly follow their references, with and without the lag, in simulation as well."""
+def test_a_slow_drive_is_found_where_the_simulated_loop_does_not_tell(robot: RobotConfig) -> None:
+    """The wrist's drives hardly follow their references, with and without the lag, also in simulation."""
     slow = HiddenEffect(effect="actuator_bandwidth", joint="joint_5", parameters={"time_constant": 0.032})
-    document = diagnosed(robot, trajectory, 2, slow).document
+    document = diagnosed(2, slow).document
     (finding,) = document.findings
     assert (finding.effect, finding.joint) == ("actuator_bandwidth", "joint_5")
     assert finding.gap_after < 0.8 * finding.gap_before

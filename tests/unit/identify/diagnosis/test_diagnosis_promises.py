@@ -4,19 +4,17 @@ import json
 import os
 import subprocess
 import sys
-from functools import cache
 from pathlib import Path
 
 import pytest
 
-from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
-from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.configs import RobotConfig, load_robot
+from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.recording import Recording, write_recording
 from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
 from armident.identify.document import Finding, IdentificationDocument
-from armident.identify.identification.api import identify_recording
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import FAST, recording, tx40_baseline
 
 ARMIDENT = [sys.executable, "-m", "armident.daq.cli"]
 PLUGIN = '''
@@ -41,14 +39,11 @@ TIGHT_SPOT = Effect(
 def recorded(
     robot: RobotConfig, seed: int, *effects: HiddenEffect, trajectory: str = "tx40_excitation", repeats: int = 2
 ) -> Recording:
-    scenario = Scenario(schema="armident/scenario/1", effects=effects) if effects else None
-    once: Trajectory = load_trajectory(f"trajectories/{trajectory}.yaml")
-    moves = once.model_copy(update={"moves": once.moves * repeats})
-    return simulate_recording(robot, moves, seed, scenario=scenario, period=1e-3)
+    return recording(robot.name, trajectory, seed, *effects, repeats=repeats, period=FAST)
 
 
-def diagnosed(recording: Recording, robot: RobotConfig, baseline: IdentificationDocument | None = None) -> Diagnosis:
-    experiments, notes = experiments_from_recording(recording, robot)
+def diagnosed(data: Recording, robot: RobotConfig, baseline: IdentificationDocument | None = None) -> Diagnosis:
+    experiments, notes = experiments_from_recording(data, robot)
     return diagnose(experiments, [], robot, notes=notes, baseline=baseline)
 
 
@@ -80,15 +75,9 @@ def test_what_could_hide_does_up_to_the_size_that_is_told_and_no_further() -> No
         assert [f.effect for f in document.findings] == found, share
 
 
-@cache
-def baseline() -> IdentificationDocument:
-    robot = load_robot("tx40")
-    return identify_recording(recorded(robot, 100), robot).document
-
-
 def against_baseline(seed: int, *effects: HiddenEffect) -> list[Finding]:
     robot = load_robot("tx40")
-    return diagnosed(recorded(robot, seed, *effects), robot, baseline()).document.findings
+    return diagnosed(recorded(robot, seed, *effects), robot, tx40_baseline()).document.findings
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Single cases of the shipped suite in which a wrong answer lies near."""
 
+import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -7,9 +8,10 @@ from typing import Any
 import pytest
 
 from armident.configs.loading import load_suite
-from armident.identify.diagnosis import batch
+from armident.identify.document import to_json
 from armident.identify.evaluation.cases import all_cases
-from armident.virtual_robot.batch import record
+from armident.identify.evaluation.tasks import DiagnosisTask, diagnose_file
+from armident.virtual_robot.json_server import simulate_request
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 proof = pytest.mark.proof
@@ -30,10 +32,10 @@ def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]
         "effects": [asdict(part) for part in case.parts],
         "out": str(file),
     }
-    hidden = record(request)["truth"][0]
-    lacking = {"leave_out": case.leave_out, "joints": [part.joint for part in case.parts]} if case.leave_out else {}
-    told = batch.answer({"id": case.key, "do": "diagnose", "recording": str(file), "robot": case.config, **lacking})
-    return told["document"], hidden
+    hidden = simulate_request(request)["truth"][0]
+    joints = tuple(part.joint for part in case.parts) if case.leave_out else ()
+    document = diagnose_file(DiagnosisTask(file, case.config, case.leave_out, joints)).document
+    return json.loads(to_json(document)), hidden
 
 
 def test_a_late_torque_of_joint_2_is_found_in_the_loop_that_it_makes(tmp_path: Path) -> None:
@@ -52,7 +54,7 @@ def test_a_late_torque_of_joint_2_is_found_in_the_loop_that_it_makes(tmp_path: P
 def test_a_late_torque_is_no_friction_that_yields_where_noise_hides_what_the_loop_gains(
     run: int, tmp_path: Path
 ) -> None:
-    """Put right, the torque has more error at measured signals: there it is in step with the noise of the encoder."""
+    """The corrected torque has more error at measured signals, where it is in phase with the encoder noise."""
     told, hidden = diagnosed(f"effect time_delay joint_3 typical tx40 run {run}", tmp_path)
     found = told["findings"][0]
     assert (found["effect"], found["joint"]) == ("time_delay", "joint_3")
@@ -63,14 +65,14 @@ def test_a_late_torque_is_no_friction_that_yields_where_noise_hides_what_the_loo
 def test_a_link_that_swings_beyond_the_bandwidth_is_found_where_measured_positions_bring_more_noise(
     run: int, tmp_path: Path
 ) -> None:
-    """Differentiated four times they make the error at measured signals larger, and the loop hardly another torque."""
+    """Fourth derivatives enlarge the error at measured signals, and the loop changes the torque little."""
     told, hidden = diagnosed(f"effect joint_elasticity joint_1 typical emps run {run}", tmp_path)
     (found,) = told["findings"]
     assert (found["effect"], told["verdict"]) == ("joint_elasticity", "explained")
     assert 0.5 < found["parameters"]["compliance"] / hidden["compliance"] < 2.0
     errors = told["gap"]["validation"]
     assert errors["after"]["all"] > errors["before"]["all"]  # what makes it hard
-    # Without the noise of the derivatives it is nearer, and that is what is said of it.
+    # Without derivative noise the gap closes, and the document says so.
     assert found["evidence"]["gap_without_derivative_noise"] < 0.97 * found["gap_before"]
     assert told["simulated"]["torque_without_derivative_noise"]["joint_1"] == pytest.approx(
         found["evidence"]["gap_without_derivative_noise"]

@@ -1,12 +1,12 @@
-"""What has changed since a baseline was identified is named for what it is, and nothing where nothing has."""
+"""Parameter changes against a baseline: named effects, and no finding without a change."""
 
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from armident.configs import DataError, RobotConfig, Trajectory, load_robot, load_trajectory
-from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.configs import DataError, RobotConfig, load_robot
+from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.recording import Recording
 from armident.identify.diagnosis.baseline import cautious, compared
 from armident.identify.diagnosis.candidates import Workshop
@@ -14,9 +14,8 @@ from armident.identify.diagnosis.numbers import NumbersFinding, stale_numbers
 from armident.identify.diagnosis.regression import Fit, fit
 from armident.identify.diagnosis.study import build_study
 from armident.identify.document import IdentificationDocument
-from armident.identify.identification.api import identify_recording
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import FAST, recording, tx40_baseline
 
 REPEATS = 2
 Recorded = Callable[..., Recording]
@@ -28,24 +27,20 @@ def robot() -> RobotConfig:
 
 
 @pytest.fixture(scope="module")
-def recorded(robot: RobotConfig) -> Recorded:
-    once: Trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
-    trajectory = once.model_copy(update={"moves": once.moves * REPEATS})
-
+def recorded() -> Recorded:
     def record(seed: int, *effects: HiddenEffect) -> Recording:
-        scenario = Scenario(schema="armident/scenario/1", effects=effects) if effects else None
-        return simulate_recording(robot, trajectory, seed, scenario=scenario, period=1e-3)
+        return recording("tx40", "tx40_excitation", seed, *effects, repeats=REPEATS, period=FAST)
 
     return record
 
 
 @pytest.fixture(scope="module")
-def baseline(robot: RobotConfig, recorded: Recorded) -> IdentificationDocument:
-    return identify_recording(recorded(100), robot).document
+def baseline() -> IdentificationDocument:
+    return tx40_baseline()
 
 
-def studied(robot: RobotConfig, recording: Recording) -> tuple[Fit, Workshop]:
-    study = build_study(experiments_from_recording(recording, robot)[0], [], robot)
+def studied(robot: RobotConfig, data: Recording) -> tuple[Fit, Workshop]:
+    study = build_study(experiments_from_recording(data, robot)[0], [], robot)
     found = fit(study)
     return found, Workshop(study, found.theta)
 

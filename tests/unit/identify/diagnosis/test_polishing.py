@@ -1,19 +1,19 @@
-"""Nonlinear parameters of findings are moved to where the data have them, all at once."""
+"""Joint Gauss-Newton refinement of the nonlinear parameters of findings."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from armident.configs import load_robot, load_trajectory
+from armident.configs import load_robot
 from armident.configs.schema.robot import Effect
-from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.polishing import polished
 from armident.identify.diagnosis.regression import fit
 from armident.identify.diagnosis.state import refit
 from armident.identify.diagnosis.study import Study, build_study
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import recording
 
 LINK, RESONANCE = 0.7 * 95.0, 12.0
 """Mass on the spring, kg, and its frequency behind a motor that is held, Hz."""
@@ -25,15 +25,13 @@ def study() -> Study:
     robot = load_robot("emps")
     stiffness = LINK * (2 * np.pi * RESONANCE) ** 2
     hidden = HiddenEffect(effect="joint_elasticity", joint="joint_1", parameters={"stiffness": stiffness})
-    scenario = Scenario(schema="armident/scenario/1", description="a soft spindle", effects=(hidden,))
-    trajectory = load_trajectory("trajectories/emps_excitation.yaml")
-    recording = simulate_recording(robot, trajectory, 3, scenario=scenario)
-    experiments, _ = experiments_from_recording(recording, robot)
+    data = recording("emps", "emps_excitation", 3, hidden)
+    experiments, _ = experiments_from_recording(data, robot)
     return build_study(experiments, [], robot)
 
 
 def with_spring(study: Study, frequency: float, damping: float) -> Effect:
-    """The stanza of a link on its spring."""
+    """Configuration entry of an elastic joint."""
     shapes = {"frequency": frequency, "damping": damping, "rotor": 0.0}
     return Effect(effect="joint_elasticity", joint="joint_1", parameters=shapes)
 

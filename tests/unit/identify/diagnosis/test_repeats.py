@@ -1,4 +1,4 @@
-"""What a repeated motion tells of the noise, and what a residual beyond noise does to the verdict."""
+"""Noise from repeated motion, and the verdict for a residual beyond noise."""
 
 from dataclasses import replace
 from functools import cache
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from armident.configs import RobotConfig, load_robot, load_trajectory
-from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.configs import RobotConfig, load_robot
+from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.interchange.importing import import_recording
 from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
 from armident.identify.diagnosis.excess import HEADROOM, MATERIAL, excess_of, excesses, pieces
@@ -20,7 +20,7 @@ from armident.identify.diagnosis.study import Study, build_study
 from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.thesis.recordings import measured_emps
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import FAST, recording
 
 Array = NDArray[np.float64]
 
@@ -35,11 +35,8 @@ def robot() -> RobotConfig:
 
 @cache
 def recorded(seed: int, *, bump: bool = False, trajectory: str = "tx40_excitation") -> Experiment:
-    scenario = Scenario(schema="armident/scenario/1", effects=(BUMP,)) if bump else None
-    recording = simulate_recording(
-        robot(), load_trajectory(f"trajectories/{trajectory}.yaml"), seed, scenario=scenario, period=1e-3
-    )
-    (experiment,), _ = experiments_from_recording(recording, robot())
+    data = recording("tx40", trajectory, seed, *([BUMP] if bump else []), period=FAST)
+    (experiment,), _ = experiments_from_recording(data, robot())
     return experiment
 
 

@@ -1,13 +1,13 @@
-"""Grids of candidates are looked at all at once, and every shape gets what it would get by itself."""
+"""Screening of a whole grid of candidates gives the statistics of single candidates."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from armident.configs import load_robot, load_trajectory
+from armident.configs import load_robot
 from armident.configs.schema.robot import Effect
-from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.candidates import Workshop, candidates
 from armident.identify.diagnosis.foretold import foretold
 from armident.identify.diagnosis.regression import Fit, Products
@@ -16,7 +16,7 @@ from armident.identify.diagnosis.study import Study, build_study
 from armident.identify.diagnosis.trial import directions_beside, noise_with, score_statistics
 from armident.identify.diagnosis.whitening import joints_of
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import FAST, recording
 
 DELAY = 0.006
 
@@ -24,11 +24,10 @@ DELAY = 0.006
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
     """TX40 whose third torque is recorded late, at 1 kHz."""
-    robot, trajectory = load_robot("tx40"), load_trajectory("trajectories/tx40_excitation.yaml")
+    robot = load_robot("tx40")
     hidden = HiddenEffect(effect="time_delay", joint="joint_3", parameters={"delay": DELAY})
-    scenario = Scenario(schema="armident/scenario/1", effects=(hidden,))
-    recording = simulate_recording(robot, trajectory, 2, scenario=scenario, period=1e-3, setpoint_every=1)
-    experiments, _ = experiments_from_recording(recording, robot)
+    data = recording("tx40", "tx40_excitation", 2, hidden, period=FAST, setpoint_every=1)
+    experiments, _ = experiments_from_recording(data, robot)
     return refit(build_study(experiments, [], robot), robot, None)[1]
 
 
@@ -91,7 +90,7 @@ def test_joints_are_those_with_a_number_that_is_not_zero() -> None:
 
 
 def late(study: Study, delay: float, joint: str = "joint_3") -> Study:
-    """The recordings put right by a delay."""
+    """Recordings corrected for a delay."""
     stanza = Effect(effect="time_delay", joint=joint, parameters={"delay": delay})
     return study.of_robot(study.robot.model_copy(update={"effects": (stanza,)}))
 

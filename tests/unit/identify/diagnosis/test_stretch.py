@@ -1,23 +1,23 @@
-"""Stretches that a diagnosis cuts from recordings."""
+"""Segments that a diagnosis cuts from recordings."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from armident.configs import load_robot, load_trajectory
+from armident.configs import load_robot
 from armident.configs.schema.robot import Effect
 from armident.identify.diagnosis.study import Study, build_study
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import recording
 
 
 @pytest.fixture(scope="module")
 def study() -> Study:
-    """EMPS with a model whose friction yields over 2 cm before it slides."""
+    """EMPS with presliding friction over 2 cm."""
     robot = load_robot("emps")
-    recording = simulate_recording(robot, load_trajectory("trajectories/emps_excitation.yaml"), 0)
-    experiments, _ = experiments_from_recording(recording, robot)
+    data = recording("emps", "emps_excitation", 0)
+    experiments, _ = experiments_from_recording(data, robot)
     yielding = Effect(effect="presliding_friction", joint="joint_1", parameters={"displacement": 0.02, "fcd": -5.0})
     return build_study(experiments, [], robot.model_copy(update={"effects": (yielding,)}))
 

@@ -1,4 +1,4 @@
-"""Where model and data disagree: shapes without a formula, lines, and silence where there is nothing."""
+"""Residual dependences: nonparametric curves, spectral lines, none in a correct model."""
 
 from functools import cache
 from pathlib import Path
@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from armident.configs import load_robot, load_trajectory
-from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.configs import load_robot
+from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.candidates import Workshop
 from armident.identify.diagnosis.experiment import CONTAINS, recommended_experiment
 from armident.identify.diagnosis.hints import HINTS, hint_of
@@ -21,7 +21,7 @@ from armident.identify.diagnosis.where import Disagreement, unexplained, where
 from armident.identify.effects.registry import catalogue
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.thesis.recordings import measured_emps
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import FAST, recording
 
 BUMP = 5.0
 """Height of the hidden bump, N m; the noise of joint 2 in the band of the comparison is 3 N m."""
@@ -29,11 +29,8 @@ BUMP = 5.0
 
 def studied(*effects: HiddenEffect, seed: int) -> tuple[Fit, Workshop]:
     robot = load_robot("tx40")
-    once = load_trajectory("trajectories/tx40_excitation.yaml")
-    three_times = once.model_copy(update={"moves": once.moves * 3})
-    scenario = Scenario(schema="armident/scenario/1", effects=effects) if effects else None
-    recording = simulate_recording(robot, three_times, seed, scenario=scenario, period=1e-3, setpoint_every=1)
-    study = build_study(experiments_from_recording(recording, robot)[0], [], robot)
+    data = recording("tx40", "tx40_excitation", seed, *effects, repeats=3, period=FAST, setpoint_every=1)
+    study = build_study(experiments_from_recording(data, robot)[0], [], robot)
     found = fit(study)
     return found, Workshop(study, found.theta)
 
@@ -45,7 +42,7 @@ def healthy() -> tuple[Fit, Workshop]:
 
 @cache
 def strange() -> tuple[tuple[Disagreement, ...], tuple[Disagreement, ...]]:
-    """Everywhere that a plant with two effects outside the catalogue disagrees, and what is unexplained."""
+    """Residual dependences of a plant with two effects outside the catalogue, and the unexplained ones."""
     bump = HiddenEffect(effect="torque_bump", joint="joint_2", parameters={"torque": BUMP, "position": 0.3})
     ripple = HiddenEffect(effect="mains_ripple", joint="joint_3", parameters={"amplitude": 1.0, "frequency": 100.0})
     data = studied(bump, ripple, seed=40)
@@ -87,7 +84,7 @@ def test_an_arm_as_its_model_says_shows_nothing() -> None:
 
 
 def test_the_measured_emps_disagrees_in_its_friction_first(shared_data: Path) -> None:
-    """What it lacks is known: viscous friction that differs between the directions (Janot, Gautier, Brunot 2019)."""
+    """Known missing effect: direction-dependent viscous friction (Janot, Gautier, Brunot 2019)."""
     measured = measured_emps(shared_data)
     if measured is None:
         pytest.skip("no DATA_EMPS.mat in the measured data")

@@ -1,4 +1,4 @@
-"""Wrong signs and exchanged drives are named from recordings that were rewired, and from no others."""
+"""Wrong signs and exchanged drives: detection in rewired recordings, none in correct ones."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from armident.configs import DataError, RobotConfig, load_robot, load_trajectory
+from armident.configs import DataError, RobotConfig, load_robot
 from armident.configs.schema.robot import Effect
 from armident.identify.diagnosis.wiring_check import find_wiring
 from armident.identify.effects.wiring import rewired
 from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import FAST, recording
 
 POSITION, TORQUE, BOTH = {"position": 1.0}, {"torque": 1.0}, {"position": 1.0, "torque": 1.0}
 
@@ -27,7 +27,7 @@ def order(joint: str, other: str, signals: dict[str, float]) -> Effect:
 
 
 def mistaken(experiments: list[Experiment], robot: RobotConfig, *stanzas: Effect) -> list[Experiment]:
-    """With the mistakes made: each is its own inverse."""
+    """Experiments with wiring errors; each is its own inverse."""
     return rewired(experiments, robot.model_copy(update={"effects": stanzas}))
 
 
@@ -38,8 +38,8 @@ def robot() -> RobotConfig:
 
 @pytest.fixture(scope="module")
 def virtual(robot: RobotConfig) -> list[Experiment]:
-    recording = simulate_recording(robot, load_trajectory("trajectories/tx40_excitation.yaml"), 3, period=1e-3)
-    return experiments_from_recording(recording, robot)[0]
+    data = recording("tx40", "tx40_excitation", 3, period=FAST)
+    return experiments_from_recording(data, robot)[0]
 
 
 @pytest.fixture(scope="module")

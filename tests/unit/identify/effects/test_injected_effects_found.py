@@ -1,4 +1,4 @@
-"""Every effect hidden in a virtual arm, in a form of its own, comes out first by name and place."""
+"""Every effect injected into a virtual arm is the best candidate at its joint."""
 
 from dataclasses import dataclass, field
 from functools import cache
@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from armident.configs import RobotConfig, Trajectory, load_robot, load_trajectory
-from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.configs import RobotConfig, load_robot
+from armident.configs.schema.scenario import HiddenEffect
+from armident.daq.recording import Recording
 from armident.identify.diagnosis.search import Search
 from armident.identify.diagnosis.state import Settings
 from armident.identify.diagnosis.study import build_study
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import FAST, recording
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
-
-PERIOD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -86,10 +85,10 @@ SAMPLE = [
 """One effect of each family on the TX40 and all of the EMPS, whose diagnoses are short; `make proof` has the rest."""
 
 
-def trajectory(name: str) -> Trajectory:
-    """The excitation; of the TX40 three times, so that something can be learnt and something be judged."""
-    once = load_trajectory(f"trajectories/{name}_excitation.yaml")
-    return once.model_copy(update={"moves": once.moves * (3 if name == "tx40" else 1)})
+def recorded(robot: str, seed: int, *effects: HiddenEffect) -> Recording:
+    """The excitation; three times on the TX40, so that a part is left for validation."""
+    repeats = 3 if robot == "tx40" else 1
+    return recording(robot, f"{robot}_excitation", seed, *effects, repeats=repeats, period=FAST, setpoint_every=1)
 
 
 def known_of(case: Case) -> RobotConfig:
@@ -109,8 +108,7 @@ def known_of(case: Case) -> RobotConfig:
 @cache
 def healthy(robot: str) -> Any:
     """Trials beside the model of a healthy arm."""
-    recording = simulate_recording(load_robot(robot), trajectory(robot), 7, period=PERIOD, setpoint_every=1)
-    experiments, _ = experiments_from_recording(recording, load_robot(robot))
+    experiments, _ = experiments_from_recording(recorded(robot, 7), load_robot(robot))
     with threadpool_limits(1):  # type: ignore[no-untyped-call]
         return Search(build_study(experiments, [], load_robot(robot)), Settings()).start()
 
@@ -121,10 +119,9 @@ def healthy(robot: str) -> Any:
 )
 def test_what_is_hidden_comes_out_first(case: Case) -> None:
     hidden = HiddenEffect(effect=case.effect, joint=case.joint, other=case.other, parameters=case.parameters)
-    scenario = None if case.leave_out else Scenario(schema="armident/scenario/1", effects=(hidden,))
     whole, known = load_robot(case.robot), known_of(case)
-    recording = simulate_recording(whole, trajectory(case.robot), 1, scenario=scenario, period=PERIOD, setpoint_every=1)
-    experiments, _ = experiments_from_recording(recording, whole)
+    data = recorded(case.robot, 1, *([] if case.leave_out else [hidden]))
+    experiments, _ = experiments_from_recording(data, whole)
     with threadpool_limits(1):  # type: ignore[no-untyped-call]
         state = Search(build_study(experiments, [], known), Settings()).start()
     passing = state.passing(Settings())

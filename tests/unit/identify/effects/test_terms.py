@@ -1,13 +1,13 @@
-"""Effects in a robot configuration are terms of its model: identified, simulated, refused where they make no sense."""
+"""Effects of a robot configuration as model terms: identification, simulation, refused entries."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 
-from armident.configs import ConfigError, RobotConfig, load_robot, load_trajectory
+from armident.configs import ConfigError, RobotConfig, load_robot
 from armident.configs.schema.robot import Effect
-from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.controller.nominal import nominal_controller
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model
@@ -19,7 +19,7 @@ from armident.identify.robot.relaxation import simulate_with_terms
 from armident.identify.robot.simulation import simulate
 from armident.identify.signals.bandpass import butterworth
 from armident.virtual_robot.inertias import plant_parameters
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import recording
 
 DT = 1e-3
 
@@ -78,7 +78,7 @@ def test_viscous_friction_as_a_term_moves_the_simulated_arm_like_that_of_the_mod
 def test_a_simulated_arm_feels_the_torque_that_its_own_motion_gives_a_term(
     robot: RobotConfig, theta: Any, effect: str, linear: float, shapes: dict[str, float]
 ) -> None:
-    """What a late or elastic drive adds depends on accelerations and torques, and so on itself."""
+    """The torque of a late or elastic drive depends on accelerations and torques, and so on itself."""
     model = arm_model(robot)
     q_ref = reference(robot)
     controller = nominal_controller(model, theta, q_ref[::50], DT, 10.0)
@@ -97,7 +97,7 @@ def test_a_simulated_arm_feels_the_torque_that_its_own_motion_gives_a_term(
 def test_a_term_that_is_more_inertia_than_the_joint_has_itself_is_felt_at_every_instant(
     robot: RobotConfig, theta: Any
 ) -> None:
-    """A load that is computed from the last motion could not hold back a rotor heavier than its link."""
+    """An explicit scheme would diverge with a rotor heavier than its link."""
     model = arm_model(robot)
     q_ref = reference(robot)
     rotor = 2.0 * float(model.mass_matrix(theta, q_ref[:1])[0, 3, 3])
@@ -113,7 +113,7 @@ def test_a_term_that_is_more_inertia_than_the_joint_has_itself_is_felt_at_every_
 
 
 def test_a_drive_that_gives_half_its_torque_moves_an_axis_of_twice_the_parameters_alike() -> None:
-    """Half of what the arm needs is reported; its controller, made for that, moves it as before."""
+    """The drive reports half the torque, and its controller has twice the gain."""
     plain = load_robot("emps")
     model = arm_model(plain)
     values = np.array([95.0, 200.0, 20.0, -3.0])[: model.base.b]
@@ -136,10 +136,9 @@ def _on_joint_1(torque: Any, robot: RobotConfig) -> Any:
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv", "didim"])
 def test_every_method_estimates_a_term_with_the_rest(robot: RobotConfig, method: Method) -> None:
     worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.4})
-    scenario = Scenario(schema="armident/scenario/1", effects=(worn,))
-    recording = simulate_recording(robot, load_trajectory("trajectories/tx40_excitation.yaml"), 3, scenario=scenario)
+    data = recording("tx40", "tx40_excitation", 3, worn)
     known = with_effects(robot, Effect(effect="asymmetric_viscous_friction", joint="joint_2"))
-    document = identify_recording(recording, known, Options(method=method)).document
+    document = identify_recording(data, known, Options(method=method)).document
     (added,) = [p for p in document.parameters if p.name == "fva2"]
     # 0.4 of the 5.5 N m s/rad of table B.4.
     assert added.value == pytest.approx(0.4 * 5.5, abs=3.5 * added.std)
@@ -149,13 +148,13 @@ def test_every_method_estimates_a_term_with_the_rest(robot: RobotConfig, method:
 
 @pytest.mark.slow
 def test_a_wrong_drive_gain_is_identified_beside_the_dynamics(robot: RobotConfig) -> None:
-    recording = simulate_recording(robot, load_trajectory("trajectories/tx40_excitation.yaml"), 4)
+    data = recording("tx40", "tx40_excitation", 4)
     joints = list(robot.joints)
     drive = joints[1].drive
     joints[1] = joints[1].model_copy(update={"drive": drive.model_copy(update={"gain": 1.2 * drive.gain})})
     mistaken = robot.model_copy(update={"joints": tuple(joints)})
     known = with_effects(mistaken, Effect(effect="drive_gain_error", joint="joint_2"))
-    document = identify_recording(recording, known, Options(method="idim-iv")).document
+    document = identify_recording(data, known, Options(method="idim-iv")).document
     (gain,) = [p for p in document.parameters if p.name == "gain_error2"]
     # Torques reported 1.2 times too large are 0.2 more than those the model predicts.
     assert gain.value == pytest.approx(0.2, abs=3.5 * gain.std)

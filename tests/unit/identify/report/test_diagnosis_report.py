@@ -5,12 +5,12 @@ import re
 import numpy as np
 import pytest
 
-from armident.configs import load_robot, load_trajectory
-from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.configs import load_robot
+from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.report.diagnosis import SHOWN, diagnosis_report, followed_variable, telling_stretch
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import recording
 
 HIDDEN = (
     HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.15}),
@@ -20,9 +20,8 @@ HIDDEN = (
 
 @pytest.fixture(scope="module")
 def diagnosis() -> Diagnosis:
-    robot, trajectory = load_robot("emps"), load_trajectory("trajectories/emps_1.yaml")
-    scenario = Scenario(schema="armident/scenario/1", effects=HIDDEN)
-    experiments, _ = experiments_from_recording(simulate_recording(robot, trajectory, 1, scenario=scenario), robot)
+    robot = load_robot("emps")
+    experiments, _ = experiments_from_recording(recording("emps", "emps_1", 1, *HIDDEN), robot)
     found = diagnose(experiments, [], robot)
     assert {f.effect for f in found.document.findings} == {h.effect for h in HIDDEN}
     return found

@@ -5,19 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from armident.configs import load_robot, load_trajectory
 from armident.identify.document import IdentificationDocument, load_document
 from armident.identify.identification.api import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.report.files import write_identification
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import recording
 
 
 @pytest.fixture(scope="module")
 def outcome() -> IdentificationOutcome:
-    robot = load_robot("tx40.yaml")
-    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
-    return identify_recording(simulate_recording(robot, trajectory, seed=1), options=Options(method="idim-ls"))
+    return identify_recording(recording("tx40", "tx40_excitation", 1), options=Options(method="idim-ls"))
 
 
 @pytest.fixture(scope="module")
