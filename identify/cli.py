@@ -248,7 +248,7 @@ def diagnose_suite(
     strength: Annotated[str, typer.Option("--strength", help="detectable, typical, obvious: A,B,...")] = "",
     jobs: Annotated[int | None, typer.Option("--jobs", help="Cases at a time. [default: processors]", min=1)] = None,
     minutes: Annotated[
-        float | None, typer.Option("--minutes", help="Start no case after this time; call again to continue.", min=0)
+        float | None, typer.Option("--minutes", help="No new case after so long; call again to continue.", min=0)
     ] = None,
     any_version: Annotated[
         bool, typer.Option("--any-version", help="Use results of other versions of the code.")
@@ -262,12 +262,12 @@ def diagnose_suite(
 
     Example: armident diagnose-suite --quick --out suite
     """
-    from armident.identify.evaluation.run import Chosen, list_suite, run_suite
+    from armident.identify.evaluation.run import SuiteOptions, list_suite, run_suite
 
     def words(text: str) -> tuple[str, ...]:
         return tuple(word.strip() for word in text.split(",") if word.strip())
 
-    options = Chosen(suite, out, quick, words(only), words(strength), jobs, minutes, any_version)
+    options = SuiteOptions(suite, out, quick, words(only), words(strength), jobs, minutes, any_version)
     if list_cases:
         list_suite(options)
     else:

@@ -1,1 +1,1 @@
-"""The suite of a diagnosis: effects hidden in virtual arms, and how often they are found by name."""
+"""Evaluation of the diagnosis on simulated recordings with known effects: ``armident diagnose-suite``."""

@@ -1,4 +1,4 @@
-"""The cases of a suite: one recording each, what is hidden in it, and what it is to be judged by."""
+"""Cases of a suite: one simulated recording each, its hidden effects, and the expected findings."""
 
 import hashlib
 import json
@@ -12,33 +12,33 @@ from armident.configs.schema.suite import LEVELS, Level, SuiteConfig, SuiteEffec
 Kind = Literal["clean", "clean_baseline", "effect", "pair", "outside"]
 
 BASELINE_SEED = 9000
-"""Seeds of the healthy runs that baselines are identified from: their noise is not that of any case."""
+"""Noise seed of the healthy runs from which baselines are identified; no case has it."""
 CLEAN_BASELINE_SEED = 5000
-"""Seeds of the healthy runs that are judged against a baseline."""
+"""First noise seed of the healthy runs that are diagnosed with a baseline, minus one."""
 
 
 @dataclass(frozen=True)
 class InjectedEffect:
-    """One effect of a case.
+    """One simulated effect of a case.
 
     Parameters
     ----------
     effect, joint, other
-        What the virtual arm gets.
+        Effect of the virtual arm, its joint, and the second joint of an effect between two.
     names
-        What the diagnosis may call it, the first of them its own name.
+        Names that the diagnosis may give it, its own name first.
     parameters, truth
-        Expressions of the suite.
+        Expressions for the parameters of the virtual arm and of the diagnosis.
     strength
-        What ``s`` stands for in them.
+        Value of ``s`` in the expressions.
     hide
-        ``False``: the healthy arm has it already.
+        ``False`` if the effect is part of the healthy arm already.
     arm
-        Whether it is of the arm as a whole, so that no joint of a finding is wrong.
+        ``True`` for an effect of the whole arm: a finding at any joint is correct.
     brings
-        Names of effects that the arm gets with it.
+        Names of side effects; findings of them are not wrong.
     rescales
-        Whether reported torques have another size with it.
+        ``True`` if the effect changes the scale of the reported torques.
     """
 
     effect: str
@@ -60,18 +60,28 @@ class Case:
 
     Parameters
     ----------
-    kind, level
-        Which table it belongs to, and how strong its effects are; ``None`` for healthy arms.
-    robot, config, trajectory, repeats, period, seed
-        The run.
+    kind
+        Table of the case.
+    level
+        Strength of the effects; ``None`` for healthy arms.
+    robot
+        Name of the arm in the suite.
+    config, trajectory
+        Files of the robot configuration and of the trajectory.
+    repeats
+        Number of runs of the trajectory in the recording.
+    period
+        Sampling period, s.
+    seed
+        Seed of the noise.
     parts
-        What is hidden.
+        Simulated effects.
     baseline
-        Whether it is judged against the numbers of a healthy run.
+        ``True`` if the diagnosis compares with the identification of a healthy run.
     leave_out
-        What its model lacks.
+        Part that is removed from the model.
     quick
-        Whether it belongs to the quick subset.
+        ``True`` for a case of the quick subset.
     """
 
     kind: Kind
@@ -89,19 +99,19 @@ class Case:
 
     @property
     def name(self) -> str:
-        """For people: what is hidden where, how strongly, in which run."""
-        what = " and ".join(f"{p.effect} {'+'.join([p.joint, *([p.other] if p.other else [])])}" for p in self.parts)
-        words = [self.kind.replace("_", " against "), what, self.level or "", f"{self.robot} run {self.seed}"]
+        """Description: kind, effects and joints, strength, robot and seed."""
+        effects = " and ".join(f"{p.effect} {'+'.join([p.joint, *([p.other] if p.other else [])])}" for p in self.parts)
+        words = [self.kind.replace("_", " against "), effects, self.level or "", f"{self.robot} run {self.seed}"]
         return " ".join(w for w in words if w)
 
     @property
     def label(self) -> str:
-        """Row of the table: the effects' names."""
+        """Row of the table: names of the effects."""
         return " + ".join(p.names[0] for p in self.parts) or self.kind.replace("_", " against ")
 
     @property
     def key(self) -> str:
-        """Hash of all that decides the result."""
+        """Hash of everything that determines the result."""
         content = {k: v for k, v in asdict(self).items() if k not in ("quick", "kind", "level")}
         content["parts"] = [
             {k: v for k, v in part.items() if k not in ("brings", "rescales")} for part in content["parts"]
@@ -115,10 +125,15 @@ class Case:
 
 
 def all_cases(suite: SuiteConfig) -> list[Case]:
-    """Every case of a suite: healthy arms that others are compared with, then an order fair from any beginning on.
+    """Return all cases of a suite: the healthy twins first, then an order of which each beginning is representative.
 
-    Every row of the tables is spread evenly over the whole: a run that was stopped after a tenth of the cases has a
-    tenth of each. Which ones come first is drawn by the hash of what they are, the same in every run.
+    The cases of each row of the tables are spread evenly: a run that is stopped after a tenth of the cases has a tenth
+    of each row. The order within a row follows from the keys and is the same in each run.
+
+    Parameters
+    ----------
+    suite
+        The suite.
     """
     cases = [*_clean(suite), *_effects(suite), *_pairs(suite), *_outside(suite)]
     rows: dict[tuple[str, str, str | None], list[Case]] = {}
@@ -132,24 +147,26 @@ def all_cases(suite: SuiteConfig) -> list[Case]:
     return sorted(cases, key=lambda c: (c.kind != "clean" or c.seed > suite.runs, places[c.key]))
 
 
-def chosen(
+def select_cases(
     cases: Iterable[Case], *, quick: bool = False, only: Sequence[str] = (), levels: Sequence[str] = ()
 ) -> list[Case]:
-    """The cases that a user asks for.
+    """Return the cases that match all given conditions.
 
     Parameters
     ----------
+    cases
+        All cases.
     quick
-        Only those of the quick subset.
+        Only cases of the quick subset.
     only
-        Effects, or ``clean``, ``clean_baseline``, ``pair``, ``outside`` for all of that kind.
+        Names of effects, or ``clean``, ``clean_baseline``, ``pair``, ``outside`` for all cases of a kind.
     levels
         Strengths; healthy arms have none.
 
     Raises
     ------
     ConfigError
-        If nothing is called so.
+        If a name or a strength does not exist.
     """
     cases = list(cases)
     known = {c.kind for c in cases} | {p.effect for c in cases for p in c.parts}
@@ -160,17 +177,23 @@ def chosen(
         if level not in LEVELS:
             raise ConfigError(f"--strength: {level!r} is none of {', '.join(LEVELS)}")
 
-    def wanted(case: Case) -> bool:
-        # An effect that is asked for by name is meant alone; pairs are asked for as such.
+    def selected(case: Case) -> bool:
+        # The name of an effect does not select the pairs with it.
         mine = {case.kind} | ({case.parts[0].effect} if len(case.parts) == 1 else set[str]())
         named = not only or bool(mine & set(only))
         return named and (not levels or case.level in levels) and (case.quick or not quick)
 
-    return [case for case in cases if wanted(case)]
+    return [case for case in cases if selected(case)]
 
 
 def healthy_twin(case: Case) -> Case:
-    """The healthy arm on the same trajectory with the same noise, judged by the full model."""
+    """Return the case of the healthy arm with the same trajectory and noise and with the whole model.
+
+    Parameters
+    ----------
+    case
+        The case.
+    """
     return Case("clean", None, case.robot, case.config, case.trajectory, case.repeats, case.period, case.seed)
 
 
@@ -227,7 +250,7 @@ def _single(suite: SuiteConfig, kind: Kind, effects: Sequence[SuiteEffect]) -> l
             for nth, place in enumerate(places):
                 for level in effect.levels:
                     for seed in range(1, suite.runs + 1):
-                        # One place, one strength and one run of each; arms and runs in turn.
+                        # One joint, strength and run of each effect; arms and runs alternate.
                         quick = robot == robots[number % len(robots)] and nth == 0 and seed == 1 + number % suite.runs
                         quick = quick and level == ("typical" if "typical" in effect.levels else effect.levels[0])
                         out.append(

@@ -1,4 +1,4 @@
-"""The suite's report as Markdown: aims, tables, and every case that fell short."""
+"""Report of the suite as Markdown: targets, tables, and every case with a shortcoming."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -17,51 +17,53 @@ from armident.identify.evaluation.tables import (
 
 
 def _share_closed(scored: Scored) -> float:
-    """Of the injected gap; all of it where there is none."""
+    """Closed share of the injected gap; 1 without a gap."""
     closed = scored[1].closed
     return 1.0 if closed is None else closed
 
 
 SHORTFALLS: tuple[tuple[str, Callable[[Scored], bool]], ...] = (
-    ("a false alarm", lambda s: not s[0].parts and s[1].verdict != "no_gap"),
-    ("named", lambda s: s[0].kind == "outside" and fate(s[1]) == "named"),
-    ("not seen", lambda s: s[0].kind == "outside" and fate(s[1]) == "unseen"),
-    ("could hide, it says", lambda s: s[1].invisible),
+    ("false alarm", lambda s: not s[0].parts and s[1].verdict != "no_gap"),
+    ("named although outside the catalogue", lambda s: s[0].kind == "outside" and fate(s[1]) == "named"),
+    ("not detected", lambda s: s[0].kind == "outside" and fate(s[1]) == "unseen"),
+    ("below the detection limit", lambda s: s[1].invisible),
     ("not among the first two", lambda s: s[1].second is False and not s[1].invisible),
-    ("second", lambda s: s[1].first is False and s[1].second is True),
+    ("second choice", lambda s: s[1].first is False and s[1].second is True),
     (f"closed by less than {CLOSED:.0%}", lambda s: s[1].first is True and _share_closed(s) < CLOSED),
-    ("a parameter beyond three standard deviations", lambda s: not all(s[1].within)),
+    ("a parameter off by over 3 sigma", lambda s: not all(s[1].within)),
 )  # fmt: skip
-"""What a case can lack, and how to tell."""
+"""Shortcomings of a case, and the condition of each."""
 
 
 def report(result: Tables, scored: Sequence[Scored], total: int, versions: Mapping[str, int], core_hours: float) -> str:
-    """The report, one Markdown document.
+    """Return the report as one Markdown document.
 
     Parameters
     ----------
+    result
+        The tables.
     scored
-        Every case that has been run, with its score.
+        Cases with a result, and their scores.
     total
-        Cases of the suite.
+        Number of selected cases.
     versions
-        Of the code that decides the results, and how many cases are of each.
+        Number of cases by version of the code.
     core_hours
-        Time that simulating and diagnosing took, summed over the cases, h.
+        Computing time of all cases, h.
     """
     code = ", ".join(f"{version} ({count} cases)" for version, count in versions.items())
     head = (
         f"{len(scored)} of {total} cases, {core_hours:.1f} core-hours, code {code}. "
-        f"The aims are for {' and '.join(AIMED_AT)} strengths; a case fell short where the last table says so."
+        f"The targets apply to {' and '.join(AIMED_AT)} strengths; the last table lists the cases with shortcomings."
     )
-    parts = ["# What a diagnosis finds of what is hidden", head]
+    parts = ["# Detection of simulated effects by the diagnosis", head]
     tables: tuple[tuple[str, Sequence[tuple[str, Callable[[Any], str]]], Sequence[Any]], ...] = (
-        ("Aims", AIM_COLUMNS, result.aims),
-        ("Hidden effects", COLUMNS, result.effects),
+        ("Targets", AIM_COLUMNS, result.aims),
+        ("Simulated effects", COLUMNS, result.effects),
         ("Pairs of effects", COLUMNS, result.pairs),
-        ("Nothing hidden", HEALTHY_COLUMNS, result.healthy),
-        ("Effects without a name", OUTSIDE_COLUMNS, result.outside),
-        ("Cases that fell short", SHORTFALL_COLUMNS, shortfalls(scored)),
+        ("Healthy arms", HEALTHY_COLUMNS, result.healthy),
+        ("Effects outside the catalogue", OUTSIDE_COLUMNS, result.outside),
+        ("Cases with shortcomings", SHORTFALL_COLUMNS, shortfalls(scored)),
     )
     for title, columns, rows in tables:
         if rows:
@@ -70,20 +72,31 @@ def report(result: Tables, scored: Sequence[Scored], total: int, versions: Mappi
 
 
 def shortfalls(scored: Sequence[Scored]) -> list[tuple[str, str, str]]:
-    """Cases of the strengths that are aimed at, and healthy arms, that lack something: which, what, what was said."""
+    """List the cases with shortcomings, of healthy arms and of the strengths with targets.
+
+    Parameters
+    ----------
+    scored
+        Cases with a result, and their scores.
+
+    Returns
+    -------
+    list of tuple
+        Name of the case, shortcomings, and short form of the diagnosis.
+    """
     found = []
     for case, score in scored:
-        lacks = [what for what, told in SHORTFALLS if told((case, score))]
+        lacks = [name for name, holds in SHORTFALLS if holds((case, score))]
         if lacks and (case.level in AIMED_AT or not case.parts):
             closed = "" if score.closed is None else f", {score.closed:.0%} closed"
-            said = score.verdict.replace("_", " ") + (f": {score.named}" if score.named else "") + closed
-            found.append((case.name, "; ".join(lacks), said))
+            diagnosis = score.verdict.replace("_", " ") + (f": {score.named}" if score.named else "") + closed
+            found.append((case.name, "; ".join(lacks), diagnosis))
     return sorted(found, key=lambda row: row[0])
 
 
 SHORTFALL_COLUMNS: tuple[tuple[str, Callable[[Any], str]], ...] = (
     ("case", lambda row: row[0]),
-    ("lacks", lambda row: row[1]),
+    ("shortcomings", lambda row: row[1]),
     ("diagnosis", lambda row: row[2]),
 )
 

@@ -1,52 +1,59 @@
-"""What a diagnosis is worth, beside what was hidden."""
+"""Score of a diagnosis: comparison with the simulated effects."""
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
+from armident.identify.document import Alternative, DetectionLimit, DiagnosisDocument, Finding, NotVisible
 from armident.identify.evaluation.cases import Case, InjectedEffect
-from armident.identify.evaluation.store import Record
-
-Document = dict[str, Any]
+from armident.identify.evaluation.store import CaseResult
 
 SIGMAS = 3.0
-"""Distance from the truth, in standard deviations, that a parameter may have."""
+"""Accepted deviation of a parameter from the truth, in standard deviations."""
 LEAST_GAP = 0.05
-"""Injected gap, as a share of the noise's power, under which the share closed means nothing: what a few
-parameters more cost by chance alone is half a percent of it."""
+"""Smallest injected gap, as a fraction of the noise power, for which the closed share is evaluated.
+
+For comparison: a few additional parameters change the error power by half a percent of the noise by chance.
+"""
 LOW_CONFIDENCE = 0.5
-"""A name that is stated with less is called more probably wrong than right by the diagnosis itself."""
+"""Confidence below which the diagnosis considers a finding more probably wrong than right."""
+
+Named = Finding | Alternative | NotVisible | DetectionLimit
+"""Parts of a document that name an effect and a joint."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """How one case went.
+    """Result of the comparison of one case.
 
     Parameters
     ----------
     verdict
-        Of the diagnosis.
-    first, second
-        Whether every hidden effect has its right name and place among the findings; among the findings and what each
-        of them calls its closest rival. ``None`` where nothing is hidden that has a name.
+        Verdict of the diagnosis.
+    first
+        All simulated effects are among the findings with the correct effect and joint; a single effect is the first
+        finding. ``None`` where nothing in the catalogue is simulated.
+    second
+        The same, with the closest alternative of each finding counted too.
     missed
-        Nothing was found, and nothing left unexplained.
+        The verdict is ``no_gap`` although an effect is simulated.
     invisible
-        Not found, nothing else in its place and nothing left unexplained, and the diagnosis says that these recordings
-        cannot show the effect, at all or of this size; of a pair one may have been found.
+        Not found, without another finding and without an unexplained rest, and the document states that the recording
+        cannot show the effect or that its size is below the detection limit. Of a pair, one may be found.
     extra
-        Findings beside what is hidden and what comes with it.
+        Number of findings besides the simulated effects and their side effects.
     closed
         Share of the injected gap above the noise floor that is closed on held-out data; ``None`` without a gap.
     within
-        Of every parameter that can be compared, whether it is within three standard deviations of the truth.
+        For each comparable parameter, ``True`` if it is within three standard deviations of the truth.
     confidence
-        Highest of any finding; zero without one.
+        Highest confidence of the findings; zero without findings.
     named
         First finding, as ``effect joint``.
     shown
-        Whether the held-out recording has the injected gap at all: a bump that the motion does not pass is not in it.
+        ``False`` if the held-out recording does not contain the injected gap, for example if the motion does not pass
+        the position of a disturbance.
     """
 
     verdict: str
@@ -62,72 +69,97 @@ class Score:
     shown: bool = True
 
 
-def score(case: Case, record: Record, healthy: Record | None) -> Score:
-    """Judge the record of a case.
+def score(case: Case, result: CaseResult, healthy: CaseResult | None) -> Score:
+    """Compare the diagnosis of a case with the simulated effects.
 
     Parameters
     ----------
+    case
+        The case.
+    result
+        Its result.
     healthy
-        Record of its healthy twin, which says what the noise alone costs; ``None`` where nothing is hidden.
+        Result of its healthy twin, which has the torque error of the noise alone; ``None`` where nothing is simulated.
     """
-    document: Document = record["document"]
-    findings: list[Document] = document["findings"]
+    document = result.diagnosis
+    findings = document.findings
     matched = [next((f for f in findings if matches(part, f)), None) for part in case.parts]
     known = bool(case.parts) and case.kind != "outside"
     first = second = None
     if known:
         first = all(f is not None for f in matched)
         if len(case.parts) == 1:
-            # One effect: what the diagnosis names before all else.
             first = bool(findings) and matches(case.parts[0], findings[0])
         second = all(_among(part, findings) for part in case.parts)
-    truths = [*record["truth"], *({} for _ in case.parts)]
+    truths = [*result.truth, *({} for _ in case.parts)]
     absent = [(p, truth) for p, truth, f in zip(case.parts, truths, matched, strict=False) if f is None]
-    extra = sum(not any(matches(part, f) or _comes_with(part, f) for part in case.parts) for f in findings)
-    right = [f for f in matched if f is not None] if known else []
+    extra = sum(not any(matches(part, f) or _is_side_effect(part, f) for part in case.parts) for f in findings)
+    correct = [f for f in matched if f is not None] if known else []
     return Score(
-        verdict=document["verdict"],
+        verdict=document.verdict,
         first=first,
         second=second,
-        missed=document["verdict"] == "no_gap" and bool(case.parts),
+        missed=document.verdict == "no_gap" and bool(case.parts),
         invisible=bool(absent)
         and not case.baseline
         and not extra
-        and document["verdict"] in ("no_gap", "explained")
-        and all(_called_invisible(part, truth, document) for part, truth in absent),
+        and document.verdict in ("no_gap", "explained")
+        and all(_below_limit(part, truth, document) for part, truth in absent),
         extra=extra,
-        closed=None if healthy is None else closed_share(case, document, healthy["document"]),
+        closed=None if healthy is None else closed_share(case, document, healthy.diagnosis),
         within=tuple(
             ok
-            for f, truth in zip(matched, record["truth"], strict=False)
-            if f is not None and f in right
+            for f, truth in zip(matched, result.truth, strict=False)
+            if f is not None and f in correct
             for ok in within(f, truth)
         ),
-        confidence=max((f["confidence"] for f in findings), default=0.0),
-        named=f"{findings[0]['effect']} {findings[0]['joint']}" if findings else None,
-        shown=healthy is None or _injected(case, document, healthy["document"]) >= LEAST_GAP,
+        confidence=max((f.confidence for f in findings), default=0.0),
+        named=f"{findings[0].effect} {findings[0].joint}" if findings else None,
+        shown=healthy is None or _injected(case, document, healthy.diagnosis) >= LEAST_GAP,
     )
 
 
-def matches(part: InjectedEffect, finding: Document) -> bool:
-    """Whether a finding (or a rival of one) names a hidden effect and its place; a pair in either order."""
-    if finding["effect"] not in part.names:
+def matches(part: InjectedEffect, named: Named) -> bool:
+    """Return ``True`` if an entry of a document names a simulated effect at its joint; two joints in either order.
+
+    Parameters
+    ----------
+    part
+        The simulated effect.
+    named
+        A finding, an alternative, or an entry of ``not_visible`` or ``detection_limits``.
+    """
+    if named.effect not in part.names:
         return False
     if part.arm:
         return True
-    places = {part.joint, part.other} - {None}
-    found = {finding["joint"], finding.get("other")} - {None}
-    return found == places or (finding.get("other") is None and found <= places)
+    other = None if isinstance(named, Alternative | NotVisible) else named.other
+    expected = {part.joint, part.other} - {None}
+    found = {named.joint, other} - {None}
+    return found == expected or (other is None and found <= expected)
 
 
-def closed_share(case: Case, document: Document, healthy: Document) -> float | None:
-    """``(before^2 - after^2) / (before^2 - clean^2)`` of the held-out torque errors, over the joints concerned.
+def closed_share(case: Case, document: DiagnosisDocument, healthy: DiagnosisDocument) -> float | None:
+    """Return ``(before^2 - after^2) / (before^2 - healthy^2)`` of the held-out torque errors of the joints concerned.
 
-    Errors of the torques at measured motion, or of the simulated closed loop's, whichever shows the injected gap more
-    clearly. Measured motion differentiated once more brings noise that a delay or an elastic joint does not have: what
-    the findings change is taken at measured or at simulated motion, whichever leaves less.
-    In N m or N: an arm that lost half its friction needs less torque, of which the same noise is a larger percentage.
-    ``None`` where there is no gap to speak of, or where reported torques have another size than the healthy arm's.
+    The errors are those at measured motion or those of the simulated closed loop, whichever show the injected gap more
+    clearly. A further derivative of measured motion adds noise that a delay or an elastic joint does not cause. The
+    change by the findings is therefore the smaller of that at measured and that at simulated motion. The unit is N m or
+    N: percentages depend on the torque, which an effect such as lost friction reduces.
+
+    Parameters
+    ----------
+    case
+        The case.
+    document
+        Its diagnosis.
+    healthy
+        Diagnosis of its healthy twin.
+
+    Returns
+    -------
+    float or None
+        ``None`` without an injected gap, or if the reported torques are scaled differently from the healthy arm's.
     """
     if any(part.rescales for part in case.parts) and not case.baseline:
         return None
@@ -137,94 +169,104 @@ def closed_share(case: Case, document: Document, healthy: Document) -> float | N
     return (before - after) / (before - clean)
 
 
-def _injected(case: Case, document: Document, healthy: Document) -> float:
-    """Power that is injected, over that of the healthy arm's errors."""
+Powers = tuple[float, float, float]
+"""Error power before and after the findings are added, and that of the healthy arm, (N m)^2 or N^2."""
+When = Literal["before", "after"]
+
+
+def _injected(case: Case, document: DiagnosisDocument, healthy: DiagnosisDocument) -> float:
+    """Injected error power relative to that of the healthy arm."""
     before, _, clean = _clearest(case, document, healthy)
     return before / max(clean, 1e-300) - 1.0
 
 
-def _clearest(case: Case, document: Document, healthy: Document) -> "Powers":
-    """Where the gap shows most."""
+def _clearest(case: Case, document: DiagnosisDocument, healthy: DiagnosisDocument) -> Powers:
+    """Powers at measured motion or of the simulated loop, whichever show the larger gap."""
     views = [_at_measured_motion(case, document, healthy)]
-    both = [(of.get("simulated") or {}).get("torque_before") for of in (document, healthy)]
-    if all(both) and not case.baseline:
-        views.append(_of_the_simulated_loop(case, document, healthy))
+    if not case.baseline and all((of.simulated or {}).get("torque_before") for of in (document, healthy)):
+        views.append(_of_simulated_loop(case, document, healthy))
     return max(views, key=lambda v: v[0] / max(v[2], 1e-300))
 
 
-Powers = tuple[float, float, float]
-"""Of the errors before and after, and of the healthy arm."""
+def _at_measured_motion(case: Case, document: DiagnosisDocument, healthy: DiagnosisDocument) -> Powers:
+    def power(rms: dict[str, float]) -> float:
+        return sum(rms[j] ** 2 for j in _joints(case, rms))
 
-
-def _at_measured_motion(case: Case, document: Document, healthy: Document) -> Powers:
-    def power(gap: Document) -> float:
-        return sum(float(gap["rms"][j]) ** 2 for j in _joints(case, gap["rms"]))
-
-    validation = document["gap"]["validation"]
-    numbers = [f for f in document["findings"] if f["kind"] == "numbers"]
+    validation, clean = document.gap.validation, healthy.gap.validation.before.rms
+    numbers = [f for f in document.findings if f.kind == "numbers"]
     if case.baseline and numbers:
-        place = numbers[0]["joint"]
-        torque = _torques(document, "before")[place]
-        return (
-            (float(numbers[0]["gap_before"]) * torque) ** 2,
-            (float(numbers[-1]["gap_after"]) * torque) ** 2,
-            float(healthy["gap"]["validation"]["before"]["rms"][place]) ** 2,
-        )
-    after = power(validation["after"])
-    foretold = (document.get("simulated") or {}).get("torque_without_derivative_noise")
-    if foretold is not None:
+        joint = numbers[0].joint
+        torque = _torques(document, "before")[joint]
+        return (numbers[0].gap_before * torque) ** 2, (numbers[-1].gap_after * torque) ** 2, clean[joint] ** 2
+    after = power(validation.after.rms)
+    simulated = (document.simulated or {}).get("torque_without_derivative_noise")
+    if simulated is not None:
         torques = _torques(document, "after")
-        after = min(after, sum((foretold[j] * torques[j]) ** 2 for j in _joints(case, foretold)))
-    return power(validation["before"]), after, power(healthy["gap"]["validation"]["before"])
+        after = min(after, sum((simulated[j] * torques[j]) ** 2 for j in _joints(case, simulated)))
+    return power(validation.before.rms), after, power(clean)
 
 
-def _of_the_simulated_loop(case: Case, document: Document, healthy: Document) -> Powers:
-    def power(of: Document, when: str) -> float:
-        errors, torques = of["simulated"][f"torque_{when}"], _torques(of, when)
+def _of_simulated_loop(case: Case, document: DiagnosisDocument, healthy: DiagnosisDocument) -> Powers:
+    def power(of: DiagnosisDocument, when: When) -> float:
+        errors, torques = (of.simulated or {})[f"torque_{when}"], _torques(of, when)
         return float(sum((errors[j] * torques[j]) ** 2 for j in _joints(case, errors)))
 
     return power(document, "before"), power(document, "after"), power(healthy, "before")
 
 
-def _torques(document: Document, when: str) -> dict[str, float]:
-    """A hundredth of the torque of each joint (RMS), N m or N, of which errors ``before`` or ``after`` are percentages.
+def _torques(document: DiagnosisDocument, when: When) -> dict[str, float]:
+    """RMS torque of each joint over 100, N m or N: the unit of percentage errors.
 
-    They differ where torques have been put right.
+    The values before and after differ if a finding corrects the torques.
     """
-    gap = document["gap"]["validation"][when]
-    return {joint: gap["rms"][joint] / max(gap["by_joint"][joint], 1e-300) for joint in gap["rms"]}
+    validation = document.gap.validation
+    gap = validation.before if when == "before" else validation.after
+    return {joint: gap.rms[joint] / max(gap.by_joint[joint], 1e-300) for joint in gap.rms}
 
 
-def _joints(case: Case, every: Iterable[str]) -> set[str]:
-    """Joints that the effects of a case act on."""
+def _joints(case: Case, every: Iterable[str]) -> list[str]:
+    """Joints on which the effects of a case act."""
     if any(part.arm for part in case.parts):
-        return set(every)
-    return {j for part in case.parts for j in (part.joint, part.other) if j is not None}
+        return sorted(every)
+    return sorted({j for part in case.parts for j in (part.joint, part.other) if j is not None})
 
 
-def within(finding: Document, truth: dict[str, float]) -> list[bool]:
-    """Of the parameters that finding and truth share, whether they agree."""
-    deviations = finding["evidence"].get("std", {})
+def within(finding: Finding, truth: dict[str, float]) -> list[bool]:
+    """Compare the parameters that finding and truth share.
+
+    Parameters
+    ----------
+    finding
+        The finding.
+    truth
+        True values by name.
+
+    Returns
+    -------
+    list of bool
+        ``True`` for each parameter within three standard deviations of the truth.
+    """
+    deviations = finding.evidence.get("std", {})
     out = []
     for name, value in truth.items():
         std = deviations.get(name)
-        if name in finding["parameters"] and std is not None and math.isfinite(std):
-            out.append(abs(finding["parameters"][name] - value) <= SIGMAS * std)
+        if name in finding.parameters and std is not None and math.isfinite(std):
+            out.append(abs(finding.parameters[name] - value) <= SIGMAS * std)
     return out
 
 
-def _comes_with(part: InjectedEffect, finding: Document) -> bool:
-    return finding["effect"] in part.brings and finding["joint"] == part.joint
+def _is_side_effect(part: InjectedEffect, finding: Finding) -> bool:
+    return finding.effect in part.brings and finding.joint == part.joint
 
 
-def _among(part: InjectedEffect, findings: Sequence[Document]) -> bool:
-    return any(matches(part, f) or any(matches(part, rival) for rival in f["alternatives"][:1]) for f in findings)
+def _among(part: InjectedEffect, findings: Sequence[Finding]) -> bool:
+    return any(matches(part, f) or any(matches(part, other) for other in f.alternatives[:1]) for f in findings)
 
 
-def _called_invisible(part: InjectedEffect, truth: dict[str, float], document: Document) -> bool:
-    """Whether the diagnosis says that an effect cannot show, or could hide with parameters of this size."""
-    if any(matches(part, entry) for entry in document["not_visible"]):
+def _below_limit(part: InjectedEffect, truth: dict[str, float], document: DiagnosisDocument) -> bool:
+    """``True`` if the document calls an effect not visible, or its detection limits exceed the true parameters."""
+    if any(matches(part, entry) for entry in document.not_visible):
         return True
-    limits = [entry["limits"] for entry in document.get("detection_limits", []) if matches(part, entry)]
-    sizes = [[abs(value) < below[name] for name, value in truth.items() if name in below] for below in limits]
+    limits = [entry.limits for entry in document.detection_limits if matches(part, entry)]
+    sizes = [[abs(value) < limit[name] for name, value in truth.items() if name in limit] for limit in limits]
     return any(bool(compared) and all(compared) for compared in sizes)

@@ -1,4 +1,4 @@
-"""What the suite shows on a terminal."""
+"""Progress and tables of the suite on a terminal."""
 
 import sys
 import threading
@@ -12,21 +12,27 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from armident.identify.evaluation.cases import Case
-from armident.identify.evaluation.store import Record
+from armident.identify.evaluation.store import CaseResult
 from armident.identify.evaluation.tables import AIM_COLUMNS, COLUMNS, HEALTHY_COLUMNS, OUTSIDE_COLUMNS, Tables
-from armident.identify.evaluation.workers import Done
+from armident.identify.evaluation.workers import OnResult
 
 PLAIN_EVERY_S = 30.0
-"""Between two lines of progress where stderr is no terminal."""
+"""Time between two lines of progress if stderr is not a terminal, s."""
 LEAST_WIDTH = 120
-"""Columns of text that the widest table needs."""
+"""Width of the widest table, characters."""
 
 
 @contextmanager
-def progress(total: int) -> Iterator[Done]:
-    """Count cases: a bar where stderr is a terminal, otherwise a plain line now and then; failures at once."""
+def progress(total: int) -> Iterator[OnResult]:
+    """Show progress on stderr: a bar on a terminal, otherwise a line every 30 s; failures at once.
+
+    Parameters
+    ----------
+    total
+        Number of cases.
+    """
     lock, begin = threading.Lock(), time.monotonic()
-    finished, said = 0, begin
+    finished, shown = 0, begin
     bar = None
     if sys.stderr.isatty():
         bar = Progress(
@@ -41,17 +47,17 @@ def progress(total: int) -> Iterator[Done]:
         task = bar.add_task("diagnose-suite", total=total)
         bar.start()
 
-    def done(case: Case, record: Record) -> None:
-        nonlocal finished, said
+    def on_result(case: Case, result: CaseResult) -> None:
+        nonlocal finished, shown
         with lock:
             finished += 1
-            if "error" in record:
-                print(f"diagnose-suite: failed: {case.name}: {record['error']}", file=sys.stderr, flush=True)
+            if result.error is not None:
+                print(f"diagnose-suite: failed: {case.name}: {result.error}", file=sys.stderr, flush=True)
             now = time.monotonic()
             if bar is not None:
                 bar.update(task, advance=1, description=case.name[:60])
-            elif now - said >= PLAIN_EVERY_S or finished == total:
-                said = now
+            elif now - shown >= PLAIN_EVERY_S or finished == total:
+                shown = now
                 left = (now - begin) / finished * (total - finished)
                 print(
                     f"diagnose-suite: {finished} of {total}, {now - begin:.0f} s, about {left:.0f} s left",
@@ -60,35 +66,45 @@ def progress(total: int) -> Iterator[Done]:
                 )
 
     try:
-        yield done
+        yield on_result
     finally:
         if bar is not None:
             bar.stop()
 
 
 def show(result: Tables, run: int, total: int) -> None:
-    """Print the tables, and of how many cases they are."""
+    """Print the tables and the number of cases in them.
+
+    Parameters
+    ----------
+    result
+        The tables.
+    run
+        Number of cases with a result or an error.
+    total
+        Number of selected cases.
+    """
     console = Console()
     if not console.is_terminal:
         console = Console(width=LEAST_WIDTH)
     for title, columns, rows in (
-        ("hidden effects", COLUMNS, result.effects),
+        ("simulated effects", COLUMNS, result.effects),
         ("pairs of effects", COLUMNS, result.pairs),
-        ("nothing hidden", HEALTHY_COLUMNS, result.healthy),
-        ("effects without a name", OUTSIDE_COLUMNS, result.outside),
-        ("aims", AIM_COLUMNS, result.aims),
+        ("healthy arms", HEALTHY_COLUMNS, result.healthy),
+        ("effects outside the catalogue", OUTSIDE_COLUMNS, result.outside),
+        ("targets", AIM_COLUMNS, result.aims),
     ):
         if rows:
             console.print(_table(title, columns, rows))
     console.print(f"{run} of {total} cases have been run", highlight=False)
     if run < total:
-        console.print("they are a sample of all kinds; the same command goes on with the others", highlight=False)
+        console.print("they are a sample of all kinds; the same command runs the others", highlight=False)
 
 
 def _table(title: str, columns: Sequence[tuple[str, Callable[[Any], str]]], rows: Sequence[Any]) -> Table:
     table = Table(title=title, title_justify="left")
     for k, (heading, _) in enumerate(columns):
-        left = not k or heading in ("strength", "most often")
+        left = not k or heading in ("strength", "most frequent finding")
         table.add_column(heading, justify="left" if left else "right", no_wrap=left)
     for row in rows:
         table.add_row(*(value(row) for _, value in columns))

@@ -1,4 +1,4 @@
-"""The tables of a suite: by effect and strength, healthy arms, and effects outside the catalogue."""
+"""Tables of a suite: by effect and strength, healthy arms, and effects outside the catalogue."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -14,31 +14,34 @@ from armident.identify.evaluation.score import LOW_CONFIDENCE, Score
 
 Scored = tuple[Case, Score]
 CLOSED = 0.9
-"""Share of the injected gap that is to close."""
+"""Target for the closed share of the injected gap."""
 AIMED_AT = ("typical", "obvious")
-"""Strengths for which the aims are meant; what is just detectable may be missed."""
+"""Strengths with targets; just detectable effects may be missed."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One effect at one strength; shares are of 1, ``None`` where nothing can be counted.
+    """One effect at one strength; shares are fractions of 1, ``None`` without cases.
 
     Parameters
     ----------
+    label, level
+        Names of the effects, and their strength.
     n, failed
-        Cases judged, and cases without a diagnosis.
+        Number of cases with a diagnosis, and of cases that failed.
     first, second
-        Right name and place: as the first finding, or as that or its closest rival; of what is not called invisible.
+        Share of cases with the correct effect and joint as first finding, or as its closest alternative too; without
+        the cases below the detection limit.
     missed, invisible
-        Nothing found; and called invisible in this motion.
+        Share of cases without a finding, and of cases below the detection limit that the diagnosis states.
     extra
-        Cases with findings beside what is hidden.
+        Share of cases with findings besides the simulated effects.
     closed
-        Median share of the injected gap closed.
+        Median closed share of the injected gap.
     closed_enough
-        Cases in which at least 90 % of it closed.
+        Share of cases with at least `CLOSED` of the gap closed.
     within
-        Parameters within three standard deviations.
+        Share of parameters within three standard deviations of the truth.
     """
 
     label: str
@@ -57,7 +60,19 @@ class Row:
 
 @dataclass(frozen=True)
 class Healthy:
-    """Healthy arms of one kind: how many were called otherwise, and the two-sided 95 % bounds (Clopper, Pearson)."""
+    """Healthy arms of one kind.
+
+    Parameters
+    ----------
+    label
+        Kind and robot.
+    n, failed
+        Number of cases with a diagnosis, and of cases that failed.
+    alarms
+        Number of verdicts other than ``no_gap``.
+    low, high
+        Two-sided 95 % confidence limits of the false alarm rate, see `clopper_pearson`.
+    """
 
     label: str
     n: int
@@ -69,7 +84,25 @@ class Healthy:
 
 @dataclass(frozen=True)
 class Outside:
-    """An effect without a name: left unexplained, named with low confidence, named, not seen, or not in the data."""
+    """One effect outside the catalogue at one strength; shares are fractions of 1, ``None`` without cases.
+
+    Parameters
+    ----------
+    label, level
+        Name of the effect, and its strength.
+    n, failed
+        Number of cases with a diagnosis, and of cases that failed.
+    unexplained
+        Share of cases without a finding and with an unexplained rest: the correct result.
+    low_confidence, named
+        Share of cases with findings, all with confidence below `LOW_CONFIDENCE`, or not.
+    unseen
+        Share of cases with verdict ``no_gap`` although the held-out data contain the gap.
+    absent
+        Share of cases with verdict ``no_gap`` whose held-out data do not contain the gap.
+    most_often
+        Most frequent first finding of the ``named`` cases.
+    """
 
     label: str
     level: str
@@ -85,7 +118,19 @@ class Outside:
 
 @dataclass(frozen=True)
 class Aim:
-    """One figure of the suite's aims."""
+    """One figure with a target.
+
+    Parameters
+    ----------
+    what
+        Description of the figure.
+    value
+        Reached value, a fraction of 1; ``None`` without cases.
+    aim
+        Target, a fraction of 1.
+    n
+        Number of cases or parameters.
+    """
 
     what: str
     value: float | None
@@ -94,13 +139,25 @@ class Aim:
 
     @property
     def reached(self) -> bool | None:
-        """``None`` without cases."""
+        """``True`` if the value is at least the target; ``None`` without cases."""
         return None if self.value is None else self.value >= self.aim
 
 
 @dataclass(frozen=True)
 class Tables:
-    """All of it."""
+    """All tables of a suite.
+
+    Parameters
+    ----------
+    effects, pairs
+        Single effects and pairs of effects, by strength.
+    healthy
+        Healthy arms.
+    outside
+        Effects outside the catalogue.
+    aims
+        Figures with targets.
+    """
 
     effects: tuple[Row, ...]
     pairs: tuple[Row, ...]
@@ -110,7 +167,15 @@ class Tables:
 
 
 def tables(scored: Sequence[Scored], failed: Sequence[Case]) -> Tables:
-    """Count what the cases of a suite came to."""
+    """Return the tables of a suite.
+
+    Parameters
+    ----------
+    scored
+        Cases with a result, and their scores.
+    failed
+        Cases that failed.
+    """
     singles = [s for s in scored if s[0].kind == "effect"]
     pairs = [s for s in scored if s[0].kind == "pair"]
     return Tables(
@@ -123,11 +188,19 @@ def tables(scored: Sequence[Scored], failed: Sequence[Case]) -> Tables:
 
 
 def clopper_pearson(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Two-sided bounds of a probability after ``k`` of ``n`` (Clopper, Pearson 1934)."""
-    tail = (1 - level) / 2
-    low = 0.0 if k == 0 else float(stats.beta.ppf(tail, k, n - k + 1))
-    high = 1.0 if k == n else float(stats.beta.ppf(1 - tail, k + 1, n - k))
-    return low, high
+    """Return the two-sided confidence limits of a probability (Clopper and Pearson, Biometrika 26, 1934).
+
+    Parameters
+    ----------
+    k
+        Number of events.
+    n
+        Number of trials.
+    level
+        Confidence level.
+    """
+    interval = stats.binomtest(k, n).proportion_ci(level, "exact")
+    return float(interval.low), float(interval.high)
 
 
 def _groups(scored: Iterable[Scored], failed: Iterable[Case]) -> dict[tuple[str, str], tuple[list[Scored], int]]:
@@ -214,7 +287,13 @@ def _outside(scored: Sequence[Scored], failed: Sequence[Case]) -> Iterable[Outsi
 
 
 def fate(score: Score) -> str:
-    """What became of an effect without a name: see `Outside`."""
+    """Return the column of `Outside` for an effect outside the catalogue.
+
+    Parameters
+    ----------
+    score
+        Score of the case.
+    """
     if score.confidence >= LOW_CONFIDENCE:
         return "named"
     if score.confidence > 0:
@@ -239,37 +318,55 @@ def _aims(scored: Sequence[Scored]) -> tuple[Aim, ...]:
         return Aim(what, share(hits), wanted, len(hits))
 
     return (
-        aim("name and place right", [s.first is True for s in named], 0.95),
-        aim("name and place right, or second", [s.second is True for s in named], 0.99),
-        aim("pairs: both names and places right", [s.first is True for s in pairs], 0.95),
-        aim("name and place right, what it says could hide counted too", [s.first is True for s in single], 0.95),
-        aim("right, or second, what it says could hide counted too", [s.second is True for s in single], 0.99),
-        aim("pairs, what it says could hide counted too", [s.first is True for s in both], 0.95),
-        aim("healthy arms called healthy", [s.verdict == "no_gap" for s in clean], 0.99),
+        aim("effect and joint correct", [s.first is True for s in named], 0.95),
+        aim("effect and joint correct, first or second choice", [s.second is True for s in named], 0.99),
+        aim("pairs: both effects and joints correct", [s.first is True for s in pairs], 0.95),
         aim(
-            "outside the catalogue, in the data: unexplained, or named with low confidence",
+            "effect and joint correct, with the cases below the detection limit",
+            [s.first is True for s in single],
+            0.95,
+        ),
+        aim(
+            "first or second choice, with the cases below the detection limit", [s.second is True for s in single], 0.99
+        ),
+        aim("pairs, with the cases below the detection limit", [s.first is True for s in both], 0.95),
+        aim("healthy arms with verdict no_gap", [s.verdict == "no_gap" for s in clean], 0.99),
+        aim(
+            "outside the catalogue, gap in the data: unexplained or low confidence",
             [f in ("unexplained", "low_confidence") for f in there],
             0.90,
         ),
-        Aim("share of the injected gap closed, mean where named", _mean(closed), 0.90, len(closed)),
-        aim(f"cases with at least {CLOSED:.0%} of it closed", [c >= CLOSED for c in closed], 0.90),
+        Aim("mean closed share of the injected gap where the effect is correct", _mean(closed), 0.90, len(closed)),
+        aim(f"cases with at least {CLOSED:.0%} of the gap closed", [c >= CLOSED for c in closed], 0.90),
         aim("parameters within three standard deviations", parameters, 0.90),
     )
 
 
 def _mean(closed: Sequence[float]) -> float | None:
-    """What one case closes beyond its gap makes up for no other."""
+    """Mean closed share, each limited to 1: a share above 1 does not compensate for another case."""
     return sum(min(c, 1.0) for c in closed) / len(closed) if closed else None
 
 
 def share(hits: Iterable[bool]) -> float | None:
-    """Share of true ones, ``None`` of nothing."""
+    """Return the fraction of ``True``; ``None`` without elements.
+
+    Parameters
+    ----------
+    hits
+        The elements.
+    """
     counted = list(hits)
     return sum(counted) / len(counted) if counted else None
 
 
 def percent(value: float | None) -> str:
-    """A share as a reader wants it."""
+    """Return a share in percent as text.
+
+    Parameters
+    ----------
+    value
+        The share, a fraction of 1; ``None`` becomes ``-``.
+    """
     return "-" if value is None else f"{100 * value:.0f}"
 
 
@@ -281,7 +378,7 @@ COLUMNS: tuple[tuple[str, Callable[[Any], str]], ...] = (
     ("top-1 %", lambda r: percent(r.first)),
     ("top-2 %", lambda r: percent(r.second)),
     ("missed %", lambda r: percent(r.missed)),
-    ("unseeable %", lambda r: percent(r.invisible)),
+    ("below limit %", lambda r: percent(r.invisible)),
     ("extra %", lambda r: percent(r.extra)),
     ("closed %", lambda r: percent(r.closed)),
     (">= 90 %", lambda r: percent(r.closed_enough)),
@@ -292,7 +389,7 @@ HEALTHY_COLUMNS: tuple[tuple[str, Callable[[Any], str]], ...] = (
     ("n", lambda r: str(r.n)),
     ("failed", lambda r: str(r.failed or "")),
     ("false alarms", lambda r: str(r.alarms)),
-    ("95 % bounds, %", lambda r: f"{100 * r.low:.1f} to {100 * r.high:.1f}"),
+    ("95 % limits, %", lambda r: f"{100 * r.low:.1f} to {100 * r.high:.1f}"),
 )
 OUTSIDE_COLUMNS: tuple[tuple[str, Callable[[Any], str]], ...] = (
     ("outside the catalogue", lambda r: r.label),
@@ -302,14 +399,14 @@ OUTSIDE_COLUMNS: tuple[tuple[str, Callable[[Any], str]], ...] = (
     ("unexplained %", lambda r: percent(r.unexplained)),
     ("low confidence %", lambda r: percent(r.low_confidence)),
     ("named %", lambda r: percent(r.named)),
-    ("unseen %", lambda r: percent(r.unseen)),
-    ("not in the data %", lambda r: percent(r.absent)),
-    ("most often", lambda r: r.most_often or ""),
+    ("not detected %", lambda r: percent(r.unseen)),
+    ("gap not in the data %", lambda r: percent(r.absent)),
+    ("most frequent finding", lambda r: r.most_often or ""),
 )
 AIM_COLUMNS: tuple[tuple[str, Callable[[Any], str]], ...] = (
-    ("aim, typical and obvious strengths", lambda r: r.what),
+    ("figure, typical and obvious strengths", lambda r: r.what),
     ("n", lambda r: str(r.n)),
     ("%", lambda r: "-" if r.value is None else f"{100 * r.value:.1f}"),
-    ("aim %", lambda r: f"{100 * r.aim:.0f}"),
+    ("target %", lambda r: f"{100 * r.aim:.0f}"),
     ("reached", lambda r: {True: "yes", False: "no", None: "-"}[r.reached]),
 )

@@ -1,4 +1,4 @@
-"""Runs the cases: every lane has a plant and a diagnosis of its own, and takes one case after the other."""
+"""Runs the cases of a suite: each worker has a plant process and a diagnosis process and runs one case at a time."""
 
 import tempfile
 import threading
@@ -11,154 +11,176 @@ from typing import Any
 
 from armident.configs import ArmidentError
 from armident.identify.evaluation.cases import BASELINE_SEED, Case, InjectedEffect, healthy_twin
-from armident.identify.evaluation.process import Room
-from armident.identify.evaluation.store import Record, Store
+from armident.identify.evaluation.diagnosis_process import DiagnosisProcess
+from armident.identify.evaluation.plant_process import PlantProcess
+from armident.identify.evaluation.store import CaseResult, Store
+from armident.identify.evaluation.tasks import (
+    DiagnosisTask,
+    IdentificationTask,
+    TimedDiagnosis,
+    diagnose_file,
+    identify_file,
+)
 
-PLANT, DIAGNOSIS = "armident.virtual_robot.batch", "armident.identify.diagnosis.batch"
-PATIENCE_S = 900.0
-"""For one answer; the first one of a machine waits for the compiler."""
+TIMEOUT_S = 900.0
+"""Time limit of a simulation or a diagnosis, s; the first one includes the compilation of its loops."""
 
-Done = Callable[[Case, Record], None]
+OnResult = Callable[[Case, CaseResult], None]
+"""Receives each case with its result or error."""
 
 
-class Lanes:
-    """As many lanes as jobs; results go into the store.
+class Stopped(Exception):
+    """The run was stopped before a case had a result."""
+
+
+class CaseRunner:
+    """Runs cases in parallel and stores their results.
+
+    The error of a case is its result and does not end the run. A healthy twin that several cases need is run once.
 
     Parameters
     ----------
     store
-        Results so far.
+        Results.
     out
         Folder of logs and baselines.
     jobs
-        Number of lanes.
+        Number of workers.
     """
 
     def __init__(self, store: Store, out: Path, jobs: int) -> None:
         self._store, self._out, self._jobs = store, out, jobs
-        self._shared: dict[str, Future[Record]] = {}
+        self._results: dict[str, Future[CaseResult]] = {}
+        self._baselines: dict[Path, Future[None]] = {}
+        self._workers: list[_Worker] = []
         self._lock = threading.Lock()
+        self._stop = threading.Event()
 
-    def run(self, cases: Sequence[Case], done: Done, until: float | None = None) -> None:
-        """Carry out every case that has no result yet, and the healthy twins they need.
+    def run(self, cases: Sequence[Case], on_result: OnResult, until: float | None = None) -> None:
+        """Run every case without a result, and the healthy twins that they need.
+
+        Ctrl-C ends the running cases without a result; the next run repeats them.
 
         Parameters
         ----------
-        done
-            Called, from a lane's thread, with every case that now has a result or has failed.
+        cases
+            The cases.
+        on_result
+            Called from a thread of a worker after each case.
         until
-            `time.monotonic` after which no further case is begun.
+            `time.monotonic` after which no further case is started.
         """
         queue: SimpleQueue[Case] = SimpleQueue()
         for case in cases:
             queue.put(case)
-        stop = threading.Event()
         with ThreadPoolExecutor(self._jobs) as pool:
-            lanes = [pool.submit(self._lane, k, queue, done, stop, until) for k in range(self._jobs)]
+            threads = [pool.submit(self._work, k, queue, on_result, until) for k in range(self._jobs)]
             try:
-                for lane in lanes:
-                    lane.result()
-            finally:
-                stop.set()
+                for thread in threads:
+                    thread.result()
+            except BaseException:
+                self._stop.set()
+                with self._lock:
+                    workers = list(self._workers)
+                for worker in workers:
+                    worker.kill()
+                raise
 
-    def _lane(
-        self, number: int, queue: SimpleQueue[Case], done: Done, stop: threading.Event, until: float | None
-    ) -> None:
-        rooms = [Room(module, self._out / "logs" / f"{module}.{number}.log") for module in (PLANT, DIAGNOSIS)]
+    def _work(self, number: int, queue: "SimpleQueue[Case]", on_result: OnResult, until: float | None) -> None:
+        """Run cases of the queue until it is empty, time is up or the run is stopped."""
         with tempfile.TemporaryDirectory(prefix="armident-suite-") as scratch:
-            bench = _Bench(rooms[0], rooms[1], Path(scratch) / "recording.mcap")
+            logs = self._out / "logs"
+            worker = _Worker(
+                PlantProcess(logs / f"plant.{number}.log"),
+                DiagnosisProcess(logs / f"diagnosis.{number}.log"),
+                Path(scratch) / "recording.mcap",
+            )
+            with self._lock:
+                self._workers.append(worker)
             try:
-                while not stop.is_set() and (until is None or time.monotonic() < until):
-                    try:
-                        case = queue.get_nowait()
-                    except Empty:
-                        return
+                while not self._stop.is_set() and (until is None or time.monotonic() < until):
+                    case = queue.get_nowait()
                     if case.parts:
-                        self._carry_out(healthy_twin(case), bench)
-                    done(case, self._carry_out(case, bench))
+                        self._case_result(healthy_twin(case), worker)
+                    on_result(case, self._case_result(case, worker))
+            except (Empty, Stopped):
+                return
             finally:
-                for room in rooms:
-                    room.close()
+                worker.close()
 
-    def _carry_out(self, case: Case, bench: "_Bench") -> Record:
-        """The result of a case: stored, awaited from another lane, or made here."""
-        key = case.key
+    def _case_result(self, case: Case, worker: "_Worker") -> CaseResult:
+        """Return the result of a case: from the store, from another worker, or by running it."""
         with self._lock:
-            stored = self._store.get(key)
+            stored = self._store.get(case.key)
             if stored is not None:
                 return stored
-            pending = self._shared.get(key)
-            mine: Future[Record] | None = None
+            pending = self._results.get(case.key)
             if pending is None:
-                mine = self._shared[key] = Future()
+                future = self._results[case.key] = Future[CaseResult]()
         if pending is not None:
             return pending.result()
-        assert mine is not None
-        record: Record
         try:
-            record = {"key": key, "case": case.name, **self._result(case, bench)}
-        except ArmidentError as error:
-            record = {"key": key, "case": case.name, "error": str(error)}
+            result = self._store.add(self._run_case(case, worker))
         except BaseException as error:
-            mine.set_exception(error)
+            future.set_exception(error)
             raise
-        self._store.add(record)
-        mine.set_result(record)
-        return record
+        future.set_result(result)
+        return result
 
-    def _result(self, case: Case, bench: "_Bench") -> Record:
-        baseline = self._baseline(case, bench) if case.baseline else None
-        made = bench.record(case)
+    def _run_case(self, case: Case, worker: "_Worker") -> CaseResult:
         try:
-            answer = bench.diagnose(case, baseline)
+            baseline = self._baseline(case, worker) if case.baseline else None
+            simulated = worker.simulate(case)
+            diagnosis = worker.diagnose(case, baseline)
+        except ArmidentError as error:
+            if self._stop.is_set():
+                raise Stopped from error
+            return CaseResult(key=case.key, case=case.name, error=str(error))
         finally:
-            bench.recording.unlink(missing_ok=True)
-        document = answer["document"]
-        for unimportant in ("recordings", "versions", "model"):
-            document.pop(unimportant, None)
-        return {
-            "effects": made["effects"],
-            "truth": made["truth"],
-            "document": document,
-            "seconds": {"simulate": made["seconds"], "diagnose": answer["seconds"]},
-        }
+            worker.recording.unlink(missing_ok=True)
+        return CaseResult(
+            key=case.key,
+            case=case.name,
+            effects=simulated["effects"],
+            truth=simulated["truth"],
+            document=diagnosis.document,
+            seconds={"simulate": simulated["seconds"], "diagnose": diagnosis.seconds},
+        )
 
-    def _baseline(self, case: Case, bench: "_Bench") -> Path:
-        """Identification of the healthy arm on the case's trajectory, with other noise."""
+    def _baseline(self, case: Case, worker: "_Worker") -> Path:
+        """Return the file of the identification of the healthy arm on the case's trajectory, with other noise."""
         healthy = Case(
             "clean", None, case.robot, case.config, case.trajectory, case.repeats, case.period, BASELINE_SEED
         )
         path = self._out / "baselines" / f"{self._store.version}-{healthy.key}.json"
         with self._lock:
-            pending = self._shared.get(str(path))
-            mine: Future[Record] | None = None
+            pending = self._baselines.get(path)
             if pending is None:
-                mine = self._shared[str(path)] = Future()
-        if mine is None:
-            assert pending is not None
+                future = self._baselines[path] = Future[None]()
+        if pending is not None:
             pending.result()
-        else:
-            try:
-                if not path.exists():
-                    bench.record(healthy)
-                    bench.identify(healthy, path)
-                mine.set_result({})
-            except BaseException as error:
-                mine.set_exception(error)
-                raise
-            finally:
-                bench.recording.unlink(missing_ok=True)
+            return path
+        try:
+            if not path.exists():
+                worker.simulate(healthy)
+                worker.identify(healthy, path)
+        except BaseException as error:
+            future.set_exception(error)
+            raise
+        finally:
+            worker.recording.unlink(missing_ok=True)
+        future.set_result(None)
         return path
 
 
-class _Bench:
-    """A plant and a diagnosis that hand each other one recording."""
+class _Worker:
+    """A plant process and a diagnosis process that share one file for the recording."""
 
-    def __init__(self, plant: Room, diagnosis: Room, recording: Path) -> None:
-        self._plant, self._diagnosis, self.recording = plant, diagnosis, recording
+    def __init__(self, plant: PlantProcess, diagnosis: DiagnosisProcess, recording: Path) -> None:
+        self.plant, self.diagnosis, self.recording = plant, diagnosis, recording
 
-    def record(self, case: Case) -> Record:
-        """Simulate a case."""
+    def simulate(self, case: Case) -> dict[str, Any]:
+        """Write the recording of a case."""
         request = {
             "id": case.key,
             "robot": case.config,
@@ -169,28 +191,29 @@ class _Bench:
             "effects": [_effect(part) for part in case.parts],
             "out": str(self.recording),
         }
-        return self._plant.ask(request, PATIENCE_S)
+        return self.plant.request(request, TIMEOUT_S)
 
-    def diagnose(self, case: Case, baseline: Path | None) -> Record:
-        """Diagnose what was recorded; nothing of what is hidden goes over."""
-        request: dict[str, Any] = {
-            "id": case.key,
-            "do": "diagnose",
-            "recording": str(self.recording),
-            "robot": case.config,
-            "baseline": None if baseline is None else str(baseline),
-        }
-        if case.leave_out is not None:
-            joints = [j for part in case.parts for j in (part.joint, part.other) if j]
-            request |= {"leave_out": case.leave_out, "joints": joints}
-        return self._diagnosis.ask(request, PATIENCE_S)
+    def diagnose(self, case: Case, baseline: Path | None) -> TimedDiagnosis:
+        """Diagnose the recording; the task contains nothing about the hidden effects."""
+        joints = [joint for part in case.parts for joint in (part.joint, part.other) if joint]
+        task = DiagnosisTask(
+            self.recording, case.config, case.leave_out, tuple(joints) if case.leave_out else (), baseline
+        )
+        return self.diagnosis.run(diagnose_file, task, TIMEOUT_S)
 
     def identify(self, case: Case, out: Path) -> None:
-        """Identify what was recorded."""
-        request = {
-            "id": case.key, "do": "identify", "recording": str(self.recording), "robot": case.config, "out": str(out),
-        }  # fmt: skip
-        self._diagnosis.ask(request, PATIENCE_S)
+        """Identify the recording and write the identification document."""
+        self.diagnosis.run(identify_file, IdentificationTask(self.recording, case.config, out), TIMEOUT_S)
+
+    def kill(self) -> None:
+        """End both processes at once, from another thread."""
+        self.plant.kill()
+        self.diagnosis.kill()
+
+    def close(self) -> None:
+        """End both processes."""
+        self.plant.close()
+        self.diagnosis.close()
 
 
 def _effect(part: InjectedEffect) -> dict[str, Any]:

@@ -1,14 +1,19 @@
-"""The suite at work: effects hidden in virtual arms are found by name, and healthy arms are left alone."""
+"""Runs of the suite: simulated effects are found, and healthy arms have no findings."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
 import yaml
 
 from armident.identify.evaluation.run import REPORT, RESULTS, SUMMARY, TABLE
+from armident.processes import CommandProcess, start_command
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -58,14 +63,45 @@ def test_a_spring_is_found_and_a_run_goes_on_where_it_was(small: Path, tmp_path:
     assert (result["run"], result["not_run"]) == (2, 0)
     assert result["healthy"][0]["alarms"] == 0
     assert "joint_spring,obvious,1" in (out / TABLE).read_text(encoding="utf-8")
-    told = (out / REPORT).read_text(encoding="utf-8")
-    assert "2 of 2 cases" in told
-    assert "| joint_spring | obvious | 1 |" in told
+    text = (out / REPORT).read_text(encoding="utf-8")
+    assert "2 of 2 cases" in text
+    assert "| joint_spring | obvious | 1 |" in text
     lines = (out / RESULTS).read_text(encoding="utf-8")
     again = diagnose_suite(*words, "--json")
     assert "2 cases, 2 done before" in again.stderr
     assert json.loads(again.stdout) == result
     assert (out / RESULTS).read_text(encoding="utf-8") == lines
+
+
+def test_ctrl_c_ends_a_run_and_the_next_one_continues(small: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ["diagnose-suite", "--suite", str(small), "--out", str(out), "--jobs", "2"]
+    with CommandProcess(words, start=partial(start_command, own_session=True)) as suite:
+        log = out / "logs" / "diagnosis.0.log"
+        until = time.monotonic() + 120
+        while not log.exists() and time.monotonic() < until:
+            time.sleep(0.1)
+        children = descendants(getattr(suite.process, "pid", 0))
+        suite.send_signal(signal.SIGINT)
+        begin = time.monotonic()
+        suite.process.wait(60)
+    assert time.monotonic() - begin < 30
+    assert suite.exit_code == 130, suite.errors()
+    assert "Traceback" not in suite.errors()
+    assert children
+    assert not any(Path(f"/proc/{child}").exists() for child in children)
+    assert not (out / RESULTS).exists()
+    assert diagnose_suite(*words[1:]).returncode == 0
+
+
+def descendants(ancestor: int) -> list[int]:
+    """Numbers of all child processes of a process, and of theirs."""
+    parents = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
+    children = [pid for pid, parent in parents.items() if parent == ancestor]
+    return children + [pid for child in children for pid in descendants(child)]
 
 
 def test_a_case_that_fails_is_reported_and_not_swallowed(small: Path, tmp_path: Path) -> None:
@@ -81,14 +117,14 @@ def test_a_case_that_fails_is_reported_and_not_swallowed(small: Path, tmp_path: 
 
 
 LEAST = {
-    "name and place right": 0.70,
-    "name and place right, or second": 0.70,
-    "healthy arms called healthy": 1.0,
-    "share of the injected gap closed, mean where named": 0.85,
-    "cases with at least 90% of it closed": 0.60,
+    "effect and joint correct": 0.70,
+    "effect and joint correct, first or second choice": 0.70,
+    "healthy arms with verdict no_gap": 1.0,
+    "mean closed share of the injected gap where the effect is correct": 0.85,
+    "cases with at least 90% of the gap closed": 0.60,
     "parameters within three standard deviations": 0.70,
 }
-"""Of the quick subset, one run of each effect: below what it comes to by two binomial deviations or more."""
+"""Limits for the quick subset (one run per effect): two binomial standard deviations below its results or more."""
 
 
 @pytest.mark.proof

@@ -1,4 +1,4 @@
-"""Which cases a suite has."""
+"""Cases of the shipped suite and their selection."""
 
 from collections import Counter
 from pathlib import Path
@@ -9,9 +9,9 @@ import yaml
 from armident.configs import ConfigError, config_path, load_robot, load_suite, load_trajectory
 from armident.configs.schema.scenario import Scenario
 from armident.configs.schema.suite import LEVELS
-from armident.identify.evaluation.cases import all_cases, chosen, healthy_twin
-from armident.virtual_robot.batch import resolved
+from armident.identify.evaluation.cases import all_cases, healthy_twin, select_cases
 from armident.virtual_robot.effects import CATALOGUE, OUTSIDE, hidden_effects
+from armident.virtual_robot.json_server import resolve_effect
 
 SUITE = load_suite("suite")
 CASES = all_cases(SUITE)
@@ -53,7 +53,7 @@ def test_every_hidden_effect_is_one_that_the_virtual_arm_takes() -> None:
                 "effect": part.effect, "joint": part.joint, "other": part.other, "parameters": part.parameters,
                 "truth": part.truth, "strength": part.strength,
             }  # fmt: skip
-            effect, truth = resolved(entry, robots[case.robot], once[Path(case.trajectory)])
+            effect, truth = resolve_effect(entry, robots[case.robot], once[Path(case.trajectory)])
             assert set(truth) == set(part.truth)
             if part.hide:
                 scenario = Scenario(schema="armident/scenario/1", effects=(effect,))
@@ -88,7 +88,7 @@ def test_a_twin_is_the_healthy_arm_of_the_same_run_and_one_of_the_clean_cases() 
 
 
 def test_the_quick_subset_has_every_effect_and_both_arms() -> None:
-    quick = chosen(CASES, quick=True)
+    quick = select_cases(CASES, quick=True)
     assert len(quick) < 60
     for kind in ("effect", "outside"):
         whole = {p.effect for c in CASES if c.kind == kind for p in c.parts}
@@ -100,13 +100,13 @@ def test_the_quick_subset_has_every_effect_and_both_arms() -> None:
 
 
 def test_cases_can_be_chosen_by_effect_and_by_strength() -> None:
-    some = chosen(CASES, only=["joint_spring"], levels=["obvious"])
+    some = select_cases(CASES, only=["joint_spring"], levels=["obvious"])
     assert {(c.label, c.level) for c in some} == {("joint_spring", "obvious")}
-    assert {c.kind for c in chosen(CASES, only=["clean"])} == {"clean"}
+    assert {c.kind for c in select_cases(CASES, only=["clean"])} == {"clean"}
     with pytest.raises(ConfigError, match=r"--only: 'joint_sprig'"):
-        chosen(CASES, only=["joint_sprig"])
+        select_cases(CASES, only=["joint_sprig"])
     with pytest.raises(ConfigError, match=r"--strength: 'huge'"):
-        chosen(CASES, levels=["huge"])
+        select_cases(CASES, levels=["huge"])
 
 
 def test_a_suite_that_names_an_unknown_robot_is_refused(tmp_path: Path) -> None:
