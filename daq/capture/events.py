@@ -34,7 +34,7 @@ class EventHandler:
     def __init__(self, plan: CapturePlan, assembler: Assembler, sink: Sink) -> None:
         self.counts = dict.fromkeys(COUNTED, 0)
         self.moving = False
-        """Whether the capture moves the arm: a failing drive or bus ends the capture then."""
+        """True while the capture moves the arm: a failing drive or bus ends the capture then."""
         self.triggers: tuple[str, ...] = ()
         self.change(plan.session)
         self._plan, self._assembler, self._sink = plan, assembler, sink

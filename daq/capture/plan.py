@@ -52,7 +52,7 @@ class CapturePlan:
 
     @property
     def produces_sync(self) -> bool:
-        """Whether the capture sends SYNC."""
+        """True if the capture sends SYNC."""
         return self.session.sync.role == "producer" and not self.listen_only
 
     @property

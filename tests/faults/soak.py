@@ -74,7 +74,7 @@ def record(seconds: float, rate_hz: int, folder: Path, channels: list[str]) -> i
     (folder / "soak.json").write_text(json.dumps(document))
     counters, size = document["counters"], Path(document["recording"]).stat().st_size
     print(f"{count} SYNCs at {rate_hz} Hz on {len(channels)} buses in {wall:.1f} s, {12 * count} frames;")
-    print(f"  sender: worst lateness {late_ms:.1f} ms, grid moved {shifted} times, {failed} refused")
+    print(f"  sender: largest delay {late_ms:.1f} ms, grid moved {shifted} times, {failed} refused")
     print(
         f"  rows {counters['samples.rows']}, in gaps {counters['samples.in_gaps']}, gaps {counters['gaps']},", end=" "
     )

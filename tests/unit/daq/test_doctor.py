@@ -101,7 +101,7 @@ def test_states_reach_the_service_manager(tmp_path: Path, monkeypatch: pytest.Mo
         notifier.stopping()
         received = [manager.recv(200).decode() for _ in range(3)]
         os.unlink(tmp_path / "notify")
-        notifier.progress("nobody listens any more")
+        notifier.progress("no manager receives this")
         notifier.close()
     assert received == ["READY=1\nSTATUS=cell: recording", "WATCHDOG=1\nSTATUS=SYNC 5", "STOPPING=1"]
     monkeypatch.delenv("NOTIFY_SOCKET")
