@@ -23,6 +23,8 @@ from armident.daq.matching.streams import captured_streams
 from armident.daq.recording import Gap, read_recording
 from armident.daq.streaming import Keys, decode_block, open_session
 
+pytestmark = pytest.mark.slow
+
 ROWS, EVERY_S, SECONDS = 100, 0.02, 3.0
 """Six axes at 5 kHz, taken every 20 ms."""
 MEMORY = 150_000_000

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDERS = ("configs", "drivers", "daq", "identify", "virtual_robot", "tests")
 CALLS = (

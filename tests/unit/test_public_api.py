@@ -43,6 +43,7 @@ def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
         armident.identfy  # noqa: B018 - the access is the test
 
 
+@pytest.mark.slow
 def test_type_checkers_see_every_name(tmp_path: Path) -> None:
     names = ", ".join(f"armident.{name}" for name in armident.__all__)
     (tmp_path / "uses.py").write_text(

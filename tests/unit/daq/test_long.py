@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.timeout(280)
 def test_a_minute_of_six_drives_is_recorded_without_loss() -> None:

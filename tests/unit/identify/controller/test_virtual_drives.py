@@ -24,6 +24,8 @@ from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.servo import CONTROL_PERIOD, VELOCITY_FILTER_HZ, gains
 
+pytestmark = pytest.mark.slow
+
 Floats = NDArray[np.float64]
 
 TABLE_5_12 = (10, 20, 3, 13, 10, 20)

@@ -33,6 +33,7 @@ def diagnosed(seed: int, *effects: HiddenEffect) -> Diagnosis:
     return diagnose(experiments, [], robot, notes=notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_plant_without_hidden_effects_has_no_gap(seed: int) -> None:
     document = diagnosed(seed).document
@@ -40,6 +41,7 @@ def test_a_plant_without_hidden_effects_has_no_gap(seed: int) -> None:
     assert document.gap.validation.before == document.gap.validation.after
 
 
+@pytest.mark.slow
 def test_a_worn_joint_is_named_and_its_size_is_right() -> None:
     worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
     found = diagnosed(0, worn)
@@ -51,6 +53,7 @@ def test_a_worn_joint_is_named_and_its_size_is_right() -> None:
     assert found.document.verdict == "explained"
 
 
+@pytest.mark.slow
 def test_a_cogging_motor_is_named_with_its_harmonic() -> None:
     cogging = HiddenEffect(effect="cogging_torque", joint="joint_3", parameters={"amplitude": 1.2, "harmonic": 1.0})
     finding = diagnosed(1, cogging).document.findings[0]
@@ -58,6 +61,7 @@ def test_a_cogging_motor_is_named_with_its_harmonic() -> None:
     assert finding.parameters["harmonic"] == 1.0
 
 
+@pytest.mark.slow
 def test_held_out_error_of_the_joint_falls_with_every_finding() -> None:
     worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.4})
     document = diagnosed(2, worn).document
@@ -109,6 +113,7 @@ def test_a_stanza_with_a_parameter_of_another_effect_is_refused(robot: RobotConf
         arm_model(robot.model_copy(update={"effects": (stanza,)}))
 
 
+@pytest.mark.slow
 def test_identifying_with_the_effect_inside_brings_the_torque_error_down(robot: RobotConfig) -> None:
     worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.4})
     data = recording("tx40", "tx40_excitation", 3, worn, repeats=REPEATS)
@@ -122,6 +127,7 @@ def test_identifying_with_the_effect_inside_brings_the_torque_error_down(robot: 
     assert added.unit == "N m s/rad"
 
 
+@pytest.mark.slow
 def test_a_slow_drive_is_found_where_the_simulated_loop_does_not_tell(robot: RobotConfig) -> None:
     """The wrist's drives hardly follow their references, with and without the lag, also in simulation."""
     slow = HiddenEffect(effect="actuator_bandwidth", joint="joint_5", parameters={"time_constant": 0.032})

@@ -13,6 +13,8 @@ from armident.identify.diagnosis.study import build_study
 from armident.identify.document import Gap
 from tests.statistics.measured import MACHINES, tx40
 
+pytestmark = pytest.mark.slow
+
 
 def diagnosed(shared_data: Path, name: str, folder: str) -> Diagnosis:
     if not (shared_data / folder).is_dir():

@@ -16,6 +16,8 @@ from armident.identify.document import Finding, IdentificationDocument
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording, tx40_baseline
 
+pytestmark = pytest.mark.slow
+
 ARMIDENT = [sys.executable, "-m", "armident.daq.cli"]
 PLUGIN = '''
 import numpy as np
@@ -80,28 +82,24 @@ def against_baseline(seed: int, *effects: HiddenEffect) -> list[Finding]:
     return diagnosed(recorded(robot, seed, *effects), robot, tx40_baseline()).document.findings
 
 
-@pytest.mark.slow
 def test_other_friction_of_one_joint_is_another_number_and_no_structure() -> None:
     cold = HiddenEffect(effect="friction_scale", joint="joint_3", parameters={"factor": 1.3})
     (finding,) = against_baseline(3, cold)
     assert (finding.kind, finding.effect, finding.joint) == ("numbers", "friction_change", "joint_3")
 
 
-@pytest.mark.slow
 def test_a_structural_effect_is_no_other_number() -> None:
     worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
     (finding,) = against_baseline(4, worn)
     assert (finding.kind, finding.effect, finding.joint) == ("structure", "asymmetric_viscous_friction", "joint_2")
 
 
-@pytest.mark.slow
 def test_the_gain_of_one_drive_is_named() -> None:
     gain = HiddenEffect(effect="drive_gain_error", joint="joint_2", parameters={"error": 0.1})
     findings = [f for f in against_baseline(5, gain) if f.effect == "drive_gain_error"]
     assert [f.joint for f in findings] == ["joint_2"]
 
 
-@pytest.mark.slow
 def test_a_drive_that_gives_twice_its_torque_is_sized_by_what_the_model_with_it_predicts() -> None:
     """Of the torque that the model without it predicts, which reports half of it, it would be another share."""
     robot = load_robot("tx40")
@@ -116,7 +114,6 @@ def test_a_drive_that_gives_twice_its_torque_is_sized_by_what_the_model_with_it_
     assert after < before
 
 
-@pytest.mark.slow
 def test_like_joints_that_were_exchanged_are_found_though_nothing_else_is_amiss() -> None:
     robot = load_robot("tx40")
     both = {"position": 1.0, "torque": 1.0}
@@ -125,7 +122,6 @@ def test_like_joints_that_were_exchanged_are_found_though_nothing_else_is_amiss(
     assert [(f.effect, f.joint, f.other) for f in document.findings] == [("joint_order", "joint_4", "joint_5")]
 
 
-@pytest.mark.slow
 def test_a_base_that_was_tilted_is_named() -> None:
     tilted = HiddenEffect(effect="gravity_direction", joint="joint_1", parameters={"tilt": 0.05, "azimuth": 0.7})
     assert [f.effect for f in against_baseline(6, tilted)] == ["gravity_direction"]

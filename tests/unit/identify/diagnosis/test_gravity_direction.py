@@ -11,6 +11,8 @@ from armident.identify.experiment import Experiment
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 
+pytestmark = pytest.mark.slow
+
 ROBOT = load_robot("kuka_lwr4").model_copy(update={"effects": ()})
 DT = 5e-3
 SECONDS = 20.0

@@ -17,6 +17,8 @@ from armident.identify.document import IdentificationDocument
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording, tx40_baseline
 
+pytestmark = pytest.mark.slow
+
 REPEATS = 2
 Recorded = Callable[..., Recording]
 

@@ -15,6 +15,8 @@ from armident.identify.diagnosis.study import Study, build_study
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import recording
 
+pytestmark = pytest.mark.slow
+
 LINK, RESONANCE = 0.7 * 95.0, 12.0
 """Mass on the spring, kg, and its frequency behind a motor that is held, Hz."""
 

@@ -22,6 +22,8 @@ from armident.identify.identification.from_recording import experiments_from_rec
 from armident.identify.thesis.recordings import measured_emps
 from tests.fixtures.arms import FAST, recording
 
+pytestmark = pytest.mark.slow
+
 Array = NDArray[np.float64]
 
 BUMP = HiddenEffect(effect="torque_bump", joint="joint_2", parameters={"torque": 5.0, "position": 0.3})
@@ -135,12 +137,10 @@ def test_slow_torques_that_nothing_knows_are_no_noise_even_without_a_repetition(
     assert excess.amplitude[-1] ** 2 < HEADROOM * excess.noise[-1] ** 2
 
 
-@pytest.mark.slow
 def test_two_recordings_of_a_healthy_arm_have_no_gap() -> None:
     assert diagnose([recorded(2), recorded(3)], [], robot()).document.verdict == "no_gap"
 
 
-@pytest.mark.slow
 def test_two_recordings_of_one_motion_show_an_effect_outside_the_catalogue() -> None:
     document = diagnose([recorded(0, bump=True), recorded(1, bump=True)], [], robot()).document
     assert document.verdict in ("unexplained", "partly_explained")
@@ -172,7 +172,6 @@ def own_last_third(shared_data: Path) -> Diagnosis:
     return diagnose([measured.experiment], [], load_robot("emps"))
 
 
-@pytest.mark.slow
 def test_nothing_is_stated_of_the_emps_that_does_not_convince(own_last_third: Diagnosis) -> None:
     document = own_last_third.document
     stated = {f.effect for f in document.findings}
@@ -186,7 +185,6 @@ def test_nothing_is_stated_of_the_emps_that_does_not_convince(own_last_third: Di
     assert all(f.confidence < 0.5 and f.effect not in stated for f in document.considered)
 
 
-@pytest.mark.slow
 def test_what_the_findings_leave_of_the_emps_is_no_noise_and_said_to_be_unexplained(own_last_third: Diagnosis) -> None:
     document = own_last_third.document
     assert document.verdict == "partly_explained"

@@ -18,6 +18,8 @@ from armident.identify.diagnosis.whitening import joints_of
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording
 
+pytestmark = pytest.mark.slow
+
 DELAY = 0.006
 
 

@@ -23,6 +23,8 @@ from armident.identify.identification.from_recording import experiments_from_rec
 from armident.identify.thesis.recordings import measured_emps
 from tests.fixtures.arms import FAST, recording
 
+pytestmark = pytest.mark.slow
+
 BUMP = 5.0
 """Height of the hidden bump, N m; the noise of joint 2 in the band of the comparison is 3 N m."""
 

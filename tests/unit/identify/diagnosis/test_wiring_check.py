@@ -15,6 +15,8 @@ from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording
 
+pytestmark = pytest.mark.slow
+
 POSITION, TORQUE, BOTH = {"position": 1.0}, {"torque": 1.0}, {"position": 1.0, "torque": 1.0}
 
 

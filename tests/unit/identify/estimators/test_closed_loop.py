@@ -1,4 +1,4 @@
-"""The closed loop that instruments come from: given up where the identified controller leads astray."""
+"""Replacement of the identified controller where its closed loop does not move like the robot."""
 
 from functools import partial
 
@@ -14,6 +14,8 @@ from armident.identify.identification.options import Method, Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.virtual_robot.offline import simulate_recording
 
+pytestmark = pytest.mark.slow
+
 SLOW = 0.002
 """Sampling period, s, at which the identified controller of the TX40 swings in simulation."""
 
@@ -27,18 +29,18 @@ def at_500_hz() -> list[Experiment]:
 
 @pytest.mark.parametrize("method", ["idim-iv", "idim-piv"])
 def test_a_loop_at_the_edge_of_stability_is_replaced(at_500_hz: list[Experiment], method: Method) -> None:
-    """The iterates wander with the identified controller; those of the stand-in come to rest beside least squares."""
+    """The iterates wander with the identified controller, and converge near least squares with a stiff one."""
     found = identify_experiment(at_500_hz, load_robot("tx40.yaml"), Options(method=method))
     assert found.converged
     assert found.controller["kind"] == "nominal"
-    assert any("a stiff stand-in is used" in warning for warning in found.warnings)
+    assert any("A stiff PD controller is used" in warning for warning in found.warnings)
     ls, ls_std = found.idim_ls
     assert np.all(found.std < 10 * ls_std)
     essential = found.essential
     assert np.all(np.abs(found.theta - ls)[essential] < 0.3 * np.abs(ls)[essential] + 6 * found.std[essential])
 
 
-def test_a_prefilter_that_comes_to_no_rest_is_done_without(
+def test_idim_iv_replaces_a_prefilter_that_does_not_converge(
     at_500_hz: list[Experiment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same iterations, stopped after the first: the estimate is that of IDIM-IV, which converges."""
@@ -46,7 +48,7 @@ def test_a_prefilter_that_comes_to_no_rest_is_done_without(
     robot = load_robot("tx40.yaml")
     found = identify_experiment(at_500_hz, robot, Options())
     assert found.converged
-    assert any("stopped after 1 iterations without converging" in warning for warning in found.warnings)
+    assert any("IDIM-PIV did not converge (stopped after 1 iterations)" in warning for warning in found.warnings)
     without = identify_experiment(at_500_hz, robot, Options(method="idim-iv"))
     np.testing.assert_allclose(found.theta, without.theta, rtol=0, atol=1e-9)
     # Serial correlation counts, which plain IDIM-IV leaves out.

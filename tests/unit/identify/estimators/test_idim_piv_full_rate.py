@@ -16,7 +16,7 @@ from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.estimators.idim_piv import idim_piv
 from armident.identify.experiment import Experiment
 from armident.identify.identification.auxiliary_loop import closed_loop
-from armident.identify.identification.equations import PIV_CUTOFF, equations
+from armident.identify.identification.equations import PIV_CUTOFF, Prepared, equations
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
@@ -28,6 +28,8 @@ from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording
+
+pytestmark = pytest.mark.slow
 
 Floats = NDArray[np.float64]
 
@@ -66,7 +68,8 @@ def loop(factor: int | None, band_hz: float) -> tuple[list[ExperimentEquations],
     ls = idim_ls(equations(model(), [experiment], [motion], plain), model().base.names)
     decimation = decimation_of("idim-piv", experiment.dt, BANDWIDTH_HZ, factor)
     options = Options(method="idim-piv", decimation=factor)
-    auxiliary, start, _ = closed_loop(model(), [experiment], [motion], options, ls.theta, decimation, BANDWIDTH_HZ, [])
+    prepared = Prepared(model(), [experiment], [motion])
+    auxiliary, start, _, _ = closed_loop(prepared, options, ls.theta, decimation, BANDWIDTH_HZ)
     return equations(model(), [experiment], [motion], decimation), replace(auxiliary, band_hz=band_hz), start
 
 
@@ -77,7 +80,6 @@ def estimated(factor: int | None, band_hz: float) -> Estimate:
         return idim_piv(blocks, auxiliary, start)
 
 
-@pytest.mark.slow
 def test_every_sample_gives_what_the_rough_decimation_gives() -> None:
     full, rough = estimated(1, BAND_HZ), estimated(None, BAND_HZ)
 
@@ -90,7 +92,6 @@ def test_every_sample_gives_what_the_rough_decimation_gives() -> None:
     assert 0.8 < np.median(full.std / rough.std) < 1.25
 
 
-@pytest.mark.slow
 def test_instruments_of_any_band_take_set_points_for_information_that_the_smoothed_regressor_lacks() -> None:
     blocks, auxiliary, _ = loop(1, np.inf)
     limited = estimated(1, BAND_HZ)
@@ -129,7 +130,6 @@ def test_no_chosen_decimation_is_wider_than_twice_the_band(cutoff_hz: float) -> 
     assert 0.5 / (0.0002 * factor) < 2.0 * cutoff_hz
 
 
-@pytest.mark.slow
 def test_identification_at_the_recorded_rate_converges_without_a_warning() -> None:
     found = identify_experiment(recorded()[0], load_robot("tx40"), Options(method="idim-piv", decimation=1))
 

@@ -32,6 +32,8 @@ from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant
 
+pytestmark = pytest.mark.slow
+
 Floats = NDArray[np.float64]
 Iterative = Callable[[list[ExperimentEquations], AuxiliaryModel, Floats], Estimate]
 
@@ -160,7 +162,6 @@ def test_encoders_a_hundred_times_as_coarse_still_give_the_parameters(method: It
     assert found.converged or found.stop_reason.startswith(("stopped after", "the equations of", "no step"))
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_clie_equals_didim_and_cloe_feels_the_weakest_parameters_a_thousand_times_less() -> None:
     data = recorded(1.0)

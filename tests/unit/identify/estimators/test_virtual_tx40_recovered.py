@@ -17,6 +17,8 @@ from armident.identify.identification.result import Identification
 from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording
 
+pytestmark = pytest.mark.slow
+
 ESSENTIAL = (
     *("zz1r", "fv1", "fc1", "xx2r", "xz2r", "zz2r", "mx2r", "fv2", "fc2", "xx3r", "zz3r", "my3r", "ia3", "fv3", "fc3"),
     *("mx4", "ia4", "fv4", "fc4", "my5r", "ia5", "fv5", "fc5", "ia6", "fv6", "fc6", "fvm6", "fcm6"),
@@ -98,7 +100,6 @@ def test_a_recording_without_reference_still_gives_the_parameters() -> None:
     assert (np.abs(result.theta - truth())[chosen] < 5 * identified(0, 1.0, Options()).std[chosen]).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "seeds", [3, pytest.param(20, marks=[pytest.mark.proof, pytest.mark.timeout(1800)])], ids=lambda n: f"{n} seeds"
 )

@@ -16,6 +16,8 @@ from armident.identify.identification.equations import LS_CUTOFF
 from armident.identify.identification.options import Options
 from armident.virtual_robot.offline import simulate_recording
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def document() -> IdentificationDocument:

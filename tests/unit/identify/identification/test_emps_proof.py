@@ -34,6 +34,8 @@ from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import differentiate
 
+pytestmark = pytest.mark.slow
+
 Floats = NDArray[np.float64]
 
 DT = 1e-3

@@ -38,6 +38,8 @@ from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
 
+pytestmark = pytest.mark.slow
+
 KUKA = load_robot("kuka_lwr4")
 PANDA = load_robot("panda")
 TRAINED_SHARE = 0.7

@@ -17,6 +17,8 @@ from armident.identify.report.identification import identification_report
 from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def recording() -> Recording:
@@ -49,7 +51,6 @@ def test_every_method_meets_the_arm(method: Method) -> None:
     assert (np.abs(result.theta - truth)[chosen] < 5 * result.std[chosen]).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", ["clie", "cloe"])
 def test_output_errors_meet_the_arm_too(method: Method) -> None:
     outcome = identified(options(method))

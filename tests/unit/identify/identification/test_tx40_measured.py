@@ -12,6 +12,8 @@ from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
 from tests.tx40_reference import TABLE_B4, published_estimate
 
+pytestmark = pytest.mark.slow
+
 STANDSTILL_S = 7.5
 DT = 2e-4
 

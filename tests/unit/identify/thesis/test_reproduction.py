@@ -34,6 +34,8 @@ from armident.virtual_robot.cli import robot as robot_command
 from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
 from armident.virtual_robot.run import record_robot
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -33,6 +33,8 @@ from armident.identify.thesis.emps_protocol import (
     worst_factor,
 )
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def rows() -> dict[str, Row]:
