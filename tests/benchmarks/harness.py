@@ -1,7 +1,8 @@
 """What a benchmark is: a figure of ours beside that of a named alternative, measured in the same run."""
 
+import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 
@@ -21,6 +22,8 @@ class Row:
         Unit of both figures.
     note
         Conditions and proof that both computed the same.
+    low, high
+        Smallest and largest ratio of the rounds, where there are several.
     """
 
     name: str
@@ -29,6 +32,8 @@ class Row:
     ratio: float | None
     unit: str
     note: str = ""
+    low: float | None = None
+    high: float | None = None
 
 
 def best_of(function: Callable[[], object], repeat: int = 3) -> float:
@@ -39,3 +44,20 @@ def best_of(function: Callable[[], object], repeat: int = 3) -> float:
         function()
         times.append(time.perf_counter() - start)
     return min(times)
+
+
+def ratio_of_medians(ours: Sequence[float], alternative: Sequence[float]) -> tuple[float, float, float]:
+    """Compare two figures over several interleaved rounds.
+
+    Parameters
+    ----------
+    ours, alternative
+        Figures of the rounds, one each, in the same unit; smaller is better.
+
+    Returns
+    -------
+    tuple
+        Ratio of the medians (> 1: ours is better), and the smallest and the largest ratio within a round.
+    """
+    ratios = [theirs / mine for mine, theirs in zip(ours, alternative, strict=True)]
+    return statistics.median(alternative) / statistics.median(ours), min(ratios), max(ratios)

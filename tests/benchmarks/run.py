@@ -65,6 +65,8 @@ def _print(rows: list[Row]) -> None:
     for row in rows:
         alternative = "" if row.alternative is None else f"{row.alternative:.4g}"
         ratio = "" if row.ratio is None else f"{row.ratio:.3g}"
+        if row.low is not None and row.high is not None:
+            ratio += f" ({row.low:.3g} to {row.high:.3g})"
         table.add_row(row.name, f"{row.ours:.4g}", alternative, ratio, row.unit, row.note)
     # a redirected table is not squeezed into the width of a terminal that is not there
     Console(width=None if sys.stdout.isatty() else 160).print(table)
