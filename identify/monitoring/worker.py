@@ -1,10 +1,10 @@
 """Identification worker: identifies every experiment from the samples and events on Zenoh, publishes the result."""
 
 import json
+import logging
 import math
 import queue
 import signal
-import sys
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,6 +23,8 @@ from armident.identify.document import to_json
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.report.files import write_identification
+
+log = logging.getLogger(__name__)
 
 MAX_WAITING_S = 10.0
 """Longest wait for missing blocks after the end event of an experiment, s."""
@@ -202,7 +204,7 @@ class Worker:
         self._refused += 1
         if math.log10(self._refused).is_integer():
             times = f" ({self._refused} times)" if self._refused > 1 else ""
-            print(f"armident: warning: {error}{times}", file=sys.stderr)
+            log.warning("%s%s", error, times)
 
     def _hand_over_if_complete(self) -> None:
         current = self._current
@@ -242,11 +244,11 @@ class Worker:
                 code = self._identify(assembly)
             except ArmidentError as error:
                 code = error.exit_code
-                print(f"armident: {error}", file=sys.stderr, flush=True)
+                log.error("%s", error)
                 self._status("failed", capture=assembly.capture, message=str(error))
             except Exception as error:
                 # The worker must survive any failure of one experiment.
-                print(f"armident: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+                log.error("%s: %s", type(error).__name__, error)
                 self._status("failed", capture=assembly.capture, message=f"{type(error).__name__}: {error}")
             self._results.put(code)
 
@@ -265,7 +267,7 @@ class Worker:
         document, report = write_identification(outcome, self._out / f"{name}.identification")
         self._status("done", capture=assembly.capture, result=str(document))
         for warning in outcome.document.warnings:
-            print(f"armident: warning: {warning}", file=sys.stderr)
+            log.warning("%s", warning)
         print(
             f"worker: relative torque error {outcome.document.relative_error_pct:.2f} %\n"
             f"result: {document}\nreport: {report}",
