@@ -15,6 +15,7 @@ PYTEST := $(PY) -m pytest
 WITH_VCAN := $(PY) -m armident.drivers.vcan -n 2 --
 # a worker that has finished takes tests from the other; shared results are on disk (tests/fixtures)
 PARALLEL := -n auto --dist worksteal
+LINT := $(PY) -m ruff check $(SOURCES) && $(PY) -m ruff format --check $(SOURCES) && $(PY) -m mypy && $(VENV)/bin/lint-imports
 
 .PHONY: help install demo check test proof coverage lint vcan suite bench lock clean
 
@@ -50,10 +51,7 @@ demo: install ## the whole story on this machine, ends with a report (DEMO="--ou
 	@$(VENV)/bin/armident demo $(DEMO)
 
 lint: install
-	@$(PY) -m ruff check $(SOURCES)
-	$(PY) -m ruff format --check $(SOURCES)
-	$(PY) -m mypy
-	$(VENV)/bin/lint-imports
+	@$(LINT)
 
 check: lint ## ruff, mypy, import-linter and the quick tests, under two minutes
 	@$(PYTEST) -q $(PARALLEL) -m "not vcan and not slow and not proof"
@@ -67,7 +65,7 @@ test: install ## everything but the proofs, the tests on vcan included, under fi
 	vcan=$$!
 	trap 'kill $$vcan 2>/dev/null || true' EXIT
 	failed=
-	$(MAKE) --no-print-directory lint || failed=1
+	{ $(LINT); } || failed=1
 	nice -n 10 $(PYTEST) $(PARALLEL) -m "not vcan and not proof" 2>&1 | tee .cache/tests.log || failed=1
 	echo "Tests on vcan (.cache/tests-vcan.log):"
 	wait $$vcan || failed=1
