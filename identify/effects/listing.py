@@ -28,7 +28,16 @@ def described(effect: Effect) -> dict[str, Any]:
         "description": effect.says,
         "scope": effect.scope,
         "parameters": [
-            {"name": p.name, "unit": list(p.unit), "sign": p.sign, "requires": p.through, "absorbs": p.replaces or None}
+            {
+                "name": p.name,
+                "unit": list(p.unit),
+                "sign": p.sign,
+                "requires": p.through,
+                "absorbs": p.replaces or None,
+                # Former names, printed for one release.
+                "through": p.through,
+                "replaces": p.replaces or None,
+            }
             for p in effect.linear
         ],
         "nonlinear_parameters": [
