@@ -16,7 +16,7 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.experiment import Experiment
 from armident.identify.identification.auxiliary_loop import closed_loop
-from armident.identify.identification.equations import aligned_torque, equations, least_rows
+from armident.identify.identification.equations import Prepared, aligned_torque, equations, least_rows
 from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.robot.arm import ArmModel
@@ -261,19 +261,20 @@ def _simulated(
     model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], bandwidth: float
 ) -> tuple[list[Derivatives], str, AuxiliaryModel, list[str]]:
     """Motion of the simulated closed loop with the parameters of IDIM-LS, one per experiment."""
-    dt, warnings = experiments[0].dt, list[str]()
+    dt = experiments[0].dt
     rigid = model.without_terms()
     lengths = [e.q.shape[0] for e in experiments]
     decimation = decimation_of("idim-ls", dt, bandwidth, None, samples=lengths, rows=least_rows(rigid))
     ls = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names)
-    auxiliary, start, description = closed_loop(
-        rigid, experiments, signals, Options(method="idim-iv"), ls.theta, decimation, bandwidth, warnings
+    prepared = Prepared(rigid, experiments, signals)
+    auxiliary, start, description, warnings = closed_loop(
+        prepared, Options(method="idim-iv"), ls.theta, decimation, bandwidth
     )
     runs = auxiliary.simulate(start)
     if runs is None:
         raise DataError("the closed loop cannot be simulated with the model as it stands")
     motions = [Derivatives(run.q, run.qd, run.qdd, None, dt, e.start) for run, e in zip(runs, experiments, strict=True)]
-    return motions, str(description["kind"]), auxiliary, warnings
+    return motions, str(description["kind"]), auxiliary, list(warnings)
 
 
 def _seen(q: Array, measured: Derivatives, dt: float) -> Derivatives:

@@ -83,11 +83,11 @@ class AuxiliaryModel:
     dt: float
     decimation: Decimation
     max_velocity: NDArray[np.float64]
-    warnings: list[str] = field(default_factory=list)
     anchor: NDArray[np.float64] | None = None
     band_hz: float = np.inf
     starts: Sequence[float] | None = None
     _last: NDArray[np.float64] | None = None
+    _warnings: list[str] = field(default_factory=list)
 
     @property
     def limits_band(self) -> bool:
@@ -95,12 +95,23 @@ class AuxiliaryModel:
         return 0.5 / (self.dt * self.decimation.factor) >= WIDER * self.band_hz
 
     def fresh(self) -> Self:
-        """The same loop without memory of estimates and warnings: what an estimator starts with."""
-        return replace(self, warnings=[], _last=None)
+        """A copy without earlier estimates and warnings, with which an estimator starts."""
+        return replace(self, _warnings=[], _last=None)
 
-    def said(self) -> tuple[str, ...]:
-        """Warnings so far, each once."""
-        return tuple(dict.fromkeys(self.warnings))
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings since the last :meth:`fresh`, each once."""
+        return tuple(dict.fromkeys(self._warnings))
+
+    def warn(self, text: str) -> None:
+        """Add a warning for the result.
+
+        Parameters
+        ----------
+        text
+            One sentence.
+        """
+        self._warnings.append(text)
 
     def with_gear_ratios(self, share: float) -> Self:
         """The loop as someone simulates it who takes the gear ratios for ``share`` of what they are (section 4.2.3).
@@ -229,9 +240,9 @@ class AuxiliaryModel:
             runs = self.simulate(target)
             if runs is not None:
                 self._last = target
-                self.warnings.append(
-                    f"an iterate was not physical: {reason}; "
-                    f"simulated a point {100 * damped.step * share:.1f} % of the way to it"
+                self.warn(
+                    f"An iterate was not physical ({reason}). "
+                    f"The simulation used {100 * damped.step * share:.1f} % of the step to it."
                 )
                 return target, runs
         raise DataError("the auxiliary closed loop cannot be simulated: it diverges between all estimates tried")

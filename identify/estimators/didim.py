@@ -66,7 +66,7 @@ def didim(
     else:
         covariance = inverse_gram(z)  # 2.37
     residuals = whitened_residuals(simulated, theta, noise)
-    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())
+    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)
 
 
 def solve_didim(

@@ -73,4 +73,4 @@ def idim_iv(
             noise = noise_models(blocks, theta, covariance, serial_order)
             covariance = serial_covariance(zeta, x, keep, weights, noise)
     residuals = whitened_residuals(blocks, theta, noise)
-    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())
+    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)

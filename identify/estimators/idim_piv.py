@@ -87,4 +87,4 @@ def idim_piv(
     theta, done, converged, reason = iterate(step, start, iterations)
     covariance = solved(theta).covariance
     residuals = whitened_residuals(measured, theta, noise)
-    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())
+    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)

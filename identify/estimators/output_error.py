@@ -88,7 +88,7 @@ def output_error(
     noise = search.variances()
     covariance = search.covariance(noise)
     residuals = whitened(search.errors(), keep, noise)
-    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())
+    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)
 
 
 def _approach(

@@ -112,7 +112,7 @@ def sensitivities(auxiliary: AuxiliaryModel, theta: Array, response: Response, s
                 columns[i] = _quotient(moved, response, factor * steps[i])
     lost = [auxiliary.model.base.names[i] for i, column in enumerate(columns) if column is None]
     if lost:
-        auxiliary.warnings.append(f"the closed loop does not survive the smallest change of {', '.join(lost)}")
+        auxiliary.warn(f"The closed loop diverges at the smallest change of {', '.join(lost)}: not estimated.")
     return [_quotient(response, response, 1.0) if column is None else column for column in columns]
 
 

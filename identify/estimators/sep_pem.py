@@ -61,4 +61,4 @@ def sep_pem(
         noise = noise_models(simulated, theta, covariance, max_order)  # step 2, 6.27
         covariance = inverse_gram(stacked(simulated, noise)[0])  # step 3, 6.29
     residuals = whitened_residuals(simulated, theta, noise)
-    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.said())
+    return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)

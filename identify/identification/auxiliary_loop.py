@@ -1,9 +1,9 @@
-"""The closed loop that the auxiliary model simulates: which controller, which reference, which first parameters."""
+"""Choice of the closed loop that the auxiliary model simulates: controller, references and first parameters."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from armident.identify.controller.parametric import ControlLaw, identify_paramet
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.measured_instruments import MotionInstruments
 from armident.identify.experiment import Experiment
-from armident.identify.identification.equations import PIV_CUTOFF
+from armident.identify.identification.equations import PIV_CUTOFF, Prepared
 from armident.identify.identification.options import Options
 from armident.identify.identification.solvers import MEASURED
 from armident.identify.robot.arm import ArmModel
@@ -26,40 +26,89 @@ from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives
 
 RUNAWAY = 3.0
-"""A simulated joint that is this many times faster than the measured one ever was has diverged."""
+"""Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged."""
 
 RELEVANT = 0.3
 """Relative velocity error of the auxiliary model below which its instruments are relevant enough."""
 
+NO_REFERENCE = (
+    "There is no reference trajectory in the recording. Instruments: simulation of a stiff PD controller that "
+    "tracks the smoothed measured motion."
+)
+NOT_LIKE_THE_ROBOT = (
+    "The identified controller does not move the simulated arm like the robot. A stiff PD controller is used."
+)
+
 Array = NDArray[np.float64]
 
 
+class ClosedLoop(NamedTuple):
+    """The closed loop that an estimator simulates.
+
+    Parameters
+    ----------
+    auxiliary
+        The auxiliary model.
+    start
+        Parameters with which it runs, shape (b,): the first iterate.
+    controller
+        Description of the controller, as in the result document: its kind, parameters, and the relative error of the
+        simulated velocities in percent.
+    warnings
+        Reasons why a preferred controller was not used.
+    """
+
+    auxiliary: AuxiliaryModel
+    start: Array
+    controller: dict[str, Any]
+    warnings: tuple[str, ...] = ()
+
+
 def closed_loop(
-    model: ArmModel,
-    experiments: Sequence[Experiment],
-    signals: Sequence[Derivatives],
+    prepared: Prepared,
     options: Options,
     ls: Array,
     decimation: Decimation,
     bandwidth: float,
-    warnings: list[str],
-    without: str | None = None,
-) -> tuple[AuxiliaryModel, Array, dict[str, Any]]:
-    """The first closed loop that runs and moves like the robot, the theta it starts from, and what it is.
+    excluded: str | None = None,
+) -> ClosedLoop:
+    """First closed loop whose simulation runs and moves like the robot (thesis 5.2).
 
-    ``without`` is a kind of controller that is passed over.
+    Controllers are tried in order of preference: the identified or known one, then a stiff PD controller. Each is
+    simulated with the IDIM-LS estimate, then with the initial parameters of the configuration.
+
+    Parameters
+    ----------
+    prepared
+        The arm, the experiments and the derivatives of their positions.
+    options
+        Method and controller.
+    ls
+        IDIM-LS estimate, shape (b,).
+    decimation
+        Parallel filter of the method.
+    bandwidth
+        Closed-loop bandwidth, Hz.
+    excluded
+        Kind of controller that is not tried.
+
+    Raises
+    ------
+    DataError
+        If every simulation diverges and the method has no measured regressor.
     """
+    model, experiments, signals = prepared.model, prepared.experiments, prepared.signals
     dt = experiments[0].dt
     starts = [("idim-ls", ls), ("initial_parameters", initial_parameters(model))]
     fastest = RUNAWAY * np.max([np.abs(s.qd).max(axis=0) for s in signals], axis=0) + 1e-3
 
     @cache
-    def surrogate() -> list[Array]:
+    def smoothed_motion() -> list[Array]:
         return [butterworth(s.q, dt, min(PIV_CUTOFF * bandwidth, 0.4 / dt)) for s in signals]
 
-    closest: tuple[float, AuxiliaryModel, Array, dict[str, Any]] | None = None
+    closest: tuple[float, ClosedLoop] | None = None
     for controller, references, description in _controllers(
-        model, experiments, signals, options, ls, bandwidth, surrogate, without
+        prepared, options, ls, bandwidth, smoothed_motion, excluded
     ):
         for origin, start in starts:
             auxiliary = AuxiliaryModel(
@@ -78,66 +127,69 @@ def closed_loop(
             runs = auxiliary.simulate(start)
             if runs is None:
                 continue
-            miss = velocity_error(runs, signals)
-            found = description | {"start": origin, "velocity_error_pct": 100 * miss}
-            if closest is None or miss < closest[0]:
-                closest = (miss, auxiliary, start, found)
+            error = velocity_error(runs, signals)
+            if closest is None or error < closest[0]:
+                found = description | {"start": origin, "velocity_error_pct": 100 * error}
+                closest = error, ClosedLoop(auxiliary, start, found)
             break
         if closest is not None and closest[0] < RELEVANT:
             break
     if closest is None:
         if options.method not in MEASURED or options.noise_model == "grey-box":
             raise DataError("no closed loop could be simulated: it diverges with every controller and start tried")
-        reason = "no closed loop could be simulated with this estimate: instruments from the smoothed motion itself"
-        warnings.append(reason)
-        return MotionInstruments.of(model, surrogate(), dt, decimation), ls, {"kind": "followed", "reason": reason}
-    _, auxiliary, start, found = closest
-    if found["kind"] == "nominal":
-        warnings.append(found["reason"])
-    return auxiliary, start, found
+        reason = "No closed loop can be simulated with this estimate. Instruments: the smoothed measured motion."
+        instruments = MotionInstruments.of(model, smoothed_motion(), dt, decimation)
+        return ClosedLoop(instruments, ls, {"kind": "followed", "reason": reason}, (reason,))
+    loop = closest[1]
+    return loop._replace(warnings=(loop.controller["reason"],)) if loop.controller["kind"] == "nominal" else loop
 
 
 def velocity_error(runs: Sequence[Simulation], signals: Sequence[Derivatives]) -> float:
-    """Norm of the difference of simulated and smoothed velocities over that of the smoothed ones."""
-    apart = [float(np.linalg.norm(run.qd - s.qd)) for run, s in zip(runs, signals, strict=True)]
-    return float(np.linalg.norm(apart) / np.linalg.norm([np.linalg.norm(s.qd) for s in signals]))
+    """Norm of the difference of simulated and smoothed velocities over that of the smoothed ones.
+
+    Parameters
+    ----------
+    runs, signals
+        Simulated and smoothed motion of every experiment.
+    """
+    differences = [float(np.linalg.norm(run.qd - s.qd)) for run, s in zip(runs, signals, strict=True)]
+    return float(np.linalg.norm(differences) / np.linalg.norm([np.linalg.norm(s.qd) for s in signals]))
 
 
 def _controllers(
-    model: ArmModel,
-    experiments: Sequence[Experiment],
-    signals: Sequence[Derivatives],
+    prepared: Prepared,
     options: Options,
     ls: Array,
     bandwidth: float,
-    surrogate: Callable[[], Sequence[Array]],
-    without: str | None,
+    smoothed_motion: Callable[[], Sequence[Array]],
+    excluded: str | None,
 ) -> Iterator[tuple[DiscreteController, Sequence[Array], dict[str, Any]]]:
-    """Controllers with their references, the preferred one first, a stiff stand-in last."""
-    robot, dt = model.robot, experiments[0].dt
+    """Controllers with their references, the preferred one first, a stiff PD controller last."""
+    model, experiments = prepared.model, prepared.experiments
+    dt = experiments[0].dt
     references = [e.q_ref for e in experiments if e.q_ref is not None]
-    reason = "no reference trajectory in the recording: instruments from a simulation that follows the smoothed motion"
+    reason = NO_REFERENCE
     if len(references) == len(experiments):
-        if options.controller == without:
+        if options.controller == excluded:
             pass
         elif options.controller == "known":
-            yield known_controller(robot, dt), references, {"kind": "known"}
+            yield known_controller(model.robot, dt), references, {"kind": "known"}
         else:
-            yield _identified(robot, experiments, references, options, dt)
-        reason = "the identified controller does not move the simulated arm like the real one: a stiff stand-in is used"
-    postures = np.concatenate([s.q[:: max(1, s.q.shape[0] // 200)] for s in signals])
+            yield _identified(model.robot, experiments, references, options, dt)
+        reason = NOT_LIKE_THE_ROBOT
+    postures = np.concatenate([s.q[:: max(1, s.q.shape[0] // 200)] for s in prepared.signals])
     try:
-        stand_in = nominal_controller(model, ls, postures, dt, bandwidth)
+        stiff = nominal_controller(model, ls, postures, dt, bandwidth)
     except DataError:
-        # Inertias that are not positive: no gain can be chosen by them.
+        # Inertias that are not positive: no gains can be chosen for them.
         return
-    yield stand_in, surrogate(), {"kind": "nominal", "reason": reason, "error_taps": stand_in.error_taps.tolist()}
+    yield stiff, smoothed_motion(), {"kind": "nominal", "reason": reason, "error_taps": stiff.error_taps.tolist()}
 
 
 def _identified(
     robot: RobotConfig, experiments: Sequence[Experiment], references: Sequence[Array], options: Options, dt: float
 ) -> tuple[DiscreteController, Sequence[Array], dict[str, Any]]:
-    """Every motor's controller from position, reference and torque at its shaft."""
+    """Controller of every motor, identified from position, reference and torque at its shaft (thesis 5.2)."""
     ratios = robot.transmission_matrix
     to_motor = np.linalg.inv(ratios)
     q, wanted = [e.q @ ratios.T for e in experiments], [r @ ratios.T for r in references]
@@ -174,7 +226,18 @@ def _description(response: JointResponse) -> dict[str, Any]:
 
 
 def initial_parameters(model: ArmModel) -> Array:
-    """Base parameters of the configuration's ``initial_parameters`` (standard names), the rest zero."""
+    """Base parameters (b,) of the configuration's ``initial_parameters`` (standard names), the rest zero.
+
+    Parameters
+    ----------
+    model
+        The arm.
+
+    Raises
+    ------
+    ConfigError
+        If a name is not a standard parameter of the robot.
+    """
     standard = np.zeros(len(model.names))
     for name, value in model.robot.initial_parameters.items():
         if name not in model.names:

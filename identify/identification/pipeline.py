@@ -1,10 +1,8 @@
-"""Identification of an experiment from beginning to end: what `armident identify` and the worker both call."""
+"""Identification of an experiment from beginning to end, for `armident identify` and the worker."""
 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -16,7 +14,7 @@ from armident.identify.estimators.diagnostics import diagnose_estimate
 from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.experiment import Experiment
-from armident.identify.identification.auxiliary_loop import RELEVANT, closed_loop, velocity_error
+from armident.identify.identification.auxiliary_loop import RELEVANT, ClosedLoop, closed_loop, velocity_error
 from armident.identify.identification.equations import (
     Prepared,
     aligned_torque,
@@ -26,25 +24,34 @@ from armident.identify.identification.equations import (
 )
 from armident.identify.identification.noise_decimation import decimation_from_noise
 from armident.identify.identification.options import CONTROLLERS, Options
-from armident.identify.identification.result import Array, Identification, make_result
+from armident.identify.identification.result import (
+    Array,
+    Identification,
+    LeastSquares,
+    MethodResult,
+    Statistics,
+    make_result,
+)
 from armident.identify.identification.solvers import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
 from armident.identify.identification.torque_delay import HELD, TorqueDelay
+from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_consistent
 from armident.identify.signals.bandwidth import motion_bandwidth
+from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
 
 TOLERATED_DELAY = 1.0
-"""Samples by which torque and position may be apart without a warning."""
+"""Deviation of the torque delay from the expected one that gives no warning, samples."""
 
-ANCHORINGS = 2
-"""Estimates of the arm with its terms before those that depend on its torques are left as they are."""
+TORQUE_PREDICTIONS = 2
+"""Most predictions of the torques on which terms depend."""
 
-SHARED = 6
-"""Most of them where terms are shares of these torques."""
+TORQUE_SHARE_PREDICTIONS = 6
+"""Most predictions where terms are shares of these torques."""
 
-ANCHORED = 1e-3
-"""Change of the torques by which they are predicted, over their size, that ends them."""
+PREDICTED = 1e-3
+"""Relative change of the predicted torques that ends the predictions."""
 
 Progress = Callable[[str, float], None]
 
@@ -57,8 +64,9 @@ def identify_experiment(
 ) -> Identification:
     """Identify the base parameters of a robot.
 
-    The steps are the thesis's: derivatives (5.1), IDIM-LS (2.3.2), controller (5.2), auxiliary closed loop, IDIM-IV
-    (2.3.3) or IDIM-PIV (6.2.2). IDIM-LS is always computed: it starts the iterations and stands beside their result.
+    The steps are those of the thesis: derivatives (5.1), IDIM-LS (2.3.2), controller (5.2), auxiliary closed loop,
+    IDIM-IV (2.3.3) or IDIM-PIV (6.2.2). IDIM-LS is always computed: it starts the iterations and is reported beside
+    their result.
 
     Parameters
     ----------
@@ -80,7 +88,7 @@ def identify_experiment(
     """
     experiments = [experiments] if isinstance(experiments, Experiment) else list(experiments)
     _check(experiments, robot)
-    # The matrices are tall and narrow: threads gain little, wait for each other on a busy machine, and round otherwise.
+    # The matrices are tall and narrow: threads gain little, delay each other on a busy machine, and round differently.
     with threadpool_limits(1):  # type: ignore[no-untyped-call]
         return _identify(experiments, robot, options or Options(), _Clock(progress or (lambda stage, share: None)))
 
@@ -88,152 +96,191 @@ def identify_experiment(
 def _identify(
     experiments: Sequence[Experiment], robot: RobotConfig, options: Options, clock: "_Clock"
 ) -> Identification:
+    """The steps of the thesis in their order."""
     warnings: list[str] = []
 
     clock.enter("model", 0.0)
     experiments = put_right(experiments, robot)
     model = arm_model(robot)
-    dt = experiments[0].dt
-    bandwidth = options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
+    bandwidth = (
+        options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], experiments[0].dt)
+    )
 
     clock.enter("derivatives", 0.05)
-    signals = _derivatives(experiments, robot, options, dt, bandwidth)
+    signals = _derivatives(experiments, robot, options, bandwidth)
 
     clock.enter("idim-ls", 0.2)
-    lengths = [e.q.shape[0] for e in experiments]
     if any(term.depends_on_torque for term in model.terms):
-        model = _anchored(model, experiments, signals, bandwidth, lengths)
-    decimate = partial(decimation_of, samples=lengths, rows=least_rows(model), warnings=warnings)
-    # A factor given by hand is that of the method; a method with a noise model keeps its own for the comparison.
-    factor = options.decimation if isinstance(options.decimation, int) else None
-    plain = decimate("idim-ls", dt, bandwidth, None if options.method in PREFILTERED else factor)
+        model = _with_predicted_torques(model, experiments, signals, bandwidth)
     prepared = Prepared(model, experiments, signals)
-    if options.derivatives is None and options.decimation is None and robot.preprocessing is not None:
-        ls_blocks = published_equations(model, experiments, robot.preprocessing)
-    else:
-        ls_blocks = prepared.equations(plain)
-    ls = idim_ls(ls_blocks, model.base.names, weighted=options.weighted)
-    if options.decimation == "noise":
-        factor = _memory_of_noise(model, experiments, signals, ls.theta, warnings)
-        if options.method not in PREFILTERED:
-            plain = decimate("idim-ls", dt, bandwidth, factor)
-            ls_blocks = prepared.equations(plain)
-            ls = idim_ls(ls_blocks, model.base.names, weighted=options.weighted)
+    ls = _least_squares(prepared, options, bandwidth, warnings)
 
-    controller: dict[str, Any] = {"kind": "none"}
     if options.method == "idim-ls":
-        estimate, blocks, solution = ls, ls_blocks, None
+        solution, found = None, MethodResult(ls.estimate, ls.blocks, {"kind": "none"})
     else:
         clock.enter("controller", 0.35)
-        decimation = decimate(options.method, dt, bandwidth, factor)
-        loop = partial(closed_loop, model, experiments, signals, options, ls.theta, decimation, bandwidth)
-        said: list[str] = []
-        auxiliary, start, controller = loop(said)
-        clock.enter(options.method, 0.5)
-        solution = solve(Problem(prepared, auxiliary, start, plain, options))
-        if options.method in MEASURED and controller["kind"] in CONTROLLERS:
-            astray = _astray(solution, signals)
-            if astray:
-                again: list[str] = []
-                auxiliary, start, stand_in = loop(again, without=controller["kind"])
-                second = solve(Problem(prepared, auxiliary, start, plain, options))
-                if not _astray(second, signals):
-                    solution, controller, said = second, stand_in | {"reason": astray}, [astray]
-        warnings += said
-        estimate, blocks = solution.estimate, solution.problem.blocks
-        warnings += [*solution.warnings, *estimate.warnings]
-        if not estimate.converged:
-            warnings.append(f"{options.method} did not converge: {estimate.stop_reason}")
+        solution, found = _solve_in_closed_loop(prepared, options, ls, bandwidth, clock, warnings)
 
     clock.enter("statistics", 0.85)
-    delay: TorqueDelay | None = None
-    used = sum(r.size for series in estimate.residuals for r in series)
-    essential = essential_parameters(estimate.theta, estimate.covariance, used)
-    if solution is None:
-        joints = [joint.name for joint in robot.joints]
-        diagnostics = diagnose_estimate(model.base.names, joints, blocks, estimate, essential=essential)
-    else:
-        diagnostics = solution.diagnostics(essential)
-        if controller["kind"] in CONTROLLERS:
-            delay = solution.delay()
-            warnings += _late(delay, robot)
-    physical = None
+    statistics = _statistics(prepared, found, solution, warnings)
     if options.physical:
         clock.enter("physical", 0.95)
-        physical = nearest_consistent(model, estimate.theta, estimate.covariance)
+        physical = nearest_consistent(model, found.estimate.theta, found.estimate.covariance)
+        statistics = replace(statistics, physical=physical)
         if not physical.compatible:
             warnings.append(physical.verdict)
     clock.done()
-    return make_result(
-        options, model, estimate, essential, diagnostics, physical, delay, blocks, ls, ls_blocks, controller,
-        "joint torque" if solution is None else solution.noise_of, warnings, clock.spent,
-    )  # fmt: skip
+    return make_result(options, model, found, ls, statistics, warnings, clock.spent)
 
 
-def _astray(solution: Solution, signals: Sequence[Derivatives]) -> str:
-    """Why the instruments of an estimate are not to be trusted, or nothing.
+def _least_squares(prepared: Prepared, options: Options, bandwidth: float, warnings: list[str]) -> LeastSquares:
+    """IDIM-LS (2.3.2) on equations decimated by the bandwidth, by the user's factor, or by the memory of the noise."""
+    model, experiments = prepared.model, prepared.experiments
+    lengths = [e.q.shape[0] for e in experiments]
 
-    A controller can move the arm with the first estimate and, at the edge of stability, not with a later one: the
-    iterates then wander, or come to rest where the instruments have little to do with the motion.
+    def decimation(factor: int | None) -> Decimation:
+        dt, rows = experiments[0].dt, least_rows(model)
+        return decimation_of("idim-ls", dt, bandwidth, factor, samples=lengths, rows=rows, warnings=warnings)
+
+    def estimate(blocks: Sequence[ExperimentEquations]) -> Estimate:
+        return idim_ls(blocks, model.base.names, weighted=options.weighted)
+
+    # A factor chosen by the user is that of the method; a method with a noise model keeps its own for the comparison.
+    factor = options.decimation if isinstance(options.decimation, int) else None
+    plain = decimation(None if options.method in PREFILTERED else factor)
+    published = model.robot.preprocessing
+    if options.derivatives is None and options.decimation is None and published is not None:
+        blocks = published_equations(model, experiments, published)
+    else:
+        blocks = prepared.equations(plain)
+    ls = estimate(blocks)
+    if options.decimation == "noise":
+        factor = _memory_of_noise(prepared, ls.theta, warnings)
+        if options.method not in PREFILTERED:
+            plain = decimation(factor)
+            blocks = prepared.equations(plain)
+            ls = estimate(blocks)
+    return LeastSquares(ls, blocks, plain, factor)
+
+
+def _solve_in_closed_loop(
+    prepared: Prepared,
+    options: Options,
+    ls: LeastSquares,
+    bandwidth: float,
+    clock: "_Clock",
+    warnings: list[str],
+) -> tuple[Solution, MethodResult]:
+    """Controller (5.2), auxiliary closed loop, and the method; a second time if the controller proves unsuitable."""
+    experiments, rows = prepared.experiments, least_rows(prepared.model)
+    decimation = decimation_of(
+        options.method,
+        experiments[0].dt,
+        bandwidth,
+        ls.factor,
+        samples=[e.q.shape[0] for e in experiments],
+        rows=rows,
+        warnings=warnings,
+    )
+
+    def in_loop(loop: ClosedLoop) -> Solution:
+        return solve(Problem(prepared, loop.auxiliary, loop.start, ls.decimation, options))
+
+    loop = closed_loop(prepared, options, ls.estimate.theta, decimation, bandwidth)
+    clock.enter(options.method, 0.5)
+    solution = in_loop(loop)
+    kind = loop.controller["kind"]
+    if options.method in MEASURED and kind in CONTROLLERS:
+        defect = _defect_of_loop(solution, prepared.signals)
+        if defect:
+            other = closed_loop(prepared, options, ls.estimate.theta, decimation, bandwidth, excluded=kind)
+            second = in_loop(other)
+            if not _defect_of_loop(second, prepared.signals):
+                solution = second
+                loop = other._replace(controller=other.controller | {"reason": defect}, warnings=(defect,))
+    estimate = solution.estimate
+    warnings += [*loop.warnings, *solution.warnings, *estimate.warnings]
+    if not estimate.converged:
+        warnings.append(f"{options.method} did not converge: {estimate.stop_reason}")
+    return solution, MethodResult(estimate, solution.problem.blocks, loop.controller, solution.noise_of)
+
+
+def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | None, warnings: list[str]) -> Statistics:
+    """Essential parameters, tests of the estimate, and the delay of the torques where a reference was recorded."""
+    model, estimate = prepared.model, found.estimate
+    used = sum(r.size for series in estimate.residuals for r in series)
+    essential = essential_parameters(estimate.theta, estimate.covariance, used)
+    if solution is None:
+        joints = [joint.name for joint in model.robot.joints]
+        return Statistics(
+            essential, diagnose_estimate(model.base.names, joints, found.blocks, estimate, essential=essential)
+        )
+    diagnostics = solution.diagnostics(essential)
+    if found.controller["kind"] not in CONTROLLERS:
+        return Statistics(essential, diagnostics)
+    delay = solution.delay()
+    warnings += _delay_warnings(delay, model.robot)
+    return Statistics(essential, diagnostics, delay)
+
+
+def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
+    """Reason why the instruments of an estimate are unsuitable; empty if they are suitable.
+
+    A controller can move the arm with the first estimate and, at the edge of stability, not with a later one. Then the
+    iterates do not settle, or settle where the instruments have little to do with the motion.
     """
     runs = solution.problem.auxiliary.simulate(solution.estimate.theta)
     if runs is None:
-        why = "diverges"
-    elif (miss := velocity_error(runs, signals)) >= RELEVANT:
-        why = f"misses the measured velocities by {100 * miss:.0f} %"
+        defect = "diverges with"
+    elif (error := velocity_error(runs, signals)) >= RELEVANT:
+        defect = f"misses the measured velocities by {100 * error:.0f} % with"
     elif solution.estimate.converged:
         return ""
     else:
-        why = "leads to no convergence"
-    return f"the loop of the identified controller {why} with the parameters it leads to: a stiff stand-in is used"
+        defect = "does not converge to"
+    return f"The loop of the identified controller {defect} the estimated parameters. A stiff PD controller is used."
 
 
-def _anchored(
-    model: ArmModel,
-    experiments: Sequence[Experiment],
-    signals: Sequence[Derivatives],
-    bandwidth: float,
-    lengths: Sequence[int],
+def _with_predicted_torques(
+    model: ArmModel, experiments: Sequence[Experiment], signals: Sequence[Derivatives], bandwidth: float
 ) -> ArmModel:
-    """The model whose terms predict torques by an estimate: first of the rigid arm, then with the terms in it."""
+    """The model with terms at predicted torques: first by the rigid arm, then by the arm with its terms."""
     rigid = model.without_terms()
+    lengths = [e.q.shape[0] for e in experiments]
     decimation = decimation_of("idim-ls", experiments[0].dt, bandwidth, None, samples=lengths, rows=least_rows(model))
     theta = idim_ls(equations(rigid, experiments, signals, decimation), rigid.base.names).theta
-    for _ in range(SHARED if any(term.scales_torque for term in model.terms) else ANCHORINGS):
+    shared = any(term.scales_torque for term in model.terms)
+    for _ in range(TORQUE_SHARE_PREDICTIONS if shared else TORQUE_PREDICTIONS):
         model = model.anchored(np.concatenate([theta[: rigid.base.b], np.zeros(model.e)]))
         before, rows = theta[: rigid.base.b], equations(model, experiments, signals, decimation)
         theta = idim_ls(rows, model.base.names).theta
         change = [block.x[..., : rigid.base.b] @ (theta[: rigid.base.b] - before) for block in rows]
         whole = [block.x[..., : rigid.base.b] @ before for block in rows]
-        if sum(float(np.sum(c**2)) for c in change) <= ANCHORED**2 * sum(float(np.sum(w**2)) for w in whole):
+        if sum(float(np.sum(c**2)) for c in change) <= PREDICTED**2 * sum(float(np.sum(w**2)) for w in whole):
             break
     return model
 
 
-def _memory_of_noise(
-    model: ArmModel,
-    experiments: Sequence[Experiment],
-    signals: Sequence[Derivatives],
-    theta: Array,
-    warnings: list[str],
-) -> int:
-    """The decimation after which the noise that IDIM-LS leaves at the full rate is hardly correlated."""
-    left = [
+def _memory_of_noise(prepared: Prepared, theta: Array, warnings: list[str]) -> int:
+    """Decimation factor after which the residuals of IDIM-LS at the full rate are hardly correlated (6.2.3)."""
+    model = prepared.model
+    errors = [
         aligned_torque(e.tau)
         - model.inverse_dynamics(theta, s.q, s.qd, s.qdd)
         - model.term_regressor(model.motion(s.q, s.qd, s.qdd, e.dt, e.start)) @ theta[theta.size - model.e :]
-        for e, s in zip(experiments, signals, strict=True)
+        for e, s in zip(prepared.experiments, prepared.signals, strict=True)
     ]
-    found = decimation_from_noise(left)
+    found = decimation_from_noise(errors)
     if found.bounded:
-        warnings.append(f"the noise may remember more than the {found.factor} samples that the decimation was set to")
+        warnings.append(
+            f"The noise is correlated over more than {found.factor} samples, the limit of the decimation: "
+            "standard deviations may be too small."
+        )
     return found.factor
 
 
-def _late(delay: TorqueDelay | None, robot: RobotConfig) -> list[str]:
+def _delay_warnings(delay: TorqueDelay, robot: RobotConfig) -> list[str]:
     """A warning for every joint whose torque is recorded more than a sample off the position it belongs to."""
-    if delay is None:
-        return []
     off = delay.contradicts() & (np.abs(delay.samples - HELD) > TOLERATED_DELAY)
     return [
         f"{joint.name}: the torque belongs to the position {samples:.1f} +- {std:.1f} samples later, expected is {HELD}"
@@ -243,13 +290,14 @@ def _late(delay: TorqueDelay | None, robot: RobotConfig) -> list[str]:
 
 
 def _derivatives(
-    experiments: Sequence[Experiment], robot: RobotConfig, options: Options, dt: float, bandwidth: float
+    experiments: Sequence[Experiment], robot: RobotConfig, options: Options, bandwidth: float
 ) -> list[Derivatives]:
+    """Smoothed positions and their derivatives (5.1)."""
     resolution = encoder_resolution(robot) if options.nvr == "tracking-error" else None
     return [
         replace(
             differentiate(
-                e.q, dt, options.derivatives or "irwsm", options.nvr, bandwidth, q_ref=e.q_ref, resolution=resolution
+                e.q, e.dt, options.derivatives or "irwsm", options.nvr, bandwidth, q_ref=e.q_ref, resolution=resolution
             ),
             start=e.start,
         )
@@ -259,7 +307,7 @@ def _derivatives(
 
 @dataclass
 class _Clock:
-    """Reports stages and how long each took."""
+    """Reports stages and measures their durations, s."""
 
     report: Progress
     spent: dict[str, float] = field(default_factory=dict)

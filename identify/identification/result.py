@@ -1,4 +1,4 @@
-"""The result of an identification, and how it is put together."""
+"""The result of an identification, and its assembly."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ from armident.identify.regression.ar_noise import whiteness
 from armident.identify.regression.equations import Estimate, ExperimentEquations, residuals
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import ConsistentParameters
+from armident.identify.signals.decimate import Decimation
 
 Array = NDArray[np.float64]
 
@@ -35,22 +36,22 @@ class Identification:
     Parameters
     ----------
     names, units, formulas, theta, std, covariance, essential
-        Base parameters (b,), the formulas of those that stand for several, their covariance (b, b), and which of them
-        the data need.
+        Base parameters (b,) in SI units, the formulas of regrouped ones, their standard deviations (b,), their
+        covariance (b, b), and the mask (b,) of the essential ones.
     diagnostics
         Tests of the estimate.
     physical
-        The nearest physically consistent arm, where it was asked for.
+        The nearest physically consistent arm; ``None`` if not asked for.
     delay
-        Of the recorded torques against the positions, where a reference trajectory was recorded.
+        Delay of the recorded torques against the positions; ``None`` without a reference trajectory.
     relative_error_pct, relative_error_pct_by_joint
         ``|y - X theta| / |y|`` on the torques decimated to twice the bandwidth, overall and (n,).
     whiteness, residual_autocorrelation, autocorrelation_bound
-        Of the residuals that the estimator weighs: test, (n, lags), and 2 sigma (n,).
+        Whiteness test of the whitened residuals, their autocorrelation (n, lags), and its 2-sigma bound (n,).
     idim_ls
         Theta and standard deviations of IDIM-LS on the same data, for comparison.
     t, tau_measured, tau_predicted
-        Decimated instants (M,) and torques (M, n), experiments one after the other.
+        Decimated instants (M,), s, and torques (M, n), N m or N, experiments one after the other.
     """
 
     method: str
@@ -84,23 +85,93 @@ class Identification:
     autocorrelation_bound: Array
 
 
+@dataclass(frozen=True)
+class LeastSquares:
+    """The IDIM-LS estimate and its equations.
+
+    Parameters
+    ----------
+    estimate, blocks
+        Estimate, and the equations of every experiment.
+    decimation
+        Parallel filter of the methods without a noise model.
+    factor
+        Decimation factor chosen by the user or from the noise; ``None``: from the bandwidth.
+    """
+
+    estimate: Estimate
+    blocks: Sequence[ExperimentEquations]
+    decimation: Decimation
+    factor: int | None
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """The estimate of the chosen method.
+
+    Parameters
+    ----------
+    estimate, blocks
+        Estimate, and the equations of every experiment.
+    controller
+        Description of the controller of the auxiliary model; its kind is ``none`` for IDIM-LS.
+    noise_of
+        Quantity to which noise models and residuals belong.
+    """
+
+    estimate: Estimate
+    blocks: Sequence[ExperimentEquations]
+    controller: dict[str, Any]
+    noise_of: str = "joint torque"
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Tests of an estimate.
+
+    Parameters
+    ----------
+    essential
+        Mask (b,) of the essential parameters.
+    diagnostics
+        Tests of instruments and residuals.
+    delay
+        Delay of the recorded torques; ``None`` without a reference trajectory.
+    physical
+        Nearest physically consistent parameters; ``None`` if not asked for.
+    """
+
+    essential: NDArray[np.bool_]
+    diagnostics: Diagnostics
+    delay: TorqueDelay | None = None
+    physical: ConsistentParameters | None = None
+
+
 def make_result(
     options: Options,
     model: ArmModel,
-    estimate: Estimate,
-    essential: NDArray[np.bool_],
-    diagnostics: Diagnostics,
-    physical: ConsistentParameters | None,
-    delay: TorqueDelay | None,
-    blocks: Sequence[ExperimentEquations],
-    ls: Estimate,
-    ls_blocks: Sequence[ExperimentEquations],
-    controller: dict[str, Any],
-    noise_of: str,
+    found: MethodResult,
+    ls: LeastSquares,
+    statistics: Statistics,
     warnings: Sequence[str],
     timing_s: dict[str, float],
 ) -> Identification:
-    """Put a result together: statistics of the estimate and its errors on the least-squares equations."""
+    """Assemble the result; relative errors are those on the equations of IDIM-LS.
+
+    Parameters
+    ----------
+    options, model
+        As used.
+    found, ls
+        Estimate of the method, and of IDIM-LS for comparison.
+    statistics
+        Tests of the estimate of the method.
+    warnings
+        Lines for the user; each is kept once.
+    timing_s
+        Duration of every stage, s.
+    """
+    estimate, ls_blocks = found.estimate, ls.blocks
     joints = [joint.name for joint in model.robot.joints]
     overall, by_joint = relative_errors(ls_blocks, estimate.theta)
     tests = [whiteness(series) for series in estimate.residuals]
@@ -112,10 +183,10 @@ def make_result(
         theta=estimate.theta,
         covariance=estimate.covariance,
         std=estimate.std,
-        essential=essential,
-        diagnostics=diagnostics,
-        physical=physical,
-        delay=delay,
+        essential=statistics.essential,
+        diagnostics=statistics.diagnostics,
+        physical=statistics.physical,
+        delay=statistics.delay,
         relative_error_pct=overall,
         relative_error_pct_by_joint=by_joint,
         iterations=estimate.iterations,
@@ -125,19 +196,19 @@ def make_result(
             JointWhiteness(name, test.lags, test.fraction_outside) for name, test in zip(joints, tests, strict=True)
         ),
         noise_model={
-            "of": noise_of,
-            "rate_hz": float(1 / (blocks[0].t[1] - blocks[0].t[0])),
+            "of": found.noise_of,
+            "rate_hz": float(1 / (found.blocks[0].t[1] - found.blocks[0].t[0])),
             "joints": [
                 {"joint": name, "order": ar.order, "variance": ar.variance, "coefficients": ar.coefficients.tolist()}
                 for name, ar in zip(joints, estimate.noise, strict=True)
             ],
         },
-        controller=controller,
+        controller=found.controller,
         timing_s=timing_s,
         warnings=tuple(dict.fromkeys(warnings)),
         options=options,
-        idim_ls=(ls.theta, ls.std),
-        idim_ls_relative_error_pct=relative_errors(ls_blocks, ls.theta)[0],
+        idim_ls=(ls.estimate.theta, ls.estimate.std),
+        idim_ls_relative_error_pct=relative_errors(ls_blocks, ls.estimate.theta)[0],
         t=np.concatenate([b.t for b in ls_blocks]),
         tau_measured=np.concatenate([b.y for b in ls_blocks]),
         tau_predicted=np.concatenate([b.x @ estimate.theta for b in ls_blocks]),
@@ -147,7 +218,15 @@ def make_result(
 
 
 def relative_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tuple[float, Array]:
-    """``|y - X theta| / |y|`` in percent, overall and per joint (n,)."""
+    """``|y - X theta| / |y|`` in percent, overall and per joint (n,).
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    theta
+        Base parameters, shape (b,).
+    """
     errors = residuals(blocks, theta)
     miss = sum(np.sum(np.where(b.keep, e, 0.0) ** 2, axis=0) for e, b in zip(errors, blocks, strict=True))
     power = sum(np.sum(np.where(b.keep, b.y, 0.0) ** 2, axis=0) for b in blocks)
@@ -155,17 +234,31 @@ def relative_errors(blocks: Sequence[ExperimentEquations], theta: Array) -> tupl
 
 
 def units(model: ArmModel) -> tuple[str, ...]:
-    """SI units of the base parameters, those of the terms at the end, (b,)."""
+    """SI units of the base parameters, those of the terms at the end, shape (b,).
+
+    Parameters
+    ----------
+    model
+        The arm.
+    """
     rigid = [unit(name, model.robot) for name in model.base.names[: model.base.b - model.e]]
     return (*rigid, *(one for term in model.terms for one in term.units))
 
 
 UNITS = {"ia": ("kg m^2", "kg"), "fv": ("N m s/rad", "N s/m"), "fc": ("N m", "N"), "of": ("N m", "N")}
-"""Of friction, offset and rotor inertia of a revolute and of a prismatic joint, by the first two letters."""
+"""SI units at a revolute and at a prismatic joint, by the first two letters of the parameter's name."""
 
 
 def unit(name: str, robot: RobotConfig) -> str:
-    """SI unit of a base parameter, joint side."""
+    """SI unit of a base parameter, joint side.
+
+    Parameters
+    ----------
+    name
+        Base parameter.
+    robot
+        Its robot; joints are revolute or prismatic.
+    """
     kind = name[:2]
     if kind in ("mx", "my", "mz"):
         return "kg m"

@@ -1,4 +1,4 @@
-"""The methods by name: which equations each of them solves, and the estimator that does it."""
+"""Equations and estimator of every identification method, by name."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
 
 CONTRADICTION = 5.0
-"""Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before it is disbelieved."""
+"""Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before IDIM-IV replaces it."""
 
 PREFILTERED: tuple[Method, ...] = ("idim-piv", "sep-pem")
 """Methods with a noise model: their equations are decimated only roughly (thesis section 7.2)."""
@@ -55,7 +55,7 @@ def decimation_of(
     bandwidth_hz
         Closed-loop bandwidth.
     factor
-        As chosen by hand, which stands however few equations it leaves; ``None``: from the bandwidth.
+        Factor chosen by the user, kept however few equations it leaves; ``None``: from the bandwidth.
     samples
         Length of every experiment.
     rows
@@ -67,24 +67,24 @@ def decimation_of(
     cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)
     wanted = design(dt, cutoff, factor)
     chosen = wanted if factor is not None else sufficient(wanted, dt, samples, rows)
-    left, heard = decimated_rows(chosen, samples), [] if warnings is None else warnings
+    left, lines = decimated_rows(chosen, samples), [] if warnings is None else warnings
     if left < rows:
-        heard.append(
-            f"the decimation by {chosen.factor} leaves {left} equations per joint, fewer than {rows}: the estimate "
-            "and its standard deviations are uncertain; record longer"
-            + (" or decimate less" if chosen.factor > 1 else "")
+        lines.append(
+            f"The decimation by {chosen.factor} leaves {left} equations per joint, fewer than {rows}: estimate and "
+            "standard deviations are uncertain. Next: record longer"
+            + (" or decimate less." if chosen.factor > 1 else ".")
         )
     elif chosen is not wanted:
-        heard.append(
-            f"a cut-off of {cutoff:.3g} Hz leaves {decimated_rows(wanted, samples)} equations per joint, fewer than "
-            f"{rows}: raised to {0.5 / (dt * chosen.factor):.3g} Hz, which leaves {left}"
+        lines.append(
+            f"A cut-off of {cutoff:.3g} Hz leaves {decimated_rows(wanted, samples)} equations per joint, fewer than "
+            f"{rows}: raised to {0.5 / (dt * chosen.factor):.3g} Hz, which leaves {left}."
         )
     return chosen
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What every method is given: experiments with derivatives, the closed loop, and where to start.
+    """Input of every method: experiments with derivatives, the closed loop, and the first iterate.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class Problem:
     def in_band(self) -> "Problem":
         """The same, decimated to the band of the instruments where the equations have a wider one.
 
-        At the recorded rate nearly all rows lie beyond the band in which anything is told.
+        At the recorded rate nearly all rows lie beyond the band of the instruments and carry no information.
         """
         auxiliary = self.auxiliary
         if not auxiliary.limits_band:
@@ -126,10 +126,18 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solution:
-    """An estimate, the problem it belongs to, and what is to be said about it.
+    """An estimate with the problem that it solves.
 
-    ``prefiltered``: the noise models of the estimate have weighed its rows, not only entered its covariance.
-    ``noise_of``: the quantity that noise models and residuals of the estimate belong to.
+    Parameters
+    ----------
+    estimate, problem
+        Estimate, and the equations to which it belongs.
+    prefiltered
+        True if the noise models weighted the rows; false if they only entered the covariance.
+    noise_of
+        Quantity to which noise models and residuals belong.
+    warnings
+        Lines for the result document.
     """
 
     estimate: Estimate
@@ -194,12 +202,12 @@ def solve(problem: Problem) -> Solution:
 
 
 def _idim_piv(problem: Problem) -> Solution:
-    """IDIM-PIV, unless the prefilter contradicts IDIM-IV, or comes to no rest where IDIM-IV does.
+    """IDIM-PIV (6.2.2), or IDIM-IV where the prefilter contradicts it or does not converge.
 
-    A noise model may move the estimate within its uncertainty only. Where it moves it further, the residual
-    is not noise but what the model lacks, and its inverse filter amplifies that (thesis section 6.2.3); then, as in
-    SEP-PEM, the dynamic model is estimated without it and it only enters the covariance (6.2.1). So it is where the
-    iterations with the prefilter, which weighs what lies beyond the motion's own frequencies, do not converge.
+    A noise model may move the estimate within its uncertainty only. Where it moves it further, the residual is model
+    error and not noise, and the inverse filter amplifies it (thesis section 6.2.3). Then, as in SEP-PEM, the dynamic
+    model is estimated without the noise model, which only enters the covariance (6.2.1). The same holds where the
+    iterations with the prefilter, which weights frequencies beyond those of the motion, do not converge.
     """
     options, plain = problem.options, problem.plain_problem
     without = idim_iv(plain.blocks, plain.auxiliary, problem.start, serial_order=options.max_ar_order)
@@ -214,17 +222,17 @@ def _idim_piv(problem: Problem) -> Solution:
     worst = int(np.argmax(shift))
     if shift[worst] > CONTRADICTION:
         name = problem.auxiliary.model.base.names[worst]
-        why = (
-            f"the prefilter of idim-piv moves {name} by {shift[worst]:.0f} standard deviations from idim-iv: the "
-            "residuals are model error, not noise"
+        reason = (
+            f"The noise model cannot explain the residuals ({name} would move by {shift[worst]:.0f} std): "
+            "the model misses an effect"
         )
     elif without.converged and not estimate.converged:
-        why = f"idim-piv {estimate.stop_reason} without converging"
+        reason = f"IDIM-PIV did not converge ({estimate.stop_reason})"
     else:
         if options.noise_model == "grey-box":
             return Solution(estimate, problem, noise_of="motor position")
         return Solution(estimate, problem, prefiltered=True)
-    warning = f"{why}; the parameters are those of idim-iv, the noise model only enters their standard deviations"
+    warning = f"{reason}. Result: IDIM-IV. Next: armident diagnose."
     return Solution(without, plain, warnings=(warning,))
 
 

@@ -32,7 +32,7 @@ def newey_west(series: Sequence[Array], lags: int) -> Array:
     for lag in range(1, min(lags, max(s.shape[0] for s in series) - 1) + 1):
         products = sum(_summed_products(s[lag:], s[: s.shape[0] - lag]) for s in series if s.shape[0] > lag)
         variance = variance + 2 * (1 - lag / (lags + 1)) * np.asarray(products)
-    return np.maximum(variance, 0.0)
+    return np.asarray(np.maximum(variance, 0.0))
 
 
 def _summed_products(a: Array, b: Array) -> Array:

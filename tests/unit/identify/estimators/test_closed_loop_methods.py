@@ -206,7 +206,7 @@ def test_a_start_that_cannot_be_simulated_is_refused_or_led_back_to_the_anchor(m
 
 def test_warnings_of_one_estimator_are_not_those_of_the_next() -> None:
     data = recorded()
-    data.loop.warnings.append("old")
+    data.loop.warn("old")
     assert didim(data.blocks, data.loop, data.truth).warnings == ()
 
 

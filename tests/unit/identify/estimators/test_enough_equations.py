@@ -67,7 +67,7 @@ def test_slow_motion_raises_the_cut_off_and_says_so(method: Method) -> None:
     assert decimated_rows(found, SAMPLES) >= 92
     (warning,) = warnings
     share = PIV_CUTOFF if method == "idim-piv" else LS_CUTOFF
-    assert f"a cut-off of {0.1 * share:.3g} Hz leaves" in warning
+    assert f"A cut-off of {0.1 * share:.3g} Hz leaves" in warning
     assert "fewer than 92: raised to" in warning
 
 
@@ -84,7 +84,7 @@ def test_a_factor_by_hand_stands_with_a_warning() -> None:
     assert found.factor == 250
     (warning,) = warnings
     assert "decimation by 250 leaves 6 equations per joint, fewer than 92" in warning
-    assert warning.endswith("record longer or decimate less")
+    assert warning.endswith("record longer or decimate less.")
 
 
 def test_a_recording_too_short_for_any_decimation_keeps_all_samples_with_a_warning() -> None:
@@ -93,7 +93,7 @@ def test_a_recording_too_short_for_any_decimation_keeps_all_samples_with_a_warni
     assert found.factor == 1
     (warning,) = warnings
     assert "leaves 80 equations per joint, fewer than 92" in warning
-    assert warning.endswith("record longer")
+    assert warning.endswith("record longer.")
 
 
 def test_equations_of_slow_motion_are_as_many_as_promised() -> None:
