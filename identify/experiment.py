@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Experiment:
-    """What the estimators see of a recording; SI units, joint side, no gaps.
+    """Signals of a recording as the estimators use them: SI units, joint side, no gaps.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Is an estimate to be trusted: instruments, endogeneity, residuals, and the set of essential parameters.
+"""Tests of an estimate: instruments, endogeneity, residuals, and the set of essential parameters.
 
 All tests work on the equations as the estimator weighs them (thesis 2.24, 6.30). Where it weighs without a noise model
 (IDIM-LS, IDIM-IV), one is fitted first (6.21 to 6.25), so that no test takes serial correlation for something else.
@@ -42,7 +42,7 @@ LAGS_PER_ROOT_SAMPLE = 1.3
 """Lags of the Newey-West variance of M samples over ``sqrt(M)`` (Lazarus, Lewis, Stock and Watson 2018)."""
 
 SAME = 1e-8
-"""Share of the IV variance under which the two estimators of the endogeneity test are one and the same."""
+"""Share of the IV variance below which the two estimators of the endogeneity test count as identical."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a user may choose of an identification."""
+"""Options of an identification."""
 
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
@@ -19,7 +19,7 @@ NOISE_MODELS: tuple[NoiseModelName, ...] = get_args(NoiseModelName)
 
 @dataclass(frozen=True)
 class Options:
-    """What a user may choose; everything has a default that needs no knowledge.
+    """Options of an identification; every default works without knowledge of the robot.
 
     Parameters
     ----------
