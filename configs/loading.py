@@ -1,6 +1,8 @@
 """Loading and checking of configuration files; an error is one line that names file, key and expected value."""
 
 import difflib
+import logging
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -9,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from armident.configs.errors import ConfigError
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
-from armident.configs.schema.session import SessionConfig
+from armident.configs.schema.session import RENAMED, SessionConfig
 from armident.configs.schema.suite import SuiteConfig
 from armident.configs.schema.trajectory import Trajectory
 from armident.configs.urdf import UrdfGeometry, geometry_from_urdf
@@ -29,6 +31,8 @@ SHIPPED = ("robots", "cells", "trajectories", "scenarios", "suites", "eds")
 _LONGEST = 80
 """Maximum number of characters of a file that a message quotes."""
 T = TypeVar("T", bound=BaseModel)
+
+log = logging.getLogger(__name__)
 
 
 def config_path(name: str | Path, listed: tuple[str, ...] = ("robots", "cells")) -> Path:
@@ -124,7 +128,13 @@ def load_session(name: str | Path) -> SessionConfig:
         If the file is missing or wrong; names file, key and expected value.
     """
     path = config_path(name)
-    session = _load(path, SessionConfig)
+    data = _read_mapping(_read_text(path), str(path))
+    session = _checked(data, SessionConfig, str(path))
+    for key in data.get("recording", {}):
+        if key in RENAMED:
+            _warn_once(
+                f"{path}: recording.{key} is now recording.{RENAMED[key]}; the next release refuses the old name"
+            )
     base = path.resolve().parent
 
     def resolved(relative: Path, key: str) -> Path:
@@ -187,6 +197,11 @@ def load_scenario(name: str | Path) -> Scenario:
         If the file is missing or wrong; names file, key and expected value.
     """
     return _load(config_path(name, listed=("scenarios",)), Scenario)
+
+
+@cache
+def _warn_once(message: str) -> None:
+    log.warning(message)
 
 
 def _load(path: Path, kind: type[T]) -> T:

@@ -171,31 +171,43 @@ def doctor(
     run(config, as_json)
 
 
-def heal(
+def recover(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings that were not finished.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print what became of them as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
 ) -> None:
-    """Give torn recordings their index and summary, so that every MCAP reader opens them, and say what they lack.
+    """Add index and summary to truncated recordings, so that every MCAP reader opens them; print the missing parts.
 
-    Complete ones are left alone. A file that is being written is refused.
+    Complete recordings are not touched. A file that is being written is refused.
 
-    Example: armident heal recordings/*.mcap
+    Example: armident recover recordings/*.mcap
     """
     import json
 
     from armident.daq.recording import recover_recording
 
-    healed = [recover_recording(path) for path in recordings]
+    results = [recover_recording(path) for path in recordings]
     if as_json:
         print(
             json.dumps(
                 [
-                    {"path": str(h.path), "missing": h.missing, "original": h.original and str(h.original)}
-                    for h in healed
+                    {"path": str(r.path), "missing": r.missing, "original": r.original and str(r.original)}
+                    for r in results
                 ]
             )
         )
         return
-    for found in healed:
-        kept = "" if found.original is None else f"; as it was: {found.original}"
-        print(f"{found.path}: " + ("complete" if found.missing is None else f"healed: {found.missing}{kept}"))
+    for result in results:
+        kept = "" if result.original is None else f"; damaged file kept as {result.original}"
+        print(f"{result.path}: " + ("complete" if result.missing is None else f"recovered: {result.missing}{kept}"))
+
+
+def heal(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings that were not finished.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
+) -> None:
+    """Former name of `armident recover`.
+
+    Example: armident recover recordings/*.mcap
+    """
+    logging.getLogger(__name__).warning("heal is now recover; the next release removes the old name")
+    recover(recordings, as_json)

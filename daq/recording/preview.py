@@ -1,6 +1,6 @@
-"""Channels for looking: some samples of every stream in SI units at the joints, which any viewer plots as they are.
+"""Preview channels: a part of every stream's samples in SI units at the joints, for viewers of MCAP files.
 
-Readers of ours do not use them: what was measured is in the streams, as it came off the bus.
+armident does not read them: the measured values are in the streams, as they came off the bus.
 """
 
 from collections.abc import Mapping
@@ -15,21 +15,41 @@ from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.model import Field
 
 PREFIX = "si_"
-"""How the topics begin: ``/si_samples`` shows ``/samples``."""
+"""Prefix of the topics: ``/si_samples`` shows ``/samples``."""
 
 
 @dataclass(frozen=True)
 class PreviewChannel:
-    """What is shown of one stream: every ``every``-th SYNC, by ``matrix`` (n, n) from the raw values of each field."""
+    """Preview of one stream.
+
+    Parameters
+    ----------
+    layout
+        Layout of the preview; ``layout.every`` is the number of SYNCs between two samples.
+    matrices
+        Of each field, the matrix (n, n) that maps raw values to SI units.
+    """
 
     layout: StreamLayout
     matrices: tuple[NDArray[np.float64], ...]
 
     @classmethod
-    def at(
+    def of_stream(
         cls, stream: StreamLayout, robot: RobotConfig, sample_rate_hz: float, rate_hz: float
     ) -> "PreviewChannel | None":
-        """A view of a stream with at most ``rate_hz`` samples per second; ``None`` if it has nothing to show."""
+        """Return the preview of a stream, ``None`` if it has nothing but status words.
+
+        Parameters
+        ----------
+        stream
+            Layout of the stream.
+        robot
+            The robot, for its transmission.
+        sample_rate_hz
+            Rate of SYNC, 1/s.
+        rate_hz
+            Highest rate of the preview, 1/s.
+        """
         every = stream.every * max(1, -(-round(sample_rate_hz) // round(max(rate_hz, 1.0) * stream.every)))
         fields, matrices = [], []
         for field in stream.fields:
@@ -51,14 +71,29 @@ class PreviewChannel:
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What the channel says of its fields."""
+        """Channel metadata: unit and side of every field."""
         units = {field.name: f"{field.unit}, {field.side} side" for field in self.layout.fields}
         return units | {"armident.shows": f"every {self.layout.every}th SYNC of /{self.layout.name[len(PREFIX) :]}"}
 
-    def of(
+    def select(
         self, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-        """The samples shown of rows ``sync`` and ``t_ns`` (N,), ``raw`` (N, n)."""
+        """Return the rows of the preview.
+
+        Parameters
+        ----------
+        sync
+            SYNC numbers, (N,).
+        t_ns
+            Times, ns UTC, (N,).
+        raw
+            Raw values of every field of the stream, (N, n) each.
+
+        Returns
+        -------
+        tuple
+            SYNC numbers and times (M,), and values in SI units, (M, n) by field.
+        """
         shown = np.flatnonzero((sync + 1) % self.layout.every == 0)
         values = {
             field.name: raw[field.name][shown].astype(np.float64) @ matrix.T

@@ -1,4 +1,4 @@
-"""Writes recordings: MCAP, chunk by chunk, so that what is on the disk is always whole up to the last chunk."""
+"""Writes recordings: MCAP, chunk by chunk, so that a file on the disk is complete up to its last chunk."""
 
 import contextlib
 import errno
@@ -7,7 +7,7 @@ import json
 import os
 import secrets
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,24 +16,29 @@ from typing import Any, Self
 
 import numpy as np
 import zstandard
+from mcap.records import Channel, ChunkIndex, Header, Metadata, MetadataIndex, Schema
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig, SessionConfig
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
-from armident.daq.recording.lost_rows import STANDS_STILL, LostRows, RowRanges
+from armident.daq.recording.lost_rows import DISK_STALLED, LostRows, RowRanges
 from armident.daq.recording.model import Gap, Mark, Recording
+from armident.daq.recording.names import (
+    CHECK,
+    COUNTERS,
+    FACTS,
+    GAPS_TOPIC,
+    LAYOUT_KEY,
+    MARKS_TOPIC,
+    RECORDING,
+    ROBOT,
+    SCHEMA,
+    SESSION,
+)
 from armident.daq.recording.preview import PREFIX, PreviewChannel
 from armident.daq.recording.summary import Summary
 
-SCHEMA = "armident/recording/1"
-GAPS_TOPIC, MARKS_TOPIC = "/events/gaps", "/events/marks"
-COUNTERS = "armident.counters"
-CHECK = "armident.check"
-"""Metadata that follow what they check: the checksum of so many bytes before them.
-
-The first checks the head; those of what comes at the end begin with the head's, so that they are of this file alone.
-"""
 _ZSTD_LEVEL = 1
 _ROWS_PER_CHUNK = 5000
 _MOST_CHANNELS = 65_000
@@ -42,31 +47,32 @@ _EVENTS = {
     GAPS_TOPIC: {"stream": "string", "first": "integer", "last": "integer", "joint": "string", "reason": "string"},
     MARKS_TOPIC: {"kind": "string", "sync": "integer", "t_ns": "integer", "text": "string"},
 }
+"""Topics of events, with the JSON types of their entries."""
 
 
 class RecordingWriter:
-    """A recording being written.
+    """Writes a recording.
 
-    Rows are gathered and written as one zstd chunk with its index per ``chunk_ns``, then synced to the disk: a killed
-    process or a pulled plug loses at most that. A chunk that does not go to the disk whole (disk full) is taken back,
-    its rows are counted in :attr:`lost_rows`, and writing goes on.
+    Rows are gathered, written as one zstd chunk with its message indexes per ``chunk_ns``, and synced to the disk: a
+    killed process or a power loss costs no more than that. If a chunk cannot be written completely (disk full), it is
+    removed again, its rows are counted in :attr:`lost_rows`, and writing continues.
 
     Parameters
     ----------
     path
         The file; must not exist yet.
     robot, session
-        Stored in the file.
+        Configurations that are stored in the file.
     sample_rate_hz
         Rate of SYNC, 1/s.
     layouts
         One per stream.
     metadata
-        Facts worth keeping, stored in the file.
+        Facts about the capture that are stored in the file.
     chunk_ns
-        Longest time a chunk spans, ns.
-    look_hz
-        Samples per second for looking, in SI units (`looking`); 0: none.
+        Longest time that a chunk spans, ns.
+    preview_hz
+        Rate of the preview channels in SI units (`preview`), 1/s; 0: none.
 
     Raises
     ------
@@ -83,29 +89,12 @@ class RecordingWriter:
         layouts: Sequence[StreamLayout],
         metadata: Mapping[str, str],
         chunk_ns: int = 100_000_000,
-        look_hz: float = 0.0,
+        preview_hz: float = 0.0,
     ) -> None:
         self.path = path
         self.lost_rows = 0
         self.problem: str | None = None
         self._chunk_ns = chunk_ns
-        facts = {"schema": SCHEMA, "sample_rate_hz": repr(sample_rate_hz), "check": CHECK}
-        texts = {
-            "armident.recording": facts,
-            "armident.robot": {"json": robot.model_dump_json(by_alias=True)},
-            "armident.session": {} if session is None else {"json": session.model_dump_json(by_alias=True)},
-            "armident.facts": dict(metadata),
-        }
-        # Channels have numbers of their own in every file: a chunk that strayed in from another one is noticed.
-        first = 1 + zlib.crc32(repr(texts).encode()) % _MOST_CHANNELS
-        self._layouts = {layout.name: (k, layout) for k, layout in enumerate(layouts, start=first)}
-        self._topics = {topic: first + len(layouts) + k for k, topic in enumerate(_EVENTS)}
-        looks = [PreviewChannel.at(layout, robot, sample_rate_hz, look_hz) for layout in layouts if look_hz > 0]
-        numbers = range(first + len(layouts) + len(_EVENTS), 2**16)
-        self._looks = {
-            look.layout.name[len(PREFIX) :]: (k, look)
-            for k, look in zip(numbers, (look for look in looks if look is not None), strict=False)
-        }
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
         self._parts: list[bytes] = []
         self._unwritten = LostRows({layout.name: layout.every for layout in layouts})
@@ -114,43 +103,64 @@ class RecordingWriter:
         self._size = 0
         self._rows = 0
         self._span: tuple[int, int] | None = None
-        schemas = [mcap.schema(k, la.message_name, "protobuf", la.descriptor) for k, la in self._layouts.values()]
-        channels = [
-            mcap.channel(k, k, la.topic, "protobuf", {"armident.stream": la.to_json()})
-            for k, la in self._layouts.values()
-        ]
+        self._position = self._head_crc = 0
+        texts = {
+            RECORDING: {"schema": SCHEMA, "sample_rate_hz": repr(sample_rate_hz), "check": CHECK},
+            ROBOT: {"json": robot.model_dump_json(by_alias=True)},
+            SESSION: {} if session is None else {"json": session.model_dump_json(by_alias=True)},
+            FACTS: dict(metadata),
+        }
+        # Channel ids differ from file to file, so that a chunk of another file is noticed.
+        first = 1 + zlib.crc32(repr(texts).encode()) % _MOST_CHANNELS
+        self._layouts = {layout.name: (k, layout) for k, layout in enumerate(layouts, start=first)}
+        self._topics = {topic: first + len(layouts) + k for k, topic in enumerate(_EVENTS)}
+        previews = _previews(layouts, robot, sample_rate_hz, preview_hz)
+        ids = range(first + len(layouts) + len(_EVENTS), 2**16)
+        self._previews = {
+            preview.layout.name[len(PREFIX) :]: (k, preview) for k, preview in zip(ids, previews, strict=False)
+        }
+        self._summary = Summary(*self._schemas_and_channels())
+        self._name = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+        self._file = _created(self._name, path)
+        self._write_head(texts)
+
+    def _schemas_and_channels(self) -> tuple[list[bytes], list[bytes]]:
+        """Return the schema and channel records; each channel has the id of its schema."""
+        schemas, channels = [], []
+
+        def add(k: int, topic: str, schema: tuple[str, str, bytes], encoding: str, metadata: dict[str, str]) -> None:
+            name, schema_encoding, data = schema
+            schemas.append(mcap.encode(Schema(k, data, schema_encoding, name)))
+            channels.append(mcap.encode(Channel(k, topic, encoding, metadata, k)))
+
+        for k, layout in self._layouts.values():
+            schema = layout.message_name, "protobuf", layout.descriptor
+            add(k, layout.topic, schema, "protobuf", {LAYOUT_KEY: layout.to_json()})
         for topic, k in self._topics.items():
             properties = {name: {"type": kind} for name, kind in _EVENTS[topic].items()}
             document = json.dumps({"type": "object", "properties": properties}).encode()
-            schemas.append(mcap.schema(k, f"armident{topic.replace('/', '.')}", "jsonschema", document))
-            channels.append(mcap.channel(k, k, topic, "json", {}))
-        for k, look in self._looks.values():
-            schemas.append(mcap.schema(k, look.layout.message_name, "protobuf", look.layout.descriptor))
-            channels.append(mcap.channel(k, k, look.layout.topic, "protobuf", look.metadata))
-        self._summary = Summary(schemas, channels)
-        # A file of this name has its head whole, whenever we are killed.
-        self._name = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+            add(k, topic, (f"armident{topic.replace('/', '.')}", "jsonschema", document), "json", {})
+        for k, preview in self._previews.values():
+            schema = preview.layout.message_name, "protobuf", preview.layout.descriptor
+            add(k, preview.layout.topic, schema, "protobuf", preview.metadata)
+        return schemas, channels
+
+    def _write_head(self, texts: Mapping[str, Mapping[str, str]]) -> None:
+        """Write all records before the first chunk, then give the file its name."""
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(self._name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-            # Whoever heals torn recordings sees that this one is being written.
-            with contextlib.suppress(OSError):
-                fcntl.flock(self._file, fcntl.LOCK_EX)
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
-        self._position = self._head_crc = 0
-        try:
-            head = mcap.MAGIC + mcap.header(f"armident {_version()}") + b"".join(schemas + channels)
+            head = mcap.MAGIC + mcap.encode(Header("", f"armident {_version()}"))
+            head += b"".join(self._summary.schemas + self._summary.channels)
             self._append(head)
             for name, text in texts.items():
-                if text or name == "armident.facts":
-                    head += self._add_metadata(name, text)
-            self._add_check(head)
+                if text or name == FACTS:
+                    head += self._add_metadata(Metadata(name, dict(text)))
+            self._add_metadata(checksum_record(head))
             self._head_crc = zlib.crc32(head)
-            self._name = _published(self._name, path)
+            # A file of this name has a complete head, even if the process is killed.
+            self._name = _published(self._name, self.path)
         except OSError as error:
             self.abort()
-            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+            raise ConfigError(f"{self.path}: cannot be written: {error.strerror}") from error
 
     @property
     def size(self) -> int:
@@ -159,13 +169,25 @@ class RecordingWriter:
 
     @property
     def rows(self) -> dict[str, int]:
-        """Rows of every stream that are in the file."""
+        """Number of rows in the file, by stream."""
         return {name: self._summary.messages.get(channel, 0) for name, (channel, _) in self._layouts.items()}
 
     def append(
         self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Add rows to a stream: ``sync`` and ``t_ns`` of shape (N,), each of ``raw`` (N, n)."""
+        """Add rows to a stream.
+
+        Parameters
+        ----------
+        stream
+            Name of the stream.
+        sync
+            SYNC numbers, (N,).
+        t_ns
+            Receive times of the SYNCs, ns UTC, (N,).
+        raw
+            Raw values of every field, (N, n) each.
+        """
         if len(sync) == 0:
             return
         channel, layout = self._layouts[stream]
@@ -174,17 +196,17 @@ class RecordingWriter:
         self._rows += len(rows)
         self._unwritten.gather(stream, sync)
         self._gather(channel, t_ns, offsets, rows.tobytes())
-        if stream in self._looks:
-            channel, look = self._looks[stream]
-            sync, t_ns, shown = look.of(sync, t_ns, raw)
+        if stream in self._previews:
+            channel, preview = self._previews[stream]
+            sync, t_ns, values = preview.select(sync, t_ns, raw)
             if sync.size:
-                rows = look.layout.pack(channel, sync, t_ns, shown)
+                rows = preview.layout.pack(channel, sync, t_ns, values)
                 offsets = self._size + np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.itemsize)
                 self._gather(channel, t_ns, offsets, rows.tobytes())
         self._flush_if_full()
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
-        """Record gaps found at ``t_ns``."""
+        """Record gaps that were found at ``t_ns`` (ns UTC)."""
         for gap in gaps:
             self._event(GAPS_TOPIC, gap.first, t_ns, asdict(gap))
             self._unwritten.events.append((GAPS_TOPIC, gap.first, asdict(gap)))
@@ -198,19 +220,19 @@ class RecordingWriter:
         self._flush_if_full()
 
     def leave_out(self, rows: RowRanges) -> None:
-        """Rows that nobody could hand to the disk: they are lost as if it had refused them."""
+        """Count rows as lost that were never handed over, because the disk was too slow."""
         self.lost_rows += rows.rows
-        self.problem = f"{self.path}: {STANDS_STILL}"
+        self.problem = f"{self.path}: {DISK_STALLED}"
         self._unwritten.lose(rows)
 
     def take_over(self, other: "RecordingWriter") -> None:
-        """Tell what the file of another writer could not be told: rows and events that its disk did not take."""
+        """Record the lost rows and unwritten events of another writer, whose file could not be finished."""
         self._unwritten.take_over(other._unwritten)
         for topic, sync, entries in other._unwritten.events:
             self._event(topic, sync, other._last_ns, entries)
 
     def flush(self) -> None:
-        """Write what is gathered as a chunk and bring it to the disk."""
+        """Write the gathered rows and events as a chunk, and sync it to the disk."""
         for gap in self._unwritten.gaps():
             self._event(GAPS_TOPIC, gap.first, self._last_ns, asdict(gap))
         if not self._parts or self._span is None:
@@ -225,8 +247,16 @@ class RecordingWriter:
             counts[channel] = len(pairs)
             offsets[channel] = self._position + len(chunk) + len(indexes)
             indexes += mcap.message_index(channel, pairs.tobytes())
-        place = mcap.ChunkPlace(
-            *self._span, self._position, len(chunk), offsets, len(indexes), len(compressed), len(raw)
+        index = ChunkIndex(
+            chunk_length=len(chunk),
+            chunk_start_offset=self._position,
+            compression=mcap.COMPRESSION,
+            compressed_size=len(compressed),
+            message_end_time=self._span[1],
+            message_index_length=len(indexes),
+            message_index_offsets=offsets,
+            message_start_time=self._span[0],
+            uncompressed_size=len(raw),
         )
         try:
             self._append(chunk + indexes)
@@ -236,7 +266,7 @@ class RecordingWriter:
             self.problem = f"{self.path}: {error.strerror}"
             self._unwritten.failed()
         else:
-            self._summary.add_chunk(place, counts)
+            self._summary.add_chunk(index, counts)
             self._unwritten.written()
         self._parts, self._indexes, self._size, self._rows, self._span = [], {}, 0, 0, None
         for topic, sync, event in self._unwritten.events:
@@ -245,17 +275,23 @@ class RecordingWriter:
     def close(self, counters: Mapping[str, int]) -> None:
         """Write the rest, the counters and the summary; the file is complete afterwards.
 
+        Parameters
+        ----------
+        counters
+            Counters of the capture.
+
         Raises
         ------
         ConfigError
-            If the disk does not take the end of the file; what is there remains readable as a torn file.
+            If the end of the file cannot be written. The file remains readable as a truncated one.
         """
         try:
             self.flush()
-            # A disk that did not take the last rows may take the word that they are missing.
+            # If the last rows could not be written, their gaps may still fit on the disk.
             self.flush()
-            self._add_check(self._add_metadata(COUNTERS, {key: str(value) for key, value in counters.items()}))
-            self._append(self._summary.ending(self._position))
+            entries = {key: str(value) for key, value in counters.items()}
+            self._add_metadata(checksum_record(self._add_metadata(Metadata(COUNTERS, entries)), self._head_crc))
+            self._append(self._summary.encode(self._position))
             os.fsync(self._file)
         except OSError as error:
             raise ConfigError(f"{self.path}: could not be finished: {error.strerror}") from error
@@ -263,7 +299,7 @@ class RecordingWriter:
             self._release()
 
     def abort(self) -> None:
-        """Leave nothing behind."""
+        """Close and delete the file."""
         self._release()
         self._name.unlink(missing_ok=True)
 
@@ -297,20 +333,13 @@ class RecordingWriter:
         if self._span is not None and self._span[1] - self._span[0] >= self._chunk_ns:
             self.flush()
 
-    def _add_metadata(self, name: str, entries: Mapping[str, str]) -> bytes:
-        """Write a metadata record; the bytes of it."""
-        data = mcap.metadata(name, entries)
-        place = mcap.MetadataPlace(name, self._position, len(data))
+    def _add_metadata(self, metadata: Metadata) -> bytes:
+        """Write a metadata record; return its bytes."""
+        data = mcap.encode(metadata)
+        index = MetadataIndex(self._position, len(data), metadata.name)
         self._append(data)
-        self._summary.metadata.append(place)
+        self._summary.metadata.append(index)
         return data
-
-    def _add_check(self, data: bytes) -> None:
-        """Write the checksum of what was just written: chunks have their own, the other records have none."""
-        record = mcap.check(CHECK, data, self._head_crc)
-        place = mcap.MetadataPlace(CHECK, self._position, len(record))
-        self._append(record)
-        self._summary.metadata.append(place)
 
     def _append(self, data: bytes) -> None:
         """Write all of ``data``, or nothing."""
@@ -327,7 +356,14 @@ class RecordingWriter:
 
 
 def write_recording(recording: Recording, path: Path) -> None:
-    """Write a recording that is in memory; the file appears under its name when it is complete.
+    """Write a recording from memory; the file appears under its name when it is complete.
+
+    Parameters
+    ----------
+    recording
+        The recording.
+    path
+        The file; an existing one is replaced.
 
     Raises
     ------
@@ -362,14 +398,50 @@ def write_recording(recording: Recording, path: Path) -> None:
         writer.abort()
 
 
+def checksum_record(data: bytes, start: int = 0) -> Metadata:
+    """Return the metadata record with the checksum of ``data``, the bytes right before it.
+
+    Chunks have checksums of their own, other records have none.
+
+    Parameters
+    ----------
+    data
+        The bytes.
+    start
+        CRC-32 that the checksum continues.
+    """
+    return Metadata(CHECK, {"bytes": str(len(data)), "crc32": str(zlib.crc32(data, start))})
+
+
+def _previews(
+    layouts: Iterable[StreamLayout], robot: RobotConfig, sample_rate_hz: float, preview_hz: float
+) -> list[PreviewChannel]:
+    if preview_hz <= 0:
+        return []
+    previews = (PreviewChannel.of_stream(layout, robot, sample_rate_hz, preview_hz) for layout in layouts)
+    return [preview for preview in previews if preview is not None]
+
+
+def _created(temporary: Path, path: Path) -> int:
+    """Create the file and lock it, so that it is not recovered while it is written; return its descriptor."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        with contextlib.suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    return file
+
+
 def _published(temporary: Path, path: Path) -> Path:
-    """Give a file its name, which nothing may have yet; the name."""
+    """Give a file its name, which must be free; return the name."""
     try:
         os.link(temporary, path)
     except FileExistsError:
         raise
     except OSError:
-        # A file system without links.
+        # The file system has no hard links.
         if path.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from None
         temporary.rename(path)

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.daq.recording.lost_rows import STANDS_STILL, RowRanges
+from armident.daq.recording.lost_rows import DISK_STALLED, RowRanges
 from armident.daq.recording.model import Gap, Mark
 from armident.daq.recording.ring_buffer import TriggeredSeries
 from armident.daq.recording.rotation import RecordingSeries
@@ -141,7 +141,7 @@ class QueuedSeries:
     @property
     def problem(self) -> str | None:
         """What went wrong with writing last, in words."""
-        return f"{self.path}: {STANDS_STILL}" if self._left_out else self._state.problem
+        return f"{self.path}: {DISK_STALLED}" if self._left_out else self._state.problem
 
     @property
     def waiting_rows(self) -> int:

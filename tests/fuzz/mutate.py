@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 import zstandard
+from mcap.opcode import Opcode
 
 from armident.daq.recording import mcap_records as mcap
 
@@ -120,9 +121,9 @@ def forge_recording(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
                 del records[k]
             case 2:
                 records[k] = rng.randrange(256), body
-            case _ if opcode == mcap.CHUNK:
+            case _ if opcode == Opcode.CHUNK:
                 records[k] = opcode, _forged_chunk(rng, body)
-            case _ if opcode in (mcap.METADATA, mcap.CHANNEL) and b"{" in body and rng.random() < 0.7:
+            case _ if opcode in (Opcode.METADATA, Opcode.CHANNEL) and b"{" in body and rng.random() < 0.7:
                 records[k] = opcode, _forged_json(rng, body)
             case _:
                 records[k] = opcode, spoil_bytes(rng, [body])

@@ -201,3 +201,11 @@ def test_values_that_yaml_reads_as_another_type_are_refused(line: str, expected:
 
 def test_numbers_are_those_of_yaml_1_2() -> None:
     assert read_yaml("[010, 0x1F, 1e-3, 1_000, .5, 2024-01-02]", "x") == ["010", 31, 0.001, 1000, 0.5, "2024-01-02"]
+
+
+def test_the_former_name_of_a_key_is_read_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    session = load_session(session_with(tmp_path, recording={"look_hz": 20.0}))
+    assert session.recording.preview_hz == 20.0
+    assert "recording.look_hz is now recording.preview_hz" in caplog.text
+    with pytest.raises(ConfigError, match=r"recording\.look_hz: unknown key"):
+        load_session(session_with(tmp_path, recording={"look_hz": 20.0, "preview_hz": 10.0}))

@@ -13,10 +13,10 @@ from tests.unit.daq.test_recording import make_recording
 ROWS = 5000
 
 
-def written(path: Path, look_hz: float, close: bool = True) -> None:
+def written(path: Path, preview_hz: float, close: bool = True) -> None:
     recording = make_recording(ROWS)
     layouts = [StreamLayout.of(s, [j.name for j in recording.robot.joints]) for s in recording.streams.values()]
-    writer = RecordingWriter(path, recording.robot, None, 5000.0, layouts, {}, 20_000_000, look_hz)
+    writer = RecordingWriter(path, recording.robot, None, 5000.0, layouts, {}, 20_000_000, preview_hz)
     for first in range(0, ROWS + 3, 50):
         for stream in recording.streams.values():
             part = (stream.sync >= first) & (stream.sync < first + 50)

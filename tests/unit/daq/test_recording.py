@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
@@ -302,7 +303,7 @@ def with_chunks(data: bytes, change: Callable[[bytearray], None]) -> bytes:
     out = bytearray(mcap.MAGIC)
     for opcode, _, body in mcap.records(memoryview(data), len(mcap.MAGIC)):
         content = bytearray(body)
-        if opcode == mcap.CHUNK:
+        if opcode == Opcode.CHUNK:
             change(content)
         out += mcap.record(opcode, bytes(content))
     return bytes(out) + mcap.MAGIC
@@ -328,7 +329,7 @@ def test_a_recording_that_lies_about_its_number_of_rows_is_read_all_the_same(tmp
     recording = make_recording(2000)
     write_chunked(recording, tmp_path / "r.mcap").close({})
     data = (tmp_path / "r.mcap").read_bytes()
-    place = next(at for op, at, _ in mcap.records(memoryview(data), len(mcap.MAGIC)) if op == mcap.STATISTICS)
+    place = next(at for op, at, _ in mcap.records(memoryview(data), len(mcap.MAGIC)) if op == Opcode.STATISTICS)
     forged = bytearray(data)
     # The counts by channel are the last of the statistics: make the first of them enormous, and the checksum none.
     struct.pack_into("<Q", forged, place + mcap.RECORD_HEAD.size + 46 + 2, 2**60)
@@ -369,7 +370,7 @@ def test_a_chunk_of_another_recording_is_not_taken_for_one_of_this(tmp_path: Pat
     write_chunked(replace(other, metadata={"host": "y"}), tmp_path / "2.mcap").close({})
     parts = [(tmp_path / name).read_bytes() for name in ("1.mcap", "2.mcap")]
     chunks = [
-        [(at, at + 9 + len(body)) for op, at, body in mcap.records(memoryview(part), 8) if op == mcap.CHUNK]
+        [(at, at + 9 + len(body)) for op, at, body in mcap.records(memoryview(part), 8) if op == Opcode.CHUNK]
         for part in parts
     ]
     (begin, end), (first, last) = chunks[0][1], chunks[1][1]

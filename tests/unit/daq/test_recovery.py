@@ -135,14 +135,32 @@ def test_what_is_no_recording_is_refused_and_left_alone(tmp_path: Path) -> None:
 
 def test_the_command_says_what_is_missing(tmp_path: Path) -> None:
     data = torn(make_recording(1000), tmp_path / "r.mcap", 0.6)
-    app = application(["heal"])
-    shown = CliRunner().invoke(app, ["heal", str(tmp_path / "r.mcap")])
+    app = application(["recover"])
+    shown = CliRunner().invoke(app, ["recover", str(tmp_path / "r.mcap")])
     assert shown.exit_code == 0
     last = read_recording(tmp_path / "r.mcap").samples.sync[-1]
-    assert f"r.mcap: healed: the file was not finished: whatever came after SYNC {last}" in shown.output
-    again = CliRunner().invoke(app, ["heal", "--json", str(tmp_path / "r.mcap")])
+    assert f"r.mcap: recovered: the file was not finished: whatever came after SYNC {last}" in shown.output
+    again = CliRunner().invoke(app, ["recover", "--json", str(tmp_path / "r.mcap")])
     assert json.loads(again.output)[0]["missing"] is None
     assert len(data) > 0
+
+
+def test_the_former_name_of_the_command_still_works(tmp_path: Path) -> None:
+    torn(make_recording(1000), tmp_path / "r.mcap", 0.6)
+    shown = CliRunner().invoke(application(["heal"]), ["heal", str(tmp_path / "r.mcap")])
+    assert shown.exit_code == 0
+    assert "heal is now recover" in shown.stderr
+    assert "r.mcap: recovered: " in shown.stdout
+
+
+def test_a_file_recovered_by_version_0_1_still_says_what_it_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torn(make_recording(1000), tmp_path / "r.mcap", 0.6)
+    monkeypatch.setattr("armident.daq.recording.recovery.RECOVERED", "armident.healed")
+    found = recover_recording(tmp_path / "r.mcap")
+    assert found.missing is not None
+    assert read_recording(tmp_path / "r.mcap").missing == found.missing
 
 
 WRITE_UNTIL_KILLED = """

@@ -204,7 +204,7 @@ def test_rows_for_which_there_is_no_room_are_counted_and_become_gaps(
             lost.append(series.lost_rows)
         assert lost[-1] > 1000
         assert series.problem is not None
-        assert series.problem.endswith("the disk stands still")
+        assert series.problem.endswith("the disk has stalled")
         disk.set()
         until(lambda: series.waiting_rows == 0)
         for first in range(2500, 3000, 50):

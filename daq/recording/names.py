@@ -1,0 +1,31 @@
+"""Names of the topics and metadata records of a recording."""
+
+SCHEMA = "armident/recording/1"
+"""Version of the file's content, in the metadata record ``RECORDING``."""
+
+GAPS_TOPIC, MARKS_TOPIC = "/events/gaps", "/events/marks"
+"""Topics of gaps and marks, JSON."""
+
+LAYOUT_KEY = "armident.stream"
+"""Channel metadata: the layout of a stream's messages (`StreamLayout.to_json`)."""
+
+RECORDING = "armident.recording"
+"""Metadata: schema, sample rate and name of the checksum records."""
+
+ROBOT, SESSION, FACTS = "armident.robot", "armident.session", "armident.facts"
+"""Metadata: the configurations as JSON, and facts about the capture."""
+
+COUNTERS = "armident.counters"
+"""Metadata: the counters of the capture, written at its end."""
+
+CHECK = "armident.check"
+"""Metadata: number of bytes before the record and their CRC-32.
+
+The first one covers the head of the file. Those at the end continue the head's CRC, so that they fit this file alone.
+"""
+
+RECOVERED = "armident.recovered"
+"""Metadata of a recovered file: the missing parts, in words."""
+
+RECOVERED_OLD = "armident.healed"
+"""Name of `RECOVERED` up to version 0.1, still read."""

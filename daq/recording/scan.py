@@ -1,0 +1,366 @@
+"""One pass over the records of a recording, in file order and checked, for reading and for recovery."""
+
+import zlib
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import zstandard
+from mcap.opcode import Opcode
+from mcap.records import Channel, Metadata, Statistics
+
+from armident.configs import DataError
+from armident.daq.recording import mcap_records as mcap
+from armident.daq.recording.layout import StreamLayout
+from armident.daq.recording.names import CHECK, COUNTERS, LAYOUT_KEY
+
+_LARGEST_CHUNK = 1 << 28
+"""Largest uncompressed chunk that is read, bytes."""
+_WORKERS, _CHUNKS_AHEAD = 2, 16
+"""Threads that decompress, and chunks they may be ahead of the scan."""
+_IN_DATA = frozenset(
+    map(
+        int,
+        (
+            Opcode.HEADER,
+            Opcode.SCHEMA,
+            Opcode.CHANNEL,
+            Opcode.MESSAGE,
+            Opcode.CHUNK,
+            Opcode.MESSAGE_INDEX,
+            Opcode.ATTACHMENT,
+            Opcode.METADATA,
+            Opcode.DATA_END,
+        ),
+    )
+)
+"""Opcodes that may precede the summary."""
+
+
+class MessageRun(NamedTuple):
+    """Consecutive messages of one channel: ``count`` records in bytes ``start`` to ``end`` of a chunk."""
+
+    channel_id: int
+    start: int
+    end: int
+    count: int
+
+
+class MessageIndexContent(NamedTuple):
+    """Channel and number of entries of a message index."""
+
+    channel_id: int
+    count: int
+
+
+@dataclass(frozen=True)
+class RecordItem:
+    """A valid record other than a chunk, in bytes ``start`` to ``end`` of the file; ``content`` if it was decoded."""
+
+    opcode: int
+    start: int
+    end: int
+    content: Channel | Metadata | MessageIndexContent | None
+
+
+@dataclass(frozen=True)
+class ChunkItem:
+    """A valid chunk, in bytes ``start`` to ``end`` of the file.
+
+    Parameters
+    ----------
+    start, end
+        Position in the file, bytes.
+    body
+        Content of the chunk record.
+    raw
+        Its records, uncompressed.
+    runs
+        Its messages in order.
+    """
+
+    start: int
+    end: int
+    body: memoryview
+    raw: bytes
+    runs: list[MessageRun]
+
+    def message_counts(self) -> dict[int, int]:
+        """Return the number of messages by channel."""
+        counts: dict[int, int] = {}
+        for run in self.runs:
+            counts[run.channel_id] = counts.get(run.channel_id, 0) + run.count
+        return counts
+
+
+@dataclass(frozen=True)
+class DamageItem:
+    """A damaged record in bytes ``start`` to ``end`` of the file."""
+
+    opcode: int
+    start: int
+    end: int
+
+
+Item = RecordItem | ChunkItem | DamageItem
+_Pending = tuple[int, int, memoryview, "Future[bytes | None] | None"]
+
+
+class RecordingScan:
+    """Iterates over the records up to the end of the data, and keeps what they say of the file.
+
+    A damaged record behind the head is skipped and described in ``damage``. Other threads decompress chunks ahead of
+    the iteration.
+
+    Parameters
+    ----------
+    data
+        The file.
+
+    Attributes
+    ----------
+    channels, layouts
+        Channels and stream layouts so far, by channel id.
+    metadata
+        Entries of the metadata records so far, by name.
+    messages
+        Number of messages in valid chunks so far, by channel id.
+    expected
+        Number of messages by channel id that the summary states; ``None`` without a valid summary.
+    damage
+        Descriptions of damaged records.
+    head_crc
+        CRC-32 of the head; ``None`` before its checksum record.
+    finished
+        True if the file has its data end and closing magic.
+    end
+        End of the last complete record, bytes.
+
+    Raises
+    ------
+    DataError
+        If the file is not MCAP. The iteration raises it if the file is no recording of armident, too.
+    """
+
+    def __init__(self, data: memoryview) -> None:
+        if bytes(data[: len(mcap.MAGIC)]) != mcap.MAGIC:
+            raise DataError("not a recording (not an MCAP file)")
+        self.channels: dict[int, Channel] = {}
+        self.layouts: dict[int, StreamLayout] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.messages: dict[int, int] = {}
+        self.expected = expected_messages(data)
+        self.damage: list[str] = []
+        self.head_crc: int | None = None
+        self.finished = False
+        self.end = 0
+        self._data = data
+
+    def __iter__(self) -> Iterator[Item]:
+        """Yield the records in file order, the data end last.
+
+        Raises
+        ------
+        MalformedRecord
+            If the head is damaged.
+        DataError
+            If messages do not have their channel's layout.
+        """
+        with ThreadPoolExecutor(_WORKERS, "zstd") as pool:
+            for opcode, start, body, chunk in self._read_ahead(pool):
+                end = start + mcap.RECORD_HEAD.size + len(body)
+                item: Item | None = None
+                try:
+                    if chunk is None:
+                        item = RecordItem(opcode, start, end, self._decoded(opcode, start, body))
+                    elif (raw := chunk.result()) is not None:
+                        item = ChunkItem(start, end, body, raw, self._runs(raw))
+                    else:
+                        self.damage.append(f"the chunk at byte {start} is damaged and left out")
+                except mcap.MalformedRecord as error:
+                    if chunk is None and self.head_crc is None:
+                        raise
+                    self.damage.append(f"the record at byte {start} is damaged and left out ({error})")
+                self.end = end
+                if isinstance(item, ChunkItem):
+                    for channel, count in item.message_counts().items():
+                        self.messages[channel] = self.messages.get(channel, 0) + count
+                elif item is None and chunk is None:
+                    # Of counters and their checksum, either may be the damaged one.
+                    self.metadata.pop(COUNTERS, None)
+                yield item or DamageItem(opcode, start, end)
+                if opcode == Opcode.DATA_END:
+                    break
+        self.finished = self.finished and bytes(self._data[-len(mcap.MAGIC) :]) == mcap.MAGIC
+
+    def missing(self, last_sync: int | None) -> list[str]:
+        """Describe what the file lacks, after the iteration; empty for a complete file.
+
+        Parameters
+        ----------
+        last_sync
+            SYNC number of the last sample; ``None`` if there is none.
+        """
+        words = list(self.damage)
+        if self.finished and not self.damage:
+            words += [
+                f"{self.messages.get(k, 0)} messages of topic {self.channels[k].topic} where {count} were written"
+                for k, count in (self.expected or {}).items()
+                if k in self.channels and count != self.messages.get(k, 0)
+            ]
+        if not self.finished:
+            since = "from the start" if last_sync is None else f"after SYNC {last_sync}"
+            words.append(
+                f"the file was not finished: whatever came {since} and the counters are missing"
+                f" ({len(self._data) - self.end} bytes of a torn record left out)"
+            )
+        return words
+
+    def _read_ahead(self, pool: ThreadPoolExecutor) -> Iterator[_Pending]:
+        """Yield the records in file order, with the futures of the chunks."""
+        waiting: deque[_Pending] = deque()
+        chunks = 0
+        for opcode, at, body in mcap.records(self._data, len(mcap.MAGIC)):
+            future = None
+            if opcode == Opcode.CHUNK:
+                # All records before the first chunk are decoded by now, so it is known if chunks must have checksums.
+                future = pool.submit(_uncompressed, body, self.head_crc is not None)
+                chunks += 1
+            waiting.append((opcode, at, body, future))
+            while waiting and (chunks > _CHUNKS_AHEAD or chunks == 0):
+                chunks -= waiting[0][3] is not None
+                yield waiting.popleft()
+        yield from waiting
+
+    def _decoded(self, opcode: int, at: int, body: memoryview) -> Channel | Metadata | MessageIndexContent | None:
+        """Check a record at byte ``at``, register its content and return it.
+
+        Raises
+        ------
+        MalformedRecord
+            If it may not precede the summary, is malformed, or states another checksum than that of the bytes before.
+        """
+        if opcode not in _IN_DATA:
+            raise mcap.MalformedRecord(f"a record of kind {opcode:02X}h before the end of the data")
+        if opcode == Opcode.MESSAGE_INDEX:
+            return MessageIndexContent(*mcap.read_message_index(body))
+        if opcode == Opcode.CHANNEL:
+            channel = mcap.decode(Channel, body)
+            self._add_channel(channel)
+            return channel
+        if opcode == Opcode.METADATA:
+            metadata = mcap.decode(Metadata, body)
+            if metadata.name == CHECK:
+                crc = self._verified(metadata.metadata, at)
+                self.head_crc = crc if self.head_crc is None else self.head_crc
+            self.metadata[metadata.name] = metadata.metadata
+            return metadata
+        self.finished = opcode == Opcode.DATA_END
+        return None
+
+    def _verified(self, entries: dict[str, str], at: int) -> int:
+        """Return the CRC-32 that a checksum record at byte ``at`` states, if it is right."""
+        try:
+            size, crc = int(entries["bytes"]), int(entries["crc32"])
+        except (KeyError, ValueError) as error:
+            raise mcap.MalformedRecord("a checksum record without a checksum") from error
+        if not 0 < size <= at or zlib.crc32(self._data[at - size : at], self.head_crc or 0) != crc:
+            raise mcap.MalformedRecord(f"the {size} bytes before byte {at} are not what was written")
+        return crc
+
+    def _add_channel(self, channel: Channel) -> None:
+        if self.channels.setdefault(channel.id, channel) != channel:
+            raise mcap.MalformedRecord(f"another channel {channel.id}")
+        if LAYOUT_KEY in channel.metadata:
+            self.layouts[channel.id] = StreamLayout.from_json(channel.metadata[LAYOUT_KEY])
+
+    def _runs(self, raw: bytes) -> list[MessageRun]:
+        """Return the messages in a chunk's records; channels in it are registered."""
+        runs = []
+        at = 0
+        while at + mcap.RECORD_HEAD.size <= len(raw):
+            opcode, length = mcap.RECORD_HEAD.unpack_from(raw, at)
+            body = at + mcap.RECORD_HEAD.size
+            end = body + length
+            if end > len(raw):
+                raise mcap.MalformedRecord("a record reaches beyond its chunk")
+            if opcode == Opcode.CHANNEL:
+                self._add_channel(mcap.decode(Channel, memoryview(raw)[body:end]))
+            elif opcode == Opcode.MESSAGE and length >= mcap.MESSAGE_HEAD.size:
+                channel_id = mcap.MESSAGE_HEAD.unpack_from(raw, body)[0]
+                run = self._run(raw, channel_id, at, end)
+                runs.append(run)
+                end = run.end
+            at = end
+        return runs
+
+    def _run(self, raw: bytes, channel_id: int, at: int, end: int) -> MessageRun:
+        """Return the run that begins with the message in bytes ``at`` to ``end``."""
+        layout = self.layouts.get(channel_id)
+        if layout is not None:
+            count = layout.run_length(raw, at, channel_id)
+            if count == 0:
+                raise DataError(f"a message of topic {layout.topic} is not as long as its channel says")
+            return MessageRun(channel_id, at, at + count * layout.record[0].itemsize, count)
+        if channel_id not in self.channels:
+            raise mcap.MalformedRecord(f"messages of a channel {channel_id} that this file has not")
+        return MessageRun(channel_id, at, end, 1)
+
+
+def expected_messages(data: memoryview) -> dict[int, int] | None:
+    """Return the number of messages by channel id that a file's summary states.
+
+    Parameters
+    ----------
+    data
+        The file.
+
+    Returns
+    -------
+    dict or None
+        ``None`` if the file has no summary, or its checksum is wrong.
+    """
+    footer_start = len(data) - len(mcap.MAGIC) - mcap.FOOTER_SIZE
+    footer_end = footer_start + mcap.FOOTER_SIZE
+    if footer_start < len(mcap.MAGIC) or bytes(data[footer_end:]) != mcap.MAGIC:
+        return None
+    try:
+        footer = mcap.read_footer(data[footer_start:footer_end])
+        start, crc = footer.summary_start, footer.summary_crc
+        if not 0 < start <= footer_start or (crc and zlib.crc32(data[start : footer_end - 4]) != crc):
+            return None
+        for opcode, _, body in mcap.records(data[:footer_start], start):
+            if opcode == Opcode.STATISTICS:
+                return dict(mcap.decode(Statistics, body).channel_message_counts)
+    except mcap.MalformedRecord:
+        return None
+    return None
+
+
+def _uncompressed(body: memoryview, checked: bool) -> bytes | None:
+    """Return the records in a chunk, or ``None`` if it is damaged; a ``checked`` one must have a checksum."""
+    try:
+        chunk = mcap.read_chunk(body)
+    except mcap.MalformedRecord:
+        return None
+    if chunk.size > _LARGEST_CHUNK:
+        return None
+    if chunk.compression == mcap.COMPRESSION:
+        try:
+            # Memory is reserved by the size in the zstd frame, never by that in the chunk's head alone.
+            if zstandard.frame_content_size(chunk.data) not in (-1, chunk.size):
+                return None
+            raw = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.size)
+        except zstandard.ZstdError:
+            return None
+    elif chunk.compression == "":
+        raw = bytes(chunk.data)
+    elif chunk.compression == "lz4":
+        raise DataError("compressed with lz4; recordings are compressed with zstd")
+    else:
+        return None
+    if len(raw) != chunk.size or ((checked or chunk.crc) and zlib.crc32(raw) != chunk.crc):
+        return None
+    return raw
