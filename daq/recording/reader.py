@@ -100,7 +100,7 @@ class _Content:
         for run in chunk.runs:
             layout = self.scan.layouts.get(run.channel_id)
             if layout is not None:
-                records = np.frombuffer(chunk.raw, layout.record[0], count=run.count, offset=run.start)
+                records = np.frombuffer(chunk.raw, layout.record[0], count=run.number, offset=run.start)
                 self.rows_of(run.channel_id).append(records)
                 continue
             topic = self.scan.channels[run.channel_id].topic

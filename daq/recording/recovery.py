@@ -145,7 +145,7 @@ class _Chunk:
         """Add a message index in bytes ``start`` to ``end``."""
         self.index.message_index_offsets[content.channel_id] = start
         self.index.message_index_length += end - start
-        self.indexed[content.channel_id], self.end = content.count, end
+        self.indexed[content.channel_id], self.end = content.number, end
 
     def rebuild_indexes(self) -> bytes:
         """Return message indexes made from its messages; the index record then refers to them."""
@@ -208,13 +208,16 @@ class _Contents:
                 self.end = item.end
         if RECORDING not in self.scan.metadata:
             raise DataError("an MCAP file, but not a recording of armident, or torn before its first chunk")
+        self._add_tail()
+        missing = self.scan.missing(self._last_sync)
+        self.missing = "; ".join(recovered_words(self.scan.metadata) + missing) if missing else None
+
+    def _add_tail(self) -> None:
+        """Rebuild the indexes of a last chunk: it is complete, they need not be."""
         if self._last is not None:
-            # The chunk is complete, its indexes need not be: they are made again.
             self.end = self._last.indexes_start
             self.tail = self._last.rebuild_indexes()
             self.summary.add_chunk(self._last.index, self._last.messages)
-        missing = self.scan.missing(self._last_sync)
-        self.missing = "; ".join(recovered_words(self.scan.metadata) + missing) if missing else None
 
     def _add_damage(self, item: DamageItem) -> None:
         if item.opcode == Opcode.CHUNK:
@@ -249,7 +252,7 @@ class _Contents:
         for run in item.runs:
             layout = self.scan.layouts.get(run.channel_id)
             if layout is not None and layout.name == "samples":
-                self._last_sync = layout.last_sync(item.raw, run.start, run.count)
+                self._last_sync = layout.last_sync(item.raw, run.start, run.number)
         content = mcap.read_chunk(item.body)
         index = ChunkIndex(
             chunk_length=item.end - item.start,

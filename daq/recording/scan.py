@@ -40,19 +40,19 @@ _IN_DATA = frozenset(
 
 
 class MessageRun(NamedTuple):
-    """Consecutive messages of one channel: ``count`` records in bytes ``start`` to ``end`` of a chunk."""
+    """Consecutive messages of one channel: ``number`` records in bytes ``start`` to ``end`` of a chunk."""
 
     channel_id: int
     start: int
     end: int
-    count: int
+    number: int
 
 
 class MessageIndexContent(NamedTuple):
     """Channel and number of entries of a message index."""
 
     channel_id: int
-    count: int
+    number: int
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class ChunkItem:
         """Return the number of messages by channel."""
         counts: dict[int, int] = {}
         for run in self.runs:
-            counts[run.channel_id] = counts.get(run.channel_id, 0) + run.count
+            counts[run.channel_id] = counts.get(run.channel_id, 0) + run.number
         return counts
 
 
