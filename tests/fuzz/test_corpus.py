@@ -8,6 +8,8 @@ import pytest
 from tests.fuzz.harness import CORPUS, Finding, attempt
 from tests.fuzz.targets import TARGETS
 
+pytestmark = pytest.mark.slow
+
 NEW = 20
 """Inputs besides the corpus; `python -m tests.fuzz` tries as many as there is time for."""
 

@@ -6,6 +6,8 @@ import pytest
 from armident.daq.matching.assembler import Assembler, Batch, TpdoStream
 from armident.drivers.can.frames import Frames, frames
 
+pytestmark = pytest.mark.slow
+
 PERIOD_NS = 200_000
 OVERFLOW = 240
 BUSES = 3

@@ -182,6 +182,7 @@ for first in range(0, 20_000, 20):
 """
 
 
+@pytest.mark.slow
 def test_a_writer_killed_at_any_moment_leaves_a_file_that_heals(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     whole = make_recording(20_000).samples

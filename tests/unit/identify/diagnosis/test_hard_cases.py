@@ -139,7 +139,7 @@ def test_ripple_among_the_frequencies_of_the_motion_is_a_line(tmp_path: Path) ->
     assert "16.7 Hz" in rest["hint"]
 
 
-@pytest.mark.parametrize("strength", ["obvious emps run 3", "typical emps run 4"])
+@pytest.mark.parametrize("strength", [pytest.param("obvious emps run 3", marks=proof), "typical emps run 4"])
 def test_a_spring_is_found_beside_friction_that_is_far_stronger(strength: str, tmp_path: Path) -> None:
     """A bristle carries the Coulomb friction of a joint with Stribeck friction, too, or reversals hide the spring."""
     told, _ = diagnosed(f"pair joint_spring joint_1 and stribeck_friction joint_1 {strength}", tmp_path)
@@ -149,6 +149,7 @@ def test_a_spring_is_found_beside_friction_that_is_far_stronger(strength: str, t
     assert told["gap"]["validation"]["after"]["all"] < 0.5
 
 
+@proof
 def test_friction_far_from_where_it_seems_is_found_where_the_arm_sticks_and_its_model_does_not(tmp_path: Path) -> None:
     """Four fifths of the torque are error before; steps downhill from the first look end in a hollow beside it.
 

@@ -12,6 +12,8 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.cli import TrajectoryOptions, trajectory_command
 from armident.identify.excitation.design import design_trajectory, predict_precision
 
+pytestmark = pytest.mark.slow
+
 NOISE = np.sqrt([1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523])
 """Standard deviation of the torque noise of the TX40 after the decimate filter, N m (thesis table 6.3)."""
 

@@ -15,6 +15,8 @@ from armident.identify.robot.consistent import identifiability, nearest_consiste
 from armident.virtual_robot.inertias import plant_parameters
 from tests.pinocchio_oracle import random_parameters, random_robot
 
+pytestmark = pytest.mark.slow
+
 Array = NDArray[np.float64]
 
 
