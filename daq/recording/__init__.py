@@ -1,4 +1,4 @@
-"""Recordings: what they are, how they are read and written."""
+"""Recordings in memory and in MCAP files: model, reader, writers and recovery."""
 
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.model import Field, Gap, Mark, Recording, Stream, join_parts

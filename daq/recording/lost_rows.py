@@ -1,4 +1,4 @@
-"""What the disk did not take: rows that become gaps, and events that are written later."""
+"""Rows that could not be written, which become gaps, and events that are written later."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 from armident.daq.recording.model import Gap
 
 NOT_WRITTEN = "not written"
-"""Samples that were received, but the disk did not take them."""
+"""Reason of gaps whose samples were received but not written."""
 
 DISK_STALLED = "the disk has stalled"
 """Problem that is reported while rows are left out."""
 
 Event = tuple[str, int, dict[str, Any]]
-"""Topic, SYNC number and entries."""
+"""Topic, SYNC number and JSON entries of an event."""
 
 
 class RowRanges:
-    """Rows of streams, from one SYNC to another; what goes on without a seam is one span.
+    """Ranges of rows by stream, as first and last SYNC number; adjacent ranges are merged.
 
     Parameters
     ----------
     every
-        Of each stream, on every how many SYNCs it has a row.
+        By stream, the number of SYNCs from one row to the next.
     """
 
     def __init__(self, every: Mapping[str, int]) -> None:
@@ -36,26 +36,42 @@ class RowRanges:
         return any(self._spans.values())
 
     def add(self, stream: str, sync: NDArray[np.int64]) -> None:
-        """Add rows by their SYNCs, shape (N,), which may have gaps."""
+        """Add rows.
+
+        Parameters
+        ----------
+        stream
+            Name of the stream.
+        sync
+            SYNC numbers of the rows, (N,), increasing; they may have gaps.
+        """
         breaks = [0, *(np.flatnonzero(np.diff(sync) != self._every[stream]) + 1).tolist(), len(sync)]
         for begin, end in pairwise(breaks):
             self.add_span(stream, int(sync[begin]), int(sync[end - 1]))
 
     def add_span(self, stream: str, first: int, last: int) -> None:
-        """Add the rows from SYNC ``first`` to ``last``."""
+        """Add a range of rows.
+
+        Parameters
+        ----------
+        stream
+            Name of the stream.
+        first, last
+            First and last SYNC number, both inclusive.
+        """
         spans = self._spans[stream]
         if spans and first == spans[-1][1] + self._every[stream]:
             first = spans.pop()[0]
         spans.append((first, last))
 
     def take(self) -> "RowRanges":
-        """All of it, which is then elsewhere."""
+        """Return all ranges and clear this object."""
         taken = RowRanges(self._every)
         taken._spans, self._spans = self._spans, taken._spans
         return taken
 
     def before(self, other: "RowRanges") -> "RowRanges":
-        """These rows, and those of another that came later."""
+        """Return these ranges followed by later ones of ``other``."""
         both = RowRanges(self._every)
         for spans in (self._spans, other._spans):
             for stream, found in spans.items():
@@ -65,23 +81,23 @@ class RowRanges:
 
     @property
     def rows(self) -> int:
-        """How many."""
+        """Number of rows."""
         return sum(
             (last - first) // self._every[name] + 1 for name, spans in self._spans.items() for first, last in spans
         )
 
     def gaps(self) -> list[Gap]:
-        """Them as gaps."""
+        """Return the ranges as gaps."""
         return [Gap(name, *span, None, NOT_WRITTEN) for name, spans in self._spans.items() for span in spans]
 
 
 class LostRows:
-    """Rows and events of chunks that failed, and those of the chunk that is being gathered.
+    """Rows and events of chunks that could not be written, and rows of the chunk that is being gathered.
 
     Parameters
     ----------
     every
-        Of each stream, on every how many SYNCs it has a row.
+        By stream, the number of SYNCs from one row to the next.
     """
 
     def __init__(self, every: Mapping[str, int]) -> None:
@@ -89,28 +105,36 @@ class LostRows:
         self.events: list[Event] = []
 
     def gather(self, stream: str, sync: NDArray[np.int64]) -> None:
-        """Rows of these SYNCs are in the chunk."""
+        """Count rows as part of the current chunk.
+
+        Parameters
+        ----------
+        stream
+            Name of the stream.
+        sync
+            SYNC numbers of the rows, (N,).
+        """
         self._gathered.add(stream, sync)
 
     def lose(self, rows: RowRanges) -> None:
-        """Rows that never came into a chunk are lost."""
+        """Count rows that never came into a chunk as lost."""
         self._lost = self._lost.before(rows)
 
     def failed(self) -> None:
-        """The chunk was not written: its rows are lost, its events are not."""
+        """Count the rows of the current chunk as lost; its events are kept."""
         self.lose(self._gathered.take())
 
     def written(self) -> None:
-        """The chunk was written, and with it what was not before."""
+        """Clear all: the chunk was written, with the gaps and events that were pending."""
         self.events = []
         self._gathered.take()
         self._lost.take()
 
     def gaps(self) -> list[Gap]:
-        """The rows that were lost."""
+        """Return the lost rows as gaps."""
         return self._lost.gaps()
 
     def take_over(self, other: "LostRows") -> None:
-        """Take what another file could not be told."""
+        """Add the lost rows and events of another file that could not be finished."""
         self.events += other.events
         self._lost = other._lost.before(self._lost)

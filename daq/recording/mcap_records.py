@@ -38,7 +38,7 @@ class MalformedRecord(ValueError):
 
 
 class _StrictStream(ReadDataStream):
-    """Reads the content of a record, and never less than asked for."""
+    """Reads the content of a record; raises if fewer bytes than requested are left."""
 
     def read(self, length: int) -> bytes:
         data: bytes = super().read(length)
@@ -86,22 +86,58 @@ def decode(kind: type[_Decoded], content: memoryview) -> _Decoded:
 
 
 def record(opcode: int, content: bytes) -> bytes:
-    """Return a record with this opcode and content."""
+    """Return the bytes of a record.
+
+    Parameters
+    ----------
+    opcode
+        MCAP opcode.
+    content
+        Bytes behind opcode and length.
+    """
     return RECORD_HEAD.pack(opcode, len(content)) + content
 
 
 def message(channel_id: int, sequence: int, t_ns: int, data: bytes) -> bytes:
-    """Return a message record; log and publish time are both ``t_ns`` (ns)."""
+    """Return a message record.
+
+    Parameters
+    ----------
+    channel_id
+        Channel of the message.
+    sequence
+        Sequence number; its lowest 32 bits are stored.
+    t_ns
+        Log and publish time, ns.
+    data
+        Content of the message.
+    """
     return record(Opcode.MESSAGE, MESSAGE_HEAD.pack(channel_id, sequence & 0xFFFFFFFF, t_ns, t_ns) + data)
 
 
 def index_entry(t_ns: int, offset: int) -> bytes:
-    """Return the entry of a message (time in ns, offset in the chunk) in a message index."""
+    """Return the entry of a message in a message index.
+
+    Parameters
+    ----------
+    t_ns
+        Log time of the message, ns.
+    offset
+        Position of its record in the uncompressed chunk, bytes.
+    """
     return struct.pack("<QQ", t_ns, offset)
 
 
 def message_index(channel_id: int, entries: bytes) -> bytes:
-    """Return the message index record of a channel; ``entries`` are pairs of u64 (time in ns, offset in the chunk)."""
+    """Return the message index record of a channel.
+
+    Parameters
+    ----------
+    channel_id
+        The channel.
+    entries
+        Pairs of u64: log time (ns) and position in the uncompressed chunk (bytes).
+    """
     return record(Opcode.MESSAGE_INDEX, struct.pack("<HI", channel_id, len(entries)) + entries)
 
 
@@ -201,7 +237,15 @@ def read_footer(data: memoryview) -> Footer:
 
 
 def records(data: memoryview, start: int) -> Iterator[tuple[int, int, memoryview]]:
-    """Yield opcode, position and content of the records from ``start`` on, up to the first incomplete one."""
+    """Yield opcode, position and content of the complete records; stop at the first incomplete one.
+
+    Parameters
+    ----------
+    data
+        Bytes of the file.
+    start
+        Position of the first record, bytes.
+    """
     at = start
     while at + RECORD_HEAD.size <= len(data):
         opcode, length = RECORD_HEAD.unpack_from(data, at)

@@ -1,4 +1,4 @@
-"""What a recording is once it is read: raw numbers in arrays, and what they mean."""
+"""Recordings in memory: streams of raw samples by SYNC number, gaps, marks and configuration."""
 
 import hashlib
 from collections.abc import Sequence
@@ -18,9 +18,20 @@ MarkKind = Literal["experiment_start", "experiment_end", "note", "emcy", "heartb
 
 @dataclass(frozen=True)
 class Field:
-    """One quantity of every joint: ``SI = scale * raw``, on the motor's or the joint's side.
+    """Quantity of every joint: ``SI = scale * raw``, on the motor's or the joint's side.
 
-    ``demand`` is the reference position; ``unit`` is the unit after scaling (rad, m, A, V, N m, N or "").
+    Parameters
+    ----------
+    name
+        Name of the field in its stream.
+    quantity
+        Physical quantity; ``demand`` is the reference position.
+    unit
+        Unit after scaling: rad, m, rad/s, m/s, A, V, N m, N or "".
+    side
+        Side of the transmission that the value belongs to.
+    scale
+        Factors from raw to SI, one per joint.
     """
 
     name: str
@@ -34,9 +45,20 @@ class Field:
 class Stream:
     """Samples matched by SYNC: row k of every array belongs to SYNC number ``sync[k]``.
 
-    ``sync`` (N,) int64 counts SYNC from the start of the capture and is strictly increasing; a number that is
-    absent is a gap. ``t_ns`` (N,) int64 is the kernel's receive time of that SYNC (ns, UTC).
-    ``raw[name]`` has shape (N, n), one column per joint, as it came off the bus.
+    Parameters
+    ----------
+    name
+        Name of the stream.
+    every
+        Number of SYNCs from one sample to the next.
+    sync
+        SYNC numbers (N,), counted from the start of the capture, strictly increasing; an absent number is a gap.
+    t_ns
+        Receive times of these SYNCs by the kernel (N,), ns UTC.
+    fields
+        Quantity, unit and scale of each field, by name.
+    raw
+        Raw values of each field as received from the bus, (N, n), one column per joint.
     """
 
     name: str
@@ -47,18 +69,30 @@ class Stream:
     raw: dict[str, NDArray[Any]]
 
     def si(self, name: str) -> NDArray[np.float64]:
-        """The field in SI units, shape (N, n), on the side the field says."""
+        """Return a field in SI units, shape (N, n), on the side that the field states."""
         scaled: NDArray[np.float64] = self.raw[name].astype(np.float64) * np.asarray(self.fields[name].scale)
         return scaled
 
     def named(self, quantity: Quantity) -> str | None:
-        """The name of the field with this quantity, if there is one."""
+        """Return the name of the field with this quantity, or ``None``."""
         return next((f.name for f in self.fields.values() if f.quantity == quantity), None)
 
 
 @dataclass(frozen=True)
 class Gap:
-    """SYNC numbers ``first`` to ``last`` (inclusive) lack the sample of ``joint`` (``None``: of all)."""
+    """Missing samples of a stream from SYNC number ``first`` to ``last``.
+
+    Parameters
+    ----------
+    stream
+        Name of the stream.
+    first, last
+        First and last SYNC number, both inclusive.
+    joint
+        Joint whose samples are missing; ``None``: all joints.
+    reason
+        Cause, in words.
+    """
 
     stream: str
     first: int
@@ -69,7 +103,19 @@ class Gap:
 
 @dataclass(frozen=True)
 class Mark:
-    """An experiment begins or ends, or something worth keeping happened, at a SYNC number."""
+    """Event at a SYNC number: start or end of an experiment, note, EMCY or heartbeat loss.
+
+    Parameters
+    ----------
+    kind
+        Kind of the event.
+    sync
+        SYNC number; -1 before the first SYNC.
+    t_ns
+        Time, ns UTC.
+    text
+        Description.
+    """
 
     kind: MarkKind
     sync: int
@@ -78,12 +124,12 @@ class Mark:
 
 
 def gap_from(entries: object) -> Gap:
-    """A gap from what a file or a stream says of it.
+    """Return the gap from its JSON entries in a file or an event.
 
     Raises
     ------
     DataError
-        If that is none.
+        If the entries are not those of a gap.
     """
     if not isinstance(entries, dict) or not {"stream", "first", "last"} <= entries.keys() <= _GAP_ENTRIES:
         raise DataError(f"no gap: {entries!r:.100}")
@@ -96,12 +142,12 @@ def gap_from(entries: object) -> Gap:
 
 
 def mark_from(entries: object) -> Mark:
-    """A mark from what a file or a stream says of it.
+    """Return the mark from its JSON entries in a file or an event.
 
     Raises
     ------
     DataError
-        If that is none.
+        If the entries are not those of a mark.
     """
     if not isinstance(entries, dict) or not {"kind", "sync", "t_ns"} <= entries.keys() <= _MARK_ENTRIES:
         raise DataError(f"no mark: {entries!r:.100}")
@@ -113,18 +159,18 @@ def mark_from(entries: object) -> Mark:
 
 
 _NO_SYNC = 2**63
-"""No SYNC has so large a number."""
+"""Upper bound of SYNC numbers: they are int64."""
 _GAP_ENTRIES = {entry.name for entry in fields(Gap)}
 _MARK_ENTRIES = {entry.name for entry in fields(Mark)}
 
 
 def join_parts(parts: "Sequence[Recording]") -> "Recording":
-    """The recording whose files, in order, are the parts of one capture.
+    """Join the files of one capture, in order, to one recording.
 
     Raises
     ------
     DataError
-        If they are not: SYNC numbers that do not go on, or other streams.
+        If SYNC numbers do not increase from file to file, or the streams differ.
     """
     last = parts[-1]
     if len(parts) == 1:
@@ -145,7 +191,31 @@ def join_parts(parts: "Sequence[Recording]") -> "Recording":
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording, from a file or assembled from the stream: the same numbers either way."""
+    """Recording of a robot's motion, read from a file or assembled from published blocks.
+
+    Parameters
+    ----------
+    path
+        The file; ``None`` if there is none.
+    robot
+        Configuration of the robot that was recorded.
+    session
+        Configuration of the capture; ``None`` for recordings that do not come from a bus.
+    sample_rate_hz
+        Rate of SYNC, 1/s.
+    streams
+        Streams by name; ``samples`` is always one of them.
+    gaps
+        Missing samples.
+    marks
+        Starts and ends of experiments, notes, EMCY messages and heartbeat losses.
+    counters
+        Counters of the capture, such as ``samples.rows``.
+    metadata
+        Facts about the capture, such as software versions or the source file.
+    missing
+        Description of what a truncated or damaged file lacks; ``None`` if the recording is complete.
+    """
 
     path: Path | None
     robot: RobotConfig
@@ -157,16 +227,15 @@ class Recording:
     counters: dict[str, int] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
     missing: str | None = None
-    """What a torn file lacks, in words; ``None`` for a complete one."""
 
     @property
     def samples(self) -> Stream:
-        """The stream that every recording has: one row per SYNC."""
+        """Stream with one row per SYNC, present in every recording."""
         return self.streams["samples"]
 
     @property
     def sha256(self) -> str:
-        """Digest of all raw samples in order, the same for the file and for the stream it was published as."""
+        """SHA-256 of all raw samples in order, the same for the file and for the published stream."""
         digest = hashlib.sha256()
         for name in sorted(self.streams):
             stream = self.streams[name]
@@ -178,7 +247,7 @@ class Recording:
         return digest.hexdigest()
 
     def experiments(self) -> list[tuple[int, int]]:
-        """SYNC numbers (first, last) of every marked experiment; the whole recording if none is marked."""
+        """Return first and last SYNC number of every marked experiment; of the whole recording if none is marked."""
         spans: list[tuple[int, int]] = []
         start: int | None = None
         for mark in sorted(self.marks, key=lambda m: m.sync):

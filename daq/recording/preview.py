@@ -1,6 +1,6 @@
 """Preview channels: a part of every stream's samples in SI units at the joints, for viewers of MCAP files.
 
-armident does not read them: the measured values are in the streams, as they came off the bus.
+armident does not read them: the streams contain the measured values as received from the bus.
 """
 
 from collections.abc import Mapping
@@ -71,7 +71,7 @@ class PreviewChannel:
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Channel metadata: unit and side of every field."""
+        """Channel metadata with unit and side of every field."""
         units = {field.name: f"{field.unit}, {field.side} side" for field in self.layout.fields}
         return units | {"armident.shows": f"every {self.layout.every}th SYNC of /{self.layout.name[len(PREFIX) :]}"}
 

@@ -1,4 +1,4 @@
-"""How long recordings are kept: by age, and by the space that is left."""
+"""Retention of recordings: deletion by age and by free disk space."""
 
 import datetime
 import fcntl
@@ -24,30 +24,30 @@ def prune(
     min_free_bytes: float | None,
     free: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
 ) -> list[Path]:
-    """Delete recordings that are too old, then the oldest ones until there is space enough.
+    """Delete recordings that are too old, then the oldest ones until there is enough free space.
 
-    Only finished captures of this robot are touched, by the name that ``capture`` gives them; a file that is being
-    written never is.
+    Only finished captures of this robot are deleted, recognised by the names that ``capture`` gives them. A file being
+    written is never deleted.
 
     Parameters
     ----------
     directory
-        Where the recordings are; what is in folders below is left alone.
+        Directory of the recordings; its subdirectories are not searched.
     robot
-        Name of the robot, with which their names begin.
+        Name of the robot, with which the file names begin.
     now
-        The time, with its zone.
+        Current time, with its zone.
     keep_days
-        Age, by the time in the name, from which on a recording is deleted; ``None``: none for its age.
+        Age, by the time in the name, at which a recording is deleted, days; ``None``: no limit.
     min_free_bytes
-        Free space to keep on the file system; ``None``: none for the space.
+        Free space to keep on the file system, bytes; ``None``: no limit.
     free
-        Tells the free space, bytes.
+        Returns the free space, bytes.
 
     Returns
     -------
     list of Path
-        What was deleted, the oldest first.
+        Deleted files, the oldest first.
     """
     deleted = []
     for path, made in _recordings(directory, robot):
@@ -62,7 +62,7 @@ def prune(
 
 
 def _recordings(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.datetime]]:
-    """Recordings of a robot with the time in their names, the oldest first."""
+    """Yield the recordings of a robot with the times in their names, the oldest first."""
     found = []
     for path in directory.glob(f"{robot}-*.mcap*"):
         match = _NAME.search(path.name)
@@ -83,7 +83,7 @@ def _is_being_written(path: Path) -> bool:
 
 
 class RetentionThread:
-    """Deletes old recordings at regular intervals in a thread of its own, so that no capture waits for the disk.
+    """Deletes old recordings at regular intervals in a separate thread, so that a capture does not wait for the disk.
 
     Every deleted file is logged, and every error once.
 

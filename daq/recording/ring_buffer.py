@@ -1,4 +1,4 @@
-"""Keeps the last seconds of a capture in memory, and writes them, with what follows, when something happens."""
+"""Ring buffer of the last seconds of a capture, which are written, with the following ones, on a trigger."""
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +26,7 @@ class _Rows:
 
 @dataclass(frozen=True)
 class _Events:
-    """Gaps and marks that became known at a time."""
+    """Gaps and marks found at one time."""
 
     t_ns: int
     gaps: tuple[Gap, ...] = ()
@@ -34,14 +34,14 @@ class _Events:
 
 
 class TriggeredSeries:
-    """Stands in the place of a :class:`RecordingSeries` and begins one only when it is triggered.
+    """Replacement for :class:`RecordingSeries` that creates files only on a trigger.
 
     Parameters
     ----------
     begin
-        Begins the files of an event, by the number of the event (from 1).
+        Creates the files of an event, by the number of the event (from 1).
     before_ns, after_ns
-        Time to keep before and after a trigger, ns. A trigger while an event is being written prolongs it.
+        Time written before and after a trigger, ns. A trigger during an event prolongs it.
     """
 
     def __init__(self, begin: Callable[[int], RecordingSeries], before_ns: int, after_ns: int) -> None:
@@ -57,18 +57,32 @@ class TriggeredSeries:
         self._limits: tuple[int | None, int | None] | None = None
 
     def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
-        """Change when a file of an event is full."""
+        """Set the limits at which a new file of an event begins.
+
+        Parameters
+        ----------
+        max_bytes
+            Size, bytes; ``None``: no limit.
+        max_ns
+            Time span, ns; ``None``: no limit.
+        """
         self._limits = max_bytes, max_ns
         if self._series is not None:
             self._series.limit(max_bytes, max_ns)
 
     def keep(self, before_ns: int, after_ns: int) -> None:
-        """Change how much is kept before and after a trigger from now on, ns."""
+        """Set the time written around later triggers.
+
+        Parameters
+        ----------
+        before_ns, after_ns
+            Time before and after a trigger, ns.
+        """
         self._before_ns, self._after_ns = before_ns, after_ns
 
     @property
     def path(self) -> Path | None:
-        """The file being written; ``None`` while nothing is."""
+        """File being written, ``None`` between events."""
         return None if self._series is None else self._series.path
 
     @property
@@ -78,21 +92,27 @@ class TriggeredSeries:
 
     @property
     def lost_rows(self) -> int:
-        """Rows that the disk did not take, of all files."""
+        """Number of rows of all files that could not be written."""
         return self._lost_before + (0 if self._series is None else self._series.lost_rows)
 
     @property
     def problem(self) -> str | None:
-        """What went wrong last, in words."""
+        """Description of the last write error, or ``None``."""
         return self._problem if self._series is None else self._series.problem or self._problem
 
     def trigger(self, t_ns: int) -> None:
-        """Keep what was recorded up to ``before_ns`` before ``t_ns``, and what comes until ``after_ns`` after it."""
+        """Write the rows from ``before_ns`` before ``t_ns`` (ns UTC) to ``after_ns`` after it."""
         self._until = max(self._until or 0, t_ns + self._after_ns)
         self._open(t_ns)
 
     def turn(self, t_ns: int) -> Path | None:
-        """End an event that is over at ``t_ns``, or begin a file as a series does; the file that was finished."""
+        """End an event that is over at ``t_ns`` (ns UTC), or begin a new file if the current one is full.
+
+        Returns
+        -------
+        Path or None
+            The file that was finished, if one was.
+        """
         if self._until is not None and self._series is None:
             self._open(t_ns)
         if self._series is None or self._until is None:
@@ -106,7 +126,19 @@ class TriggeredSeries:
     def append(
         self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Add rows to a stream: to the event being written, or to what is kept."""
+        """Add rows to a stream, in the current event's file or in memory.
+
+        Parameters
+        ----------
+        stream
+            Name of the stream.
+        sync
+            SYNC numbers, (N,).
+        t_ns
+            Receive times of the SYNCs, ns UTC, (N,).
+        raw
+            Raw values of every field, (N, n) each.
+        """
         if len(sync) == 0:
             return
         if self._series is not None:
@@ -115,7 +147,15 @@ class TriggeredSeries:
         self._keep(_Rows(stream, sync, t_ns, raw), int(t_ns[-1]))
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
-        """Record gaps found at ``t_ns``."""
+        """Record gaps.
+
+        Parameters
+        ----------
+        gaps
+            The gaps.
+        t_ns
+            Time at which they were found, ns UTC.
+        """
         if self._series is not None:
             self._series.add_gaps(gaps, t_ns)
         else:
@@ -129,7 +169,7 @@ class TriggeredSeries:
             self._keep(_Events(marks[-1].t_ns, marks=tuple(marks)), marks[-1].t_ns)
 
     def leave_out(self, rows: RowRanges) -> None:
-        """See :meth:`RecordingWriter.leave_out`."""
+        """Count rows as lost that were never handed over (:meth:`RecordingWriter.leave_out`)."""
         if self._series is not None:
             self._series.leave_out(rows)
             return
@@ -138,23 +178,23 @@ class TriggeredSeries:
         self._keep(_Events(t_ns, gaps=tuple(rows.gaps())), t_ns)
 
     def flush(self) -> None:
-        """Bring what is written to the disk."""
+        """Write gathered rows and events of the current event to the disk."""
         if self._series is not None:
             self._series.flush()
 
     def close(self, counters: Mapping[str, int]) -> None:
-        """Finish the event being written, with the counters of the whole capture.
+        """Finish the current event's file, with the counters of the whole capture.
 
         Raises
         ------
         ConfigError
-            If the disk does not take its end.
+            If the end of the file cannot be written. The file remains readable as a truncated one.
         """
         if self._series is not None:
             self._series.close(counters)
 
     def abort(self) -> None:
-        """Leave nothing behind of a capture that did not begin."""
+        """Close and delete the current file, of a capture that did not begin."""
         if self._series is not None:
             self._series.abort()
 
@@ -171,7 +211,7 @@ class TriggeredSeries:
             self._kept.popleft()
 
     def _open(self, t_ns: int) -> None:
-        """Begin the files of an event with what is kept; tried again later where the disk refuses."""
+        """Create the files of an event and write the rows in memory; after an error, try again after ``RETRY_NS``."""
         if self._series is not None or (self._not_before is not None and t_ns < self._not_before):
             return
         try:

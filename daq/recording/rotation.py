@@ -1,4 +1,4 @@
-"""A capture in several files: a new one when the last is large or old enough, every row in exactly one of them."""
+"""Capture in several files: a new file begins when the current one reaches its size or age; each row is in one file."""
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
@@ -15,29 +15,30 @@ from armident.daq.recording.model import Gap, Mark
 from armident.daq.recording.writer import RecordingWriter
 
 RETRY_NS = 10_000_000_000
-"""Time until the next attempt, where a new file could not be begun, ns."""
+"""Time until the next attempt after a new file could not be created, ns."""
 
 
 class RecordingSeries:
-    """The files of one capture, written one after the other.
+    """Writes one capture to consecutive files.
 
-    A file is closed, with its index, when the next one has been begun: rows go on into the old one if that fails (disk
-    full, directory gone), which :attr:`problem` tells, and it is tried again ``RETRY_NS`` later.
+    A file is closed, with its index, after the next one has been created. If that fails (disk full, directory removed),
+    rows continue in the old file, :attr:`problem` describes the error, and the next attempt follows after ``RETRY_NS``.
 
     Parameters
     ----------
     begin
-        Opens part k, counted from 1, at a path.
+        Creates part k, counted from 1, at a path.
     directory, name
-        Where the files are and what they are called: ``NAME.mcap``, or ``NAME.0001.mcap`` and so on where a limit is
-        set.
-    max_bytes, max_ns
-        Size and time span at which a file is full; ``None``: no limit.
+        Directory and base name of the files: ``NAME.mcap``, or ``NAME.0001.mcap`` and so on where a limit is set.
+    max_bytes
+        Size at which a new file begins, bytes; ``None``: no limit.
+    max_ns
+        Time span at which a new file begins, ns; ``None``: no limit.
 
     Raises
     ------
     ConfigError
-        If the first file cannot be begun.
+        If the first file cannot be created.
     """
 
     def __init__(
@@ -59,25 +60,39 @@ class RecordingSeries:
 
     @property
     def path(self) -> Path:
-        """The file being written."""
+        """File being written."""
         return self._writer.path
 
     @property
     def lost_rows(self) -> int:
-        """Rows that the disk did not take, of all files."""
+        """Number of rows of all files that could not be written."""
         return self._lost_before + self._writer.lost_rows
 
     @property
     def problem(self) -> str | None:
-        """What went wrong last, in words."""
+        """Description of the last write error, or ``None``."""
         return self._writer.problem or self._problem
 
     def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
-        """Change when a file is full."""
+        """Set the limits at which a new file begins.
+
+        Parameters
+        ----------
+        max_bytes
+            Size, bytes; ``None``: no limit.
+        max_ns
+            Time span, ns; ``None``: no limit.
+        """
         self._max_bytes, self._max_ns = max_bytes, max_ns
 
     def turn(self, t_ns: int) -> Path | None:
-        """Begin a new file if the last is full at ``t_ns``, the time of the rows to come; the one that was finished."""
+        """Begin a new file if the current one is full at ``t_ns``, the time (ns UTC) of the next rows.
+
+        Returns
+        -------
+        Path or None
+            The file that was finished, if one was.
+        """
         if self._since is None:
             self._since = t_ns
         if not self._full(t_ns) or (self._not_before is not None and t_ns < self._not_before):
@@ -95,23 +110,43 @@ class RecordingSeries:
     def append(
         self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> None:
-        """See :meth:`RecordingWriter.append`."""
+        """Add rows to a stream; parameters as of :meth:`RecordingWriter.append`.
+
+        Parameters
+        ----------
+        stream
+            Name of the stream.
+        sync
+            SYNC numbers, (N,).
+        t_ns
+            Receive times of the SYNCs, ns UTC, (N,).
+        raw
+            Raw values of every field, (N, n) each.
+        """
         self._writer.append(stream, sync, t_ns, raw)
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
-        """See :meth:`RecordingWriter.add_gaps`."""
+        """Record gaps.
+
+        Parameters
+        ----------
+        gaps
+            The gaps.
+        t_ns
+            Time at which they were found, ns UTC.
+        """
         self._writer.add_gaps(gaps, t_ns)
 
     def add_marks(self, marks: Sequence[Mark]) -> None:
-        """See :meth:`RecordingWriter.add_marks`."""
+        """Record marks."""
         self._writer.add_marks(marks)
 
     def leave_out(self, rows: RowRanges) -> None:
-        """See :meth:`RecordingWriter.leave_out`."""
+        """Count rows as lost that were never handed over (:meth:`RecordingWriter.leave_out`)."""
         self._writer.leave_out(rows)
 
     def flush(self) -> None:
-        """See :meth:`RecordingWriter.flush`."""
+        """Write gathered rows and events to the disk (:meth:`RecordingWriter.flush`)."""
         self._writer.flush()
 
     def close(self, counters: Mapping[str, int]) -> None:
@@ -120,22 +155,28 @@ class RecordingSeries:
         Raises
         ------
         ConfigError
-            If the disk does not take its end; what is there remains readable as a torn file.
+            If the end of the file cannot be written. The file remains readable as a truncated one.
         """
         self._writer.close(counters)
 
     def finish(self) -> None:
-        """Finish the last file with what can be counted of it; one that cannot be is left as a torn one."""
+        """Finish the last file with counters of its own rows; if that fails, it remains as a truncated file."""
         self._finish(self._writer)
 
     def trigger(self, t_ns: int) -> None:
-        """Everything is written anyway."""
+        """Do nothing: this series writes all rows, without a trigger at ``t_ns``."""
 
     def keep(self, before_ns: int, after_ns: int) -> None:
-        """Everything is kept anyway."""
+        """Do nothing: this series writes all rows, not only those around triggers.
+
+        Parameters
+        ----------
+        before_ns, after_ns
+            Ignored.
+        """
 
     def abort(self) -> None:
-        """Leave nothing behind of a capture that did not begin."""
+        """Close and delete the current file, of a capture that did not begin."""
         self._writer.abort()
 
     def __enter__(self) -> Self:
@@ -156,7 +197,7 @@ class RecordingSeries:
         return writer
 
     def _finish(self, writer: RecordingWriter) -> None:
-        """Close a full file with what can be counted of it; one that cannot be finished is left as a torn one."""
+        """Close a full file with counters of its own rows; if that fails, it remains as a truncated file."""
         writer.flush()
         if writer is not self._writer:
             self._lost_before += writer.lost_rows

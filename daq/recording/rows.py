@@ -1,4 +1,4 @@
-"""Rows of a stream as they are read, in arrays that grow: every value is copied once, from its chunk to its place."""
+"""Growing arrays for the rows of a stream that is being read; every value is copied once."""
 
 from typing import Any
 
@@ -11,14 +11,14 @@ _FEWEST = 4096
 
 
 class Rows:
-    """What was read of one stream so far.
+    """Rows of one stream read so far.
 
     Parameters
     ----------
     layout
-        Of its messages.
+        Layout of the stream's messages.
     expected
-        How many rows there will be, where that is known; memory is touched when they come.
+        Expected number of rows, for which memory is reserved; 0 if unknown.
     """
 
     def __init__(self, layout: StreamLayout, expected: int = 0) -> None:
@@ -32,12 +32,12 @@ class Rows:
         }
 
     def append(self, records: NDArray[Any]) -> None:
-        """Add message records of the stream.
+        """Add message records of the stream, (N,) in the dtype of the layout.
 
         Raises
         ------
         DataError
-            If a record is not laid out as the stream's channel says.
+            If a record does not have the layout of the stream's channel.
         """
         end = self.size + len(records)
         if end > self._sync.size:
@@ -48,11 +48,11 @@ class Rows:
         self.size = end
 
     def arrays(self) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[str, NDArray[Any]]]:
-        """``sync`` and ``t_ns`` (N,), every raw value (N, n); nothing can be added any more."""
+        """Return ``sync`` and ``t_ns`` (N,) and the raw values (N, n) by field; nothing may be added afterwards."""
         self._resize(self.size)
         return self._sync, self._t_ns, self._raw
 
     def _resize(self, room: int) -> None:
-        # In place, where the allocator can: nobody else holds these arrays.
+        # In place where the allocator can; there are no other references to these arrays.
         for values in (self._sync, self._t_ns, *self._raw.values()):
             values.resize((room, *values.shape[1:]), refcheck=False)

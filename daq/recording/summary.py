@@ -34,7 +34,15 @@ class Summary:
     span_ns: tuple[int, int] | None = None
 
     def add_chunk(self, index: ChunkIndex, messages: Mapping[int, int]) -> None:
-        """Add a chunk and the number of its messages by channel."""
+        """Add a chunk.
+
+        Parameters
+        ----------
+        index
+            Index record of the chunk.
+        messages
+            Number of its messages by channel.
+        """
         self.chunks.append(index)
         for channel, count in messages.items():
             self.messages[channel] = self.messages.get(channel, 0) + count

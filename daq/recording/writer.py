@@ -206,7 +206,15 @@ class RecordingWriter:
         self._flush_if_full()
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
-        """Record gaps that were found at ``t_ns`` (ns UTC)."""
+        """Record gaps.
+
+        Parameters
+        ----------
+        gaps
+            The gaps.
+        t_ns
+            Time at which they were found, ns UTC.
+        """
         for gap in gaps:
             self._event(GAPS_TOPIC, gap.first, t_ns, asdict(gap))
             self._unwritten.events.append((GAPS_TOPIC, gap.first, asdict(gap)))

@@ -1,4 +1,4 @@
-"""Writes a series from a thread of its own, so that whoever drains the buses never waits for the disk."""
+"""Writes a series of files in a separate thread, so that reading the buses never waits for the disk."""
 
 import threading
 import time
@@ -18,10 +18,10 @@ from armident.daq.recording.ring_buffer import TriggeredSeries
 from armident.daq.recording.rotation import RecordingSeries
 
 MOST_WAITING_BYTES = 128 << 20
-"""Rows that may wait for the disk: some six minutes of six axes at 5 kHz."""
+"""Memory for rows that wait for the disk, bytes: about six minutes of six axes at 5 kHz."""
 
 CATCH_UP = 2.0
-"""Times as fast as they came that rows are written which have waited: the buses want the processor, too."""
+"""Largest write rate of a backlog, relative to the rate at which its rows came: reading the buses has priority."""
 
 _Do = Callable[[], object]
 _Rows = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
@@ -29,18 +29,18 @@ _Rows = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
 
 @dataclass(frozen=True)
 class _State:
-    """What the series said when it had done the last thing."""
+    """State of the series after the last piece of work."""
 
     path: Path | None
     lost_rows: int
     problem: str | None
     left_out: int
-    """Rows left out that it has been told of."""
+    """Rows left out that are already included in ``lost_rows``."""
 
 
 @dataclass(frozen=True)
 class _Work:
-    """Something to do, and the rows that go with it: their bytes, how many they are, and how long they took to come."""
+    """Work for the thread, with size (bytes), number and duration (ns) of its rows."""
 
     do: _Do
     bytes: int = 0
@@ -50,7 +50,7 @@ class _Work:
 
 @dataclass
 class _Chunk:
-    """What is handed over at once: rows of each stream as they came, gaps and when they were found, marks."""
+    """Rows of each stream, gaps with the time they were found, and marks that are handed over together."""
 
     rows: dict[str, list[_Rows]] = field(default_factory=dict)
     gaps: list[tuple[Sequence[Gap], int]] = field(default_factory=list)
@@ -73,7 +73,7 @@ class _Chunk:
     def write(self, series: RecordingSeries | TriggeredSeries) -> None:
         if self.since is not None:
             series.turn(self.since)
-        # Before the rows behind them: a file that ends in the middle says what is missing in what it has.
+        # Gaps first: a truncated file then lists the gaps of all rows it has.
         for gaps, found_ns in self.gaps:
             series.add_gaps(gaps, found_ns)
         for stream, parts in self.rows.items():
@@ -85,22 +85,22 @@ class _Chunk:
 
 
 class QueuedSeries:
-    """Stands in the place of the series that it writes to: gathers rows, and has a thread write them chunk by chunk.
+    """Replacement for the series that it writes to: gathers rows, and a thread writes them chunk by chunk.
 
-    A disk that stands still for seconds (a worn memory card, a busy server) costs memory and no samples. When
-    ``most_bytes`` wait, rows are left out until there is room again: they count in :attr:`lost_rows` and become gaps,
-    as rows do that a full disk refuses. What is reported is how it was when the last thing was done.
+    A disk that stalls for seconds (worn memory card, busy server) costs memory, no samples. When ``most_bytes`` wait,
+    rows are left out until memory is free: they count in :attr:`lost_rows` and become gaps, like rows that a full disk
+    refuses. Properties report the state after the last piece of work.
 
     Parameters
     ----------
     series
-        What is written; nobody else may use it.
+        Series to write; it must not be used elsewhere.
     every
-        Of each stream, on every how many SYNCs it has a row.
+        By stream, the number of SYNCs from one row to the next.
     chunk_ns
-        Time that rows are gathered for, ns; they are on the disk soon after.
+        Time for which rows are gathered before they are written, ns.
     most_bytes
-        Of rows that wait.
+        Largest memory for waiting rows, bytes.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class QueuedSeries:
         self._work: SimpleQueue[_Work | threading.Event | None] = SimpleQueue()
         self._hurry = threading.Event()
         self._failure: BaseException | None = None
-        # Of rows, what was handed over and what was done with: each is counted by one thread.
+        # Bytes and rows handed over and written: each counter is changed by one thread only.
         self._put_bytes = self._put_rows = self._done_bytes = self._done_rows = 0
         self._left_out, self._left_out_rows, self._told_rows = RowRanges(every), 0, 0
         self._thread: threading.Thread | None = threading.Thread(target=self._run, name="disk", daemon=True)
@@ -124,7 +124,7 @@ class QueuedSeries:
 
     @property
     def path(self) -> Path | None:
-        """The file being written, if one is."""
+        """File being written, or ``None``."""
         return self._state.path
 
     @property
@@ -134,50 +134,76 @@ class QueuedSeries:
 
     @property
     def lost_rows(self) -> int:
-        """Rows that the disk did not take, of all files."""
+        """Number of rows of all files that could not be written."""
         state = self._state
         return state.lost_rows + self._left_out_rows - state.left_out
 
     @property
     def problem(self) -> str | None:
-        """What went wrong with writing last, in words."""
+        """Description of the last write error, or ``None``."""
         return f"{self.path}: {DISK_STALLED}" if self._left_out else self._state.problem
 
     @property
     def waiting_rows(self) -> int:
-        """Rows that wait for the disk."""
+        """Number of rows that wait for the disk."""
         return self._put_rows - self._done_rows
 
     def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
-        """Change when a file is full."""
+        """Set the limits at which a new file begins.
+
+        Parameters
+        ----------
+        max_bytes
+            Size, bytes; ``None``: no limit.
+        max_ns
+            Time span, ns; ``None``: no limit.
+        """
         self._do(lambda: self._series.limit(max_bytes, max_ns))
 
     def gather(self, chunk_ns: int) -> None:
-        """Change how long rows are gathered for, ns."""
+        """Set the time for which rows are gathered, ns."""
         self._chunk_ns = chunk_ns
 
     def keep(self, before_ns: int, after_ns: int) -> None:
-        """Change how much is kept before and after a trigger from now on, ns."""
+        """Set the time written around later triggers.
+
+        Parameters
+        ----------
+        before_ns, after_ns
+            Time before and after a trigger, ns.
+        """
         self._do(lambda: self._series.keep(before_ns, after_ns))
 
     def trigger(self, t_ns: int) -> None:
-        """Have what was just recorded, and what follows, written where only events are."""
+        """Trigger an event at ``t_ns`` (ns UTC) in a series that writes only events."""
         self._do(lambda: self._series.trigger(t_ns))
 
     def turn(self, t_ns: int) -> None:
-        """Rows that begin at ``t_ns`` are to come: a new file may be begun with them."""
+        """Allow a new file to begin before the next rows, whose first time is ``t_ns`` (ns UTC)."""
         if self._chunk.since is None:
             self._chunk.since = t_ns
 
     def append(
         self, stream: str, sync: NDArray[np.int64], t_ns: NDArray[np.int64], raw: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Add rows to a stream: ``sync`` and ``t_ns`` of shape (N,), each of ``raw`` (N, n); none may change after."""
+        """Add rows to a stream; the arrays must not change afterwards.
+
+        Parameters
+        ----------
+        stream
+            Name of the stream.
+        sync
+            SYNC numbers, (N,).
+        t_ns
+            Receive times of the SYNCs, ns UTC, (N,).
+        raw
+            Raw values of every field, (N, n) each.
+        """
         if len(sync) == 0:
             return
         self._check()
         size = sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
-        # Not one in, one out: a disk that is too slow gets few long gaps.
+        # Resume at half the limit: a slow disk causes a few long gaps instead of many short ones.
         room = self._most_bytes // 2 if self._left_out else self._most_bytes
         if self._chunk.bytes + self._put_bytes - self._done_bytes + size > room:
             self._left_out.add(stream, sync)
@@ -190,7 +216,15 @@ class QueuedSeries:
             self._hand_over()
 
     def add_gaps(self, gaps: Sequence[Gap], t_ns: int) -> None:
-        """Record gaps found at ``t_ns``."""
+        """Record gaps.
+
+        Parameters
+        ----------
+        gaps
+            The gaps.
+        t_ns
+            Time at which they were found, ns UTC.
+        """
         self._chunk.gaps.append((gaps, t_ns))
 
     def add_marks(self, marks: Sequence[Mark]) -> None:
@@ -198,7 +232,7 @@ class QueuedSeries:
         self._chunk.marks += marks
 
     def flush(self) -> None:
-        """Bring all of it to the disk; returns when it is there."""
+        """Write all rows and events to the disk; return when this is done."""
         self._own_up()
         self._hand_over()
         self._wait()
@@ -209,14 +243,14 @@ class QueuedSeries:
         Raises
         ------
         ConfigError
-            If the disk does not take its end; what is there remains readable as a torn file.
+            If the end of the file cannot be written. The file remains readable as a truncated one.
         """
         self.flush()
         self._end()
         self._series.close(counters)
 
     def abort(self) -> None:
-        """Leave nothing behind of a capture that did not begin."""
+        """Close and delete the current file, of a capture that did not begin."""
         self._end()
         self._series.abort()
 
@@ -228,7 +262,7 @@ class QueuedSeries:
         self._series.__exit__(kind, error, at)
 
     def _own_up(self) -> None:
-        """Have the series say what was left out, before what comes next."""
+        """Report rows left out to the series, before the next rows."""
         if not self._left_out:
             return
         left_out, rows = self._left_out.take(), self._left_out_rows
@@ -240,7 +274,7 @@ class QueuedSeries:
         self._do(tell)
 
     def _do(self, do: _Do) -> None:
-        """Have something done behind what has been gathered so far."""
+        """Run a function in the thread, after all rows gathered so far."""
         self._hand_over()
         self._put(_Work(do))
 
@@ -250,7 +284,7 @@ class QueuedSeries:
         self._put(_Work(lambda: chunk.write(self._series), chunk.bytes, chunk.count, took_ns))
 
     def _check(self) -> None:
-        """Raise what went wrong in the thread, if something did."""
+        """Raise the exception of the thread, if there is one."""
         if self._failure is not None:
             raise self._failure
 
@@ -261,7 +295,7 @@ class QueuedSeries:
         self._work.put(work)
 
     def _wait(self) -> None:
-        """Until all that was handed over is done."""
+        """Wait until all work is done."""
         done = threading.Event()
         self._hurry.set()
         self._work.put(done)
@@ -286,13 +320,13 @@ class QueuedSeries:
                 if self._failure is None:
                     work.do()
             except BaseException as error:
-                # Raised where something is handed over next.
+                # Raised when the next work is handed over.
                 self._failure = error
             series = self._series
             self._state = _State(series.path, series.lost_rows, series.problem, self._told_rows)
             self._done_bytes += work.bytes
             self._done_rows += work.rows
             if not self._work.empty():
-                # Where SYNC rests a chunk takes long to come.
+                # While SYNC pauses, a chunk may take long to fill.
                 wanted_ns = min(work.took_ns, self._chunk_ns) / CATCH_UP
                 self._hurry.wait(1e-9 * max(0.0, wanted_ns - (time.monotonic_ns() - began)))
