@@ -24,11 +24,11 @@ HALVINGS = 8
 """Step halvings towards the last estimate that could be simulated."""
 
 WIDER = 2.0
-"""Decimated Nyquist frequency in bands of the instruments from which on they are filtered; less is left by rounding."""
+"""Least decimated Nyquist frequency, in bands of the instruments, at which the instruments are filtered."""
 
 FELT = 0.6
-"""Share of the band of the instruments up to which a simulated arm feels what terms add: beyond three bandwidths of the
-closed loop hardly any torque moves it."""
+"""Share of the band of the instruments up to which the torques of terms act on a simulated arm: hardly any torque moves
+it beyond three bandwidths of the closed loop."""
 
 POSTURES = 100
 """Postures of the references at which the mass matrix of an iterate that diverged is examined."""
@@ -36,7 +36,7 @@ POSTURES = 100
 
 @dataclass(frozen=True)
 class Response:
-    """What the simulated loop does, filtered and decimated like the equations.
+    """Response of the simulated loop, filtered and decimated like the equations.
 
     Parameters
     ----------
@@ -52,26 +52,35 @@ class Response:
 
 @dataclass
 class AuxiliaryModel:
-    """Simulates every experiment's reference through controller and arm, and filters the regressor.
+    """Simulates the reference of every experiment through controller and arm, and filters the regressor (thesis 2.3.3).
 
-    An estimate that cannot be simulated is made physical (no negative friction, a positive definite mass matrix), and,
-    if that is not enough, moved half-way, and half-way again, towards the last one that could
-    (``warnings`` says so); the estimate itself is left alone, only the simulation uses the damped one.
+    An estimate that cannot be simulated is made physical: no negative friction, a positive definite mass matrix. If
+    that is not enough, it is moved half-way, and half-way again, towards the last estimate that could be simulated.
+    Each such step adds a line to ``warnings``. Only the simulation uses the changed estimate; the estimator keeps its
+    own.
 
     Parameters
     ----------
+    model
+        The arm.
+    controller
+        Discrete controller, on the motor side.
     references
         One (N, n) array of joint references per experiment, rad or m.
     initial
         Position and velocity (n,) each at the start of every experiment.
+    dt
+        Sampling period, s.
+    decimation
+        Parallel filter of the equations.
     max_velocity
         Joint speeds (n,) beyond which a simulation counts as diverged.
     anchor
-        A theta that is known to simulate, to move towards while there is no last one.
+        Base parameters (b,) that can be simulated, to move towards while there is no earlier estimate.
     band_hz
-        Instruments vary no faster than this, whatever the decimation lets through. Beyond the motion's band the
-        measured regressor, smoothed, lacks what reference and simulated loop still hold, such as the steps in
-        which set points arrive, and a prefilter that amplifies high frequencies would count that as information.
+        Highest frequency of the instruments, whatever the decimation passes. The measured regressor is smoothed. Beyond
+        the band of the motion it lacks content that reference and simulated loop still hold, such as steps of the set
+        points. A prefilter that amplifies high frequencies would take this content for information.
     starts
         Time of the first sample of every experiment since the recordings began, s; ``None``: zero.
     """
@@ -91,11 +100,11 @@ class AuxiliaryModel:
 
     @property
     def limits_band(self) -> bool:
-        """Whether the decimation lets through so much more than ``band_hz`` that instruments are filtered."""
+        """True if the decimation passes so much more than ``band_hz`` that the instruments are filtered."""
         return 0.5 / (self.dt * self.decimation.factor) >= WIDER * self.band_hz
 
     def fresh(self) -> Self:
-        """A copy without earlier estimates and warnings, with which an estimator starts."""
+        """Copy without earlier estimates and warnings, with which an estimator starts."""
         return replace(self, _warnings=[], _last=None)
 
     @property
@@ -114,10 +123,15 @@ class AuxiliaryModel:
         self._warnings.append(text)
 
     def with_gear_ratios(self, share: float) -> Self:
-        """The loop as someone simulates it who takes the gear ratios for ``share`` of what they are (section 4.2.3).
+        """The loop simulated with gear ratios wrong by the factor ``share`` (thesis section 4.2.3).
 
-        Controller, reference and encoders live on the motor side, so the simulated joints move ``1 / share`` as far as
-        the real ones and get ``share`` of the drives' torques.
+        Controller, reference and encoders are on the motor side. The simulated joints therefore move ``1 / share`` as
+        far as the real ones and receive ``share`` of the torques of the drives.
+
+        Parameters
+        ----------
+        share
+            Assumed over true gear ratio.
         """
         robot = self.model.robot
         ratios = tuple(tuple(share * ratio for ratio in row) for row in robot.transmission)
@@ -184,11 +198,18 @@ class AuxiliaryModel:
         return [Derivatives(run.q, run.qd, run.qdd, None, self.dt, self._start(k)) for k, run in enumerate(runs)]
 
     def regressors(self, motions: Sequence[Derivatives]) -> list[NDArray[np.float64]]:
-        """Filtered regressor at motions that know no noise, one (M, n, b) per experiment."""
+        """Filtered regressor at noise-free motions, one (M, n, b) per experiment."""
         return [filtered_regressor(self.model, self._in_band(motion), self.decimation) for motion in motions]
 
     def equations(self, blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ExperimentEquations]:
-        """The equations with the simulated regressor in place of the measured one (2.32).
+        """Equations with the simulated regressor in place of the measured one (2.32).
+
+        Parameters
+        ----------
+        blocks
+            Equations at measured signals, one per experiment.
+        theta
+            Base parameters of the simulation, shape (b,).
 
         Raises
         ------
@@ -212,7 +233,7 @@ class AuxiliaryModel:
         return 0.0 if self.starts is None else self.starts[experiment]
 
     def _in_band(self, motion: Derivatives) -> Derivatives:
-        """A motion without what is faster than ``band_hz`` where the decimation leaves that in."""
+        """Motion low-pass filtered at ``band_hz`` where the decimation passes more."""
         if not self.limits_band:
             return motion
         q, qd, qdd = (butterworth(s, self.dt, self.band_hz) for s in (motion.q, motion.qd, motion.qdd))

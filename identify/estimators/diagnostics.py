@@ -1,7 +1,7 @@
 """Tests of an estimate: instruments, endogeneity, residuals, and the set of essential parameters.
 
-All tests work on the equations as the estimator weighs them (thesis 2.24, 6.30). Where it weighs without a noise model
-(IDIM-LS, IDIM-IV), one is fitted first (6.21 to 6.25), so that no test takes serial correlation for something else.
+All tests use the equations as the estimator weights them (thesis 2.24, 6.30). Where it weights without a noise model
+(IDIM-LS, IDIM-IV), one is fitted first (6.21 to 6.25), so that no test is disturbed by serial correlation.
 """
 
 import math
@@ -29,7 +29,7 @@ from armident.identify.regression.hac import newey_west
 Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
-"""Probability of rejecting what is true, in every test here."""
+"""Probability of rejecting a true hypothesis, in every test here."""
 
 WEAK_F = 23.1
 """Robust first-stage F below which an instrument is weak: bias over 10 % of the worst case cannot be excluded at 5 %
@@ -51,13 +51,15 @@ class Relevance:
 
     Parameters
     ----------
+    parameter
+        Base parameter.
     partial_r2
         Shea's partial R^2: variance of least squares over that of the instruments, 0 to 1.
     first_stage_f
         F statistic of the instruments given all other regressors (Sanderson and Windmeijer 2016), robust against
         serial and cross-joint correlation; ``inf`` where the instruments are the regressors.
     weak
-        Whether ``first_stage_f`` is below ``WEAK_F``.
+        True if ``first_stage_f`` is below ``WEAK_F``.
     """
 
     parameter: str
@@ -68,18 +70,18 @@ class Relevance:
 
 @dataclass(frozen=True)
 class Endogeneity:
-    """Durbin-Wu-Hausman test that least squares on the same equations differs by chance alone.
+    """Durbin-Wu-Hausman test of exogeneity: least squares and instruments differ by chance alone.
 
     Parameters
     ----------
     statistic, degrees, p_value
-        Chi-square statistic of the difference, its degrees of freedom (directions in which the two estimators
-        differ at all), and the probability of more under exogeneity.
+        Chi-square statistic of the difference, its degrees of freedom, and the probability of a larger statistic under
+        exogeneity. The degrees of freedom are the directions in which the two estimators differ at all.
     largest_shift, parameter
-        Greatest difference of the two in standard deviations of the IV estimate, and whose it is: what the bias of
-        least squares matters, where the statistic only says whether it can be seen.
+        Greatest difference of the two, in standard deviations of the IV estimate, and its parameter. It measures the
+        size of the bias of least squares; the statistic only measures its significance.
     rejected, verdict
-        Whether exogeneity is rejected, and in words.
+        True if exogeneity is rejected, and the result as a sentence.
     """
 
     statistic: float
@@ -93,16 +95,26 @@ class Endogeneity:
 
 @dataclass(frozen=True)
 class JointResiduals:
-    """Residuals of one joint, whitened by a noise model of ``order``.
+    """Tests of the residuals of one joint, whitened by a noise model.
 
     Parameters
     ----------
+    joint
+        Name of the joint.
+    order
+        Order of the noise model.
+    lags
+        Number of lags of the whiteness test.
     ljung_box, ljung_box_degrees, ljung_box_p
         Statistic of Ljung and Box, degrees of freedom (lags less order), probability of more if white.
+    white
+        True if whiteness is not rejected at ``SIGNIFICANCE``.
     breusch_pagan, breusch_pagan_degrees, breusch_pagan_p
         Koenker's form of the Breusch-Pagan statistic against the magnitudes in ``against``.
-    white, homoskedastic
-        Whether the tests leave it standing at ``SIGNIFICANCE``.
+    homoskedastic
+        True if a constant variance is not rejected at ``SIGNIFICANCE``.
+    against
+        Magnitudes on which the variance may depend: ``speed``, ``torque``.
     """
 
     joint: str
@@ -121,7 +133,7 @@ class JointResiduals:
 
 @dataclass(frozen=True)
 class NestedFit:
-    """F test of a set of parameters against the full set, that is of all the others being zero.
+    """F test of a set of parameters against the full set: all others are zero.
 
     Parameters
     ----------
@@ -131,7 +143,7 @@ class NestedFit:
         Statistic, its two degrees of freedom, probability of more if they are zero. The set was chosen on the same
         data, which makes the test lenient.
     sufficient
-        Whether the set is enough.
+        True if the set suffices at ``SIGNIFICANCE``.
     """
 
     kept: int
@@ -144,7 +156,7 @@ class NestedFit:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What the tests say of an estimate.
+    """Results of the tests of an estimate.
 
     Parameters
     ----------
@@ -153,7 +165,7 @@ class Diagnostics:
     condition_instruments
         The same of ``Z' W X``; ``None`` without instruments.
     relevance, endogeneity
-        ``None`` without instruments.
+        First stage of every parameter, and test of exogeneity; ``None`` without instruments.
     weak_instruments
         Parameters whose instruments are weak.
     joints
@@ -171,7 +183,7 @@ class Diagnostics:
     essential: NestedFit | None
 
     def document(self) -> dict[str, Any]:
-        """Plain numbers, strings, lists and dictionaries; what is not finite is ``None``."""
+        """Plain numbers, strings, lists and dictionaries; numbers that are not finite become ``None``."""
         plain: dict[str, Any] = _plain(asdict(self))
         return plain
 
@@ -246,6 +258,17 @@ def instrument_relevance(
 ) -> tuple[Relevance, ...]:
     """Shea's partial R^2 and the conditional first-stage F of every parameter.
 
+    Parameters
+    ----------
+    names
+        Base parameters, shape (b,).
+    blocks
+        Equations with the regressor at measured signals.
+    instruments
+        Regressor at simulated signals, one (M, n, b) array per experiment.
+    weights
+        Noise model of each joint by which the rows are weighted.
+
     Notes
     -----
     With ``Xp = Z (Z'Z)^-1 Z' X`` and ``A = (Xp'Xp)^-1`` the part of ``Xp`` that is new in column k is
@@ -284,8 +307,14 @@ def durbin_wu_hausman(
 
     Parameters
     ----------
+    names
+        Base parameters, shape (b,).
+    blocks
+        Equations with the regressor at measured signals.
+    instruments
+        Regressor at simulated signals, one (M, n, b) array per experiment.
     weights
-        Noise models by which both estimates weigh their rows.
+        Noise models by which both estimates weight their rows, one per joint.
     noise
         Noise models of the residuals, the same or richer.
 
@@ -340,6 +369,19 @@ def residual_tests(
 
     Speed and torque magnitudes are the simulated ones where there are instruments: the measured ones share their
     errors with the residuals.
+
+    Parameters
+    ----------
+    names, joints
+        Base parameters (b,) and joints (n,).
+    blocks
+        Equations with the regressor at measured signals.
+    estimate
+        The estimate to test.
+    noise
+        Noise model of each joint.
+    instruments
+        Regressor at simulated signals, one (M, n, b) array per experiment; ``None``: least squares.
     """
     motion = [b.x for b in blocks] if instruments is None else list(instruments)
     tests = []
@@ -405,14 +447,14 @@ def ljung_box(
 
 
 def breusch_pagan(residuals: Array, magnitudes: Array) -> tuple[float, int, float]:
-    """Test of Breusch and Pagan in Koenker's (1981) form, right without normality: ``M R^2`` of the squares.
+    """Test of Breusch and Pagan in Koenker's (1981) form, valid without normality: ``M R^2`` of the squares.
 
     Parameters
     ----------
     residuals
         White residuals (M,).
     magnitudes
-        What their variance may depend on (M, k).
+        Variables on which their variance may depend (M, k).
 
     Returns
     -------
@@ -527,7 +569,7 @@ def _long_run_variance(scores: Sequence[Array]) -> Array:
 
 
 def _absorbed(sensitivities: Sequence[Array], covariance: Array, lags: int) -> Array:
-    """Sums of the autocovariances of ``X C X'`` at lags 0..lags: what the parameters took out of the residuals."""
+    """Sums of the autocovariances of ``X C X'``, absorbed from the residuals, at lags 0..lags."""
     out = np.zeros(lags + 1)
     for x in sensitivities:
         weighed = x @ covariance
@@ -544,7 +586,7 @@ def _magnitudes(
     joint: int,
     order: int,
 ) -> tuple[tuple[str, ...], Array]:
-    """Speed and torque magnitudes of a joint (M, k) at the instants of its residuals, and what they are."""
+    """Speed and torque magnitudes of a joint (M, k) at the instants of its residuals, and their names."""
     against, columns = ["torque"], [[np.abs(x[:, joint] @ theta) for x in motion]]
     if f"fv{joint + 1}" in names:
         k = list(names).index(f"fv{joint + 1}")

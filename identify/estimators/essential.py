@@ -11,10 +11,11 @@ CONFIDENCE = 0.99
 def essential_parameters(
     theta: NDArray[np.float64], covariance: NDArray[np.float64], equations: int, confidence: float = CONFIDENCE
 ) -> NDArray[np.bool_]:
-    """Drop the least significant parameter, refit, and repeat until all that are left are significant.
+    """Mask of the essential parameters, by backward elimination with an F statistic (thesis B.2).
 
-    The refit is exact for estimates that are Gaussian with this covariance: fixing parameter i at zero moves the others
-    by ``-C[:, i] theta_i / C_ii``, and ``theta_i^2 / C_ii`` is the F statistic (1 and ``equations - b`` degrees).
+    The least significant parameter is dropped and the rest refitted until all that are left are significant. The refit
+    is exact for Gaussian estimates with this covariance: fixing parameter i at zero moves the others by
+    ``-C[:, i] theta_i / C_ii``, and ``theta_i^2 / C_ii`` is the F statistic (1 and ``equations - b`` degrees).
 
     Parameters
     ----------
@@ -23,6 +24,8 @@ def essential_parameters(
         a fit after selection has standard deviations that are too small.
     equations
         Number of rows of the regression.
+    confidence
+        Quantile of F below which a parameter is dropped.
 
     Returns
     -------

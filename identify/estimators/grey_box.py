@@ -17,14 +17,14 @@ FREQUENCIES = 2048
 """Points of the controller's frequency response, zero to the Nyquist frequency of the decimated equations."""
 
 SMALLEST_GAIN = 1e-4
-"""Floor of the controller's gain as a share of its largest: a pure velocity loop does not feel a constant error."""
+"""Floor of the controller's gain as a share of its largest: a pure velocity loop has none at zero frequency."""
 
 
 @dataclass(frozen=True)
 class InverseController:
     """Turns joint torque equations into equations of motor positions, ``C_j^-1`` applied to every term (6.28).
 
-    Noise models know spectra only. So ``C_j^-1`` is the stable, causal filter with the controller's inverse gain at
+    Noise models describe spectra only. So ``C_j^-1`` is the stable, causal filter with the controller's inverse gain at
     every frequency that the decimated equations hold: ``1 / D_j(z^-1)``, scaled.
 
     Parameters
@@ -40,7 +40,15 @@ class InverseController:
 
     @classmethod
     def of(cls, auxiliary: AuxiliaryModel, order: int) -> Self:
-        """The inverse of the auxiliary model's controller at its decimated rate, ``D_j`` of at most this order."""
+        """Inverse of the controller of the auxiliary model at its decimated rate.
+
+        Parameters
+        ----------
+        auxiliary
+            The simulated closed loop.
+        order
+            Highest order of ``D_j``.
+        """
         gain = controller_gain(auxiliary.controller, auxiliary.decimation.factor)
         inverse = np.asarray(np.linalg.inv(auxiliary.model.robot.transmission_matrix), dtype=np.float64)
         return cls(inverse, tuple(fit_spectrum(1.0 / row**2, order) for row in gain))
@@ -72,6 +80,13 @@ def controller_gain(controller: DiscreteController, factor: int) -> NDArray[np.f
     """Gain of each motor's controller from position noise to torque, (n, K), up to the decimated Nyquist frequency.
 
     Position noise enters with the tracking error and, in a velocity loop, with the position itself.
+
+    Parameters
+    ----------
+    controller
+        Discrete controller of n motors.
+    factor
+        Decimation factor.
     """
     z = np.exp(-1j * np.pi * np.linspace(0.0, 1.0, FREQUENCIES) / factor)
 

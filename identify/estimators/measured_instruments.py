@@ -17,17 +17,30 @@ from armident.identify.signals.decimate import Decimation
 
 @dataclass
 class MotionInstruments(AuxiliaryModel):
-    """The limit of an infinitely stiff controller: the references are the motion, whatever the parameters.
+    """Instruments at the smoothed motion: the limit of an infinitely stiff controller, whatever the parameters.
 
-    For arms that nothing recorded lets simulate: no reference, and an estimate of inertias so far from physical that no
-    controller can be chosen by it, as torque sensors behind the gears give where a wrist weighs less than its friction.
-    Instruments from measured positions are independent of the torques' noise and, where the references are smoothed by
-    another filter than the regressor, of most of the positions'.
+    For recordings whose arm cannot be simulated: there is no reference, and the estimated inertias are so far from
+    physical that no controller can be chosen by them. Torque sensors behind the gears give such estimates where a wrist
+    weighs less than its friction. Instruments from measured positions are independent of the noise of the torques.
+    Where the references are smoothed by another filter than the regressor, they are also independent of most of the
+    noise of the positions.
     """
 
     @classmethod
     def of(cls, model: ArmModel, motion: Sequence[NDArray[np.float64]], dt: float, decimation: Decimation) -> Self:
-        """Instruments from a smoothed motion, one (N, n) array of joint positions per experiment; ``dt`` in s."""
+        """Instruments from a smoothed motion.
+
+        Parameters
+        ----------
+        model
+            The arm.
+        motion
+            Smoothed joint positions, one (N, n) array per experiment, rad or m.
+        dt
+            Sampling period, s.
+        decimation
+            Parallel filter of the equations.
+        """
         # Neither controller nor initial state has a part in it.
         controller = DiscreteController.fir(np.zeros((model.n, 1)), dt)
         at_rest = [(q[0], np.zeros(model.n)) for q in motion]

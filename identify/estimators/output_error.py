@@ -27,16 +27,16 @@ from armident.identify.regression.tall_qr import triangularize
 Signal = Callable[[Response], Arrays]
 
 LEAST_DAMPING, FIRST_DAMPING, MOST_DAMPING = 1e-12, 1e-3, 1e6
-"""Levenberg-Marquardt damping, of columns of norm one: none to speak of, after a Gauss-Newton step fails, the last."""
+"""Levenberg-Marquardt damping, for columns of norm one: negligible, first after a failed Gauss-Newton step, largest."""
 
 AS_PREDICTED = 0.1
-"""Relative deviation of the error's decrease from its prediction within which the sensitivities are kept."""
+"""Relative deviation of the decrease of the error from its prediction up to which the sensitivities are kept."""
 
 SMALL_SURPRISE = 1.0
 """The same in squared standard deviations of one equation: a deviation too small to matter to any parameter."""
 
 NEAR = 3.0
-"""Standard deviations that theta may have moved since the sensitivities that its covariance is computed with."""
+"""Standard deviations by which theta may differ from that of the sensitivities in its covariance."""
 
 
 def output_error(
@@ -57,7 +57,7 @@ def output_error(
     Parameters
     ----------
     signal
-        Picks the compared signal of a response.
+        Returns the compared signal of a response.
     measured
         The same signal measured, one (M, n) array per experiment.
     blocks
@@ -108,7 +108,7 @@ def _approach(
 
 @dataclass
 class _LevenbergMarquardt:
-    """Where the minimisation stands: theta, its response, and the sensitivities last computed."""
+    """State of the minimisation: theta, its response, and the sensitivities last computed."""
 
     signal: Signal
     measured: Arrays
@@ -177,7 +177,7 @@ class _LevenbergMarquardt:
         return top[:, :-1], top[:, -1], norms
 
     def _step_left(self, noise: Sequence[ArModel]) -> float:
-        """Relative change of theta that the sensitivities still ask for."""
+        """Relative change of theta that remains by the sensitivities."""
         factor, projected, norms = self._factors(noise)
         delta = _damped(factor, projected, LEAST_DAMPING)
         return np.inf if delta is None else float(np.linalg.norm(delta / norms) / np.linalg.norm(self.theta))
@@ -187,7 +187,7 @@ class _LevenbergMarquardt:
         return float(rows @ rows)
 
     def _accept(self, noise: Sequence[ArModel]) -> bool:
-        """Go the first step, from Gauss-Newton's to the most damped, that lowers the error; false if none does."""
+        """Take the first step, from Gauss-Newton's to the most damped, that lowers the error; false if none does."""
         factor, projected, norms = self._factors(noise)
         cost = self._cost(self.errors(), noise)
         damping = self.damping

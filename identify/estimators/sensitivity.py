@@ -1,4 +1,4 @@
-"""What torque and position tell about the parameters: singular values of the Jacobians (thesis section 4.1.2)."""
+"""Sensitivity of torque and position to the parameters: singular values of the Jacobians (thesis section 4.1.2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,11 +24,11 @@ Arrays = Sequence[Array]
 DIFFERENCE = 0.01
 """Finite-difference step in standard deviations that a parameter would have if all others were known.
 
-Forward differences are then right to 1e-4 of a column's norm (TX40), far below what an iteration needs.
+Forward differences are then accurate to 1e-4 of the norm of a column (TX40), far better than an iteration needs.
 """
 
 LEAST_TORQUE = 1e-3
-"""Torque error, as a share of a joint's torque, that standard deviations count with at least: noise-free data."""
+"""Least torque error of the standard deviations, as a share of a joint's torque, for noise-free data."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Sensitivity:
     cloe
         Of the simulated position, ``Psi_CLOE`` (4.2).
     didim
-        Of the simulated regressor, the pseudo-linear stand-in for ``Psi_CLIE`` (4.22).
+        Of the simulated regressor, the pseudo-linear approximation of ``Psi_CLIE`` (4.22).
     """
 
     clie: Array
@@ -93,13 +93,15 @@ def sensitivity(auxiliary: AuxiliaryModel, theta: Array, parameters: Sequence[in
 def sensitivities(auxiliary: AuxiliaryModel, theta: Array, response: Response, steps: Array) -> list[Response]:
     """Derivatives of the response with respect to each parameter, by forward differences: b simulations at once.
 
-    A perturbation that the loop does not survive is tried backwards, then smaller; one that it never survives leaves
-    zeros and a warning.
+    If the loop diverges at a perturbation, the opposite one is tried, then smaller ones. If it diverges at all of them,
+    the derivative is zero and a warning is added.
 
     Parameters
     ----------
+    auxiliary
+        The simulated closed loop; it receives the warning.
     theta, response
-        Where to differentiate, (b,), and what the loop does there.
+        Base parameters (b,), and the response of the loop with them.
     steps
         Perturbation of each parameter, shape (b,).
     """
@@ -124,7 +126,7 @@ def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequen
     zeta
         Filtered regressor at simulated signals, one (M, n, b) array per experiment.
     torques, errors
-        Torques, and what of them is not explained, (M, n) each.
+        Torques, and their unexplained part, (M, n) each, N m or N.
     keep
         Equations to use, (M, n).
     """
@@ -136,7 +138,17 @@ def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequen
 
 
 def weighted_columns(columns: Sequence[Arrays], keep: Sequence[NDArray[np.bool_]], noise: Sequence[ArModel]) -> Array:
-    """Jacobian of 4.2 and 4.4 (rows, b): each column stacked joint by joint and weighted."""
+    """Jacobian of 4.2 and 4.4 (rows, b): each column stacked joint by joint and weighted.
+
+    Parameters
+    ----------
+    columns
+        Derivative with respect to each parameter, b sequences of one (M, n) array per experiment.
+    keep
+        Equations to use, (M, n) per experiment.
+    noise
+        Noise model of each joint.
+    """
     return np.stack([weighted_rows(column, keep, noise) for column in columns], axis=1)
 
 
@@ -151,6 +163,17 @@ def torque_sensitivities(
     auxiliary: AuxiliaryModel, theta: Array, blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
 ) -> Array:
     """Jacobian of the simulated torque (4.4), weighted, shape (rows, b).
+
+    Parameters
+    ----------
+    auxiliary
+        The simulated closed loop.
+    theta
+        Base parameters, shape (b,).
+    blocks
+        Filtered and decimated equations; only torques and kept equations are used.
+    noise
+        Noise model of each joint.
 
     Raises
     ------

@@ -11,9 +11,16 @@ from armident.identify.robot.compiled import compiled
 
 @dataclass(frozen=True)
 class ArModel:
-    """``C(z^-1) xi = e`` with ``C = 1 + c_1 z^-1 + ...`` (6.19), ``e`` white of the given variance.
+    """Noise model ``C(z^-1) xi = e`` with ``C = 1 + c_1 z^-1 + ...`` (6.19), ``e`` white.
 
-    ``coefficients`` has shape (l,); order 0 is white noise.
+    Parameters
+    ----------
+    coefficients
+        ``c_1 .. c_l``, shape (l,); order 0 is white noise.
+    variance
+        Variance of ``e``, ``lambda^2``, in squared units of the series.
+    aic
+        Akaike criterion (6.24) by which the order was chosen.
     """
 
     coefficients: NDArray[np.float64]
@@ -26,7 +33,7 @@ class ArModel:
         return self.coefficients.size
 
     def whiten(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order, ...): no initial state is invented."""
+        """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order, ...); no initial state is assumed."""
         flat = np.ascontiguousarray(x, dtype=np.float64).reshape(x.shape[0], -1)
         out: NDArray[np.float64] = _convolve(flat, self.coefficients) / np.sqrt(self.variance)
         return out.reshape((out.shape[0], *x.shape[1:]))
@@ -34,12 +41,12 @@ class ArModel:
     def widened(self, samples: int) -> "ArModel":
         """The same filter, its variance times ``((N + l) / (N - l))^2``: for weights and covariances of an estimate.
 
-        Two errors of relative size ``2 l / N`` make the information ``X' Omega^-1 X`` of the model too large.
-        The filter was fitted to the very residuals that it whitens: on others of the same process its error has the
-        variance ``(N + l) / (N - l)`` times as large (Akaike, Fitting autoregressive models for prediction, 1969). And
-        an estimate weighted by it scatters more than one weighted by the process itself, by the relative variance of an
-        AR spectrum, ``2 l / N`` on the average of the frequencies (Berk, Consistent autoregressive spectral estimates,
-        1974), less what the parameters do not feel of it.
+        Two errors of relative size ``2 l / N`` make the information ``X' Omega^-1 X`` of the model too large. First,
+        the filter was fitted to the residuals that it whitens. On other residuals of the same process its error has a
+        variance ``(N + l) / (N - l)`` times as large (Akaike, Fitting autoregressive models for prediction, 1969).
+        Second, an estimate weighted by the model scatters more than one weighted by the process itself. The excess is
+        the relative variance of an AR spectrum, ``2 l / N`` on the average of the frequencies (Berk, Consistent
+        autoregressive spectral estimates, 1974), less the part to which the parameters are insensitive.
 
         Parameters
         ----------
@@ -56,7 +63,15 @@ WHITE = ArModel(np.empty(0), 1.0, 0.0)
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Autocorrelation of residuals at lags 1..L against the 2-sigma band of white noise."""
+    """Autocorrelation of residuals against the 2-sigma band of white noise.
+
+    Parameters
+    ----------
+    autocorrelation
+        Autocorrelation at lags 1..L, shape (L,).
+    bound
+        Half width of the band.
+    """
 
     autocorrelation: NDArray[np.float64]
     bound: float
@@ -162,12 +177,30 @@ def levinson_durbin(r: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 
 def lagged_sums(x: NDArray[np.float64], max_lag: int, first: int = 0) -> NDArray[np.float64]:
-    """``sum_t x(t) . x(t - k)`` for lags 0..max_lag of a vector series (M, m), over t from ``first`` on."""
+    """``sum_t x(t) . x(t - k)`` for lags 0..max_lag, shape (max_lag + 1,).
+
+    Parameters
+    ----------
+    x
+        Vector series, shape (M, m).
+    max_lag
+        Highest lag k.
+    first
+        First t of the sums.
+    """
     return _lagged_sums(np.ascontiguousarray(x, dtype=np.float64), max_lag, first)
 
 
 def whiteness(series: Sequence[NDArray[np.float64]], lags: int = 20) -> Whiteness:
-    """Autocorrelation of residuals pooled over experiments, with the bound ``2 / sqrt(M)``."""
+    """Autocorrelation of residuals pooled over experiments, with the bound ``2 / sqrt(M)``.
+
+    Parameters
+    ----------
+    series
+        Residuals of one joint, one array (M,) per experiment.
+    lags
+        Number of lags.
+    """
     total = sum(s.size for s in series)
     mean = sum(float(s.sum()) for s in series) / total
     r = np.zeros(lags + 1)
@@ -205,15 +238,15 @@ def _lagged_sums(x: NDArray[np.float64], max_lag: int, first: int) -> NDArray[np
 
 
 PIECE = 2048
-"""Numbers that are filtered at a time."""
+"""Numbers filtered at a time."""
 
 
 @compiled
 def _convolve(x: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
     order, width = coefficients.size, x.shape[1]
     out = x[order:].copy()
-    # Row after row in memory, a sample earlier is a row before: one long sum for each coefficient, in pieces that stay
-    # in the cache.
+    # The previous sample is the previous row of the array: one long sum per coefficient, in pieces that stay in the
+    # cache.
     late, early = out.ravel(), x.ravel()
     for begin in range(0, late.size, PIECE):
         piece = late[begin : begin + PIECE]

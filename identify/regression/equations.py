@@ -1,4 +1,4 @@
-"""The stacked regression ``y = X theta + e`` of all joints and experiments, and how it is solved."""
+"""The stacked regression ``y = X theta + e`` of all joints and experiments, and its solution (thesis 2.3)."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -28,13 +28,13 @@ EXACT = 1e-10
 """Relative change of theta that ends the iterations whatever the residual does: data without noise leave rounding."""
 
 MAX_AR_ORDER = 60
-"""Highest order of the noise models that is tried."""
+"""Highest order tried for the noise models."""
 
 COVARIANCE_PASSES = 3
 """Noise model and covariance need each other; the third pass changes standard deviations by less than 1 %."""
 
 LONG_SERIES, SAMPLED, EVERY = 16_384, 128, 4
-"""From so many rows on, what the parameters absorb is told from stretches of so many, every fourth of them."""
+"""Rows of a long series; rows of a stretch of it; one stretch in so many estimates the part absorbed by parameters."""
 
 RANK_TOLERANCE = 1e-10
 """Smallest singular value of the column-normalised regressor, relative to the greatest, that counts as excited."""
@@ -43,17 +43,17 @@ PIECE = 128
 """Samples whose regressors are in the cache together; they enter the filter as one product of matrices."""
 
 ROWS_PER_TASK, SAMPLES_PER_TASK = 256, 4096
-"""Filtered rows that one thread makes at a time, at least so many and at least of so many samples."""
+"""Least filtered rows, and least samples, that one thread processes at a time."""
 
 
 @dataclass(frozen=True)
 class ExperimentEquations:
-    """One experiment after the parallel filter.
+    """Equations of one experiment after the parallel filter (thesis 2.3.1).
 
     Parameters
     ----------
     y
-        Torques, shape (M, n).
+        Torques, shape (M, n), N m or N.
     x
         Regressor at measured signals, shape (M, n, b).
     keep
@@ -70,16 +70,24 @@ class ExperimentEquations:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What every estimator returns.
+    """Result of an estimator.
 
     Parameters
     ----------
     theta, covariance
-        Base parameters (b,) and their covariance (b, b).
+        Base parameters (b,) and their covariance (b, b), SI units.
     noise
         Noise model of each joint; its variance is the sigma_j^2 of 2.25.
     residuals
         Whitened residuals of each joint, one array per experiment, in standard deviations.
+    iterations
+        Iterations done.
+    converged
+        True if the iterations converged.
+    stop_reason
+        Rule that ended the iterations, as a sentence.
+    warnings
+        Lines for the user.
     """
 
     theta: NDArray[np.float64]
@@ -102,8 +110,24 @@ def filtered_regressor(
 ) -> NDArray[np.float64]:
     """Base regressor after the parallel filter, shape (M, n, b).
 
-    Piece by piece, so that what is filtered never leaves the cache, and on all processors: neither kernel nor product
-    holds the interpreter lock. Terms of the model, which may remember, see the motion in one piece.
+    It is computed piece by piece, so that unfiltered rows stay in the cache, and on all processors: neither kernel nor
+    product holds the interpreter lock. Terms of the model may depend on the past, so they get the whole motion at once.
+
+    Parameters
+    ----------
+    model
+        The arm.
+    signals
+        Positions and derivatives, (N, n) each.
+    decimation
+        Parallel filter.
+    sharp_sign
+        True for ``sign`` of the velocity in the friction; false for the smoothed sign of the configuration.
+
+    Raises
+    ------
+    ValueError
+        If the model has terms and the signals no sampling period.
     """
     count = decimation.count(signals.q.shape[0])
     rows = max(ROWS_PER_TASK, SAMPLES_PER_TASK // decimation.factor)
@@ -153,7 +177,17 @@ def filtered_regressor(
 def weighted_rows(
     values: Sequence[NDArray[np.float64]], keep: Sequence[NDArray[np.bool_]], noise: Sequence[ArModel]
 ) -> NDArray[np.float64]:
-    """Stack (M, n) or (M, n, b) joint by joint as in 2.21, each joint whitened by its noise model."""
+    """Stack values joint by joint as in 2.21, each joint whitened by its noise model; shape (rows,) or (rows, b).
+
+    Parameters
+    ----------
+    values
+        One (M, n) or (M, n, b) array per experiment.
+    keep
+        Equations to use, (M, n) per experiment.
+    noise
+        Noise model of each joint.
+    """
     rows = []
     for j, ar in enumerate(noise):
         for value, kept in zip(values, keep, strict=True):
@@ -164,23 +198,57 @@ def weighted_rows(
 def stacked(
     blocks: Sequence[ExperimentEquations], noise: Sequence[ArModel]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Regressor (rows, b) and torques (rows,) of 2.20 and 2.21, whitened, without the equations left out."""
+    """Regressor (rows, b) and torques (rows,) of 2.20 and 2.21, whitened, without the equations left out.
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    noise
+        Noise model of each joint.
+    """
     keep = [b.keep for b in blocks]
     return weighted_rows([b.x for b in blocks], keep, noise), weighted_rows([b.y for b in blocks], keep, noise)
 
 
 def residuals(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """``tau - phi theta`` of each experiment, shape (M, n)."""
+    """``tau - phi theta`` of each experiment, shape (M, n).
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    theta
+        Base parameters, shape (b,).
+    """
     return [block.y - block.x @ theta for block in blocks]
 
 
 def joint_variances(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ArModel]:
-    """Serially uncorrelated noise with the residual variance of each joint (2.25, 2.26)."""
+    """Serially uncorrelated noise with the residual variance of each joint (2.25, 2.26).
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    theta
+        Base parameters, shape (b,).
+    """
     return error_variances(residuals(blocks, theta), [b.keep for b in blocks], theta.size)
 
 
 def residual_norm(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], scale: Sequence[ArModel]) -> float:
-    """Norm of the residuals, each joint in the units of ``scale``."""
+    """Norm of the residuals, each joint in the units of ``scale``.
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    theta
+        Base parameters, shape (b,).
+    scale
+        Noise model of each joint that scales its residuals.
+    """
     keep = [b.keep for b in blocks]
     return float(np.linalg.norm(weighted_rows(residuals(blocks, theta), keep, scale)))
 
@@ -188,9 +256,18 @@ def residual_norm(blocks: Sequence[ExperimentEquations], theta: NDArray[np.float
 def error_variances(
     errors: Sequence[NDArray[np.float64]], keep: Sequence[NDArray[np.bool_]], parameters: int
 ) -> list[ArModel]:
-    """White noise of the variance of each joint's errors, (M, n) per experiment (2.25, 2.26).
+    """White noise with the variance of each joint's errors (2.25, 2.26).
 
     The degrees of freedom spent on the parameters are shared by the joints in proportion to their equations.
+
+    Parameters
+    ----------
+    errors
+        One (M, n) array per experiment.
+    keep
+        Equations to use, (M, n) per experiment.
+    parameters
+        Number of estimated parameters.
     """
     total = sum(int(kept.sum()) for kept in keep)
     free = max(1 - parameters / total, 1.0 / total)
@@ -206,11 +283,20 @@ def noise_models(
 ) -> list[ArModel]:
     """AR model of each joint's noise from the residuals (6.21 to 6.25).
 
-    The residuals lack what the parameters have absorbed, and they absorb the low frequencies, where the motion is and
-    the precision is decided: ``cov(e - X d) = Omega - X C X'`` for an efficient estimate of covariance C. The
-    autocovariances of ``X C X'`` are given back; without, standard deviations of the virtual TX40 come
-    out 9 % too small (median, 20 seeds). The variances are widened for what the coefficients, being estimates, add to
-    the error of the parameters (:meth:`ArModel.widened`).
+    The residuals lack the noise that the parameters have absorbed. They absorb the low frequencies, which hold the
+    motion and decide the precision: ``cov(e - X d) = Omega - X C X'`` for an efficient estimate of covariance C. The
+    autocovariances of ``X C X'`` are added again. Without them, standard deviations of the virtual TX40 are 9 % too
+    small (median, 20 seeds). The variances are widened because the coefficients are estimates themselves
+    (:meth:`ArModel.widened`).
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    theta, covariance
+        Base parameters (b,) and their covariance (b, b).
+    max_order
+        Highest order tried.
     """
     errors = residuals(blocks, theta)
     factor = _square_root(covariance)
@@ -226,10 +312,19 @@ def noise_models(
 
 
 def absorbed_sums(x: NDArray[np.float64], factor: NDArray[np.float64], max_lag: int) -> NDArray[np.float64]:
-    """``sum_t f(t) . f(t - k)`` for lags 0..max_lag of ``f = x factor``, x (M, b).
+    """``sum_t f(t) . f(t - k)`` for lags 0..max_lag of ``f = x factor``, shape (max_lag + 1,).
 
-    It corrects the autocovariances of the residuals by the share b / M. Of a long series one stretch in a few says
-    that well enough, a stretch being ``SAMPLED`` rows after those that its lags look back to.
+    They correct the autocovariances of the residuals by the share b / M. One stretch in ``EVERY`` of a long series is
+    accurate enough for that: ``SAMPLED`` rows, after those that its lags need.
+
+    Parameters
+    ----------
+    x
+        Regressor of one joint, shape (M, b).
+    factor
+        Factor of the covariance, shape (b, b).
+    max_lag
+        Highest lag k.
     """
     rows = x.shape[0]
     stretch = max_lag + SAMPLED
@@ -244,7 +339,7 @@ def absorbed_sums(x: NDArray[np.float64], factor: NDArray[np.float64], max_lag: 
 
 
 def _square_root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``F`` with ``F F' = covariance``, also where rounding has taken its definiteness."""
+    """``F`` with ``F F' = covariance``, also where the covariance is not positive definite by rounding."""
     scale = np.sqrt(np.diag(covariance))
     values, vectors = linalg.eigh(covariance / np.outer(scale, scale))
     factor: NDArray[np.float64] = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
@@ -254,14 +349,34 @@ def _square_root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 def whitened_residuals(
     blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64], noise: Sequence[ArModel]
 ) -> tuple[tuple[NDArray[np.float64], ...], ...]:
-    """Residuals of each joint in standard deviations of its noise model, one array per experiment."""
+    """Residuals of each joint in standard deviations of its noise model, one array per experiment.
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    theta
+        Base parameters, shape (b,).
+    noise
+        Noise model of each joint.
+    """
     return whitened(residuals(blocks, theta), [b.keep for b in blocks], noise)
 
 
 def whitened(
     errors: Sequence[NDArray[np.float64]], keep: Sequence[NDArray[np.bool_]], noise: Sequence[ArModel]
 ) -> tuple[tuple[NDArray[np.float64], ...], ...]:
-    """Errors (M, n) of every experiment in standard deviations of each joint's noise model."""
+    """Errors of each joint in standard deviations of its noise model, one array per experiment.
+
+    Parameters
+    ----------
+    errors
+        One (M, n) array per experiment.
+    keep
+        Equations to use, (M, n) per experiment.
+    noise
+        Noise model of each joint.
+    """
     return tuple(
         tuple(ar.whiten(e[:, j])[kept[ar.order :, j]] for e, kept in zip(errors, keep, strict=True))
         for j, ar in enumerate(noise)
@@ -269,7 +384,15 @@ def whitened(
 
 
 def least_squares(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Solve ``min |y - x theta|`` by QR of the column-normalised regressor."""
+    """Solution (b,) of ``min |y - x theta|`` by QR of the column-normalised regressor (2.22).
+
+    Parameters
+    ----------
+    x
+        Regressor, shape (rows, b).
+    y
+        Torques, shape (rows,).
+    """
     b = x.shape[1]
     scale = column_norms(x)
     top = triangularize(x, y, columns=b, scales=(scale,))
@@ -280,7 +403,15 @@ def least_squares(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.
 def instrumental_variable(
     z: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Solve ``z' (y - x theta) = 0`` (2.33) through the QR factors of ``z``: no product ``z' x`` is formed."""
+    """Solution (b,) of ``z' (y - x theta) = 0`` (2.33) through the QR factors of ``z``: no product ``z' x`` is formed.
+
+    Parameters
+    ----------
+    z, x
+        Instruments and regressor, shape (rows, b).
+    y
+        Torques, shape (rows,).
+    """
     b = x.shape[1]
     scale = column_norms(x)
     top = triangularize(z, x, y, columns=b, scales=(column_norms(z), scale))
@@ -298,10 +429,15 @@ def inverse_gram(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def iv_covariance(z: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(z' x)^-1 z' z (x' z)^-1`` for whitened rows (4.34).
+    """Covariance ``(z' x)^-1 z' z (x' z)^-1`` of an IV estimate, for whitened rows (4.34), shape (b, b).
 
-    It equals ``(z' z)^-1`` (2.34, 6.31) where the simulator is exact and stays right where the controller is only
+    It equals ``(z' z)^-1`` (2.34, 6.31) where the simulator is exact. It stays valid where the controller is only
     approximate, as an identified impulse response is.
+
+    Parameters
+    ----------
+    z, x
+        Instruments and regressor, shape (rows, b).
     """
     scale = column_norms(x)
     top = triangularize(z, x, columns=x.shape[1], scales=(column_norms(z), scale))
@@ -323,10 +459,21 @@ def serial_covariance(
     weights: Sequence[ArModel],
     noise: Sequence[ArModel],
 ) -> NDArray[np.float64]:
-    """Covariance of an IV estimate with weights 2.24 whose residuals are serially correlated.
+    """Covariance (b, b) of an IV estimate with weights 2.24 whose residuals are serially correlated.
 
     ``A = (Z' W X)^-1 Z' W`` maps the noise to the estimate and ``A Omega A'`` is its covariance, with ``Omega`` given
     by the AR model of each joint: ``Z' W Omega W Z`` is the Gram matrix of ``H' W Z``.
+
+    Parameters
+    ----------
+    zeta, x
+        Instruments and regressor, one (M, n, b) array per experiment.
+    keep
+        Equations to use, (M, n) per experiment.
+    weights
+        White noise models by which the estimate weights its rows, one per joint.
+    noise
+        Noise model of the residuals of each joint.
     """
     z = weighted_rows(zeta, keep, weights)
     zs = column_norms(z)
@@ -342,7 +489,14 @@ def serial_covariance(
 
 
 def require_excitation(x: NDArray[np.float64], names: Sequence[str]) -> int:
-    """Rank of the stacked regressor; refuses a recording that leaves parameters undetermined.
+    """Rank of the stacked regressor; a motion that leaves parameters undetermined is an error.
+
+    Parameters
+    ----------
+    x
+        Regressor, shape (rows, b).
+    names
+        Base parameters, shape (b,), for the message.
 
     Raises
     ------
@@ -363,7 +517,19 @@ def require_excitation(x: NDArray[np.float64], names: Sequence[str]) -> int:
 
 
 class Iterations(NamedTuple):
-    """How an iteration ended: its theta, iterations done, whether it converged, and which rule ended it."""
+    """End of an iteration.
+
+    Parameters
+    ----------
+    theta
+        Last or best iterate, shape (b,).
+    done
+        Iterations done.
+    converged
+        True if the iterates settled.
+    reason
+        Rule that ended the iteration, as a sentence.
+    """
 
     theta: NDArray[np.float64]
     done: int
@@ -377,10 +543,21 @@ def iterate(
     iterations: int = ITERATIONS,
     tolerance: float = TOLERANCE,
 ) -> Iterations:
-    """Repeat ``step(theta, k) -> (theta, residual norm)`` until neither changes by more than ``tolerance``.
+    """Repeat a step until neither theta nor the residual norm changes by more than ``tolerance``.
 
     Where that does not happen, the iterate of the smallest residual norm is kept. Equations without a finite
     solution end the iterations.
+
+    Parameters
+    ----------
+    step
+        ``step(theta, k) -> (theta, residual norm)`` of iteration k, from 1 on.
+    start
+        First theta, shape (b,).
+    iterations
+        Most iterations.
+    tolerance
+        Relative change that ends the iterations.
     """
     theta, norm = start, np.inf
     best, least = start, np.inf
