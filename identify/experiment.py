@@ -1,4 +1,4 @@
-"""An experiment: joint positions and torques on an even time grid, ready to be identified."""
+"""Joint positions and torques of an experiment on an even time grid."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ class Experiment:
     dt
         Sampling period, s.
     start
-        Time of the first sample since the recordings began, s: what friction that warms up depends on.
+        Time of the first sample since the recordings began, s, for friction that depends on temperature.
     """
 
     q: NDArray[np.float64]

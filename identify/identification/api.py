@@ -15,18 +15,18 @@ from armident.identify.identification.result import Identification
 
 @dataclass(frozen=True)
 class IdentificationOutcome:
-    """An identification with everything that its report shows.
+    """An identification with all data of its report.
 
     Parameters
     ----------
     recordings
-        The recordings it was made from.
+        Identified recordings.
     robot
-        The configuration it is of.
+        Configuration of the robot.
     result
         The estimate with its curves.
     document
-        The contents of ``identification.json``.
+        Contents of ``identification.json``.
     """
 
     recordings: tuple[Recording, ...]
@@ -41,7 +41,7 @@ def identify_recording(
     options: Options | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> IdentificationOutcome:
-    """Identify recordings, read from files or assembled from the stream.
+    """Identification of recordings, read from files or assembled from the stream.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def identify_recording(
     robot
         Configuration to use; ``None``: the one inside the first recording.
     options
-        Of the estimator; ``None``: the defaults.
+        Options of the identification; ``None``: the defaults.
     progress
         Called with the name of a stage and the share done, 0 to 1.
 

@@ -1,4 +1,4 @@
-"""From experiments to filtered equations: derivatives, alignment of the torque, parallel filter, decimation."""
+"""Filtered equations of experiments: alignment of the torque, parallel filter, decimation (thesis 2.3.1)."""
 
 import math
 from collections.abc import Sequence
@@ -23,8 +23,7 @@ PIV_CUTOFF = 5.0
 """Cut-off of the rough decimation before IDIM-PIV, in closed-loop bandwidths (thesis section 7.2)."""
 
 EQUATIONS_PER_PARAMETER = 10.0
-"""Fewest equations, of all joints and experiments together, per base parameter: what they leave to tell the noise from
-the parameters with."""
+"""Fewest equations per base parameter, of all joints and experiments together: the rest determines the noise."""
 
 
 def least_rows(model: ArmModel) -> int:
@@ -36,27 +35,34 @@ def least_rows(model: ArmModel) -> int:
 
 
 def decimated_rows(decimation: Decimation, samples: Sequence[int]) -> int:
-    """Instants that a decimation leaves of experiments of so many samples."""
+    """Number of instants that a decimation leaves, of all experiments together.
+
+    Parameters
+    ----------
+    decimation
+        Parallel filter.
+    samples
+        Length of every experiment.
+    """
     return sum(decimation.count(count) for count in samples)
 
 
 def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: int) -> Decimation:
     """The decimation or, where it leaves too few instants, the strongest one that leaves enough.
 
-    Motion slower than the cut-off fits through any wider one: raising it costs nothing but noise that the estimator
+    Motion slower than the cut-off passes any wider filter. A higher cut-off only admits noise, which the estimator
     averages, while too few equations determine neither parameters nor noise.
 
     Parameters
     ----------
     decimation
-        As the bandwidth asks for.
+        Decimation by the bandwidth.
     dt
         Sampling period, s.
     samples
         Length of every experiment.
     rows
-        Fewest instants of all experiments together, see :func:`least_rows`. Where not even all samples are as many,
-        all samples stay.
+        Fewest instants of all experiments together, see :func:`least_rows`. All samples stay where they are fewer.
     """
     if decimated_rows(decimation, samples) >= rows:
         return decimation
@@ -87,8 +93,17 @@ def equations(
 ) -> list[ExperimentEquations]:
     """Filtered and decimated equations of every experiment.
 
-    The sign of the velocity is the smoothed one of the robot's configuration, so all samples can stay, which a linear
-    filter needs; where the configuration gives ``velocity_threshold``, slower rows are left out.
+    The sign of the velocity is the smoothed one of the robot's configuration, so all samples can stay, as a linear
+    filter requires. Where the configuration gives ``velocity_threshold``, slower rows are left out.
+
+    Parameters
+    ----------
+    model
+        The arm.
+    experiments, signals
+        Recordings of one sampling rate, and the derivatives of their positions.
+    decimation
+        Parallel filter.
     """
     threshold = model.robot.friction.velocity_threshold
     blocks = []
@@ -105,7 +120,7 @@ def equations(
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Recordings with the derivatives of their positions, and their equations, made once for every decimation.
+    """Recordings with the derivatives of their positions, and their equations, computed once for every decimation.
 
     Parameters
     ----------
@@ -121,7 +136,7 @@ class Prepared:
     _made: dict[Decimation, list[ExperimentEquations]] = field(default_factory=dict, repr=False)
 
     def equations(self, decimation: Decimation) -> list[ExperimentEquations]:
-        """:func:`equations` after a decimation, the same arrays whenever it is asked for again."""
+        """:func:`equations` after a decimation; repeated calls return the same arrays."""
         if decimation not in self._made:
             self._made[decimation] = equations(self.model, self.experiments, self.signals, decimation)
         return self._made[decimation]
@@ -130,7 +145,17 @@ class Prepared:
 def published_equations(
     model: ArmModel, experiments: Sequence[Experiment], preprocessing: Preprocessing
 ) -> list[ExperimentEquations]:
-    """Equations by the filters of a published fit: sharp ``sign``, torque as recorded, all rows."""
+    """Equations by the filters of a published fit: sharp ``sign``, torque as recorded, all rows.
+
+    Parameters
+    ----------
+    model
+        The arm.
+    experiments
+        Recordings.
+    preprocessing
+        Filters, decimation and dropped samples of the published fit.
+    """
     p = preprocessing
     blocks = []
     for experiment in experiments:

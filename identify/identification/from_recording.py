@@ -1,4 +1,4 @@
-"""From a recording, read from a file or assembled from the stream, to experiments that can be identified."""
+"""Experiments from a recording, read from a file or assembled from the stream."""
 
 from typing import Literal
 
@@ -10,20 +10,20 @@ from armident.daq.recording import Recording, Stream
 from armident.identify.experiment import Experiment
 
 MAX_MISSING_SHARE = 0.05
-"""Samples an experiment may lack; with more, what is left no longer is the motion that was designed."""
+"""Share of samples that an experiment may lack; with more, the rest no longer is the designed motion."""
 MIN_PIECE_S = 0.5
-"""A piece between two gaps shorter than this (s) cannot be filtered without edge effects all over it."""
+"""Shortest piece between two gaps, s: edge effects of the filters cover shorter ones."""
 STILL_SHARE = 1e-3
-"""A joint that uses less than this share of its position range is said not to move."""
+"""Share of its position range below which a joint counts as not moving."""
 RATE_TOLERANCE = 0.01
-"""Relative difference between the nominal rate and the receive times that is worth a warning."""
+"""Relative difference between the nominal rate and the receive times above which a note is added."""
 EFFORTS: tuple[Literal["torque", "current", "voltage"], ...] = ("torque", "current", "voltage")
 
 Array = NDArray[np.float64]
 
 
 def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tuple[list[Experiment], list[str]]:
-    """Raw numbers to SI on the joint side, cut at the experiment marks and at gaps.
+    """Experiments of a recording in SI units on the joint side, cut at the experiment marks and at gaps.
 
     Joint positions are ``R^-1 q_motor`` and joint torques ``R' tau_motor`` (thesis equation 2.14 and section B.1).
     The reference between two set points is the straight line that a CiA 402 drive interpolates (60C2h).
@@ -40,7 +40,7 @@ def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tupl
     experiments
         One per uninterrupted piece, in time order.
     notes
-        One line each for whatever a reader of the result should know.
+        Remarks for the user, one line each.
 
     Raises
     ------
@@ -108,10 +108,19 @@ def _converted(recording: Recording, robot: RobotConfig) -> tuple[list[Experimen
 def joint_positions(stream: Stream, quantity: Literal["position", "demand"], robot: RobotConfig) -> Array:
     """Position or demand of a stream on the joint side, shape (N, n), rad or m.
 
+    Parameters
+    ----------
+    stream
+        Samples of one stream.
+    quantity
+        ``position`` or ``demand``.
+    robot
+        Configuration with the transmission.
+
     Raises
     ------
     DataError
-        If the stream has no such quantity.
+        If the stream has no such quantity, or a value that is not finite.
     """
     name = stream.named(quantity)
     if name is None:
@@ -123,14 +132,21 @@ def joint_positions(stream: Stream, quantity: Literal["position", "demand"], rob
 
 
 def joint_torques(stream: Stream, robot: RobotConfig) -> Array:
-    """Joint torques from what the drives reported, shape (N, n), N m or N.
+    """Joint torques from the signals of the drives, shape (N, n), N m or N.
 
-    A current or a voltage belongs to the motor whatever side the positions are on; a torque says its side.
+    Current and voltage belong to the motor, whatever the side of the positions; a torque names its side.
+
+    Parameters
+    ----------
+    stream
+        Samples of one stream.
+    robot
+        Configuration with the drive gains and the transmission.
 
     Raises
     ------
     DataError
-        If the stream has neither current, voltage nor torque.
+        If the stream has neither current, voltage nor torque, or a value that is not finite.
     """
     wanted = robot.joints[0].drive.signal
     for quantity in sorted(EFFORTS, key=lambda effort: effort != wanted):
@@ -177,7 +193,7 @@ def _check_counters(recording: Recording) -> None:
 
 
 def _finite(stream: Stream, name: str, robot: RobotConfig) -> Array:
-    """Return the field in SI, on its own side, so that the one joint that is not a number can be named."""
+    """Return the field in SI, on its own side, so that an error can name the joint."""
     values = stream.si(name)
     bad = np.argwhere(~np.isfinite(values))
     if bad.size:
@@ -197,7 +213,7 @@ def _check_missing(present: int, first: int, last: int, dt: float) -> None:
 
 
 def _reference(recording: Recording, robot: RobotConfig) -> tuple[Array | None, NDArray[np.bool_]]:
-    """Reference (N, n) at the rate of the samples, and for which samples it is known."""
+    """Reference (N, n) at the rate of the samples, and the mask (N,) of samples with a reference."""
     sync = recording.samples.sync
     everywhere = np.ones(sync.size, dtype=bool)
     if recording.samples.named("demand") is not None:

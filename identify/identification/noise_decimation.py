@@ -1,4 +1,4 @@
-"""Decimation from the noise instead of the bandwidth: keep one sample of as many as the noise remembers (6.2.3)."""
+"""Decimation by the correlation time of the noise instead of the bandwidth (thesis 6.2.3)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ MAX_ORDER = 250
 
 @dataclass(frozen=True)
 class NoiseDecimation:
-    """A decimation and the memory of each joint's noise behind it.
+    """A decimation and the correlation time of each joint's noise.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class NoiseDecimation:
     orders
         Orders of the AR models of each joint's noise, shape (n,).
     bounded
-        Whether an order is the highest that was tried: the noise may remember longer.
+        True if an order is the highest tried: the noise may be correlated over longer times.
     """
 
     factor: int

@@ -26,26 +26,27 @@ class Options:
     method
         ``idim-piv``, ``idim-iv``, ``idim-ls``, ``didim``, ``clie``, ``cloe`` or ``sep-pem``.
     derivatives
-        ``irwsm``, ``irwsm2`` or ``bandpass``; ``None``: IRWSM 1, except that IDIM-LS uses the filters of a published
-        fit where the robot's configuration has them.
+        ``irwsm``, ``irwsm2`` or ``bandpass`` (5.1.2, 2.3.1); ``None``: IRWSM 1, except that IDIM-LS uses the filters of
+        a published fit where the robot's configuration has them.
     controller
         ``crc`` identifies it by correlation analysis, ``parametric`` as a cascade or PID by refined instrumental
         variables, ``known`` takes the gains of the configuration.
     decimation
-        Keep one sample of so many; ``noise``: of as many as the noise remembers (6.2.3); ``None``: from the bandwidth.
+        Keep one sample of so many; ``noise``: from the correlation time of the noise (6.2.3); ``None``: from the
+        bandwidth.
     nvr
         Noise-variance ratio of the smoother, or the rule to find it: ``automatic``, ``cross-validation``,
         ``likelihood``, ``tracking-error``; ``None``: ``automatic``.
     bandwidth_hz
-        Closed-loop bandwidth; ``None``: from the configuration, else from the data.
+        Closed-loop bandwidth, Hz; ``None``: from the configuration, else from the data.
     noise_model
         Of IDIM-PIV: ``black-box`` (6.27), or ``grey-box``, position noise through the controller (6.28).
     max_ar_order
         Highest order of the noise models of IDIM-PIV and SEP-PEM.
     weighted
-        Weigh each joint of IDIM-LS by its noise (2.23) or not (2.22).
+        Weight each joint of IDIM-LS by its noise (2.23) or not (2.22).
     physical
-        Look for the nearest physically consistent arm, too.
+        True to compute the nearest physically consistent arm as well.
     """
 
     method: Method = "idim-piv"
@@ -60,7 +61,7 @@ class Options:
     physical: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what is not offered, naming what is."""
+        """Refuse values that are not offered; the message names those that are."""
         for name, value, offered in (
             ("method", self.method, METHODS),
             ("derivatives", self.derivatives, (None, *DERIVATIVES)),
@@ -83,7 +84,7 @@ class Options:
 
 
 def parse_nvr(text: str | None) -> float | NvrRule | None:
-    """A noise-variance ratio as a user writes it: a number, or the name of a rule (which `Options` checks)."""
+    """Noise-variance ratio from text: a number, or the name of a rule (which `Options` checks)."""
     if text is None:
         return None
     try:
@@ -93,7 +94,7 @@ def parse_nvr(text: str | None) -> float | NvrRule | None:
 
 
 def parse_decimation(text: str | None) -> int | Literal["noise"] | None:
-    """A decimation as a user writes it: a number, or ``noise`` (which `Options` checks)."""
+    """Decimation from text: a number, or ``noise`` (which `Options` checks)."""
     if text is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Identification of an experiment from beginning to end, for `armident identify` and the worker."""
+"""Identification pipeline in the steps of the thesis, for `armident identify` and the worker."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -75,7 +75,7 @@ def identify_experiment(
     robot
         Its configuration.
     options
-        See :class:`Options`.
+        Options; ``None``: the defaults.
     progress
         Called with a stage and the share done, 0 to 1.
 
@@ -134,7 +134,7 @@ def _identify(
 
 
 def _least_squares(prepared: Prepared, options: Options, bandwidth: float, warnings: list[str]) -> LeastSquares:
-    """IDIM-LS (2.3.2) on equations decimated by the bandwidth, by the user's factor, or by the memory of the noise."""
+    """IDIM-LS (2.3.2); its equations are decimated by the bandwidth, the user's factor, or the noise (6.2.3)."""
     model, experiments = prepared.model, prepared.experiments
     lengths = [e.q.shape[0] for e in experiments]
 
@@ -280,7 +280,7 @@ def _memory_of_noise(prepared: Prepared, theta: Array, warnings: list[str]) -> i
 
 
 def _delay_warnings(delay: TorqueDelay, robot: RobotConfig) -> list[str]:
-    """A warning for every joint whose torque is recorded more than a sample off the position it belongs to."""
+    """A warning for every joint whose torque is recorded more than a sample away from its expected position."""
     off = delay.contradicts() & (np.abs(delay.samples - HELD) > TOLERATED_DELAY)
     return [
         f"{joint.name}: the torque belongs to the position {samples:.1f} +- {std:.1f} samples later, expected is {HELD}"

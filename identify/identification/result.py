@@ -22,7 +22,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class JointWhiteness:
-    """Residual autocorrelation of one joint: share of the lags outside the 2-sigma band (about 0.05 if white)."""
+    """Residual autocorrelation of one joint.
+
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    lags
+        Number of lags.
+    fraction_outside_2sigma
+        Share of the lags outside the 2-sigma band, about 0.05 if white.
+    """
 
     joint: str
     lags: int
@@ -35,21 +45,35 @@ class Identification:
 
     Parameters
     ----------
+    method
+        Name of the method.
     names, units, formulas, theta, std, covariance, essential
         Base parameters (b,) in SI units, the formulas of regrouped ones, their standard deviations (b,), their
         covariance (b, b), and the mask (b,) of the essential ones.
     diagnostics
         Tests of the estimate.
     physical
-        The nearest physically consistent arm; ``None`` if not asked for.
+        The nearest physically consistent arm; ``None`` if not requested.
     delay
         Delay of the recorded torques against the positions; ``None`` without a reference trajectory.
     relative_error_pct, relative_error_pct_by_joint
-        ``|y - X theta| / |y|`` on the torques decimated to twice the bandwidth, overall and (n,).
+        ``|y - X theta| / |y|`` on the torques decimated to twice the bandwidth, overall and (n,), percent.
+    iterations, converged, stop_reason
+        Iterations of the method, true if they converged, and the rule that ended them.
     whiteness, residual_autocorrelation, autocorrelation_bound
         Whiteness test of the whitened residuals, their autocorrelation (n, lags), and its 2-sigma bound (n,).
-    idim_ls
-        Theta and standard deviations of IDIM-LS on the same data, for comparison.
+    noise_model
+        Noise models of the joints and their rate, as in the result document.
+    controller
+        Description of the controller of the auxiliary model, as in the result document.
+    timing_s
+        Duration of every stage, s.
+    warnings
+        Lines for the user.
+    options
+        Options of the identification.
+    idim_ls, idim_ls_relative_error_pct
+        Theta and standard deviations of IDIM-LS on the same data, for comparison, and its relative error, percent.
     t, tau_measured, tau_predicted
         Decimated instants (M,), s, and torques (M, n), N m or N, experiments one after the other.
     """
@@ -138,7 +162,7 @@ class Statistics:
     delay
         Delay of the recorded torques; ``None`` without a reference trajectory.
     physical
-        Nearest physically consistent parameters; ``None`` if not asked for.
+        Nearest physically consistent parameters; ``None`` if not requested.
     """
 
     essential: NDArray[np.bool_]
@@ -161,7 +185,7 @@ def make_result(
     Parameters
     ----------
     options, model
-        As used.
+        Options and arm of the identification.
     found, ls
         Estimate of the method, and of IDIM-LS for comparison.
     statistics

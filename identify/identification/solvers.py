@@ -88,12 +88,16 @@ class Problem:
 
     Parameters
     ----------
+    prepared
+        Arm, experiments and derivatives.
     auxiliary
         The simulated closed loop with the decimation of the method.
     start
         First theta, shape (b,).
     plain
         Decimation of the methods without a noise model.
+    options
+        Options of the identification.
     """
 
     prepared: Prepared
@@ -104,17 +108,17 @@ class Problem:
 
     @cached_property
     def blocks(self) -> list[ExperimentEquations]:
-        """Equations at measured signals, decimated as the method wants them."""
+        """Equations at measured signals with the decimation of the method."""
         return self.prepared.equations(self.auxiliary.decimation)
 
     @cached_property
     def plain_problem(self) -> "Problem":
-        """The same with the decimation of the methods without a noise model."""
+        """The problem with the decimation of the methods without a noise model."""
         return replace(self, auxiliary=replace(self.auxiliary.fresh(), decimation=self.plain))
 
     @cached_property
     def in_band(self) -> "Problem":
-        """The same, decimated to the band of the instruments where the equations have a wider one.
+        """The problem decimated to the band of the instruments where the equations have a wider one.
 
         At the recorded rate nearly all rows lie beyond the band of the instruments and carry no information.
         """
@@ -148,7 +152,7 @@ class Solution:
 
     @cached_property
     def motions(self) -> list[Derivatives]:
-        """The recorded references as the estimate follows them, without what disturbed the recordings.
+        """Simulated motion of the estimate along the recorded references, without the disturbances of the recordings.
 
         Raises
         ------
@@ -159,11 +163,11 @@ class Solution:
 
     @cached_property
     def instruments(self) -> list[Array]:
-        """Regressors at these motions, thinned out to the band of the instruments, one (M, n, b) per experiment."""
+        """Regressors at these motions, decimated to the band of the instruments, one (M, n, b) per experiment."""
         return self.problem.in_band.auxiliary.regressors(self.motions)
 
     def diagnostics(self, essential: NDArray[np.bool_]) -> Diagnostics:
-        """Tests of the estimate on the equations it solves, thinned out to the band of its instruments."""
+        """Tests of the estimate on its equations, decimated to the band of its instruments."""
         problem, estimate = self.problem.in_band, self.estimate
         instruments = self.instruments
         blocks, method = problem.blocks, problem.options.method
@@ -191,7 +195,7 @@ class Solution:
 
 
 def solve(problem: Problem) -> Solution:
-    """Run the method that the options name.
+    """Solution of a problem by the method of its options.
 
     Raises
     ------

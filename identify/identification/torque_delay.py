@@ -1,12 +1,12 @@
-"""The delay between torque and position, estimated with the inverse dynamics as the ruler.
+"""Delay between torque and position, estimated with the inverse dynamic model (thesis 2.33).
 
-A drive that reports the torque it holds from one sample to the next reports it half a sample early; filters and buses
-move it further. ``tau(k)`` then belongs to the instant ``k + delta`` of the positions, and to first order in the delay
+A drive that reports the torque it holds from one sample to the next reports it half a sample early. Filters and buses
+add further delay. ``tau(k)`` then belongs to the instant ``k + delta`` of the positions. To first order in the delay,
 ``tau = phi theta + delta d(phi theta)/dk + e``: one more parameter per joint, beside those of the inverse dynamics.
 
-In a closed loop a disturbance moves the arm first and the torque afterwards, so least squares finds a delay in the
-noise itself (tens of samples on an arm with slow disturbances). The instruments of the thesis's IV estimator (2.33) do
-not know the disturbance: the regressor along the reference, or better along a simulated motion.
+In a closed loop a disturbance moves the arm first and the torque afterwards. Least squares therefore finds a delay in
+the noise itself (tens of samples on an arm with slow disturbances). The instruments of IDIM-IV (2.33) are independent
+of the disturbance: the regressor along the reference, or better along a simulated motion.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ HELD = 0.5
 """Delay in samples of a drive that reports the torque it holds until the next sample."""
 
 MAX_AR_ORDER = 10
-"""Highest order of the models of what is left after decimation, for the standard deviations."""
+"""Highest order of the noise models after decimation, for the standard deviations."""
 
 REWEIGHTINGS = 2
 """Weighted fits after the first, unweighted one."""
@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TorqueDelay:
-    """By how many samples the recorded torques run ahead of the positions.
+    """Number of samples by which the recorded torques lead the positions.
 
     Parameters
     ----------
@@ -58,8 +58,8 @@ class TorqueDelay:
     dt
         Sampling period, s.
     instrumented
-        Whether instruments that know no disturbance were there. Without, the delay is that of least squares, which
-        in a closed loop with disturbances is biased by far more than its standard deviation.
+        True if there were instruments independent of the disturbances. Otherwise the delay is that of least squares.
+        In a closed loop with disturbances its bias is far larger than its standard deviation.
     """
 
     samples: Array
@@ -73,7 +73,15 @@ class TorqueDelay:
         return self.samples * self.dt
 
     def contradicts(self, expected: float = HELD, deviations: float = 3.0) -> NDArray[np.bool_]:
-        """Joints whose delay is further than so many standard deviations from an expected one, shape (n,)."""
+        """Mask (n,) of the joints whose delay differs significantly from an expected one.
+
+        Parameters
+        ----------
+        expected
+            Expected delay, samples.
+        deviations
+            Standard deviations by which the delay must differ.
+        """
         contradiction: NDArray[np.bool_] = np.abs(self.samples - expected) > deviations * self.std
         return contradiction
 
@@ -88,8 +96,8 @@ def torque_delay(
 ) -> TorqueDelay:
     """Delay between torque and position of every joint, in fractions of samples.
 
-    The torque is taken as recorded. All base parameters are estimated along with the delays, so a delay takes only
-    what they cannot explain; each joint has its own, the wrist's coupled motors the mixture that acts on the joint.
+    The torque is taken as recorded. All base parameters are estimated along with the delays, so a delay explains only
+    what they cannot. Each joint has its own delay; coupled motors of a wrist give the mixture that acts on the joint.
 
     Parameters
     ----------
@@ -100,10 +108,11 @@ def torque_delay(
     decimation
         Parallel filter of the fit.
     instruments
-        Motions without the disturbances of the recordings, for instance simulated; ``None``: the references, and
-        where one is missing the measured motion, which makes it least squares.
+        Motions without the disturbances of the recordings, for instance simulated. ``None``: the references or, where
+        one is missing, the measured motion, which is least squares.
     regressors
-        Filtered regressors, (M, n, b) each, at the measured motions and at the instruments, where they are known.
+        Filtered regressors, (M, n, b) each, at the measured motions and at the instruments, if they were computed
+        before.
 
     Returns
     -------
