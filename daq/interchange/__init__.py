@@ -1,1 +1,1 @@
-"""Import from and export to other formats."""
+"""Import and export of recordings in other formats."""

@@ -1,7 +1,7 @@
-"""Recordings from the logs of CAN tools, and such logs from recordings: candump, BLF, ASC and what python-can knows.
+"""Conversion between recordings and logs of CAN tools: candump, BLF, ASC and other formats of python-can.
 
-A log holds frames; which of them are samples is what a session configuration says. They go the way of captured frames:
-matched to their SYNC, every SYNC accounted for.
+The session configuration defines the frames that hold samples. They are processed like captured frames: matched to
+their SYNC, with every SYNC accounted for.
 """
 
 import hashlib
@@ -29,25 +29,25 @@ from armident.drivers.can.frames import Frames, frames
 from armident.drivers.canopen.objects import COB_SYNC
 
 SUFFIXES = (".log", ".asc", ".blf", ".trc")
-"""Kinds of logs: candump -l, Vector's text and binary, PEAK's."""
+"""File name suffixes of logs: candump -l, Vector ASC and BLF, PEAK TRC."""
 
 _BATCH = 4096
 _SMALLEST_OBJECT = 16
-"""Bytes of the head of an object in a BLF file."""
+"""Size of the header of an object in a BLF file, bytes."""
 _TURN_NS = 1_000_000_000
 _ANSWER_NS = 20_000
-"""Time between a SYNC and its answers in a log that is written from a recording, which keeps the time of SYNC alone."""
+"""Time between frames of a SYNC in a log written from a recording, which has only the time of the SYNC, ns."""
 
 
 def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -> Recording:
-    """Match the frames of a log by the mapping of a session.
+    """Return the recording of a log: its frames, matched by the mapping of a session.
 
     Parameters
     ----------
     path
-        A log of one bus, or of several that have the names of the session's buses.
+        Log of one bus, or of several that have the names of the session's buses.
     session, robot
-        What TPDOs hold, and the scales of their objects.
+        Mapping of the TPDOs, and scales of their objects.
 
     Raises
     ------
@@ -100,11 +100,11 @@ def _check_classic(session: SessionConfig, where: str) -> None:
 
 
 def _in_turn(read: Sequence[Frames]) -> Iterator[tuple[int, Frames]]:
-    """Frames of each bus in turn, a second at most of one before the other's."""
+    """Yield frames of each bus in turn, with at most one second of one bus ahead of the others."""
     if len(read) == 1:
         yield from ((0, read[0][first : first + _BATCH]) for first in range(0, read[0].size, _BATCH))
         return
-    # Up to the first frame after a second: clocks that were set back keep frames in the order they came.
+    # Running maximum: frames stay in the order of reception when a clock is set back.
     seconds = [np.maximum.accumulate(f["t_ns"]) // _TURN_NS for f in read]
     for second in np.unique(np.concatenate(seconds)):
         for bus, frames_of_it in enumerate(read):
@@ -115,8 +115,15 @@ def _in_turn(read: Sequence[Frames]) -> Iterator[tuple[int, Frames]]:
 def write_log(recording: Recording, path: Path) -> None:
     """Write the SYNCs and TPDOs of a recording as a log; the file appears when it is complete.
 
-    A recording keeps the time of every SYNC; its answers follow it by what a frame takes. SYNCs that were not received
-    or not answered by all drives are not in the log, and its SYNC counter shows it.
+    A recording has the time of every SYNC; its answers follow at intervals of 20 us. SYNCs that were not received or
+    not answered by all drives are not in the log, which its SYNC counter shows.
+
+    Parameters
+    ----------
+    recording
+        A recording that comes from a bus.
+    path
+        The file; its suffix selects the format.
 
     Raises
     ------
@@ -145,7 +152,7 @@ def write_log(recording: Recording, path: Path) -> None:
 
 @dataclass(frozen=True)
 class _Log:
-    """Classic data frames with 11-bit identifiers, the bus of each by number, and how many other frames there are."""
+    """Classic data frames with 11-bit identifiers, the number of each one's bus, and the number of other frames."""
 
     frames: Frames
     bus: NDArray[np.int64]
@@ -153,7 +160,7 @@ class _Log:
     foreign: int
 
     def of(self, path: Path, bus: str, several: bool) -> Frames:
-        """The frames of one bus; those of the only one in the log, unless the session has ``several``."""
+        """Return the frames of one bus; those of the only bus in the log, unless the session has ``several``."""
         if len(self.buses) < 2 and not (self.buses and several):
             return self.frames
         if bus not in self.buses:
@@ -188,7 +195,7 @@ def _read(path: Path) -> _Log:
                 advance(done)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # whatever python-can's readers say of a file that is not what its name says
+    except Exception as error:  # python-can's readers raise various errors for malformed files
         raise DataError(
             f"{path}: not a readable {path.suffix[1:]} log (after {done} frames): {error_line(error)}"
         ) from error
@@ -202,7 +209,7 @@ def _read(path: Path) -> _Log:
 
 
 class _BlfReader(can.BLFReader):
-    """Python-can's reader, which objects that say they have no size would keep busy for ever."""
+    """BLF reader of python-can, which would loop forever on objects of size zero."""
 
     def _parse_data(self, data: bytes) -> Iterator[can.Message]:
         at = data.find(b"LOBJ")
@@ -215,7 +222,7 @@ class _BlfReader(can.BLFReader):
 
 
 def _batches(path: Path) -> Iterator[list[can.Message]]:
-    # Times in the file as they are: without, those of an ASC log would begin at zero.
+    # Absolute times; by default those of an ASC log would begin at zero.
     options = {"relative_timestamp": False} if path.suffix.lower() == ".asc" else {}
     opened = _BlfReader(path) if path.suffix.lower() == ".blf" else can.LogReader(path, **options)
     with opened as reader:
@@ -226,7 +233,7 @@ def _batches(path: Path) -> Iterator[list[can.Message]]:
 
 @contextmanager
 def _progress(path: Path) -> Iterator[Callable[[int], None]]:
-    """Shows how many frames were read, on a terminal."""
+    """Show the number of frames read, on a terminal."""
     columns = SpinnerColumn(), TextColumn("{task.description}: {task.completed:.0f} frames")
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task(path.name, total=None)
@@ -248,7 +255,7 @@ def _stream(stream: CapturedStream, parts: Sequence[Batch]) -> Stream:
 
 
 def _messages(recording: Recording, session: SessionConfig, streams: Sequence[CapturedStream]) -> Iterator[can.Message]:
-    """SYNCs in order, each followed by the TPDOs that answer it, stream by stream and joint by joint."""
+    """Yield SYNCs in order, each followed by the TPDOs that answer it, stream by stream and joint by joint."""
     overflow, channels = session.sync.counter, [bus.channel for bus in session.all_buses]
     joint_channel = [channels[bus] for bus in bus_numbers(session, recording.robot)]
     everything = sorted({int(n) for stream in recording.streams.values() for n in stream.sync})
@@ -275,7 +282,7 @@ def _messages(recording: Recording, session: SessionConfig, streams: Sequence[Ca
 
 
 def _encoded(stream: CapturedStream, recorded: Stream) -> NDArray[np.uint8]:
-    """Data bytes (N, n, 8) of the TPDOs that a stream was recorded from."""
+    """Return the data bytes (N, n, 8) of the TPDOs of a recorded stream."""
     dtype = stream.tpdo.dtype
     joints = len(stream.bus.cob_ids)
     records = np.zeros((recorded.sync.size, joints), dtype)

@@ -1,4 +1,4 @@
-"""Recordings for other tools: CSV, NPZ, MAT, Parquet and rosbag2 in SI units at the joints; logs of the bus."""
+"""Export of recordings as CSV, NPZ, MAT, Parquet and rosbag2 in SI units at the joints, and as bus logs."""
 
 import os
 from collections.abc import Callable
@@ -14,10 +14,10 @@ from armident.daq.recording import Recording, Stream
 
 
 def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
-    """Time (s), joint positions, torques and, where recorded, reference positions; every value of shape (N,).
+    """Return time ``t`` (s), joint positions ``q1..``, torques ``tau1..`` and references ``qr1..``, (N,) each.
 
-    The reference between set points is linear, as the drives interpolate it (CiA 402, 60C0h = 0); rows it does not
-    cover are NaN.
+    References are given where recorded, linear between set points, as drives interpolate (CiA 402, 60C0h = 0). Rows
+    outside the recorded set points are NaN.
 
     Raises
     ------
@@ -52,16 +52,21 @@ def columns(recording: Recording) -> dict[str, NDArray[np.float64]]:
 
 
 def export_recording(recording: Recording, path: Path) -> None:
-    """Write the columns to ``path`` (.csv, .npz, .mat, .parquet, .mcap of ROS 2), or the frames of the bus (`bus_log`).
+    """Write a recording in the format of the suffix; the file appears when it is complete.
 
-    The file appears when it is complete.
+    Parameters
+    ----------
+    recording
+        The recording.
+    path
+        The file: `columns` as .csv, .npz, .mat, .parquet or .mcap (ROS 2), or a log of the bus (`bus_log.SUFFIXES`).
 
     Raises
     ------
     ConfigError
-        If the kind of file is unknown, needs a package that is not installed, or cannot be written.
+        If the format is unknown, needs a package that is not installed, or the file cannot be written.
     DataError
-        If the recording has no samples, or frames are wanted of one that does not come from a bus.
+        If the recording has no samples, or a bus log is requested of one that does not come from a bus.
     """
     if path.suffix.lower() in LOG_SUFFIXES:
         write_log(recording, path)
@@ -90,7 +95,7 @@ def export_recording(recording: Recording, path: Path) -> None:
 
 
 def _positions(recording: Recording, stream: Stream, name: str) -> NDArray[np.float64]:
-    """A position field at the joints, (N, n)."""
+    """Return a position field at the joints, (N, n)."""
     values = stream.si(name)
     if stream.fields[name].side == "motor":
         values = values @ np.linalg.inv(recording.robot.transmission_matrix).T

@@ -1,4 +1,4 @@
-"""Recordings from what other tools wrote: CSV, MAT, NPZ, Parquet, rosbag2."""
+"""Import of measured motion from CSV, MAT, NPZ, Parquet and rosbag2."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -24,10 +24,10 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "voltage": ("voltage", "vir"),
     "demand": ("qr", "qg", "target_positions"),
 }
-"""By what names each quantity is known; ``q`` also stands for columns ``q1..qn``."""
+"""Accepted names of each quantity; ``q`` also stands for columns ``q1..qn``."""
 
 ABSENT = "-"
-"""The name that leaves out what a file holds of a quantity."""
+"""Name with which a quantity of a file is left out."""
 
 EFFORTS: tuple[Quantity, ...] = ("torque", "current", "voltage")
 _UNEVEN = 0.01
@@ -36,23 +36,41 @@ _FAR_OUT, _TOO_STRONG = 3.0, 10.0
 """Positions and torques beyond these multiples of the joint's limits are taken as a wrong unit."""
 
 _STILL = 1e-3
-"""A joint that uses less than this share of its position range says nothing about its demand."""
+"""Share of its position range that a joint must move for its demand to be checked."""
 _UNFOLLOWED = 0.5
-"""Share of the power of a joint's motion that its demand may leave unexplained before it counts as another quantity."""
+"""Largest share of the power of a joint's motion that its demand may leave unexplained."""
 
 Table = dict[str, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
 class Source:
-    """A file's named arrays, and how its places are called in messages."""
+    """Named arrays of a file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    table
+        Arrays by name, (N,) or (N, n).
+    first_line
+        Line number of the first row in a text file; ``None`` for other formats.
+    """
 
     path: Path
     table: Table
     first_line: int | None = None
 
     def place(self, row: int, name: str) -> str:
-        """Where row ``row`` of column ``name`` stands, for a message."""
+        """Return the position of a value in the file, for messages.
+
+        Parameters
+        ----------
+        row
+            Row, from 0.
+        name
+            Name of the column.
+        """
         where = f"row {row}" if self.first_line is None else f"line {self.first_line + row}"
         return f"{self.path}: {where}, column {name}"
 
@@ -67,7 +85,7 @@ def import_recording(
     names: Mapping[str, str] | None = None,
     polled: bool = False,
 ) -> Recording:
-    """Read measured motion and effort as a recording, checked before anything is written.
+    """Return measured motion and effort as a recording, after checks of content and units.
 
     Parameters
     ----------
@@ -82,20 +100,20 @@ def import_recording(
     motor_side
         Positions and torques are those of the motors; currents and voltages always are.
     rate_hz
-        Sampling rate where the file has no time column, or where its times are known to be worse than the clock.
+        Sampling rate, 1/s, if the file has no time column, or if its times are less precise than the clock.
     names
         Names of this file by quantity (``time, position, torque, current, voltage, demand``); ``-`` leaves one out.
     polled
-        The rows were read from a controller of ``rate_hz`` without waiting for its samples, so that some are repeated
-        and some missed: they are put back on its clock (`armident.daq.interchange.resample`).
+        The rows were polled from a controller of ``rate_hz``, so that some samples are repeated and some missed: they
+        are resampled onto its clock (`armident.daq.interchange.resample`).
 
     Raises
     ------
     ConfigError
         If a file or option is wrong.
     DataError
-        If the content is: missing columns, wrong number of axes, NaN, uneven time, values far outside the limits, or
-        a demand that no joint followed.
+        If the content is wrong: missing columns, wrong number of axes, NaN, uneven time, values far outside the limits,
+        or a demand that no joint followed.
     """
     names = dict(names or {})
     unknown = sorted(names.keys() - NAMES.keys())
@@ -152,7 +170,7 @@ def import_recording(
 
 
 def _known(demand: NDArray[np.float64]) -> slice:
-    """Rows from the first to the last with a demand: ours is not known before the first set point."""
+    """Return the rows from the first to the last with a demand; a capture has none before the first set point."""
     rows = np.flatnonzero(~np.isnan(demand).all(axis=1))
     return slice(int(rows[0]), int(rows[-1]) + 1) if rows.size else slice(0, len(demand))
 
@@ -170,7 +188,7 @@ def _load(path: Path, robot: RobotConfig) -> Source:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
-        except Exception as error:  # whatever zipfile, zlib and numpy say of a damaged file
+        except Exception as error:  # zipfile, zlib and numpy raise various errors for damaged files
             raise DataError(f"{path}: not a readable NPZ file: {error_line(error)}") from error
         return Source(path, _numeric(arrays))
     if kind == ".mat":
@@ -196,7 +214,7 @@ def _parquet(path: Path) -> dict[str, Any]:
     try:
         table = pyarrow.parquet.read_table(path)  # type: ignore[no-untyped-call]
         return {name: table.column(name).to_numpy() for name in table.column_names}
-    except Exception as error:  # whatever pyarrow says of a damaged file
+    except Exception as error:  # pyarrow raises various errors for damaged files
         raise DataError(f"{path}: not a readable Parquet file: {error_line(error)}") from error
 
 
@@ -211,14 +229,14 @@ def _mat(path: Path) -> dict[str, NDArray[Any]]:
         return arrays
 
     try:
-        # Some damaged files take scipy's reader down.
+        # Some damaged files crash scipy's reader.
         return read_in_subprocess(read)
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: not a readable MAT file: {error_line(error)}") from error
 
 
 def _numeric(arrays: Mapping[str, Any]) -> Table:
-    """The real arrays, vectors as (N,)."""
+    """Return the real arrays; vectors as (N,)."""
     table: Table = {}
     for name, value in arrays.items():
         if isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and value.size:
@@ -228,7 +246,7 @@ def _numeric(arrays: Mapping[str, Any]) -> Table:
 
 
 def _pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
-    """Two headerless or freely headed tables as one source; torque or the drive's own signal is what effort means."""
+    """Return two tables with free or no headers as one source; effort is torque or the drive's own signal."""
     columns: Table = {}
     first_line = 1
     for file, base in ((path, "q"), (effort, "tau")):
@@ -250,7 +268,7 @@ def _pair(path: Path, effort: Path, robot: RobotConfig) -> Source:
 
 
 def _csv(path: Path) -> tuple[list[str] | None, NDArray[np.float64], int]:
-    """Header (if there is one), values (N, columns) and the line number of the first values."""
+    """Return header (if there is one), values (N, columns) and the line number of the first values."""
     try:
         with path.open(encoding="utf-8-sig") as file:
             first = file.readline()
@@ -282,7 +300,7 @@ def _is_number(word: str) -> bool:
 
 
 def _bad_line(path: Path, delimiter: str | None, columns: int, skip: int) -> str | None:
-    """What is wrong with the first line that cannot be read."""
+    """Describe the first line that cannot be read."""
     with path.open(encoding="utf-8-sig") as file:
         for number, line in enumerate(file, start=1):
             words = line.split(delimiter)
@@ -297,7 +315,7 @@ def _bad_line(path: Path, delimiter: str | None, columns: int, skip: int) -> str
 
 
 def _pick(source: Source, quantity: str, n: int, names: Mapping[str, str]) -> NDArray[np.float64] | None:
-    """The (N, n) values of a quantity, or ``None`` if the file has none or it is to be left out."""
+    """Return the (N, n) values of a quantity, or ``None`` if the file has none or it is to be left out."""
     if names.get(quantity) == ABSENT:
         return None
     for base in (names[quantity],) if quantity in names else NAMES[quantity]:
@@ -333,7 +351,7 @@ def _check_finite(source: Source, values: NDArray[np.float64], labels: Sequence[
 
 
 def _rate(source: Source, names: Mapping[str, str]) -> float:
-    """Sampling rate from the time column, 1/s."""
+    """Return the sampling rate from the time column, 1/s."""
     times = _pick(source, "time", 1, names)
     if times is None:
         raise DataError(f"{source.path}: no time column t; say the sampling rate with --rate")
@@ -364,7 +382,7 @@ def _unit(quantity: str, robot: RobotConfig) -> str:
 
 
 def _check_units(path: Path, robot: RobotConfig, fields: Mapping[str, Field], raw: Table, known: slice) -> None:
-    """Refuse what cannot be in SI units on the side said; ``known`` are the rows that have a demand."""
+    """Refuse values far outside the limits in SI units on the stated side; ``known`` are the rows with a demand."""
     transmission = robot.transmission_matrix
     for name, values in raw.items():
         values = values[known] if name == "demand" else values
@@ -390,7 +408,7 @@ def _check_units(path: Path, robot: RobotConfig, fields: Mapping[str, Field], ra
 
 
 def _check_demand(path: Path, robot: RobotConfig, demand: NDArray[np.float64], position: NDArray[np.float64]) -> None:
-    """Refuse a demand that moves otherwise than the joints: another unit, or not what the controller was given."""
+    """Refuse a demand that does not move like the joints: another unit, or another quantity."""
     motion = np.sum((position - position.mean(axis=0)) ** 2, axis=0)
     missed = np.sum((demand - demand.mean(axis=0) - position + position.mean(axis=0)) ** 2, axis=0)
     for k in np.flatnonzero(missed > _UNFOLLOWED * motion):

@@ -1,8 +1,8 @@
-"""Samples of a controller that was read without waiting for it, put back on the controller's clock.
+"""Resampling of polled samples onto the even clock of the controller.
 
-A program that asks an arm for its state as fast as it can gets some samples twice and misses others, and when it asked
-says little about when the controller sampled. The motion does: from one sample to the next the joints advance by a
-whole number of the increments that are usual around it.
+A program that polls the state of an arm as fast as it can gets some samples twice and misses others. Its own times
+say little about the controller's sampling times. The motion does: from one sample to the next, the joints advance by
+a whole multiple of their usual increments at that time.
 """
 
 from collections.abc import Mapping
@@ -16,16 +16,16 @@ from scipy.ndimage import median_filter
 from armident.configs import DataError
 
 WINDOW = 21
-"""Increments whose median is the usual one: odd, far shorter than any motion, and more than a burst of misses."""
+"""Increments in the median filter: odd, far shorter than any motion, and longer than a burst of missed samples."""
 
 SLOW = 0.02
-"""Share of the fastest increment below which digits are too few to tell how many samples went by."""
+"""Share of the largest increment below which the number of samples is not resolved."""
 
 DOUBTFUL = 0.25
-"""An advance this far from a whole number of samples is doubtful."""
+"""Distance of an advance from a whole number of samples above which it is ambiguous."""
 
 MOST_DOUBTFUL = 0.05
-"""Share of doubtful advances beyond which the rows are not samples of one clock."""
+"""Share of ambiguous advances above which the rows are not samples of one clock."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -33,7 +33,17 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class EvenClockSamples:
-    """Even samples, and how many rows were repeats and how many samples were interpolated."""
+    """Samples on an even clock.
+
+    Parameters
+    ----------
+    values
+        Quantities, (M, n) each.
+    repeated
+        Number of repeated rows that were dropped.
+    interpolated
+        Number of missed samples that were interpolated.
+    """
 
     values: dict[str, Floats]
     repeated: int
@@ -41,10 +51,10 @@ class EvenClockSamples:
 
 
 def onto_even_clock(raw: Mapping[str, Floats]) -> EvenClockSamples:
-    """Rows as they were read, as the samples of an even clock.
+    """Return polled rows as samples on an even clock.
 
-    Repeated rows are dropped and skipped samples interpolated: positions by a cubic spline, efforts linearly. Where
-    the arm stands still every row counts as one sample.
+    Repeated rows are dropped and missed samples interpolated: positions by a cubic spline, efforts linearly. During
+    standstill every row counts as one sample.
 
     Parameters
     ----------
@@ -64,7 +74,7 @@ def onto_even_clock(raw: Mapping[str, Floats]) -> EvenClockSamples:
             f"only {index.size} of {rows.shape[0]} rows differ from the row before: too few to find a clock"
         )
     advances = _advances(raw["position"][index], np.diff(index))
-    # A position that is read again with another effort is still the same sample.
+    # The same position with another effort is still the same sample.
     kept = np.append(True, advances > 0)
     index, ticks = index[kept], np.append(0, np.cumsum(advances))[kept]
     clock = np.arange(ticks[-1] + 1)
@@ -78,7 +88,7 @@ def onto_even_clock(raw: Mapping[str, Floats]) -> EvenClockSamples:
 
 
 def _advances(q: Floats, rows: Ints) -> Ints:
-    """Samples from each row (N, n) to the next (N - 1,); where nothing moves, the number of ``rows`` that were read."""
+    """Return the samples from each row (N, n) to the next, (N - 1,); during standstill, the number of ``rows`` read."""
     steps = np.diff(q, axis=0)
     usual = median_filter(steps, size=(WINDOW, 1), mode="nearest")
     power = np.sum(usual**2, axis=1)

@@ -1,4 +1,4 @@
-"""rosbag2 files, through the MCAP they are made of: joint states in and out (sensor_msgs/msg/JointState)."""
+"""Joint states (sensor_msgs/msg/JointState) in rosbag2 files, which are MCAP files."""
 
 from pathlib import Path
 
@@ -32,10 +32,17 @@ _NS = 1_000_000_000
 
 
 def read_joint_states(path: Path, robot: RobotConfig) -> dict[str, NDArray[np.float64]]:
-    """Times ``t`` (N,), s, positions ``q`` and efforts ``tau`` (N, n) of a robot's joints.
+    """Return times ``t`` (N,), s, positions ``q`` and efforts ``tau`` (N, n) of a robot's joints.
 
-    Joints are found by their names; where the bag names none of the robot's, and has as many, they are taken in the
-    bag's order. Times are the messages' own stamps, or those of logging where stamps are not set.
+    Joints are found by their names. If the bag has none of the robot's names but the same number of joints, they are
+    taken in the bag's order. Times are the message stamps, or the log times if stamps are not set.
+
+    Parameters
+    ----------
+    path
+        The rosbag2 file.
+    robot
+        The robot, for the names of its joints.
 
     Raises
     ------
@@ -63,7 +70,7 @@ def read_joint_states(path: Path, robot: RobotConfig) -> dict[str, NDArray[np.fl
                     into.append([values[k] for k in order])
     except DataError:
         raise
-    except Exception as error:  # whatever the readers of MCAP, zstd and ROS 2's messages say of a damaged file
+    except Exception as error:  # the readers of MCAP, zstd and ROS 2 messages raise various errors for damaged files
         raise DataError(f"{path}: not a readable rosbag2 file: {error_line(error)}") from error
     if not t:
         raise DataError(f"{path}: no message on {topic}")
@@ -72,7 +79,7 @@ def read_joint_states(path: Path, robot: RobotConfig) -> dict[str, NDArray[np.fl
 
 
 def _topic(path: Path, summary: Summary | None) -> str:
-    """The one topic of joint states."""
+    """Return the only topic of joint states."""
     if summary is None:
         raise DataError(f"{path}: has no summary; `ros2 bag reindex` or `mcap recover` writes one")
     topics = sorted(
@@ -89,7 +96,7 @@ def _topic(path: Path, summary: Summary | None) -> str:
 
 
 def _order(path: Path, robot: RobotConfig, names: list[str]) -> list[int]:
-    """Where each joint of a robot stands among the names."""
+    """Return the index of each joint of a robot among the names."""
     wanted = [joint.name for joint in robot.joints]
     if set(wanted) <= set(names):
         return [names.index(name) for name in wanted]
@@ -105,7 +112,19 @@ def write_joint_states(
     t_ns: NDArray[np.int64],
     columns: dict[str, NDArray[np.float64]],
 ) -> None:
-    """Write positions ``q1..qn`` and efforts ``tau1..taun``, (N,) each, as joint states of ``t_ns``, ns UTC."""
+    """Write positions and efforts as joint states.
+
+    Parameters
+    ----------
+    path
+        The rosbag2 file.
+    joints
+        Names of the n joints.
+    t_ns
+        Times, ns UTC, (N,).
+    columns
+        Positions ``q1..qn`` and efforts ``tau1..taun``, (N,) each; either may be absent.
+    """
     q, tau = (
         np.stack([columns[f"{base}{j + 1}"] for j in range(len(joints))], axis=1) if f"{base}1" in columns else None
         for base in ("q", "tau")

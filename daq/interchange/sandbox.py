@@ -1,4 +1,4 @@
-"""Files of other tools: what their readers say of a damaged one, in our words, and readers that damage takes down."""
+"""Protection against damaged files of other tools: readers in a subprocess, and their errors in one line."""
 
 import faulthandler
 import json
@@ -13,23 +13,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 LONGEST_S = 120.0
-"""How long a reader in a process of its own may take, s."""
+"""Time limit of a reader in a subprocess, s."""
 _REFUSED = 3
 
 
 def error_line(error: Exception) -> str:
-    """What a reader of others says, in one line and not too long; its name where it says nothing."""
+    """Return the text of a reader's error in one line of limited length; the name of the error if it has no text."""
     text = " ".join("".join(c if c.isprintable() else " " for c in str(error)).split())
     return text[:200] if text else type(error).__name__
 
 
 def read_in_subprocess(read: Callable[[], Mapping[str, Any]], longest_s: float = LONGEST_S) -> dict[str, NDArray[Any]]:
-    """The arrays of real numbers that a reader returns; it runs in a process of its own, which may crash.
+    """Return the arrays of real numbers of a reader that runs in a subprocess, which may crash.
+
+    Parameters
+    ----------
+    read
+        The reader.
+    longest_s
+        Time limit, s.
 
     Raises
     ------
     ValueError
-        With what the reader says, or how its process ended.
+        With the reader's error, or the way its process ended.
     """
     with tempfile.TemporaryFile() as file:
         process = os.fork()
@@ -46,8 +53,8 @@ def read_in_subprocess(read: Callable[[], Mapping[str, Any]], longest_s: float =
 
 
 def _read_into(file: IO[bytes], read: Callable[[], Mapping[str, Any]]) -> int:
-    """What the process of a reader does: its arrays, or what it says, go into a file; the status it ends with."""
-    # That it crashes is told by the one who waits for it.
+    """Write the arrays of a reader, or its error, to a file; return the exit status of the subprocess."""
+    # The parent process reports crashes.
     faulthandler.disable()
     try:
         try:
@@ -61,18 +68,18 @@ def _read_into(file: IO[bytes], read: Callable[[], Mapping[str, Any]]) -> int:
                 np.save(file, value, allow_pickle=False)
             file.flush()
             return 0
-        except Exception as error:  # whatever readers of others raise
+        except Exception as error:  # readers raise various errors
             file.seek(0)
             file.truncate()
             file.write(error_line(error).encode(errors="replace"))
             file.flush()
             return _REFUSED
-    except BaseException:  # nothing of this process may run on
+    except BaseException:  # the subprocess must not continue
         return 1
 
 
 def _wait(process: int, longest_s: float) -> int:
-    """The exit status of a process, negative for a signal; it is killed when it takes too long."""
+    """Return the exit status of a process, negative for a signal; it is killed after the time limit."""
     until = time.monotonic() + longest_s
     pause = 1e-4
     while True:

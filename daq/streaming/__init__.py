@@ -1,4 +1,4 @@
-"""What is said on Zenoh: keys, blocks of samples, events, and how a session is opened."""
+"""Zenoh interface: keys, blocks of samples, events and sessions."""
 
 from armident.daq.streaming.codec import Block, assemble, decode_block, decode_event, encode_block, encode_event
 from armident.daq.streaming.keys import Keys

@@ -1,4 +1,4 @@
-"""Blocks of samples and events as bytes, and how they become a recording again.
+"""Binary format of published blocks and events, and their assembly to a recording.
 
 A block is ``ARMB``, version (u16), length of the head (u32), CRC-32 of all that follows it, the head (JSON:
 sequence number, rows, stream layout), then ``sync`` and ``t_ns`` as int64 and every field's raw values, little
@@ -35,7 +35,7 @@ _NEEDED: dict[str, dict[str, type | tuple[type, ...]]] = {
         "capture": str, "blocks": int, "counters": dict, "gaps": list, "marks": list, "paths": list,
     },
 }  # fmt: skip
-"""What whoever assembles a capture relies on."""
+"""Entries of events that the assembly of a capture needs, with their types."""
 _HEAD = struct.Struct("<4sHII")
 _LARGEST_HEAD = 1 << 16
 _MOST_ROWS = 1 << 20
@@ -43,7 +43,21 @@ _MOST_ROWS = 1 << 20
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive rows of one stream; ``sequence`` counts the blocks of a capture, all streams together."""
+    """Consecutive rows of one stream.
+
+    Parameters
+    ----------
+    layout
+        Layout of the stream.
+    sequence
+        Number of the block in its capture, counted over all streams.
+    sync
+        SYNC numbers, (N,).
+    t_ns
+        Receive times of the SYNCs, ns UTC, (N,).
+    raw
+        Raw values of every field, (N, n) each.
+    """
 
     layout: StreamLayout
     sequence: int
@@ -53,12 +67,12 @@ class Block:
 
     @property
     def nbytes(self) -> int:
-        """Memory of its samples."""
+        """Memory of its samples, bytes."""
         return self.sync.nbytes + self.t_ns.nbytes + sum(values.nbytes for values in self.raw.values())
 
 
 def encode_block(block: Block) -> bytes:
-    """The bytes of a block."""
+    """Return the bytes of a block."""
     head = json.dumps(
         {"sequence": block.sequence, "rows": len(block.sync), "layout": json.loads(block.layout.to_json())}
     ).encode()
@@ -70,12 +84,12 @@ def encode_block(block: Block) -> bytes:
 
 
 def decode_block(data: bytes) -> Block:
-    """A block from its bytes, every length checked before it is used.
+    """Return the block in these bytes; every length is checked before use.
 
     Raises
     ------
     DataError
-        If the bytes are not a block of this version, and why.
+        If the bytes are not a block of this version.
     """
     if len(data) < _HEAD.size:
         raise DataError(f"a block of {len(data)} bytes is too short")
@@ -113,12 +127,20 @@ def decode_block(data: bytes) -> Block:
 
 
 def encode_event(kind: str, content: Mapping[str, Any]) -> bytes:
-    """The bytes of an event: JSON with ``schema`` and ``kind``."""
+    """Return the bytes of an event: JSON with ``schema`` and ``kind``.
+
+    Parameters
+    ----------
+    kind
+        Kind of the event.
+    content
+        Other entries.
+    """
     return json.dumps({"schema": EVENT_SCHEMA, "kind": kind, **content}).encode()
 
 
 def decode_event(data: bytes) -> dict[str, Any]:
-    """An event from its bytes.
+    """Return the entries of the event in these bytes.
 
     Raises
     ------
@@ -135,7 +157,7 @@ def decode_event(data: bytes) -> dict[str, Any]:
     for key, kinds in needed.items():
         if key not in event or not isinstance(event[key], kinds) or isinstance(event[key], bool):
             raise DataError(f"an event {event['kind']} whose {key!r} is missing or cannot be understood")
-    # Listeners name files after it.
+    # Listeners use the name of the capture as a file name.
     if "capture" in needed and not _CAPTURE.fullmatch(event["capture"]):
         raise DataError(f"an event of a capture named {event['capture']!r:.60}")
     return event
@@ -149,7 +171,21 @@ def start_content(
     layouts: Iterable[StreamLayout],
     metadata: Mapping[str, str],
 ) -> dict[str, Any]:
-    """What an ``experiment_start`` event says: all a listener needs to understand the blocks that follow."""
+    """Return the content of an ``experiment_start`` event: all that a listener needs to decode the following blocks.
+
+    Parameters
+    ----------
+    capture
+        Name of the capture.
+    robot, session
+        Configurations.
+    sample_rate_hz
+        Rate of SYNC, 1/s.
+    layouts
+        One per stream.
+    metadata
+        Facts about the capture.
+    """
     return {
         "capture": capture,
         "sample_rate_hz": sample_rate_hz,
@@ -168,7 +204,23 @@ def end_content(
     marks: Iterable[Mark],
     paths: Sequence[Path],
 ) -> dict[str, Any]:
-    """What an ``experiment_end`` event says: what a complete assembly has to contain, and where the files are."""
+    """Return the content of an ``experiment_end`` event: the required blocks, and the files.
+
+    Parameters
+    ----------
+    capture
+        Name of the capture.
+    blocks
+        Number of blocks of the capture.
+    counters
+        Counters of the capture.
+    gaps
+        Missing samples.
+    marks
+        Marks of the capture.
+    paths
+        Files of the capture.
+    """
     return {
         "capture": capture,
         "blocks": blocks,
@@ -180,7 +232,7 @@ def end_content(
 
 
 def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str, Any]) -> Recording:
-    """The recording that a capture published, the same numbers as in its file.
+    """Return the recording of a published capture, with the same samples as its file.
 
     Parameters
     ----------
@@ -192,12 +244,12 @@ def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str
     Returns
     -------
     Recording
-        ``path`` is that of the file; ``missing`` says which blocks did not arrive.
+        ``path`` is that of the file; ``missing`` describes the blocks that did not arrive.
 
     Raises
     ------
     DataError
-        If the events or blocks do not belong together or cannot be understood.
+        If the events or blocks do not belong together or are malformed.
     """
     if start.get("capture") != end.get("capture"):
         raise DataError("the start and the end are of different captures")
@@ -244,7 +296,7 @@ def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str
 
 
 def _count(value: object) -> int:
-    """A number that counts something."""
+    """Return the value if it is a non-negative integer."""
     if type(value) is not int or value < 0:
         raise TypeError(f"expected a count, found {value!r:.60}")
     return value

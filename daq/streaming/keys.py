@@ -5,7 +5,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Keys:
-    """The key expressions of one robot in one cell."""
+    """Key expressions of one robot in one cell.
+
+    Parameters
+    ----------
+    cell
+        Name of the cell.
+    robot
+        Name of the robot.
+    """
 
     cell: str
     robot: str
@@ -32,7 +40,7 @@ class Keys:
 
     @property
     def status(self) -> str:
-        """What capture and worker are doing, progress included (JSON)."""
+        """State of capture and worker, with progress (JSON)."""
         return f"{self.base}/status"
 
     @property
@@ -46,9 +54,9 @@ class Keys:
         return f"{self.base}/result/diagnosis"
 
     def command(self, name: str) -> str:
-        """A command to the capture (``save``, ``mark``, ``stop``), answered like a query."""
+        """Key of a command to the capture (``save``, ``mark``, ``stop``), which is answered like a query."""
         return f"{self.base}/command/{name}"
 
     def alive(self, component: str) -> str:
-        """Liveliness token of a component (``capture``, ``worker``)."""
+        """Key of the liveliness token of a component (``capture``, ``worker``)."""
         return f"{self.base}/alive/{component}"

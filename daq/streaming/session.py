@@ -1,4 +1,4 @@
-"""Opens Zenoh sessions: peers on loopback that find each other without a router and without multicast."""
+"""Zenoh sessions between peers on the loopback interface, without router and multicast."""
 
 import json
 import zlib
@@ -16,13 +16,20 @@ _CELLS = 5_000
 
 
 def endpoints(session: SessionConfig) -> dict[Role, str]:
-    """Where capture and worker of a cell listen by default: two ports of loopback, told from the cell's name."""
+    """Return the default endpoints of a cell's capture and worker: two loopback ports derived from the cell's name."""
     port = _FIRST_PORT + 2 * (zlib.crc32(f"{session.cell}/{session.robot.stem}".encode()) % _CELLS)
     return {"capture": f"tcp/127.0.0.1:{port}", "worker": f"tcp/127.0.0.1:{port + 1}"}
 
 
 def configuration(session: SessionConfig, role: Role) -> zenoh.Config:
-    """The Zenoh configuration of a role: the session's file, or peers on loopback.
+    """Return the Zenoh configuration of a role: the session's file, or peers on the loopback interface.
+
+    Parameters
+    ----------
+    session
+        Configuration of the cell.
+    role
+        ``capture`` or ``worker`` (listen), or ``observer``.
 
     Raises
     ------
@@ -55,12 +62,12 @@ def configuration(session: SessionConfig, role: Role) -> zenoh.Config:
 
 
 def open_session(session: SessionConfig, role: Role) -> zenoh.Session:
-    """Open a Zenoh session; capture and worker may start in any order, and again.
+    """Open a Zenoh session; capture and worker may start in any order and restart.
 
     Parameters
     ----------
     session
-        The cell's configuration.
+        Configuration of the cell.
     role
         ``capture`` and ``worker`` listen, one each per cell; an ``observer`` only connects to both.
 
