@@ -1,1 +1,1 @@
-"""Where model and data disagree, what is missing, and whether adding it closes the gap on unseen data."""
+"""Diagnosis of effects that a model lacks, tested on held-out data."""

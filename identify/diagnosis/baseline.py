@@ -1,4 +1,4 @@
-"""A fit beside a baseline, and the directions in which a change of the plant would part them."""
+"""Comparison of a fit with a baseline, along the directions in which changes of the plant move the parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,15 +16,23 @@ from armident.identify.regression.equations import COVARIANCE_PASSES, Experiment
 Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-7
-"""Directions of normalised changes shorter than this are none."""
+"""Relative singular value below which a direction of normalised changes is dropped."""
 
 ESTIMABLE = 0.999
-"""Share of a parameter that must lie in the directions seen for it to have a value of its own."""
+"""Share of a parameter in the observed directions above which it is estimable by itself."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """A candidate: an effect at a place, and what the known parameters (k,) do per unit of its own, (k, m)."""
+    """Candidate change of the plant.
+
+    Parameters
+    ----------
+    effect, place
+        Effect and its place.
+    directions
+        Change of the known parameters (k,) per unit of the parameters of the effect, shape (k, m).
+    """
 
     effect: Effect
     place: Place
@@ -33,19 +41,21 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A fit beside a baseline.
+    """A fit and a baseline, with the covariance of their difference.
 
     Parameters
     ----------
+    fit
+        Fit of the present recording.
     known
-        Which parameters of the fit the baseline has, (k,).
+        Numbers of the parameters of the fit that the baseline has, (k,).
     theta0, covariance0
-        The baseline's, (k,) and (k, k).
+        Parameters of the baseline and their covariance, (k,) and (k, k).
     covariance
-        Of the difference, (k, k).
+        Covariance of the difference, (k, k).
     absorbed
-        What terms that the baseline has not would have done to its parameters had they been in its data, (k, m):
-        nobody knows which of the two models it was, so differences along these directions are no evidence.
+        Change of the parameters of the baseline by terms that it lacks, had these terms acted in its data, (k, m). It
+        is unknown if they acted, so differences along these directions are no evidence.
     """
 
     fit: Fit
@@ -71,11 +81,16 @@ class Comparison:
     def solved(self, changes: Sequence[Change]) -> tuple[Array, Array, Array, float, int]:
         """Parameters of changes by generalised least squares.
 
+        Parameters
+        ----------
+        changes
+            Changes of the plant.
+
         Returns
         -------
         tuple
-            Parameters (of `absorbed` first), covariance, which of them have a value of their own, the chi-square that
-            is left and its degrees of freedom.
+            Parameters (of `absorbed` first), covariance, mask of the parameters that are estimable one by one, the
+            remaining chi-square and its degrees of freedom.
         """
         stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
         target = self.whitened(self.difference)
@@ -91,13 +106,13 @@ class Comparison:
         return inverse @ (u.T @ target), inverse @ inverse.T, own, float(rest @ rest), target.size - int(kept.sum())
 
     def predicted(self, changes: Sequence[Change]) -> Array:
-        """Parameters (b,) with the baseline's numbers after these changes; the terms it has not go along."""
+        """Parameters (b,) of the baseline after these changes; terms that it lacks follow by :meth:`completed`."""
         values = self.solved(changes)[0]
         stack = np.column_stack([self.absorbed, *(c.directions for c in changes)])
         return self.completed(self.theta0 + stack @ values)
 
     def completed(self, known: Array) -> Array:
-        """All parameters of the fit (b,), those that the baseline has as given."""
+        """All parameters of the fit (b,) given those of the baseline: the others by conditional mean."""
         theta = self.fit.theta.copy()
         free = np.setdiff1d(np.arange(theta.size), self.known)
         if free.size:
@@ -112,7 +127,14 @@ class Comparison:
 
 
 def compared(fit: Fit, baseline: IdentificationDocument) -> Comparison:
-    """Put a fit beside a baseline.
+    """Comparison of a fit with a baseline.
+
+    Parameters
+    ----------
+    fit
+        Fit of the present recording.
+    baseline
+        Document of an earlier identification.
 
     Raises
     ------
@@ -147,7 +169,7 @@ def compared(fit: Fit, baseline: IdentificationDocument) -> Comparison:
 
 
 def cautious(fit: Fit) -> Fit:
-    """The fit with noise models that count what its parameters have absorbed, and that they are estimates.
+    """Fit with conservative noise models: they include the part absorbed by the parameters, and their own uncertainty.
 
     A search compares candidates in one recording, and needs neither; two recordings are compared by covariances.
     """

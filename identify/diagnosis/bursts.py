@@ -1,9 +1,9 @@
-"""Bursts: torques that come for moments, at times that nothing in the motion tells.
+"""Kurtosis test for transient disturbances that are independent of the motion.
 
-What comes for a moment leaves no mark where noise is looked for: over a whole recording it is a small part of the
-residual's power, and it repeats with nothing. It shows in how the residual is distributed: noise of currents and
-encoders is a sum of many small things and so is Gaussian, what comes in bursts has heavier tails. The test is that of
-the fourth moment, with the number of samples that a Gaussian series of the same autocorrelation is worth.
+Transients are a small part of the power of the residual over a whole recording, and they do not repeat. So tests of
+power and of repeated motion miss them. They change the distribution of the residual: noise of currents and encoders
+is a sum of many small contributions and so is Gaussian, transients have heavier tails. The test is that of the fourth
+moment, with the effective sample size of a Gaussian series of the same autocorrelation.
 """
 
 from collections.abc import Sequence
@@ -21,37 +21,37 @@ from armident.identify.signals.decimate import design
 Array = NDArray[np.float64]
 
 BANDWIDTHS = 2.0
-"""Highest frequency that is looked at, over the bandwidth of the motion: above it the noise drowns what an arm does."""
+"""Highest frequency of the test, over the bandwidth of the motion: above it the noise dominates."""
 
 LEAST = 50.0
-"""Independent samples under which the tails of a distribution cannot be judged."""
+"""Least number of independent samples for a test of the tails."""
 
 MEDIAN = float(stats.chi2.ppf(0.5, 1))
 """Median of the power of Gaussian noise over its mean."""
 
 QUIET = 0.05
-"""Power that noise is taken to have at any speed, over its mean power, at least."""
+"""Least power of the noise at any speed, over its mean power."""
 
 MATERIAL = 0.05
-"""Share of the residual's power, as smoothed, that must be more than noise of its usual power for it to be a gap."""
+"""Least share of the power of the smoothed residual in excess of usual noise for a finding."""
 
 RARE = 1e-3
-"""Chance of noise to reach beyond the band of the curve, in each moment."""
+"""Probability that noise exceeds the band of the curve, in each window."""
 
 
 @dataclass(frozen=True)
 class Bursts:
-    """What a joint's residual has of bursts.
+    """Transients in the residual of one joint.
 
     Parameters
     ----------
     share
-        Share of its power, as smoothed, that is more than noise of its usual power.
+        Share of its power, as smoothed, in excess of noise of its usual power.
     p_value
-        That Gaussian noise of the same autocorrelation has such tails.
+        Probability of such tails for Gaussian noise of the same autocorrelation.
     t, amplitude, noise
-        Middle of moments of the recording, s, the root mean square of the smoothed residual in each, and what noise of
-        the usual power exceeds in one of a thousand, N m or N, (G,) each.
+        Centres of the windows, s; root mean square of the smoothed residual in each; level that noise of the usual
+        power exceeds in one window of a thousand, N m or N, (G,) each.
     """
 
     share: float
@@ -62,12 +62,14 @@ class Bursts:
 
 
 def bursts(fit: Fit, alpha: float = 0.01) -> dict[int, Bursts]:
-    """Bursts of the joints whose residual has any that matter.
+    """Transients of the joints with a significant and material share of them.
 
     Parameters
     ----------
+    fit
+        Fit whose residuals are tested.
     alpha
-        Chance of a false alarm over all joints.
+        Probability of a false alarm over all joints.
     """
     study = fit.study
     stretches = (*study.train, *study.held)
@@ -85,20 +87,19 @@ def bursts(fit: Fit, alpha: float = 0.01) -> dict[int, Bursts]:
 def bursts_of(
     residual: Sequence[Array], speed: Sequence[Array], times: Sequence[Array], dt: float, bandwidth: float
 ) -> Bursts | None:
-    """What the residual of one joint has of bursts; ``None`` where too little was recorded to say.
+    """Transients in the residual of one joint; ``None`` where the recording is too short for a test.
 
-    Noise that is stronger at some speeds of the joint than at others, or in one stretch than in another, is none. The
-    variance of the fourth moment of a Gaussian series is that of Lomnicki (1961), its distribution from there on that
-    of Anscombe and Glynn (1983).
+    Noise whose power depends on the speed of the joint, or on the stretch, does not count. The variance of the fourth
+    moment of a Gaussian series is that of Lomnicki (1961); its distribution follows Anscombe and Glynn (1983).
 
     Parameters
     ----------
     residual, speed, times
-        Torque that the model leaves, N m or N, absolute velocity of the joint, and instants, s: (N,) of each stretch.
+        Residual torque, N m or N, absolute velocity of the joint, and instants, s: (N,) of each stretch.
     dt
         Their sampling period, s.
     bandwidth
-        Of the motion, Hz.
+        Bandwidth of the motion, Hz.
     """
     smooth = design(dt, min(BANDWIDTHS * bandwidth, 0.25 / dt))
     window = max(1, round(0.5 / (bandwidth * dt * smooth.factor)))
@@ -121,7 +122,7 @@ def bursts_of(
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """Residual of a stretch (N,), its usual power at each instant, and itself made even: of unit power at any speed."""
+    """Residual of a stretch (N,), its usual power at each instant, and the residual scaled to unit power."""
 
     own: Array
     usual: Array
@@ -138,14 +139,14 @@ class _Piece:
         return cls(own, usual, even / max(float(np.sqrt(np.mean(even**2))), 1e-150), t)
 
     def moments(self, window: int) -> Array:
-        """Time, power and usual power of moments of so many samples, (3, G)."""
+        """Mean time, power and usual power of windows of ``window`` samples, (3, G)."""
         count = self.own.size // window
         signals = np.stack([self.t, self.own**2, self.usual])[:, : count * window]
         return np.asarray(signals.reshape(3, count, window).mean(axis=2))
 
 
 def _correlated(x: Array, power: int) -> float:
-    """How many samples of a series are worth an independent one where moments of that power matter."""
+    """Number of samples of a series per independent one, for moments of that power."""
     spectrum = np.abs(np.fft.rfft(x, 2 * x.size)) ** 2
     correlation = np.fft.irfft(spectrum)[: x.size]
     return float(1.0 + 2.0 * np.sum((correlation[1:] / correlation[0]) ** power)) if correlation[0] > 0 else 1.0
@@ -158,6 +159,6 @@ def _anscombe_glynn(kurtosis: float, n: float) -> float:
     x = (kurtosis - mean) / np.sqrt(variance)
     skew = 6.0 * (n * n - 5 * n + 2) / ((n + 7) * (n + 9)) * np.sqrt(6.0 * (n + 3) * (n + 5) / (n * (n - 2) * (n - 3)))
     a = 6.0 + 8.0 / skew * (2.0 / skew + np.sqrt(1.0 + 4.0 / skew**2))
-    # Tails so light that the formula has no value for them are no bursts.
+    # The formula has no value for very light tails, which are no transients.
     cubed = (1.0 - 2.0 / a) / max(1.0 + x * np.sqrt(2.0 / (a - 4.0)), 1e-9)
     return float((1.0 - 2.0 / (9.0 * a) - np.cbrt(cubed)) / np.sqrt(2.0 / (9.0 * a)))

@@ -1,4 +1,4 @@
-"""Which effects could sit where, and the columns they would add."""
+"""Candidate effects with their places, and the columns that they add to the regressor."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,7 +25,15 @@ Kept = tuple[Array, bool]
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect at a place; the nonlinear parameters are those of the grid that are to be tried."""
+    """An effect at a place, with the grid of its nonlinear parameters.
+
+    Parameters
+    ----------
+    effect, place
+        Effect and its place.
+    grid
+        Combinations of nonlinear parameters to try, as pairs of name and value.
+    """
 
     effect: Effect
     place: Place
@@ -37,7 +45,7 @@ class Candidate:
         return self.effect.name, self.place.joint, self.place.other
 
     def closer(self) -> "Candidate":
-        """The candidate for a loop that has it inside, with what is worth trying there."""
+        """The candidate for a loop that contains it, with the additional values that are useful there."""
         shapes = self.effect.shapes
         axes = [sorted({tried[k][1] for tried in self.grid} | {*s.closer}) for k, s in enumerate(shapes)]
         if not any(shape.closer for shape in shapes):
@@ -48,7 +56,15 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Columns:
-    """Whitened columns of a candidate, (R, k) each: training rows and held-out rows, measured and simulated."""
+    """Whitened columns of a candidate.
+
+    Parameters
+    ----------
+    x, z
+        Training rows at measured and at simulated signals, (R, k).
+    held_x, held_z
+        Held-out rows at measured and at simulated signals, (R', k).
+    """
 
     x: Array
     z: Array
@@ -58,14 +74,16 @@ class Columns:
 
 @dataclass
 class Workshop:
-    """Makes columns of candidates, and keeps what can be used again.
+    """Cache of the columns of candidates.
 
     Parameters
     ----------
     study
         The stretches.
     theta
-        Parameters by which effects that depend on the model's torques predict them.
+        Parameters (b,) that predict the torques on which effects depend.
+    kept
+        Columns computed so far, by effect, place, nonlinear parameters, part and signals.
     """
 
     study: Study
@@ -74,7 +92,15 @@ class Workshop:
     _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
 
     def with_theta(self, study: Study, theta: Array) -> "Workshop":
-        """The same after a refit; columns that depend neither on theta nor on another simulation stay."""
+        """Cache after a refit; columns that depend neither on theta nor on another simulation stay.
+
+        Parameters
+        ----------
+        study
+            The stretches after the refit.
+        theta
+            New parameters, shape (b,).
+        """
         moved = any(a.simulated is not b.simulated for a, b in zip(study.train, self.study.train, strict=True))
         still = {
             key: value
@@ -86,11 +112,29 @@ class Workshop:
     def instruments(
         self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel], *, keep: bool = True
     ) -> Array:
-        """Whitened columns (R, k) at the simulated signals of the training data: what a search looks at."""
+        """Whitened columns (R, k) at the simulated signals of the training data, as the search uses them.
+
+        Parameters
+        ----------
+        effect, place, shapes
+            Effect, its place and nonlinear parameters.
+        noise
+            Noise model of each joint.
+        keep
+            True to keep the columns in the cache.
+        """
         return whitened(self.band(effect, place, shapes, "train", "simulated", keep=keep), noise)
 
     def columns(self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel]) -> Columns:
-        """Whitened columns of an effect."""
+        """Whitened columns of an effect.
+
+        Parameters
+        ----------
+        effect, place, shapes
+            Effect, its place and nonlinear parameters.
+        noise
+            Noise model of each joint.
+        """
         parts = (
             whitened(self.band(effect, place, shapes, part, kind), noise)
             for part in ("train", "held")
@@ -99,7 +143,15 @@ class Workshop:
         return Columns(*parts)
 
     def motion(self, stretch: Stretch, kind: str) -> Motion:
-        """A stretch as effects see it."""
+        """Signals of a stretch on which the columns of effects depend.
+
+        Parameters
+        ----------
+        stretch
+            A stretch of the study.
+        kind
+            ``measured`` or ``simulated``.
+        """
         key = (id(stretch), kind)
         if key not in self._motions:
             self._motions[key] = self.study.motion(stretch, kind, self.theta)
@@ -112,10 +164,12 @@ class Workshop:
 
         Parameters
         ----------
+        effect, place, shapes
+            Effect, its place and nonlinear parameters.
         part, kind
             ``train`` or ``held``; ``measured`` or ``simulated``.
         keep
-            Whether they may be asked for again.
+            True to keep the columns in the cache.
         """
         (made,) = self._bands(effect, place, (shapes,), part, kind, keep=keep)
         return tuple(self._of_all_joints(columns, place) for columns in made)
@@ -123,9 +177,20 @@ class Workshop:
     def grid(
         self, effect: Effect, place: Place, grid: Sequence[Shapes], noise: Sequence[ArModel], *, keep: bool = True
     ) -> list[tuple[int, Array]]:
-        """Instruments of a whole grid, (R, G k) of every joint that they act on, by its number.
+        """Instruments of a whole grid, (R, G k), with the number of every joint on which they act.
 
-        Whitened columns at the simulated signals of the training data, shape after shape.
+        Whitened columns at the simulated signals of the training data, one combination of the grid after the other.
+
+        Parameters
+        ----------
+        effect, place
+            Effect and its place.
+        grid
+            Combinations of nonlinear parameters, G of them.
+        noise
+            Noise model of each joint.
+        keep
+            True to keep the columns in the cache.
         """
         made = self._bands(effect, place, grid, "train", "simulated", keep=keep)
         stretches = range(len(self.study.train))
@@ -180,7 +245,7 @@ class Workshop:
         return whole
 
     def _of_all_joints(self, kept: Kept, place: Place) -> Array:
-        """Columns (M, n, k), joint by joint in memory, as they are whitened."""
+        """Columns (M, n, k), contiguous for each joint, as whitening needs them."""
         columns, own = kept
         if not own:
             return columns
@@ -197,8 +262,8 @@ def _predicts(name: str) -> bool:
 def candidates(workshop: Workshop) -> Iterator[Candidate]:
     """All effects of the catalogue at all places of the robot that it does not have there already.
 
-    Left out are effects that are nothing but other numbers, exchanges of signals, and those that say of themselves
-    that this motion cannot show them.
+    Left out are effects that only change parameters, exchanges of signals, and effects that this motion does not
+    excite.
     """
     study = workshop.study
     motion = workshop.motion(study.train[0], "measured")
@@ -226,7 +291,15 @@ def candidates(workshop: Workshop) -> Iterator[Candidate]:
 
 
 def places(effect: Effect, n: int) -> list[Place]:
-    """Where an effect can sit in an arm of n joints."""
+    """Possible places of an effect in an arm.
+
+    Parameters
+    ----------
+    effect
+        Effect of one joint, of a pair of joints, or of the arm.
+    n
+        Number of joints.
+    """
     if effect.scope == "pair":
         return [Place(i, j) for i, j in combinations(range(n), 2)]
     if effect.scope == "arm":
@@ -235,6 +308,16 @@ def places(effect: Effect, n: int) -> list[Place]:
 
 
 def grid(effect: Effect, motion: Motion, place: Place) -> tuple[Shapes, ...]:
-    """All combinations of nonlinear parameters to try."""
+    """All combinations of nonlinear parameters to try.
+
+    Parameters
+    ----------
+    effect
+        Effect with its nonlinear parameters.
+    motion
+        Motion that determines the ranges.
+    place
+        Place of the effect.
+    """
     axes = [[(shape.name, float(v)) for v in shape.grid(motion, place.joint)] for shape in effect.shapes]
     return tuple(product(*axes))

@@ -1,4 +1,4 @@
-"""Changes of a plant that the catalogue knows, and how well each explains what differs from a baseline."""
+"""Changes of a plant in the catalogue, ranked by how well they explain the difference from a baseline."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,26 +16,26 @@ STRUCTURAL = {
     "gravity_direction": "gravity direction changed since the baseline",
     "rotor_inertia": "motor inertia changed since the baseline",
 }
-"""Effects that a model can also lack, which parameters of an arm take over in part: another number against a baseline,
-of either sign; and how to say so."""
+"""Effects of the model structure that base parameters absorb in part, with the words for a change (of either sign)
+against a baseline."""
 
 USUAL = CLOSE
-"""Log-odds of what changes in the life of an arm (friction, loads, offsets) to what does so hardly ever (`STRUCTURAL`):
-where a joint's torque is nearly all friction, more friction and another torque per ampere cannot be told apart."""
+"""Prior log-odds of common changes (friction, loads, offsets) against rare ones (`STRUCTURAL`): where the torque of a
+joint is nearly all friction, more friction and another torque constant are ambiguous."""
 
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """How a candidate does beside others.
+    """Score of a candidate among others.
 
     Parameters
     ----------
     change
         The candidate.
     p_value
-        That it explains so much of the difference without merit.
+        Probability that a candidate without merit reduces the chi-square as much.
     score
-        Gain in log-likelihood, less the number of its parameters (Akaike), plus the logarithm of its odds beforehand.
+        Gain in log-likelihood, less the number of its parameters (Akaike), plus the logarithm of its prior odds.
     """
 
     change: Change
@@ -44,7 +44,15 @@ class Standing:
 
 
 def changes(comparison: Comparison, workshop: Workshop) -> Iterator[Change]:
-    """All effects that are other numbers, at all their places."""
+    """All effects that change parameters of the model, at all their places.
+
+    Parameters
+    ----------
+    comparison
+        Fit and baseline.
+    workshop
+        Cache of the columns of the same study.
+    """
     fit = comparison.fit
     motion = workshop.motion(fit.study.train[0], "measured")
     rigid = fit.theta.size - fit.study.model.e
@@ -66,7 +74,17 @@ def changes(comparison: Comparison, workshop: Workshop) -> Iterator[Change]:
 
 
 def p_value(comparison: Comparison, others: Sequence[Change], change: Change) -> float:
-    """That a change beside others explains so much of the difference without merit."""
+    """Probability that a change without merit, added to others, reduces the chi-square as much.
+
+    Parameters
+    ----------
+    comparison
+        Fit and baseline.
+    others
+        Changes already present.
+    change
+        The tested change.
+    """
     _, _, _, before, free_before = comparison.solved(others)
     _, _, _, after, free_after = comparison.solved([*others, change])
     if free_before == free_after:
@@ -75,7 +93,17 @@ def p_value(comparison: Comparison, others: Sequence[Change], change: Change) ->
 
 
 def ranked(comparison: Comparison, found: Sequence[Change], pool: Sequence[Change]) -> list[Standing]:
-    """Candidates by score, the best first."""
+    """Candidates by score, the best first.
+
+    Parameters
+    ----------
+    comparison
+        Fit and baseline.
+    found
+        Changes already present.
+    pool
+        Candidates.
+    """
     _, _, _, before, free_before = comparison.solved(found)
     standings = []
     for change in pool:

@@ -243,7 +243,7 @@ def _diagnose(
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What a search found, with the drives wired in one way: data, models at its ends, and what is left."""
+    """Result of a search with the drives wired in one way: data, first and final model, and remaining dependences."""
 
     study: Study
     first: State
@@ -253,7 +253,7 @@ class _Found:
 
     @property
     def open(self) -> int:
-        """Effects that the wiring needs, and what stays unexplained with them."""
+        """Number of effects that the wiring needs, plus the number of remaining dependences."""
         return len(self.outcome.findings) + len(self.left)
 
     @property
@@ -271,7 +271,7 @@ def _searched(
     steps: _Steps,
     settings: Settings,
 ) -> _Found:
-    """Search for effects, with the mistakes of wiring undone."""
+    """Search for effects, with wiring errors corrected."""
     wired = robot if wiring is None else robot.model_copy(update={"effects": (*wiring.stanzas, *robot.effects)})
     steps("derivatives and closed loop")
     study = build_study(training, validation, wired)
@@ -288,7 +288,7 @@ def _searched(
 
 
 def _verdict(findings: Sequence[Finding], left: Sequence[Disagreement]) -> Verdict:
-    """``no_gap`` and ``explained`` say that what remains is noise (see `excess`) and varies with nothing."""
+    """Verdict; with ``no_gap`` and ``explained`` the residual is noise (see `excess`) and depends on no variable."""
     if findings:
         return "partly_explained" if left else "explained"
     return "unexplained" if left else "no_gap"
@@ -300,7 +300,7 @@ def _predicted(state: State) -> Array:
 
 
 def _beside(final: State, state: State) -> Array:
-    """Torques of another model (M, n); what it misses of recordings as it has them, on them as they are put right."""
+    """Torques (M, n) of another model, with its residuals referred to the corrected recordings of the final one."""
     pairs = zip(final.study.held, state.study.held, strict=True)
     return np.asarray(_predicted(state) + np.concatenate([right.y - own.y for right, own in pairs]))
 

@@ -1,4 +1,4 @@
-"""Findings that do not convince once all is said: their place goes to a likelier effect, or to what is unexplained."""
+"""Backward elimination of findings whose posterior share is below 0.5; a likelier effect may take their place."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,20 +12,20 @@ from armident.identify.diagnosis.where import Disagreement, Survey, strangers, u
 from armident.identify.document import Finding
 
 CONVINCING = 0.5
-"""Confidence, with that of effects which do just as well, under which a name is more probably wrong than right."""
+"""Confidence, including that of ambiguous effects, below which a finding is more probably wrong than right."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What is left of a search when nothing of it is in doubt.
+    """Model after backward elimination.
 
     Parameters
     ----------
     state
-        The model with what convinces.
+        The model with the findings that remain.
     findings, considered
-        What was added to the model, that first which closes most of its joint's gap; and what was taken out again or
-        never convinced.
+        Effects added to the model, ordered by the share of the gap of their joint that they close; and effects that
+        were removed again or never accepted.
     lacking
         The model without each of the findings.
     left
@@ -40,15 +40,17 @@ class Outcome:
 
 
 def convincing(search: Search, first: State, final: State, seen: Survey) -> Outcome:
-    """Take out, one after the other, the findings that convince least.
+    """Model after removal of the findings with the lowest posterior share, one after the other.
 
-    Where a joint lacks something that the catalogue has no entry for, many an effect takes a part of it, and does so on
-    unseen data, too: the arm makes similar motions there, and what is wrong repeats with them. Noise cannot do that, so
-    no test against noise refuses them. A finding is right only if it leaves less unnamed than it explains, and if no
-    other effect in its place is twenty times likelier; such a rival takes its place.
+    Where a joint lacks an effect that the catalogue does not contain, many other effects take a part of it, on held-out
+    data too, because similar motions repeat the same error. Tests against noise do not reject them. A finding is kept
+    only if it explains more than it leaves unnamed, and if no other effect in its place is twenty times likelier; such
+    a rival takes its place.
 
     Parameters
     ----------
+    search
+        The search, with its settings.
     first, final
         Model as configured, and at the end of the search.
     seen
@@ -93,7 +95,7 @@ def _left_open(finding: Finding) -> float:
 def _instead_of(
     search: Search, final: State, taken_out: Sequence[Finding], left: Sequence[Disagreement]
 ) -> list[Disagreement]:
-    """What has no name and took the place of findings, at joints with nothing else left, however small it is."""
+    """Unnamed dependences in place of removed findings, at joints without any other, however small."""
     told: list[Disagreement] = []
     for finding in taken_out:
         at = {finding.joint, finding.other or finding.joint}
@@ -127,9 +129,9 @@ def _without(search: Search, first: State, final: State, finding: int, been: set
 def _exchanged(
     search: Search, first: State, final: State, considered: Sequence[Finding], been: set[Places]
 ) -> State | None:
-    """The model with something that was taken out in the place of a finding of its joint, where that comes nearer.
+    """Model with a removed effect in place of a finding of its joint, where that fits better; otherwise ``None``.
 
-    Of two that shared a gap the one that convinced less may be the right one once it is alone.
+    Of two effects that shared a gap, the less likely one may be the right one once it is alone.
     """
     own, joints = len(first.study.robot.effects), final.study.joints
     for number in range(own, len(final.study.robot.effects)):
@@ -150,7 +152,7 @@ def _exchanged(
 
 
 def _unique(considered: Sequence[Finding], findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Each once, and none that came back."""
+    """Every removed finding once, without those that are in the final model."""
     kept: dict[tuple[str, str, str | None], Finding] = {}
     stated = {(f.effect, f.joint, f.other) for f in findings}
     for f in considered:

@@ -1,9 +1,9 @@
-"""Whether what a model leaves is noise: its power at the frequencies of the motion beside that of noise.
+"""Lack-of-fit test: power of the residual at the frequencies of the motion against that of the noise.
 
-Noise of currents and encoders is about as strong beyond the frequencies of the motion as at them; what a model lacks
-follows the motion. So the residual's spectrum at the frequencies of the motion is held against its strongest part
-beyond. Where the arm makes the same motion twice nothing has to be supposed of the noise: it is what differs
-between the two times, at every frequency by itself, and what is the same both times is the model's fault.
+Noise of currents and encoders is about as strong above the frequencies of the motion as at them; a missing effect
+follows the motion. So the spectrum of the residual at the frequencies of the motion is compared with its strongest
+part above. Where the arm repeats a motion no assumption on the noise is needed. The difference of the repetitions is
+noise, at every frequency by itself; their common part is an error of the model.
 """
 
 from collections.abc import Sequence
@@ -23,27 +23,27 @@ Array = NDArray[np.float64]
 Pieces = tuple[Sequence[Array], Sequence[Array] | None]
 
 INSIDE = (0.0, 0.125, 0.25, 0.5, 1.0)
-"""Edges of the frequencies of the motion, over its bandwidth: octaves, for what is slow has few frequencies."""
+"""Edges of the frequencies of the motion, over its bandwidth: octaves, because low ones have few frequencies."""
 
 BEYOND = (1.0, 1.5, 2.0, 2.5, 3.5)
-"""Edges of those that noise is looked at; the filters begin above them."""
+"""Edges of the frequencies that determine the noise, over the bandwidth; the filters act above them."""
 
 HEADROOM = 4.0
-"""Density that noise may have at the frequencies of the motion over that beyond: loops and filters colour it."""
+"""Greatest ratio of noise densities at the frequencies of the motion and above: loops and filters colour the noise."""
 
 MATERIAL = 0.05
-"""Share of a joint's residual power that must not be noise for it to be a gap."""
+"""Least share of a joint's residual power in excess of noise for a lack of fit."""
 
 TOGETHER = 1 / 3
-"""Part of the chance of a false alarm that is for all joints together."""
+"""Share of alpha spent on the combined (Fisher) test over joints."""
 
 SPREAD = 1.5
-"""Neighbouring frequencies under a Hann window that count as one."""
+"""Number of neighbouring frequencies per independent one under a Hann window."""
 
 
 @dataclass(frozen=True)
 class Excess:
-    """What of a joint's residual is not noise.
+    """Lack of fit of one joint.
 
     Parameters
     ----------
@@ -52,9 +52,9 @@ class Excess:
     share
         Share of the residual's power that is not noise.
     p_value
-        That noise alone is so strong at the frequencies of the motion, of this one joint.
+        Probability of so much power at the frequencies of the motion from noise alone, of this one joint.
     repeated
-        Whether the noise is known from a repetition of the motion.
+        True if the noise is known from a repetition of the motion.
     f, amplitude, noise
         Centres of the octaves, Hz, and the root of the spectral density there of the residual and of the noise,
         N m/sqrt(Hz) or N/sqrt(Hz), (G,) each.
@@ -72,16 +72,18 @@ class Excess:
 def excesses(fit: Fit, alpha: float = 0.01) -> list[Excess]:
     """Joints whose residual is not compatible with noise.
 
-    One criterion for every robot: at the frequencies of the motion, octave by octave, power over that of noise has an
-    F-distribution if the residual is noise, and the octaves of a joint are combined by Fisher's method. A joint is
-    among them if chance makes it so strong with a probability under ``alpha`` over all joints, and at least `MATERIAL`
-    of the residual's power is more than noise. Of several joints a third of ``alpha`` is for what shows at none of them
-    alone (a base that shakes): the joints are combined likewise, and the one that is least like noise stands for all.
+    One criterion for every robot. At the frequencies of the motion, octave by octave, power over that of noise has an
+    F-distribution if the residual is noise. The octaves of a joint are combined by Fisher's method. A joint is listed
+    if its p-value is significant at ``alpha`` over all joints, and at least `MATERIAL` of the residual's power is more
+    than noise. With several joints a third of ``alpha`` is spent on the combined (Fisher) test over joints, for errors
+    too small at each of them (a base that shakes). The joint with the smallest p-value is then listed.
 
     Parameters
     ----------
+    fit
+        Fit whose residuals are tested.
     alpha
-        Chance of a false alarm over all joints.
+        Probability of a false alarm over all joints.
     """
     looks = (excess_of(fit, j, own) for j, own in enumerate(pieces(fit)))
     every = [e for e in looks if e is not None]
@@ -93,12 +95,16 @@ def excesses(fit: Fit, alpha: float = 0.01) -> list[Excess]:
 
 
 def excess_of(fit: Fit, joint: int, pieces: Pieces) -> Excess | None:
-    """What of one joint's residual is not noise; ``None`` where too little was recorded to say.
+    """Lack of fit of one joint; ``None`` where the recording is too short for a test.
 
     Parameters
     ----------
+    fit
+        Fit whose residuals are tested.
+    joint
+        Number of the joint.
     pieces
-        The joint's residual where the arm moves, and what is noise of it, if that is known.
+        Residual of the joint where the arm moves, and its noise, if that is known.
     """
     dt, bandwidth = fit.study.dt * fit.study.decimation.factor, lowest_frequency(fit.study)
     sums, differences = (None if part is None else Spectrum.of(part, dt) for part in pieces)
@@ -130,7 +136,7 @@ def excess_of(fit: Fit, joint: int, pieces: Pieces) -> Excess | None:
 
 
 def pieces(fit: Fit) -> list[Pieces]:
-    """Of every joint: sums and differences of repetitions, or else the held-out residual."""
+    """Sums and differences of repetitions of every joint, or else the held-out residual."""
     held = fit.errors(fit.theta, held=True)
     both = [*fit.errors(fit.theta, held=False), *held]
     halves = [r.halves(both) for r in repeats(fit.study, 1.0 / lowest_frequency(fit.study))]
@@ -149,7 +155,7 @@ class Spectrum:
     f, density
         Frequencies without zero, Hz, and one-sided power densities there, (F,).
     power_sum
-        Mean square of all pieces, by their length, less what is constant.
+        Mean square of all pieces, weighted by their length, without the mean.
     """
 
     f: Array
@@ -158,7 +164,15 @@ class Spectrum:
 
     @classmethod
     def of(cls, pieces: Sequence[Array], dt: float) -> "Spectrum":
-        """Of pieces (N,) each, under a Hann window."""
+        """Periodograms under a Hann window.
+
+        Parameters
+        ----------
+        pieces
+            One array (N,) each.
+        dt
+            Sampling period, s.
+        """
         f, density, length = [], [], 0.0
         for piece in pieces:
             of_piece = 2 * dt * periodogram(hann_window(piece.size) * piece)
@@ -169,7 +183,13 @@ class Spectrum:
         return cls(np.concatenate(f), every, float(every.sum()) / length)
 
     def level(self, low: float, high: float) -> tuple[float, float]:
-        """Mean density between two frequencies, and its degrees of freedom; zeros where there is no frequency."""
+        """Mean density between two frequencies, and its degrees of freedom; zeros where there is no frequency.
+
+        Parameters
+        ----------
+        low, high
+            Frequencies, Hz.
+        """
         inside = (self.f >= low) & (self.f < high)
         count = int(inside.sum())
         return (float(self.density[inside].mean()), max(2.0 * count / SPREAD, 2.0)) if count else (0.0, 0.0)

@@ -40,8 +40,17 @@ DOUBTFUL = 0.6
 def described(search: Search, first: State, final: State, left: Sequence[Disagreement]) -> list[Finding]:
     """Findings in the order in which they were made.
 
-    Every one is compared with its rivals beside all the others: its confidence is the share of the likelihood that is
-    its own, times the share of what is wrong with the joint that it explains.
+    Every finding is compared with its rivals in the model of all others. Its confidence is its share of the likelihood,
+    times the share of the error of its joint that it explains.
+
+    Parameters
+    ----------
+    search
+        The search, with its settings.
+    first, final
+        Model as configured, and with the findings.
+    left
+        Dependences of the residual of the final model.
     """
     own = len(first.study.robot.effects)
     stanzas = list(with_values(final).effects)
@@ -56,7 +65,7 @@ def described(search: Search, first: State, final: State, left: Sequence[Disagre
 
 
 def _still_missing(final: State, stanza: Stanza) -> dict[str, float]:
-    """Standard deviation of what a recording was put right by: that of the next to nothing that is still missing."""
+    """Standard deviation of the parameter of a correction: that of a further correction in the final model."""
     effect = known(stanza.effect)
     place = place_of(stanza, effect, final.study.robot, stanza.effect)
     rest = judge(final.fit, Candidate(effect, place, ((),)), (), final.workshop)
@@ -72,28 +81,28 @@ def _finding(
     trials = [t for t in rest.trials if not t.forbidden]
     mine = next((t for t in trials if t.candidate.key == (effect.name, place.joint, place.other)), None)
     rivals = [t for t in trials if t is not mine]
-    # Only what could have been found in its place takes confidence from a finding.
+    # Only candidates that pass in its place reduce the confidence of a finding.
     serious = [t for t in rest.passing(search.settings) if t is not mine]
     if mine is not None and effect.undo is not None:
-        # With torques that belong to other positions no loop is the arm's own, and scores in it mean little: rivals are
-        # those that come as near to the recordings when they are in the model.
+        # With torques that belong to other positions no loop simulates the arm, and scores mean little: rivals are
+        # those that fit the recordings as well when they are in the model.
         again = in_loop_of(study, rest.fit, mine.candidate)
         mine = again if again is not None and again.score > mine.score else mine
         others = [(t, search.with_trial(rest, t)) for t in serious]
         serious = [
             t for t, other in others if other and nearer(other, rest, material) and not nearer(final, other, material)
         ]
-    # Rows of other joints, which a change goes along with, are no part of what it is a share of.
+    # The share refers to rows of the joint itself; a change in rows of other joints does not count.
     share = 0.0 if mine is None else min(mine.share, 1.0)
     if mine is not None and effect.undo is not None:
         was, now = power_put_right(rest, final), power_put_right(final, rest)
         share = max(share, float(1.0 - now[place.joint] / was[place.joint]))
     elif mine is not None and final.study.likeness_lost(rest.study, range(study.robot.n), held=True) < ALIKE:
-        # A loop that moves otherwise without it does not show how much it explains.
+        # A loop whose motion differs without the effect does not show how much it explains.
         share = max(share, float(share_explained(final, rest)[place.joint]))
     scores = [] if mine is None else [mine.score, *(_instead(t, final) for t in serious)]
     close = [] if mine is None else [score for score in scores if abs(score - mine.score) < CLOSE]
-    # What couples two joints has to account for both.
+    # An effect that couples two joints has to explain both.
     at = (stanza.joint, stanza.other) if effect.scope == "pair" else (stanza.joint,)
     nameless: dict[str, float] = {}
     if mine is not None and effect.undo is None:
@@ -102,7 +111,7 @@ def _finding(
     alone = 0.0 if mine is None else float(np.exp(mine.score - everything))
     among = float(np.exp(special.logsumexp(close) - everything)) if close else 0.0
     remaining = max((d.share for d in left if d.joint in at), default=0.0)
-    # What is left is a share of the smaller residual that the finding leaves.
+    # The remaining share refers to the smaller residual with the finding.
     explained = share / max(share + (1 - share) * remaining, 1e-300) if share > 0 else 0.0
     joint = place.joint
     foretold_gap = float(foretold_errors(rest, final)[joint])
@@ -140,7 +149,7 @@ def _finding(
 
 
 def _nameless(search: Search, rest: State, final: State, mine: Trial, joints: Collection[int]) -> dict[str, float]:
-    """Scores, in place of a finding, of what its joints have of other joints without that the catalogue has a name."""
+    """Scores of unnamed dependences on other joints in place of a finding, less their scores in the final model."""
     found = strangers(rest.fit, rest.workshop, joints, search.settings.false_alarms)
     near = [s for s in found if s.score > mine.score - CLOSE]
     scores = [s.score - s.beside(final.fit, final.workshop) for s in near]
@@ -149,16 +158,24 @@ def _nameless(search: Search, rest: State, final: State, mine: Trial, joints: Co
 
 
 def _instead(rival: Trial, final: State) -> float:
-    """Score of a rival in place of a finding: less what it scores beside the finding, too.
+    """Score of a rival in place of a finding, less its score in addition to the finding.
 
-    What both together explain is no reason to doubt either.
+    A part that only both together explain counts against neither.
     """
     beside = [t.score for t in final.trials if t.candidate.key == rival.candidate.key and not t.forbidden]
     return rival.score - max([0.0, *beside])
 
 
 def miswired(wiring: WiringFinding, robot: RobotConfig) -> list[Finding]:
-    """Mistakes of wiring as findings; their gaps are what a physical model leaves of the motor's torque, percent."""
+    """Wiring errors as findings; their gaps are residuals of a physical model, percent of the torque of the motor.
+
+    Parameters
+    ----------
+    wiring
+        Result of the wiring check.
+    robot
+        Configuration of the robot.
+    """
     names = [joint.name for joint in robot.joints]
     findings = []
     for stanza, words, p_value, rivals in zip(
@@ -189,7 +206,15 @@ def miswired(wiring: WiringFinding, robot: RobotConfig) -> list[Finding]:
 
 
 def gap_of(state: State, *, held: bool) -> Gap:
-    """Relative torque errors of a model."""
+    """Relative torque errors of a model.
+
+    Parameters
+    ----------
+    state
+        The model.
+    held
+        True for the held-out data, false for the training data.
+    """
     overall, each = relative_errors(state.fit, held=held)
     errors = np.concatenate(state.fit.errors(state.fit.theta, held=held))
     rms = np.sqrt(np.mean(errors**2, axis=0))
@@ -202,7 +227,15 @@ def gap_of(state: State, *, held: bool) -> Gap:
 
 
 def noise_floor(final: State, left: Sequence[Disagreement]) -> Gap:
-    """What remains on the held-out data, less the shares that are known not to be noise."""
+    """Remaining error on the held-out data, less the shares that are known not to be noise.
+
+    Parameters
+    ----------
+    final
+        The model with the findings.
+    left
+        Dependences of its residual.
+    """
     study = final.study
     _, each = relative_errors(final.fit, held=True)
     power = np.sum(np.concatenate([s.y for s in study.held]) ** 2, axis=0)
@@ -211,7 +244,7 @@ def noise_floor(final: State, left: Sequence[Disagreement]) -> Gap:
         if d.kind == "frequency":
             # Its share is one of the working rate, most of which lies beyond the band of the comparison.
             continue
-        # What follows the motion contains what has a name.
+        # The share that follows the motion contains the named dependences.
         own = known_shares[d.joint] + d.share if d.kind != "motion" else max(known_shares[d.joint], d.share)
         known_shares[d.joint] = min(1.0, own)
     floor = np.array([e * np.sqrt(1 - known_shares[name]) for e, name in zip(each, study.joints, strict=True)])
@@ -240,7 +273,7 @@ def undetectable(state: State) -> list[NotVisible]:
 
 
 def outdated(numbers: Sequence[NumbersFinding]) -> list[Finding]:
-    """Numbers of a baseline that no longer hold, as findings."""
+    """Changed parameters of a baseline as findings."""
     return [
         Finding(
             effect=n.effect,
@@ -265,7 +298,7 @@ def outdated(numbers: Sequence[NumbersFinding]) -> list[Finding]:
 
 
 def experiment_to_separate(findings: Sequence[Finding]) -> str | None:
-    """An experiment that separates a finding from a rival nearly as good, or makes a doubtful one surer."""
+    """Experiment that separates a finding from a close rival or raises a low confidence; ``None`` if none is needed."""
     for finding in findings:
         rivals = [known(name) for name in finding.evidence.get("ambiguous_with", [])]
         if rivals:
@@ -275,7 +308,7 @@ def experiment_to_separate(findings: Sequence[Finding]) -> str | None:
 
 
 def _terms(state: State) -> list[int]:
-    """Numbers of the stanzas that are terms."""
+    """Numbers of the effects of the configuration that are terms."""
     return [k for k, stanza in enumerate(state.study.robot.effects) if not of_recording(stanza)]
 
 

@@ -21,27 +21,35 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Foretold:
-    """Held-out errors (M, n) of every stretch: of a model at measured motion, and less what another one changes."""
+    """Held-out errors of every stretch, (M, n) each, N m or N.
+
+    Parameters
+    ----------
+    before
+        Errors of a model at the measured motion.
+    after
+        The same less the change by another model at the simulated motion.
+    """
 
     before: tuple[Array, ...]
     after: tuple[Array, ...]
 
 
 def foretold(study: Study, theta: Array, other: Study, other_theta: Array) -> Foretold | None:
-    """Errors of a model, and what another model would leave of them if it were right at simulated motion.
+    """Errors of a model, and their remainder if the change by another model is right at the simulated motion.
 
     Parameters
     ----------
     study, theta
-        The model, (b,).
+        Data and parameters (b,) of the model.
     other, other_theta
-        The same recordings with the other one, and the motion that it makes.
+        The same recordings with the other model and its simulated motion, and its parameters.
 
     Returns
     -------
     Foretold or None
-        In the torques as the other model has them put right; ``None`` where it undoes something that the first one has
-        put right, or exchanges signals.
+        Errors of the torques with the corrections of the other model; ``None`` where it drops a correction of the first
+        model, or exchanges signals.
     """
     more = tuple(stanza for stanza in other.recorded if stanza not in study.recorded)
     undone = any(stanza not in other.recorded for stanza in study.recorded)
@@ -61,7 +69,17 @@ def foretold(study: Study, theta: Array, other: Study, other_theta: Array) -> Fo
 
 
 def torque_put_right(torque: Array, study: Study, stanzas: tuple[Stanza, ...]) -> Array:
-    """Torques (N, n) at the working rate as they are without what stanzas say of recordings."""
+    """Torques (N, n) at the working rate with the corrections of recordings applied.
+
+    Parameters
+    ----------
+    torque
+        Torques, shape (N, n), N m or N.
+    study
+        Data with robot and sampling period.
+    stanzas
+        Effect entries of the configuration that correct recordings.
+    """
     robot = study.robot.model_copy(update={"effects": stanzas})
     (done,) = put_right([Experiment(q=torque, tau=torque, q_ref=None, dt=study.dt)], robot)
     return done.tau

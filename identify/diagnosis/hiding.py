@@ -45,7 +45,7 @@ def detection_limits(state: State, settings: Settings) -> list[DetectionLimit]:
 def _smallest(state: State, candidate: Candidate, shapes: Shapes, settings: Settings) -> Array | None:
     """Smallest size (k,) of each linear parameter that would be found; infinite where none would."""
     fit = state.fit
-    # Of the simulated motion: a search has made them already, and the size is that of a chance.
+    # Columns at the simulated motion: they are in the cache, and the limit is that of a probability.
     z, held_z = (
         whitened(state.workshop.band(candidate.effect, candidate.place, shapes, part, "simulated"), fit.noise)
         for part in ("train", "held")

@@ -1,4 +1,4 @@
-"""Lines in the spectrum of the residual: torques of a fixed frequency, whatever the motion."""
+"""Spectral lines of the residual: torques of a fixed frequency, independent of the motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ BLOCK = 128
 """Independent frequencies from whose median the spectrum around a line is estimated."""
 
 PADDING = 2
-"""Frequencies of the search over independent ones."""
+"""Number of searched frequencies per independent one."""
 
 HIGHEST = 0.35
 """Highest frequency of the search over the working rate: the first filter begins there."""
@@ -34,19 +34,20 @@ EQUIVALENT = BLOCK / 1.5 * np.log(2) ** 2
 
 @dataclass(frozen=True)
 class Line:
-    """A line of one joint.
+    """Spectral line of one joint.
 
     Parameters
     ----------
     frequency
-        Hz.
+        Frequency, Hz.
     p_train, p_held
-        That the training residual has such a line anywhere, and the held-out one at this frequency, by chance.
+        Probability of such a line in the training residual at any frequency, and in the held-out one at this frequency,
+        without a line.
     share
         Share of the held-out residual's power at the working rate.
     f, amplitude, noise
-        Amplitudes of the training residual around it, N m or N, and those that a residual without a line exceeds at
-        one frequency in twenty, (G,) each.
+        Frequencies around the line, Hz; amplitudes of the training residual there, N m or N; amplitudes that a residual
+        without a line exceeds at one frequency in twenty, (G,) each.
     """
 
     frequency: float
@@ -64,7 +65,17 @@ class Line:
 
 
 def residuals(study: Study, stretches: Sequence[Stretch], theta: Array) -> list[Array]:
-    """Torques less those of the model at the working rate, (N, n) each."""
+    """Torques less those of the model at the working rate, (N, n) each, N m or N.
+
+    Parameters
+    ----------
+    study
+        Data with the model.
+    stretches
+        Stretches of the study.
+    theta
+        Parameters of the model, (b,).
+    """
     return [s.torque - study.torques(s, "measured", theta) for s in stretches]
 
 
@@ -78,8 +89,10 @@ def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, low
     ----------
     train, held
         Residuals, (N,) each.
+    dt
+        Sampling period, s.
     lowest
-        Frequency at which the search begins, Hz.
+        Lowest frequency of the search, Hz.
     """
     spectra = [_Spectrum.of(e, dt) for e in train]
     size = max(s.power.size for s in spectra)
@@ -109,9 +122,16 @@ def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, low
 
 
 def of_references(study: Study, frequency: float) -> bool:
-    """Whether the references have that line, too: set points come at a rate of their own, and the arm follows them.
+    """True if the references contain the line, too: set points have a rate of their own, and the arm follows them.
 
-    The motion modulates it, so that it is some of the motion's own frequencies wide.
+    The motion modulates the line, so its width is a share of the bandwidth of the motion.
+
+    Parameters
+    ----------
+    study
+        Data with the references.
+    frequency
+        Frequency of the line, Hz.
     """
     wide = MODULATED * lowest_frequency(study)
     for reference in study.auxiliary.references:
@@ -124,12 +144,12 @@ def of_references(study: Study, frequency: float) -> bool:
 
 
 def lowest_frequency(study: Study) -> float:
-    """Bandwidth of the motion, Hz: below it what repeats with the motion has lines, too."""
+    """Bandwidth of the motion, Hz; below it the repeatable part of the residual has lines, too."""
     return 0.5 / (study.dt * study.decimation.factor * BAND)
 
 
 def _chance(ratio: float, stretches: int) -> float:
-    """That a mean over stretches of power over background is so large without a line."""
+    """Probability of so large a mean of power over background without a line."""
     return float(stats.f.sf(ratio, 2 * stretches, 2 * EQUIVALENT * stretches))
 
 

@@ -1,4 +1,4 @@
-"""What a joint's residual could depend on: one anonymous effect for every variable, without a formula."""
+"""Basis of the dependence of a residual on each variable: one effect of free shape for every variable."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,9 +18,8 @@ Kind = Literal[
     "acceleration", "time", "time and direction", "velocity of another joint", "torque of another joint",
     "frequency", "motion", "transients",
 ]  # fmt: skip
-"""Variables; those with a direction count for the positive one, and with the other sign for the negative one. The last
-are no maps: a frequency that does not move with the motion, whatever moves with it in a way nobody can tell, and
-moments at times of their own."""
+"""Variables; those with a direction have the opposite sign in the negative direction. The last three are no maps: a
+frequency independent of the motion, unexplained power at the frequencies of the motion, and transients."""
 
 SIDE = (0.0, 0.05, 0.15, 0.35, 0.65, 1.0)
 """Speeds of the knots of either direction, over the top speed: close at low speeds, where friction is curved."""
@@ -37,20 +36,20 @@ TURNS = 4
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """A free shape over one variable, at one joint.
+    """Free shape over one variable, at one joint.
 
     Parameters
     ----------
     joint
-        Whose residual.
+        Number of the joint of the residual.
     kind
-        What it varies with.
+        Kind of the variable.
     other
-        The joint or motor that the variable belongs to, where it is not the joint itself.
+        Joint or motor to which the variable belongs, if it is another one.
     knots
-        Of the hat functions, increasing; of an angle the wave numbers; of the time the time constant.
+        Knots of the hat functions, increasing; for an angle the wave numbers; for the time the time constant.
     low, high
-        Where the data are.
+        Range of the data.
     """
 
     joint: int
@@ -62,16 +61,16 @@ class Map:
 
     @property
     def key(self) -> str:
-        """Name that no other map of a study has."""
+        """Unique name among the maps of a study."""
         return f"{self.kind} {self.other} {self.joint} {self.knots[0]} {len(self.knots)}"
 
     @property
     def directed(self) -> bool:
-        """Whether the shape changes sign with the direction of motion."""
+        """True if the shape changes sign with the direction of motion."""
         return self.kind.endswith("and direction")
 
     def variable(self, motion: Motion) -> Array:
-        """What the residual is drawn over, (N,)."""
+        """Values of the variable, (N,)."""
         at = self.joint if self.other is None else self.other
         match self.kind:
             case "velocity" | "velocity of another joint":
@@ -90,7 +89,15 @@ class Map:
                 return motion.t
 
     def shape(self, x: Array, side: Array) -> Array:
-        """Basis (N, k) at values (N,) of the variable, ``side`` (N,) being the smoothed sign of the velocity."""
+        """Basis functions (N, k).
+
+        Parameters
+        ----------
+        x
+            Values of the variable, (N,).
+        side
+            Smoothed sign of the velocity, (N,).
+        """
         if self.kind == "velocity":
             speed = hats(np.abs(x), self.knots)
             return np.concatenate([speed * (0.5 + 0.5 * side)[:, None], speed * (0.5 - 0.5 * side)[:, None]], axis=1)
@@ -98,7 +105,7 @@ class Map:
             angles = x[:, None] * np.array(self.knots)
             return np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
         if self.kind in ("time", "time and direction"):
-            # A slope and a settling: what a recording can say about times after it.
+            # A slope and an exponential: they extrapolate beyond the recording.
             basis = np.stack([x / self.high, -np.expm1(-x / self.knots[0])], axis=1)
         else:
             basis = hats(x, self.knots)
@@ -124,7 +131,15 @@ class Map:
 
 
 def hats(x: Array, knots: Sequence[float] | Array) -> Array:
-    """Piecewise linear functions (N, k), one at each knot, constant beyond the outermost."""
+    """Piecewise linear functions (N, k), one at each knot, constant beyond the outermost.
+
+    Parameters
+    ----------
+    x
+        Values, (N,).
+    knots
+        Increasing knots, (k,).
+    """
     at = np.asarray(knots, dtype=np.float64)
     left = np.clip(np.searchsorted(at, x, side="right") - 1, 0, at.size - 2)
     share = np.clip((x - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
@@ -139,6 +154,8 @@ def maps(study: Study, motions: Sequence[Motion]) -> Iterator[Map]:
 
     Parameters
     ----------
+    study
+        Data with the robot.
     motions
         The training stretches at simulated signals.
     """
@@ -174,7 +191,7 @@ def _hat_maps(joint: int, kind: Kind, other: int | None, motions: Sequence[Motio
 
 
 def _angle_maps(study: Study, joint: int, motor: int, motions: Sequence[Motion]) -> Iterator[Map]:
-    """Harmonics of a motor's turn; of a prismatic axis, whose pitch nobody may know, wave numbers of its travel."""
+    """Harmonics of a motor angle; for a prismatic axis, whose pitch may be unknown, wave numbers of its travel."""
     draft = Map(joint, "motor angle", motor, (1.0,))
     values = np.concatenate([draft.variable(m) for m in motions])
     low, high = float(values.min()), float(values.max())

@@ -1,9 +1,9 @@
-"""Whether the numbers of a baseline still hold, and what has changed where they do not.
+"""Test of the parameters of a baseline, and the changes of the plant that explain a difference.
 
 A fit and a baseline of the same plant differ by their errors alone: ``d = theta - theta_0`` has the covariance
 ``S = C + C_0``. A change of the plant moves d along a few directions, ``d = B p``: those that the catalogue gives for
 a payload, other friction, another drive gain. Candidates compete by how well they explain d, and have to predict
-held-out torques better than the baseline's numbers do.
+held-out torques better than the parameters of the baseline do.
 """
 
 import re
@@ -31,28 +31,28 @@ ALTERNATIVES = 3
 
 @dataclass(frozen=True)
 class NumbersFinding:
-    """One reason why numbers of a baseline no longer hold.
+    """Change of the plant that explains why parameters differ from a baseline.
 
     Parameters
     ----------
     effect, joint, other
-        Entry of the catalogue and where, or ``changed_parameters`` for what no entry explains.
+        Entry of the catalogue and its place, or ``changed_parameters`` if no entry explains the difference.
     parameters, std
-        Changes against the baseline, as far as the data tell them one by one, and their standard deviations, which
-        hold the uncertainty of the baseline too.
+        Changes against the baseline, as far as they are estimable one by one, and their standard deviations, which
+        include the uncertainty of the baseline.
     p_value
-        Chance of so great a change of numbers if there were none, all candidates counted.
+        Probability of so large a change without a change of the plant, corrected for the number of candidates.
     gap_before, gap_after
-        Relative torque error on held-out data, percent, with the baseline's numbers and all findings before this one,
-        and with this one: of the joint, or of all joints where the arm as a whole is concerned.
+        Relative torque error on held-out data, percent, with the parameters of the baseline and all findings before
+        this one, and with this one: of the joint, or of all joints for an effect of the whole arm.
     confidence
-        Share of the posterior odds that is its own, times the chance that anything has changed at all.
+        Its share of the posterior odds, times the probability that anything has changed.
     ambiguous_with
         Effects at odds of less than 20 to 1.
     alternatives
         Effect, joint and score (see `Standing`) of the candidates next to this one.
     words
-        What it means, in plain language.
+        Description in plain language.
     """
 
     effect: str
@@ -72,18 +72,18 @@ class NumbersFinding:
 def stale_numbers(
     fit: Fit, workshop: Workshop, baseline: IdentificationDocument, alpha: float = 0.01
 ) -> list[NumbersFinding]:
-    """Name what has changed since a baseline was identified.
+    """Changes of the plant since a baseline was identified.
 
     Parameters
     ----------
     fit
-        Of the model with everything it lacked in structure.
+        Fit of the model with all findings in structure.
     workshop
-        Of the same study.
+        Cache of the columns of the same study.
     baseline
         Result of an earlier identification of the same robot.
     alpha
-        Chance of a false alarm.
+        Probability of a false alarm.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def stale_numbers(
 
 
 def _stale(comparison: Comparison, alpha: float) -> bool:
-    """Whether all parameters together, or any of them by itself, differ; half the false alarms for either test."""
+    """True if all parameters together, or any of them by itself, differ; half the false alarms for either test."""
     _, _, _, rest, free = comparison.solved([])
     together = float(stats.chi2.sf(rest, free))
     return together < alpha / 2 or bool(_changed_names(comparison, [], alpha / 2))
@@ -133,7 +133,7 @@ def _changed_names(comparison: Comparison, changes: Sequence[Change], alpha: flo
 
 
 def _closes(comparison: Comparison, before: Sequence[Change], after: Sequence[Change], alpha: float) -> bool:
-    """Whether held-out torques follow the change."""
+    """True if held-out torques follow the change."""
     return _held_out(comparison, comparison.predicted(before), comparison.predicted(after)) > stats.norm.isf(alpha)
 
 
@@ -194,7 +194,7 @@ def _described(
 
 
 def _joint(fit: Fit, change: Change) -> str:
-    """Name of the joint; a payload hangs on the last one, as its stanza does."""
+    """Name of the joint; a payload belongs to the last one, as in the configuration."""
     joints = fit.study.joints
     return joints[-1] if change.effect.name == "payload" else joints[change.place.joint]
 
@@ -221,12 +221,12 @@ def _words(effect: Effect, joint: str, values: dict[str, float], std: dict[str, 
 
 
 def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list[NumbersFinding]:
-    """What has changed and no candidate explains, in one finding."""
+    """Finding of the changed parameters that no candidate explains, if there are any."""
     fit = comparison.fit
     _, _, _, left, free = comparison.solved(found)
     p = float(stats.chi2.sf(left, free))
     changed = _changed_names(comparison, found, alpha)
-    # All together can be off without one that could be named; nobody can act on that.
+    # All parameters together may differ without a significant single one; that is no finding.
     if not changed:
         return []
     before = comparison.predicted(found)

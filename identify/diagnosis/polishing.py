@@ -1,4 +1,4 @@
-"""Nonlinear parameters of all findings at once, by instrumental variables: what a search one after the other leaves."""
+"""Gauss-Newton refinement of the nonlinear parameters of all findings at once, by instrumental variables."""
 
 from dataclasses import dataclass, replace
 
@@ -21,15 +21,15 @@ Array = NDArray[np.float64]
 STEP = 0.02
 """Relative change of a parameter for its derivative."""
 ROUNDS = 6
-"""Most steps."""
+"""Greatest number of steps."""
 LONGEST = 0.35
-"""Of a step, on a logarithmic scale."""
+"""Longest step, on a logarithmic scale."""
 SETTLED = 0.01
-"""Longest step, on a logarithmic scale, that is not worth another."""
+"""Length of a step, on a logarithmic scale, that ends the iterations."""
 FAR = 0.1
-"""Sum of the longest steps, on a logarithmic scale, after which the closed loop is simulated anew."""
+"""Sum of the longest steps, on a logarithmic scale, after which the closed loop is simulated again."""
 RANK = 1e-9
-"""Singular value under which a direction counts as undetermined, of the largest."""
+"""Singular value, over the largest, below which a direction counts as undetermined."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How sure the parameters of the effects in a model are, the nonlinear ones included."""
+"""Standard deviations of the parameters of the effects in a model, the nonlinear ones included."""
 
 from collections.abc import Mapping, Sequence
 
@@ -22,9 +22,9 @@ def standard_deviations(state: State) -> list[dict[str, float]]:
     """Standard deviations of all parameters of every term of the model, by their names in the configuration.
 
     The derivative of the torque with respect to a nonlinear parameter is one more column, so that its uncertainty
-    enters that of the linear ones (Gauss-Newton); parameters taken from a set of whole numbers count as known. What the
-    model leaves is no white noise where an effect is only nearly right: spreads are those of the residual along each
-    parameter's influence (Newey, West 1987, Econometrica 55(3)), if that is more.
+    enters that of the linear ones (Gauss-Newton). Parameters from a set of whole numbers count as known. The residual
+    is no white noise where an effect is only approximately right. The variances are then those of the residual along
+    the influence of each parameter, if they are larger (Newey, West 1987, Econometrica 55(3)).
     """
     study, fit = state.study, state.fit
     slopes: list[Array] = []
@@ -65,7 +65,7 @@ def _slope(workshop: Workshop, noise: Sequence[ArModel], term: Term, name: str, 
 
 
 def _deviations(fit: Fit, slopes: list[Array]) -> Array:
-    """Of the model's own parameters and of further ones whose columns at simulated signals are ``slopes``, (b + s,).
+    """Standard deviations of the model's own parameters and of further ones with columns ``slopes``, (b + s,).
 
     Those of the rigid model stay as they are (4.34).
     """
@@ -77,7 +77,7 @@ def _deviations(fit: Fit, slopes: list[Array]) -> Array:
     scale = np.linalg.norm(z, axis=0)
     scale[scale == 0] = 1.0
     inverse = np.linalg.pinv((z / scale).T @ (z / scale), rcond=1e-12, hermitian=True)
-    # Where the simulator is not exact, 4.34 is wider than (Z'Z)^-1; the further columns only widen it.
+    # With an inexact simulator 4.34 is wider than (Z'Z)^-1; the further columns only widen it.
     alone = np.linalg.pinv((z[:, :b] / scale[:b]).T @ (z[:, :b] / scale[:b]), rcond=1e-12, hermitian=True)
     for k in range(b - e, b + len(slopes)):
         influence = (z / scale) @ inverse[:, k] / scale[k]

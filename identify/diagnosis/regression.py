@@ -1,4 +1,4 @@
-"""The instrumental-variable regression behind a diagnosis, whitened joint by joint."""
+"""Instrumental-variable regression of a diagnosis, whitened joint by joint (thesis 2.3.3 and 6.1.3)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,12 +21,20 @@ Array = NDArray[np.float64]
 
 MAX_AR_ORDER = 30
 PASSES = 3
-"""Between parameters and noise models; a fourth changes neither visibly."""
+"""Iterations between parameters and noise models; a fourth changes neither visibly."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Whitened rows of all joints, one below the other: regressor (R, b), instruments (R, b), torques (R,)."""
+    """Whitened rows of all joints, one below the other.
+
+    Parameters
+    ----------
+    x, z
+        Regressor and instruments, (R, b).
+    y
+        Torques, (R,).
+    """
 
     x: Array
     z: Array
@@ -34,12 +42,18 @@ class Rows:
 
 
 Equation = tuple[Array, Array, Array]
-"""Of one stretch: regressor at measured and at simulated signals (M, n, b) each, torques (M, n)."""
+"""Equations of one stretch: regressor at measured and at simulated signals (M, n, b) each, torques (M, n)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Equations in the band of the comparison, one entry per stretch."""
+    """Equations in the band of the comparison.
+
+    Parameters
+    ----------
+    train, held
+        Training and held-out equations, one entry per stretch.
+    """
 
     train: tuple[Equation, ...]
     held: tuple[Equation, ...]
@@ -52,12 +66,12 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Rows of one joint, of which many columns are zero: a link hangs on the joints before it.
+    """Rows of one joint without the columns that are zero there: a link acts on the joints before it only.
 
     Parameters
     ----------
     x, z
-        Columns of regressor and instruments that are not zero.
+        Numbers of the columns of regressor and instruments that are not zero.
     parts
         ``[X, Z, y]`` of these columns, one array (M, x + z + 1) per stretch.
     """
@@ -68,7 +82,15 @@ class Block:
 
     @classmethod
     def of(cls, rows: Sequence[Equation], joint: int) -> "Block":
-        """Rows of a joint out of the equations of all."""
+        """Rows of a joint from the equations of all joints.
+
+        Parameters
+        ----------
+        rows
+            Equations of every stretch.
+        joint
+            Number of the joint.
+        """
         x, z = (
             np.flatnonzero(np.any([np.any(row[k][:, joint] != 0, axis=0) for row in rows], axis=0)) for k in range(2)
         )
@@ -83,7 +105,7 @@ class Products:
     Parameters
     ----------
     noise
-        That they are whitened by.
+        Noise models that whiten the rows.
     rows
         ``[X, Z, y]`` of every joint's block, whitened.
     parts
@@ -101,12 +123,16 @@ class Products:
 
     @classmethod
     def of(cls, equations: Equations, noise: Sequence[ArModel], known: "Products | None" = None) -> "Products":
-        """Of the training rows under given noise models.
+        """Products of the training rows under given noise models.
 
         Parameters
         ----------
+        equations
+            Equations of all stretches.
+        noise
+            Noise model of each joint.
         known
-            Products of the same equations: those of joints with the same noise model are taken from there.
+            Products of the same equations; those of joints with the same noise model are reused.
         """
         b = equations.train[0][0].shape[2]
         zx, zz, zy = np.zeros((b, b)), np.zeros((b, b)), np.zeros(b)
@@ -143,16 +169,18 @@ class Fit:
 
     Parameters
     ----------
+    study
+        Data with the model.
     theta
-        (b,), those of the terms at the end.
+        Parameters (b,), those of the terms at the end.
     noise
         AR model of each joint.
     equations
-        Rows before they were whitened.
+        Rows before whitening.
     products
-        Those of the whitened training rows.
+        Products of the whitened training rows.
     fixed
-        Whether theta is given (a baseline), so that nothing of a candidate is absorbed by it.
+        True if theta is given (a baseline) and therefore absorbs nothing of a candidate.
     """
 
     study: Study
@@ -167,13 +195,21 @@ class Fit:
         return solved(self.study, self.equations, noise, self.theta if self.fixed else None, self.products)
 
     def errors(self, theta: Array, *, held: bool) -> list[Array]:
-        """``y - X theta`` at measured signals in the band of the comparison, (M, n) of every stretch."""
+        """``y - X theta`` at measured signals in the band of the comparison, (M, n) of every stretch, N m or N.
+
+        Parameters
+        ----------
+        theta
+            Parameters, (b,).
+        held
+            True for the held-out data, false for the training data.
+        """
         rows = self.equations.held if held else self.equations.train
         return [y - applied(x, theta) for x, _, y in rows]
 
     @cached_property
     def left(self) -> list[Array]:
-        """What the model leaves of the training rows, (M, n) of every stretch."""
+        """Residual of the training rows, (M, n) of every stretch, N m or N."""
         return self.errors(self.theta, held=False)
 
     @cached_property
@@ -191,12 +227,12 @@ class Fit:
 
     @cached_property
     def residual(self) -> Array:
-        """Of the training rows, (R,)."""
+        """Whitened residual of the training rows, (R,)."""
         return whitened(self.left, self.noise)
 
     @cached_property
     def held_residual(self) -> Array:
-        """Of the held-out rows, (R,)."""
+        """Whitened residual of the held-out rows, (R,)."""
         return whitened(self.errors(self.theta, held=True), self.noise)
 
     def held_at_simulated(self, theta: Array) -> Array:
@@ -232,7 +268,7 @@ class Fit:
         return inside
 
     def beside(self, instruments: Array) -> Array:
-        """Instruments (R, k) less what the model's own explain: ``D - Z (X'Z)^-1 X'D``."""
+        """Instruments (R, k) orthogonal to those of the model: ``D - Z (X'Z)^-1 X'D``."""
         if self.fixed:
             return instruments
         inside = self._inside(self._through(instruments)[0])
@@ -244,14 +280,14 @@ class Fit:
         return rest
 
     def products_beside(self, columns: Sequence[tuple[int, Array]], count: int) -> tuple[Array, Array]:
-        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = beside(instruments)``, without making it.
+        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = beside(instruments)``, without computing B.
 
         Parameters
         ----------
         columns
-            Instruments (R, G k) of each joint that they act on, by its number, group after group.
+            Instruments (R, G k) of each joint on which they act, with its number, group after group.
         count
-            G.
+            Number of groups, G.
         """
         width = columns[0][1].shape[1]
         x, z = np.zeros((2, self.theta.size, width))
@@ -274,13 +310,13 @@ class Fit:
             left, other = grouped
             return left.transpose(0, 2, 1) @ other
 
-        # The residual has nothing along the model's own instruments.
+        # The residual is orthogonal to the model's own instruments.
         both = products(z)
         return gram - both - both.transpose(0, 2, 1) + products(self.products.zz @ inside), score.reshape(count, -1)
 
     @cached_property
     def rows_of(self) -> list[slice]:
-        """Where the whitened training rows of each joint are."""
+        """Whitened training rows of each joint."""
         return rows_of_joints([y.shape[0] for _, _, y in self.equations.train], self.noise)
 
     @cached_property
@@ -307,8 +343,10 @@ def fit(study: Study, theta0: Array | None = None) -> Fit:
 
     Parameters
     ----------
+    study
+        Data with the model.
     theta0
-        Parameters by which terms that depend on the model's torques predict them; ``None``: none do.
+        Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
 
     Raises
     ------
@@ -340,6 +378,14 @@ def solved(
 
     Parameters
     ----------
+    study
+        Data with the model.
+    equations
+        Equations of all stretches.
+    noise
+        Noise model of each joint.
+    theta
+        Given parameters (b,); ``None``: estimate them.
     known
         Products of the same equations under other noise models.
     """
@@ -351,7 +397,17 @@ def solved(
 
 
 def relative_errors(fit: Fit, theta: Array | None = None, *, held: bool) -> tuple[float, Array]:
-    """``|y - X theta| / |y|`` in percent in the band of the comparison, overall and of each joint (n,)."""
+    """``|y - X theta| / |y|`` in percent in the band of the comparison, overall and of each joint (n,).
+
+    Parameters
+    ----------
+    fit
+        Fit with data and model.
+    theta
+        Parameters (b,); ``None``: those of the fit.
+    held
+        True for the held-out data, false for the training data.
+    """
     y = np.concatenate([s.y for s in (fit.study.held if held else fit.study.train)])
     error = np.concatenate(fit.errors(fit.theta if theta is None else theta, held=held))
     each = np.linalg.norm(error, axis=0) / np.maximum(np.linalg.norm(y, axis=0), 1e-300)
@@ -359,14 +415,24 @@ def relative_errors(fit: Fit, theta: Array | None = None, *, held: bool) -> tupl
 
 
 def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Array, Array]:
-    """Regressor (M, n, b) at measured and at simulated signals, in the band of the comparison."""
+    """Regressor (M, n, b) at measured and at simulated signals, in the band of the comparison.
+
+    Parameters
+    ----------
+    study
+        Data with the model.
+    stretch
+        A stretch of the study.
+    theta
+        Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+    """
     out: list[Array] = []
     for kind in ("measured", "simulated"):
         signals = getattr(stretch, kind)
         key = (id(signals), study.model.base.names[: -study.model.e or None])
         if key not in study.rigid:
             made = study.decimation(study.model.rigid_regressor(signals.q, signals.qd, signals.qdd))
-            # With the signals, whose identity is the key only as long as they live.
+            # Kept with the signals: their identity is the key only while they exist.
             study.rigid[key] = signals, made
         rigid = study.rigid[key][1]
         if study.model.e:
@@ -381,12 +447,30 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
 
 
 def applied(columns: Array, values: Array) -> Array:
-    """``columns @ values``: (M, n, k) and (k,) to (M, n), as one product."""
+    """``columns @ values``, shape (M, n), as one product.
+
+    Parameters
+    ----------
+    columns
+        Shape (M, n, k).
+    values
+        Shape (k,).
+    """
     product: Array = (columns.reshape(-1, columns.shape[2]) @ values).reshape(columns.shape[:2])
     return product
 
 
 def noise_models(errors: Sequence[Array], parameters: float, order: int) -> list[ArModel]:
-    """AR model of each joint's residual (6.21 to 6.25), its variance corrected for the parameters estimated."""
+    """AR model of each joint's residual (6.21 to 6.25), its variance corrected for the parameters estimated.
+
+    Parameters
+    ----------
+    errors
+        Residuals, (M, n) per stretch.
+    parameters
+        Number of estimated parameters.
+    order
+        Highest order tried.
+    """
     free = 1 - parameters / sum(e.size for e in errors)
     return [ArModel(ar.coefficients, ar.variance / free, ar.aic) for ar in ar_models(errors, order)]

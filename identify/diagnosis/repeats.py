@@ -1,4 +1,4 @@
-"""Stretches in which the arm repeats a motion: what repeats with it is the fault of the model, the rest is noise."""
+"""Repetitions of a motion: the repeatable part of the residual is model error, the rest is noise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from armident.identify.diagnosis.study import Study
 Array = NDArray[np.float64]
 
 SAME = 1e-3
-"""Mean square distance of two motions over that of both from their middle, in positions over the spread of each joint,
-under which they are the same: 4.5 % of the spread."""
+"""Mean square distance of two equal motions over that of both from their mean, with positions scaled by the spread of
+each joint: 4.5 % of the spread."""
 
 MOVING = 0.1
-"""Speed of any joint, over its root mean square, from which on the arm moves."""
+"""Speed of any joint, over its root mean square, above which the arm moves."""
 
 SHORTEST = 10.0
 """Shortest repetition, in periods of the bandwidth of the motion."""
@@ -32,9 +32,9 @@ class Repeat:
     first, second
         Numbers of the two stretches, those of the training data before the held-out ones.
     rows, again
-        Rows at the rate of the comparison, where the motion is and where it is again.
+        Rows of the motion and of its repetition, at the rate of the comparison.
     shift
-        By how much the second time lies later than its rows say, in rows; under one half.
+        Delay of the repetition beyond its rows, in rows; at most one half.
     """
 
     first: int
@@ -44,9 +44,9 @@ class Repeat:
     shift: float
 
     def halves(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """Sum and difference over ``sqrt 2`` of what two stretches hold, (L, n) each.
+        """Sum and difference of the values of both stretches over ``sqrt 2``, (L, n) each.
 
-        What does not depend on the motion has the same spectrum in both; what the motion brings along is in the sum.
+        Noise that is independent of the motion has the same spectrum in both; the repeatable part is in the sum only.
         """
         there = np.arange(values[self.second].shape[0], dtype=np.float64)
         spline = interpolate.CubicSpline(there, values[self.second], axis=0)
@@ -60,8 +60,10 @@ def repeats(study: Study, period: float) -> tuple[Repeat, ...]:
 
     Parameters
     ----------
+    study
+        The stretches.
     period
-        Of the bandwidth of the motion, s.
+        Period of the bandwidth of the motion, s.
     """
     stretches = [*study.train, *study.held]
     kept = [study.decimation.instants(s.measured.q.shape[0]) for s in stretches]
@@ -91,7 +93,7 @@ def repeats(study: Study, period: float) -> tuple[Repeat, ...]:
 def _longest(
     a: Array, b: Array, moving: NDArray[np.bool_], least: int, *, itself: bool
 ) -> tuple[slice, slice, float] | None:
-    """Longest piece of one motion (M, n) that another (M', n) makes, too; of the same motion at another time."""
+    """Longest piece of one motion (M, n) that another one (M', n) repeats, or the same one at another time."""
     m, k = a.shape[0], b.shape[0]
     lags = np.arange(-(m - 1), k)
     # The motion a(t) against b(t + lag).
@@ -103,11 +105,11 @@ def _longest(
     both = power_a[end] - power_a[begin] + power_b[end + lags] - power_b[begin + lags]
     misses = (both - 2 * common) / np.maximum(both, 1e-300)
     length = np.minimum(end - begin, lags) if itself else end - begin
-    # Standing still at the same place is no motion that repeats.
+    # Standstill at the same place is no repeated motion.
     fits = (length >= least) & (moved[end] - moved[begin] > 0.5 * (end - begin)) & (misses < SAME)
     if not fits.any():
         return None
-    # Neighbouring lags fit, too: of those nearly as long as the longest, the best one.
+    # Neighbouring lags fit, too: take the best of those nearly as long as the longest.
     nearly = fits & (length >= 0.9 * np.max(length[fits]))
     at = int(np.argmin(np.where(nearly, misses, np.inf)))
     lag, size, first = int(lags[at]), int(length[at]), int(begin[at])
@@ -118,6 +120,6 @@ def _longest(
 
 
 def _vertex(values: Array) -> float:
-    """Where the parabola through values at -1, 0, 1 is lowest."""
+    """Abscissa of the minimum of the parabola through values at -1, 0, 1."""
     bend = values[0] - 2 * values[1] + values[2]
     return float(np.clip(0.5 * (values[0] - values[2]) / bend, -0.5, 0.5)) if bend > 0 else 0.0

@@ -1,9 +1,8 @@
-"""A second look at candidates, in the closed loop that they would make.
+"""Test of candidates in the closed loop that contains them.
 
-Candidates are judged at simulated signals, and the loop that these come from does not have them in it. Where a missing
-effect moves the arm visibly otherwise (elasticity, a late torque), that loop is a poor likeness and the candidate may
-fail although much speaks for it. Simulated once more with the candidate inside, it makes instruments that still know
-nothing of the noise.
+Candidates are tested at simulated signals of a loop without them. Where a missing effect changes the motion of the arm
+visibly (elasticity, a torque delay), that loop differs from the arm, and the candidate may fail in spite of a high
+score. A second simulation with the candidate in the model gives instruments that are still independent of the noise.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,22 +22,29 @@ from armident.identify.diagnosis.trial import Trial, best_trial, judge, refined,
 from armident.identify.effects.terms import arm_model
 
 SECOND_LOOKS = 2
-"""Most candidates of one state that are looked at again."""
+"""Most candidates of one state with a second test."""
 
 SUSPECT = 20.0
-"""Score that makes it worth while: what passes has about ten, without merit there is hardly any."""
+"""Least score for a second test: passing candidates have about ten, those without merit hardly any."""
 
 NEAR = 0.5
-"""Score over that of the best one at the same joint from which on two are rivals."""
+"""Score, over the best one at the same joint, above which two candidates are rivals."""
 
 APART = 0.9
-"""Values of a nonlinear parameter that differ by less are one."""
+"""Ratio of two values of a nonlinear parameter above which they count as equal."""
 
 
 def suspects(failed: Sequence[Trial], no_accident: Sequence[Trial]) -> list[Trial]:
-    """Trials that failed in spite of their score, or although chance does not make them, those first that have most.
+    """Trials that failed in spite of their score or significance, highest score first.
 
-    What explains too little to be worth a finding in a loop without it may explain much in its own.
+    An effect that explains too little in a loop without it may explain much in its own.
+
+    Parameters
+    ----------
+    failed
+        Trials that do not pass.
+    no_accident
+        Significant trials.
     """
     able = [t for t in failed if t.candidate.effect.predicts and not t.candidate.effect.sudden and not t.forbidden]
     doubtful = (t for t in able if t.score > SUSPECT or any(t is other for other in no_accident))
@@ -46,10 +52,10 @@ def suspects(failed: Sequence[Trial], no_accident: Sequence[Trial]) -> list[Tria
 
 
 def rivals(passing: Sequence[Trial]) -> list[Trial]:
-    """Trials that pass at one joint and are near each other, the best of each joint first.
+    """Passing trials of one joint with similar scores, the best of each joint first.
 
-    Each may have the better of the others in the loop that it makes: a torque that comes late looks like a joint that
-    yields where the arm is simulated with neither.
+    Their order may change in the loops that contain them. A torque delay resembles joint elasticity where the arm is
+    simulated with neither.
     """
     found: list[Trial] = []
     for joint in dict.fromkeys(t.candidate.place.joint for t in passing):
@@ -62,21 +68,27 @@ def rivals(passing: Sequence[Trial]) -> list[Trial]:
 def at_measured_signals(
     fit: Fit, candidates: Iterable[Candidate], workshop: Workshop, least: float
 ) -> list[tuple[Trial, ...]]:
-    """Trials with measured signals as instruments, of what goes with way and speed alone, those that explain most.
+    """Trials with measured signals as instruments, of effects that depend on the motion alone, highest score first.
 
-    A joint that yields before it slides, or sticks, reverses at other instants in a loop without that: the simulated
-    columns have nothing of the measured ones, and the parameters that they make are of any size. Feedback lets measured
-    ones explain a little without merit, so these trials are no evidence; the loop that they make is one to look in.
+    Friction with presliding or stiction reverses at other instants in a loop without it. The simulated columns are then
+    uncorrelated with the measured ones, and the estimates have any size. With feedback, measured signals explain a
+    little without merit. So these trials are no evidence; they only select the loop for another test.
 
     Parameters
     ----------
+    fit
+        Fit of the model.
+    candidates
+        Candidates to try.
+    workshop
+        Cache of the columns of the same fit.
     least
         Share of a joint's held-out residual power that a trial has to explain.
 
     Returns
     -------
     list
-        Of every candidate the trials at the values that screening finds and next to them on the grid, best first.
+        Of every candidate the trials at the values found by screening and next to them on the grid, best first.
     """
     tried = []
     for candidate in candidates:
@@ -94,7 +106,17 @@ def at_measured_signals(
 
 
 def neighbours(study: Study, candidate: Candidate, shapes: Shapes) -> list[Shapes]:
-    """The values next to a candidate's continuous shapes on its grid, one at a time."""
+    """Neighbours on the grid of each continuous nonlinear parameter of a candidate, one parameter at a time.
+
+    Parameters
+    ----------
+    study
+        Data with the robot.
+    candidate
+        Candidate with its grid.
+    shapes
+        Present values.
+    """
     found = []
     for k, free in enumerate(candidate.effect.refinable(study.robot, candidate.place)):
         values = sorted({grid[k][1] for grid in candidate.grid})
@@ -106,24 +128,39 @@ def neighbours(study: Study, candidate: Candidate, shapes: Shapes) -> list[Shape
 
 
 def in_one_of_their_loops(fit: Fit, trials: Iterable[Trial]) -> Trial | None:
-    """The first of some trials that makes a loop which is a better likeness of the arm, judged in it."""
+    """First of some trials whose own loop simulates the arm better, tested in that loop; ``None`` if there is none.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    trials
+        Trials in order of preference.
+    """
     return next((again for trial in trials if (again := in_its_loop(fit, trial)) is not None), None)
 
 
 def in_its_loop(fit: Fit, trial: Trial) -> Trial | None:
-    """The trial repeated with instruments from the loop that has its candidate inside.
+    """Trial repeated with instruments from the loop that contains its candidate.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    trial
+        The trial to repeat.
 
     Returns
     -------
     Trial or None
-        ``None`` where that loop diverges or is no better likeness of the arm. That of what depends on the motion alone
-        must be no worse: a joint that its controller holds moves the same with any friction.
+        ``None`` where that loop diverges or does not simulate the arm better. For effects that depend on the motion
+        alone it must only not be worse: a joint under stiff control moves the same with any friction.
     """
     study, candidate = fit.study, trial.candidate
     robot = added(study.robot, trial)
     if candidate.effect.undo is not None:
         try:
-            # That of the fit has been simulated with its parameters, too: likenesses are compared at equal terms.
+            # The loop of the fit was simulated with its parameters, too: the comparison is fair.
             moved = study.of_robot(robot).resimulated(trial.beside)
         except DataError:
             return None
@@ -139,9 +176,18 @@ def in_its_loop(fit: Fit, trial: Trial) -> Trial | None:
 
 
 def in_loop_of(moved: Study, fit: Fit, candidate: Candidate) -> Trial | None:
-    """A candidate beside the model of a fit, with the simulated motion of another study of the same recordings.
+    """Trial of a candidate in the model of a fit, with the simulated motion of another study of the same recordings.
 
-    The torques stay as they are in the fit: what is judged is what they lack.
+    The torques are those of the fit, because the candidate has to explain its residual.
+
+    Parameters
+    ----------
+    moved
+        Study whose simulated motion is used.
+    fit
+        Fit of the model.
+    candidate
+        Candidate to test.
     """
     pairs = [(fit.study.train, moved.train), (fit.study.held, moved.held)]
     train, held = (

@@ -1,8 +1,9 @@
-"""Which candidates deserve a trial of their own: a quick look with a noise model that the gap cannot fool.
+"""Selection of the candidates for a full test, with noise models that a missing effect does not bias.
 
-An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away; a
-spring is weighed forty times too lightly. So the noise for the look comes from a residual that smooth functions of
-position, speed and time have been taken out of. Trials start from it and end with a noise of their own.
+An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away. The
+weight of a spring, for example, is forty times too small. So the noise models of the selection come from a residual
+without smooth functions of position, speed and time. The full tests start from them and end with noise models of
+their own.
 """
 
 import numpy as np
@@ -19,9 +20,9 @@ from armident.identify.robot.motion import Motion
 Array = NDArray[np.float64]
 
 KNOTS = 7
-"""Of each smooth function."""
+"""Knots of each smooth function."""
 ROWS_PER_COLUMN = 12
-"""Equations that each of their columns must have, so that short recordings are not overfitted."""
+"""Least number of equations per column of these functions, against overfitting of short recordings."""
 
 
 def shortlist(
@@ -29,11 +30,22 @@ def shortlist(
 ) -> tuple[list[tuple[Candidate, Shapes]], frozenset[tuple[str, int, int | None]], tuple[ArModel, ...]]:
     """The candidates that fit the training data best.
 
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    workshop
+        Cache of the columns of the same fit.
+    every
+        All candidates.
+    most
+        Number of candidates to select.
+
     Returns
     -------
     tuple
-        Candidates with their shapes, best first, some with two; the keys of those that cannot be tried; and the noise
-        models, one for each joint, that they were looked at with.
+        Candidates with their nonlinear parameters, best first, some with two sets; the keys of those that cannot be
+        tested; and the noise models of the selection, one for each joint.
     """
     calm = fit.renoised(noise_beyond_shapes(fit, workshop))
     looks: list[tuple[float, Candidate, Shapes]] = []
@@ -53,7 +65,15 @@ def shortlist(
 
 
 def noise_beyond_shapes(fit: Fit, workshop: Workshop) -> list[ArModel]:
-    """Noise models of the residual that smooth functions of each joint's own motion leave."""
+    """Noise models of the residual without smooth functions of each joint's own motion.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    workshop
+        Cache of the columns of the same fit.
+    """
     errors = fit.errors(fit.theta, held=False)
     columns = [
         _smooth_functions(workshop, workshop.motion(s, "measured"), sum(e.shape[0] for e in errors))
@@ -87,7 +107,7 @@ def _smooth_functions(workshop: Workshop, motion: Motion, rows: int) -> list[Arr
 
 
 def _hats(values: Array, knots: int) -> Array:
-    """Piecewise linear functions, one at their own knot and zero at the others; knots at equal shares of the values."""
+    """Piecewise linear functions, one at their own knot and zero at the others; knots at quantiles of the values."""
     places = np.unique(np.quantile(values, np.linspace(0, 1, knots)))
     if places.size < 2:
         return np.ones((values.size, 1))

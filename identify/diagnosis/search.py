@@ -42,19 +42,19 @@ Array = NDArray[np.float64]
 
 
 NEEDED = 0.01
-"""Chance of its estimate by accident above which an effect found earlier is taken out again."""
+"""P-value (Wald) above which an effect found earlier is removed."""
 SHORTLIST = 15
-"""Candidates that get a trial of their own."""
+"""Number of candidates with a full test."""
 LOOPS = 3
-"""Loops in which the nonlinear parameters of one effect are sought."""
+"""Most loops in which the nonlinear parameters of one effect are estimated."""
 ROUNDS = 5
-"""Most times that a recording is put right for one finding, each time by what was still missing."""
+"""Most Newton steps for the value of one correction."""
 SETTLED = 0.01
-"""Part still missing that ends them."""
+"""Relative size of the step that ends them."""
 TAKEN_OVER = 0.25
-"""Part of a rigid parameter that an effect may leave, or have too much, where it takes it over."""
+"""Relative difference allowed where an effect takes over a rigid parameter."""
 EXPLAINED = 0.5
-"""Part of what a joint leaves beyond noise that what passes there explains, where the loop is a likeness of the arm."""
+"""Share of the lack of fit of a joint that a passing effect explains, if the loop simulates the arm well."""
 MOST = 8
 """Most effects of one diagnosis."""
 
@@ -70,7 +70,7 @@ class Search:
     settings
         Error rates.
     progress
-        Called with what is being done.
+        Called with the name of the step.
     """
 
     study: Study
@@ -84,7 +84,7 @@ class Search:
         return self.state(self.study.robot, None)
 
     def run(self) -> State:
-        """Add until nothing passes, then see whether another effect does better in each one's place."""
+        """Model after stepwise selection: effects are added until none passes, then each is tested against others."""
         state = self.start()
         own = len(self.study.robot.effects)
         been = {places_of(state)}
@@ -97,7 +97,15 @@ class Search:
         return self._exchanged(state, own)
 
     def state(self, robot: RobotConfig, before: State | None) -> State:
-        """Fit the model of a robot and try all candidates beside it; made once."""
+        """Fit of the model of a robot, with trials of all candidates; cached.
+
+        Parameters
+        ----------
+        robot
+            Configuration of the model.
+        before
+            Earlier state to start from; ``None`` for the first one.
+        """
         key = tuple(stanza.model_dump_json() for stanza in robot.effects)
         if key not in self._states:
             study, found = refit(self.study, robot, None if before is None else before.fit)
@@ -113,7 +121,7 @@ class Search:
         return self._states[key]
 
     def _again(self, state: State) -> State:
-        """With a second look at what the simulated loop without it may have been too far off to show."""
+        """State with a second test of candidates for which the simulated loop without them may be too inaccurate."""
         passing = state.passing(self.settings)
         keys = {t.candidate.key for t in passing}
         failed = [t for t in state.trials if t.candidate.key not in keys]
@@ -131,11 +139,11 @@ class Search:
         return replace(state, trials=_ranked(list(known.values())))
 
     def _otherwise(self, state: State, passing: Sequence[Trial], failed: Sequence[Trial]) -> list[tuple[Trial, ...]]:
-        """Trials to look at again where nothing explains much of what is more than noise.
+        """Trials to repeat where nothing explains most of a lack of fit.
 
-        Of what puts recordings right: a controller identified from recordings that are not makes a loop in which the
-        right one may score worst. And of what makes the joint reverse at other instants, also where it failed in spite
-        of its score.
+        They are corrections of recordings: with a controller identified from uncorrected recordings, the right
+        correction may have the lowest score. And they are effects that make the joint reverse at other instants, also
+        where they failed in spite of their score.
         """
         joints = {
             excess.joint
@@ -151,9 +159,9 @@ class Search:
         return [*able, *at_measured_signals(state.fit, other, state.workshop, FEEDBACK)]
 
     def _extended(self, state: State, own: int, been: set[Places]) -> State | None:
-        """The state with the best candidate that passes and really makes the held-out error smaller, pruned.
+        """State with the best candidate that passes and reduces the held-out error, pruned; ``None`` if there is none.
 
-        States that have been left before are not returned to: two effects could take each other's place for ever.
+        Earlier states are not repeated: otherwise two effects could replace each other for ever.
         """
         passing = state.passing(self.settings)
         if state.study.loop not in CONTROLLERS:
@@ -168,9 +176,9 @@ class Search:
         return None
 
     def _tells_the_controller(self, state: State, trial: Trial) -> bool:
-        """Whether the controller can be identified once the recording is put right, where it could not as it was.
+        """True if the controller can be identified after a correction of the recording, and could not before.
 
-        Nothing speaks more for it, while beside a stand-in scores mean little.
+        This is the strongest evidence for the correction; with a stiff nominal controller scores mean little.
         """
         if trial.candidate.effect.undo is None:
             return False
@@ -178,10 +186,17 @@ class Search:
         return extended is not None and extended.study.loop in CONTROLLERS
 
     def with_trial(self, state: State, trial: Trial) -> State | None:
-        """The state with what a trial found; ``None`` if the motion cannot tell it from what the model has.
+        """State with the effect of a trial; ``None`` if the motion cannot distinguish it from the model.
 
-        Nonlinear parameters of effects that depend on predicted torques are sought again in the loop that they make,
-        and in that which these make.
+        Nonlinear parameters of effects that depend on predicted torques are estimated again in the loop that contains
+        them, repeatedly.
+
+        Parameters
+        ----------
+        state
+            Model without the effect.
+        trial
+            Trial of the effect.
         """
         effect = trial.candidate.effect
         starts = [trial, *(t for t in state.others if t.candidate.key == trial.candidate.key and not t.forbidden)]
@@ -197,10 +212,10 @@ class Search:
             return None
 
     def _from_near_by(self, robot: RobotConfig, state: State, trial: Trial) -> RobotConfig:
-        """With nonlinear parameters of the last stanza from next to where the trial has them, if these come nearer.
+        """Robot with the last effect refined from neighbouring nonlinear parameters, if these fit better.
 
-        Asked where the joint still leaves more than noise: steps downhill may have ended in a hollow. Of what depends
-        on the motion alone, with which they cost no simulation.
+        This is done where the joint still has a lack of fit: Gauss-Newton steps may have ended in a local minimum. It
+        is done for effects that depend on the motion alone, which need no simulation.
         """
         if trial.candidate.effect.predicts:
             return robot
@@ -220,14 +235,18 @@ class Search:
         return robot
 
     def _completed(self, start: RobotConfig, state: State, whole: RobotConfig | None = None) -> RobotConfig:
-        """Polished, with what belongs to the last stanza but need not be there where that comes nearer to unseen data.
+        """Robot with the last effect refined, with its optional parameters where they fit held-out data better.
 
-        A bristle carries all the dry friction of its joint, or what is extra alone: a part of it would be another's.
+        A bristle model carries all the dry friction of its joint, or the additional part alone.
 
         Parameters
         ----------
+        start
+            Robot with the effect without optional parameters.
+        state
+            Model without the effect.
         whole
-            With all of it, to polish from there.
+            Robot with the optional parameters, as another start.
         """
         robot = polished(self.study, start, state.fit)
         whole = whole or completed(robot)
@@ -243,7 +262,7 @@ class Search:
         return whole if all_of_it and nearer(with_it, without_it, self.settings.material) else robot
 
     def _put_right(self, robot: RobotConfig, state: State, trial: Trial) -> RobotConfig:
-        """With the value in its last stanza that leaves nothing more of it to find (Newton's method).
+        """Robot with the value of its last correction at which no further correction remains (Newton's method).
 
         Raises
         ------
@@ -265,7 +284,7 @@ class Search:
         return robot
 
     def _pruned(self, state: State, own: int) -> State:
-        """Without effects that the ones found later have made superfluous; those of the configuration stay."""
+        """State without effects that later findings have made superfluous; those of the configuration stay."""
         while True:
             doubtful = [
                 (accident(state, term), k)
@@ -280,7 +299,7 @@ class Search:
             state = self.state(robot, state)
 
     def _exchanged(self, state: State, own: int) -> State:
-        """Every finding competes once more, with all others in the model."""
+        """State after every finding has competed once more, with all others in the model."""
         for k in range(own, len(state.study.robot.effects)):
             if k >= len(state.study.robot.effects):
                 break
@@ -298,9 +317,9 @@ class Search:
 
 
 def _settled(state: State, trial: Trial) -> Trial:
-    """A trial with its nonlinear parameters sought in the loop that it makes, and in that which these make.
+    """Trial with its nonlinear parameters estimated in the loop that contains them, repeatedly.
 
-    Those of effects that depend on nothing but the motion, or leap, stay where they are.
+    Those of effects that depend on the motion alone, or have jumps, stay as they are.
     """
     effect = trial.candidate.effect
     if not effect.predicts or effect.sudden or not any(effect.refinable(state.study.robot, trial.candidate.place)):

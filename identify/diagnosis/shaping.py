@@ -1,8 +1,8 @@
-"""Nonlinear parameters of a candidate by instrumental variables, as the linear ones are.
+"""Nonlinear parameters of a candidate by two-stage least squares (Amemiya 1974, J. Econometrics 2).
 
-A search at simulated signals finds roughly where they are, but the simulated loop does not have the candidate in it:
-its motor does not leap while the teeth are apart. The candidate's columns are right at measured signals only; the
-simulated ones say along which directions to look at them (two-stage least squares, Amemiya 1974, J. Econometrics 2).
+A search at simulated signals finds their approximate values, but the simulated loop does not contain the candidate: its
+motor does not jump in the backlash, for example. The columns of the candidate are right at measured signals only. The
+simulated ones are the instruments.
 """
 
 from collections.abc import Callable
@@ -19,30 +19,47 @@ from armident.identify.diagnosis.whitening import whitened
 Array = NDArray[np.float64]
 
 FIRST_LOOKS = 6
-"""Values over the range of a parameter that are tried before the best of them is refined."""
+"""Values over the range of a parameter before the refinement of the best one."""
 REFINEMENTS = 8
 """Evaluations of that refinement."""
 
 
 def both_ends(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Shapes) -> tuple[Shapes, ...]:
-    """Shapes as simulated signals have them, and as measured ones do where that is not the same: either may be astray.
+    """Nonlinear parameters by measured signals and by simulated ones, where these differ; either may be wrong.
 
-    Simulated signals are those of a loop without the effect, and measured ones hold noise that it amplifies.
+    Simulated signals are those of a loop without the effect, and measured ones contain noise that it amplifies.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    candidate
+        Candidate with its grid.
+    workshop
+        Cache of the columns of the same fit.
+    shapes
+        Nonlinear parameters by simulated signals.
     """
     found = instrumented(fit, candidate, workshop, shapes)
     return (shapes,) if found == shapes else (found, shapes)
 
 
 def instrumented(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Shapes) -> Shapes:
-    """Continuous nonlinear parameters, one after the other, between the neighbours on the grid of where they are.
+    """Continuous nonlinear parameters, one after the other, between their neighbours on the grid.
 
-    Of effects that depend on nothing but the motion they stay: that motion is simulated well, and measured velocities
-    are least sure around standstill, where friction changes most.
+    Those of effects that depend on the motion alone stay. That motion is simulated well, and measured velocities are
+    least accurate around standstill, where friction changes most.
 
     Parameters
     ----------
+    fit
+        Fit of the model.
+    candidate
+        Candidate with its grid.
+    workshop
+        Cache of the columns of the same fit.
     shapes
-        Where to begin: the best at simulated signals.
+        Start: the best values at simulated signals.
     """
     found = shapes
     if not candidate.effect.predicts:
@@ -81,7 +98,7 @@ def _explained(
 
 
 def _highest(explained: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function of a positive parameter is highest, on a logarithmic scale."""
+    """Maximum of a function of a positive parameter, on a logarithmic scale."""
     looks = np.linspace(np.log(low), np.log(high), FIRST_LOOKS)
     powers = [explained(float(np.exp(x))) for x in looks]
     best = int(np.argmax(powers))

@@ -18,9 +18,19 @@ Array = NDArray[np.float64]
 class SimulatedErrors:
     """Errors of simulated velocities and torques on the held-out data, percent of the measured ones, (n,) each.
 
-    ``torque_without_derivative_noise`` is the error of the model as configured at the measured motion, less the torque
-    that the findings add at the simulated motion: see `armident.identify.diagnosis.foretold`. NaN where a simulated
-    loop diverges or the difference is undefined.
+    NaN where a simulated loop diverges or the difference is undefined.
+
+    Parameters
+    ----------
+    joints
+        Names of the joints.
+    velocity_before, velocity_after
+        Errors of the simulated velocities with the model as configured, and with the findings.
+    torque_before, torque_after
+        Errors of the simulated torques with both models.
+    torque_without_derivative_noise
+        Error of the model as configured at the measured motion, less the torque that the findings add at the simulated
+        motion: see `armident.identify.diagnosis.foretold`.
     """
 
     joints: tuple[str, ...]
@@ -44,7 +54,13 @@ class SimulatedErrors:
 
 
 def simulated_errors(first: State, final: State) -> SimulatedErrors:
-    """Simulate the references with both models."""
+    """Errors of the closed loops of two models, simulated along the references.
+
+    Parameters
+    ----------
+    first, final
+        Model as configured, and with the findings.
+    """
     before, after = _errors(first), _errors(final)
     if before is None or after is None:
         unknown = np.full(first.study.robot.n, np.nan)
@@ -55,7 +71,13 @@ def simulated_errors(first: State, final: State) -> SimulatedErrors:
 
 
 def foretold_errors(first: State, final: State) -> Array:
-    """Held-out torque errors of a model less what another one changes at simulated motion, percent, (n,); or nan."""
+    """Held-out torque errors of a model less the change by another one at simulated motion, percent, (n,); or nan.
+
+    Parameters
+    ----------
+    first, final
+        Model as configured, and with the findings.
+    """
     found = foretold(first.study, first.fit.theta, final.study, final.fit.theta)
     if found is None:
         return np.full(first.study.robot.n, np.nan)

@@ -1,4 +1,4 @@
-"""Shapes with confidence bands: how strongly to smooth is estimated from the data."""
+"""Penalized splines with confidence bands; the smoothing strength is estimated from the data (thesis 7.3.2)."""
 
 from collections.abc import Sequence
 
@@ -15,14 +15,14 @@ UNPENALISED = 1e-9
 """Roughness, relative to the roughest direction, below which a direction counts as smooth altogether."""
 
 CONTAINED = 0.1
-"""Directions of which so little is left beside the model (relative norm) are no part of a shape: the model has them."""
+"""Relative norm orthogonal to the model below which a direction is no part of a shape: the model contains it."""
 
 STRENGTHS = np.geomspace(1e-8, 1e8, 129)
 """Smoothing strengths tried, relative to the data's."""
 
 
 def smoothed(fit: Fit, columns: Columns, basis: Array, pieces: Sequence[Array]) -> tuple[Array, Array]:
-    """A free shape fitted on the training data beside the model, with as much smoothing as the data ask for.
+    """Free shape fitted on the training data in addition to the model, with the most likely smoothing strength.
 
     State-dependent parameters are smoothed as integrated random walks, whose noise-variance ratio is found by maximum
     likelihood (thesis section 7.3.2; Young, McKenna, Bruun 2001, Int. J. Control 74(18)). That is a spline penalised on
@@ -30,17 +30,19 @@ def smoothed(fit: Fit, columns: Columns, basis: Array, pieces: Sequence[Array]) 
 
     Parameters
     ----------
+    fit
+        Fit of the model.
     columns
         Whitened columns of the shape's basis.
     basis
         The basis at the points of the curve, (G, k).
     pieces
-        Rows of the basis at stretches of the curve that are to be smooth each, (G', k).
+        Rows of the basis at the parts of the curve that are smooth each, (G', k).
 
     Returns
     -------
     value, band : ndarray
-        The shape and two standard deviations of it, (G,). What the model itself can represent is not part of it.
+        The shape and two standard deviations of it, (G,). The part that the model itself can represent is not included.
     """
     found = directions_beside(fit, columns.z)
     if found is None:
@@ -64,7 +66,7 @@ def smoothed(fit: Fit, columns: Columns, basis: Array, pieces: Sequence[Array]) 
 
 
 def _shrinkage(seen: Array, roughness: Array) -> Array:
-    """What is left of each coordinate (k,), at the smoothing strength of the largest likelihood."""
+    """Factor of each coordinate (k,) at the smoothing strength of the largest likelihood."""
     rough = roughness > UNPENALISED * max(float(roughness.max()), 1e-300)
     weight = np.ones_like(seen)
     if not rough.any():

@@ -1,4 +1,4 @@
-"""Robot configurations with the findings of a search as stanzas."""
+"""Robot configurations with the findings of a search as effect entries."""
 
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.trial import Trial
@@ -8,7 +8,15 @@ from armident.identify.effects.terms import stanza_of
 
 
 def added(robot: RobotConfig, trial: Trial) -> RobotConfig:
-    """The robot with what a trial found as its last stanza, without the parameters that the effect may be without."""
+    """Robot with the result of a trial as its last effect entry, without optional parameters of the effect.
+
+    Parameters
+    ----------
+    robot
+        Configuration.
+    trial
+        Trial of the effect to add.
+    """
     parameters = dict(trial.shapes) | values_of(trial)
     effect = trial.candidate.effect
     contained = tuple(p.name for p, there in zip(effect.linear, trial.contained, strict=True) if there)
@@ -18,7 +26,7 @@ def added(robot: RobotConfig, trial: Trial) -> RobotConfig:
 
 
 def completed(robot: RobotConfig) -> RobotConfig | None:
-    """The robot with the parameters of its last stanza that the effect may be without; ``None`` if there are none."""
+    """Robot with the optional parameters of its last effect entry; ``None`` if there are none."""
     last = robot.effects[-1]
     spared = [p.name for p in known(last.effect).linear if p.through is not None]
     if not any(name in last.without for name in spared):
@@ -28,14 +36,30 @@ def completed(robot: RobotConfig) -> RobotConfig | None:
 
 
 def valued(robot: RobotConfig, name: str, value: float) -> RobotConfig:
-    """The robot with another value of a parameter of its last stanza."""
+    """Robot with another value of a parameter of its last effect entry.
+
+    Parameters
+    ----------
+    robot
+        Configuration.
+    name, value
+        Parameter and its new value.
+    """
     last = robot.effects[-1]
     changed = last.model_copy(update={"parameters": {**last.parameters, name: value}})
     return robot.model_copy(update={"effects": (*robot.effects[:-1], changed)})
 
 
 def without(robot: RobotConfig, stanza: int) -> RobotConfig:
-    """The robot without one of its stanzas."""
+    """Robot without one of its effect entries.
+
+    Parameters
+    ----------
+    robot
+        Configuration.
+    stanza
+        Number of the entry.
+    """
     return robot.model_copy(update={"effects": (*robot.effects[:stanza], *robot.effects[stanza + 1 :])})
 
 
@@ -46,5 +70,13 @@ def values_of(trial: Trial) -> dict[str, float]:
 
 
 def stanza_number(robot: RobotConfig, term: int) -> int:
-    """Stanza of a robot's term: what is put right in recordings is a stanza, but no term."""
+    """Number of the effect entry of a term; corrections of recordings are entries, but no terms.
+
+    Parameters
+    ----------
+    robot
+        Configuration.
+    term
+        Number of the term.
+    """
     return [k for k, stanza in enumerate(robot.effects) if not of_recording(stanza)][term]

@@ -1,4 +1,4 @@
-"""The model as far as a search has come, and what can be said of it."""
+"""State of the model selection, and comparisons between states."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,29 +26,29 @@ Array = NDArray[np.float64]
 Places = tuple[tuple[str, str, str], ...]
 
 HELD_OUT_LEVEL = 0.05
-"""The held-out data alone must speak for a finding at this level, whatever the training data say."""
+"""Significance level of the held-out data alone for a finding, whatever the training data."""
 FEEDBACK = 0.05
 """Share of a joint's held-out residual power that an effect must explain which is its own instrument: feedback lets the
 motion follow the disturbances, so that terms without merit explain a percent or two."""
 
 
 ANCHORINGS = 4
-"""Most times that shares of predicted torques are made anew by what the fit with them predicts."""
+"""Most iterations between terms that scale predicted torques and the torques that the fit predicts."""
 
 ANCHORED = 0.1
-"""Change of their parameters, in standard deviations, that ends them."""
+"""Change of their parameters, in standard deviations, that ends the iterations."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a user may choose of a diagnosis.
+    """Options of a diagnosis.
 
     Parameters
     ----------
     false_alarms
-        Chance that a plant without a missing effect is said to have one, over all tests of a diagnosis.
+        Probability of a false alarm for a plant without a missing effect, over all tests of a diagnosis.
     material
-        Share of a joint's held-out residual power that an effect must explain to be worth a finding.
+        Share of a joint's held-out residual power that an effect must explain to be reported.
     """
 
     false_alarms: float = 0.01
@@ -57,18 +57,24 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The model as far as it has come, and how every candidate would do beside it.
+    """Model of one step of the selection, with the trials of all candidates in addition to it.
 
     Parameters
     ----------
+    study
+        Data with the model.
+    fit
+        Fit of the model.
+    workshop
+        Cache of the columns of the same fit.
     trials
-        Of the candidates that looked best, best first; those with a sign that physics forbids are among them.
+        Trials of the best candidates, best first; those with a sign that physics forbids are among them.
     tests
-        Number of candidates that they were chosen from.
+        Number of candidates from which they were selected.
     hidden
         Candidates that the model contains or the motion does not excite.
     others
-        Trials of the same candidates with other nonlinear parameters, which scored less.
+        Trials of the same candidates with other nonlinear parameters and lower scores.
     """
 
     study: Study
@@ -80,14 +86,14 @@ class State:
     others: tuple[Trial, ...] = ()
 
     def no_accident(self, settings: Settings) -> list[Trial]:
-        """Trials that chance does not make, however little they explain, best first."""
+        """Significant trials, however little they explain, best first."""
         level = settings.false_alarms / max(self.tests, 1)
         return [
             t for t in self.trials if not t.forbidden and t.p_value < level and t.p_held < HELD_OUT_LEVEL and t.gain > 0
         ]
 
     def passing(self, settings: Settings) -> list[Trial]:
-        """Trials that a finding may come from, best first."""
+        """Trials that may become a finding, best first."""
         return [
             t
             for t in self.no_accident(settings)
@@ -97,16 +103,18 @@ class State:
 
 
 def nearer(one: State, other: State, material: float) -> bool:
-    """Whether a model comes closer to the held-out torques than another, at measured or at simulated signals.
+    """True if a model fits the held-out torques better than another, at measured or at simulated signals.
 
-    Both count: measured positions, differentiated twice for an elastic joint, may bring more noise than the effect has
-    torque, and simulated ones are only as good as the loop. Where they alone are for it, the loop with the effect in it
-    must be no worse a likeness of the arm: what a model says of itself is no evidence.
+    Both count. Measured positions, differentiated twice for an elastic joint, may add more noise than the effect has
+    torque; simulated ones are only as good as the loop. Where only simulated signals favour the model, its loop must
+    simulate the arm no worse, since the model would otherwise be its own evidence.
 
     Parameters
     ----------
+    one, other
+        The model, and the one to improve on.
     material
-        Share of the power of a joint's whitened error by which it must be closer where only simulated signals show it.
+        Share of the power of a joint's whitened error by which it must be better where only simulated signals show it.
     """
     closer = one.study.moves_more_like_the_arm_than(other.study, held=True)
     if one.study.recorded != other.study.recorded:
@@ -117,7 +125,7 @@ def nearer(one: State, other: State, material: float) -> bool:
         return False
     noise = one.fit.noise
     before = other.fit.errors(other.fit.theta, held=True)
-    # Of the error at measured signals, less what of it the change at simulated ones explains: those know no noise.
+    # Error at measured signals less the change at simulated ones, which are free of noise.
     ways = [[e - c for e, c in zip(before, _change(other, one), strict=True)]]
     if closer:
         ways.append(one.fit.errors(one.fit.theta, held=True))
@@ -127,9 +135,16 @@ def nearer(one: State, other: State, material: float) -> bool:
 
 
 def supersedes(one: State, other: State, material: float) -> bool:
-    """Whether a model comes closer to the held-out torques than another that lacks nothing of it but one effect.
+    """True if a model fits the held-out torques better than another one that differs in one effect.
 
-    Of two effects in one place each has its loop, and either may be a likeness: what was measured decides.
+    Each of two effects in one place has its own loop, and either loop may be right: measured signals decide.
+
+    Parameters
+    ----------
+    one, other
+        The model, and the one to improve on.
+    material
+        Share of the power of a joint's whitened error, for corrections of recordings, see `nearer`.
     """
     if one.study.recorded != other.study.recorded:
         return nearer(one, other, material)
@@ -148,9 +163,9 @@ def _power(state: State) -> Array:
 
 
 def _recorded_right(one: State, other: State, material: float) -> bool:
-    """Whether recordings put right as in one state make smaller errors, where the loops hardly tell.
+    """True if the corrections of one state make smaller errors, where the loops hardly differ.
 
-    With the filters of both ways in either: a torque put right by a filter has less noise, whether it was wrong or not.
+    Both corrections are applied to either: a correction by a filter reduces noise even where the torque was right.
     """
     ours, theirs = one.study.recorded, other.study.recorded
     differ = [s for s in ours if s not in theirs] + [s for s in theirs if s not in ours]
@@ -162,26 +177,32 @@ def _recorded_right(one: State, other: State, material: float) -> bool:
         return False
     was, now = power_put_right(other, one), power_put_right(one, other)
     gained = float(np.sum(np.log(now / was)))
-    # What a loop loses that hardly differs from the arm anyhow (a stiff controller) the torques make good.
+    # A loop that hardly differs from the arm anyhow (a stiff controller) may be worse; then the torques decide.
     enough = gained < 0.0 if lost < 1.0 / ALIKE else gained + np.log(lost) < 0.0
     return bool(enough and np.any(now < (1 - material) * was))
 
 
 def share_explained(one: State, other: State) -> Array:
-    """Share of every joint's whitened held-out error at measured signals that one model has less than another, (n,)."""
+    """Relative reduction of every joint's whitened held-out error power by one model against another, (n,).
+
+    Parameters
+    ----------
+    one, other
+        The model with smaller errors, and the one it is compared with.
+    """
     was, now = (_whitened_power(s.fit.errors(s.fit.theta, held=True), one.fit.noise) for s in (other, one))
     return np.asarray(1.0 - now / np.maximum(was, 1e-300))
 
 
 def _foretold(one: State, other: State, material: float) -> bool:
-    """Whether a recording put right changes the predicted torques, at simulated motion, to where the held-out ones are.
+    """True if a correction of recordings improves the torques predicted at the simulated motion.
 
-    Noise of the encoder makes noise of the torque through the controller, in step with it: where that is strong, errors
-    at measured signals speak for whatever takes torques out of step, and hide what a loop gains.
+    The controller turns encoder noise into torque noise in phase with it. Where that noise is strong, errors at
+    measured signals favour any effect that shifts the torque in time, and hide the improvement of the loop.
     """
     differ = [stanza for stanza in one.study.recorded if stanza not in other.study.recorded]
     where = [one.study.joints.index(stanza.joint) for stanza in differ]
-    # What a model says of itself is no evidence: its loop has to be a better likeness there, over all of the data.
+    # A model is no evidence for itself: its loop has to simulate the arm better there, over all of the data.
     if np.prod([one.study.likeness_lost(other.study, where, held=held) for held in (False, True)]) >= 1.0:
         return False
     found = foretold(other.study, other.fit.theta, one.study, one.fit.theta)
@@ -192,7 +213,15 @@ def _foretold(one: State, other: State, material: float) -> bool:
 
 
 def power_put_right(state: State, other: State) -> Array:
-    """Squared norm of every joint's held-out errors, put right as the recordings of another state are, too, (n,)."""
+    """Squared norm of every joint's held-out errors, with the corrections of another state applied as well, (n,).
+
+    Parameters
+    ----------
+    state
+        The model.
+    other
+        State whose corrections are applied.
+    """
     study = state.study
     late = tuple(stanza for stanza in other.study.recorded if not known(stanza.effect).rewires)
     total = np.zeros(study.robot.n)
@@ -204,8 +233,8 @@ def power_put_right(state: State, other: State) -> Array:
 def _change(before: State, after: State) -> list[Array]:
     """Change of the held-out torques from one model to another at the simulated motion of the second, (M, n) of each.
 
-    Beyond the bandwidth of the controller it is the motion that a model changes and hardly the torque: motions of their
-    own would hide what the models disagree about.
+    Beyond the bandwidth of the controller a model changes the motion and hardly the torque. With separate motions the
+    difference of the models would be hidden.
     """
     study, theta = before.study, padded(before.fit, before.study.model)
     changes = []
@@ -223,7 +252,17 @@ def _whitened_power(errors: Sequence[Array], noise: Sequence[ArModel]) -> Array:
 
 
 def refit(study: Study, robot: RobotConfig, before: Fit | None) -> tuple[Study, Fit]:
-    """The data with the model of a robot, and its fit.
+    """Data with the model of a robot, and its fit.
+
+    Parameters
+    ----------
+    study
+        Data with another model of the same recordings.
+    robot
+        Configuration of the model.
+    before
+        Earlier fit, whose rigid parameters predict the torques on which terms depend; ``None``: fit a rigid model
+        first.
 
     Raises
     ------
@@ -249,9 +288,9 @@ def refit(study: Study, robot: RobotConfig, before: Fit | None) -> tuple[Study, 
 
 
 def _anchored(found: Fit) -> Fit:
-    """Shares of predicted torques by those that the model itself predicts.
+    """Fit whose terms scale the torques predicted by the model itself, by iteration.
 
-    A drive that gives half its torque is a share of another torque than the model without it predicts.
+    A drive that gives half its torque scales another torque than the model without it predicts.
     """
     terms = slice(found.study.model.base.b - found.study.model.e, None)
     for _ in range(ANCHORINGS):
@@ -263,13 +302,29 @@ def _anchored(found: Fit) -> Fit:
 
 
 def padded(before: Fit, model: ArmModel) -> Array:
-    """Rigid parameters of an earlier fit, zeros for the terms, (b,)."""
+    """Rigid parameters of an earlier fit, zeros for the terms, (b,).
+
+    Parameters
+    ----------
+    before
+        Earlier fit.
+    model
+        Model with terms.
+    """
     rigid = before.theta[: before.study.model.base.b - before.study.model.e]
     return np.concatenate([rigid, np.zeros(model.e)])
 
 
 def accident(state: State, term: Term) -> float:
-    """Chance that the linear parameters of a term are all zero (Wald test)."""
+    """P-value of the hypothesis that the linear parameters of a term are all zero (Wald test).
+
+    Parameters
+    ----------
+    state
+        Model with the term.
+    term
+        Term of the model.
+    """
     names = state.study.model.base.names
     own = [names.index(name) for name in term.names]
     values, covariance = state.fit.theta[own], state.fit.covariance[np.ix_(own, own)]
@@ -277,7 +332,17 @@ def accident(state: State, term: Term) -> float:
 
 
 def takes_over(state: State, term: Term, most: float) -> bool:
-    """Whether what a term takes over of rigid parameters of its joint is all of them, but for a share of ``most``."""
+    """True if a term takes over the rigid parameters of its joint entirely, up to a share of ``most``.
+
+    Parameters
+    ----------
+    state
+        Model with the term.
+    term
+        Term of the model.
+    most
+        Greatest relative difference of the parameter.
+    """
     estimates = dict(zip(state.study.model.base.names, state.fit.theta, strict=True))
     for name, linear in zip(term.names, term.linear, strict=True):
         whole = estimates.get(f"{linear.replaces}{term.place.joint + 1}", 0.0)
@@ -287,7 +352,15 @@ def takes_over(state: State, term: Term, most: float) -> bool:
 
 
 def with_values(state: State, shapes: Mapping[int, Mapping[str, float]] | None = None) -> RobotConfig:
-    """The robot with the estimated values in its stanzas."""
+    """Robot with the estimated values in its effect entries.
+
+    Parameters
+    ----------
+    state
+        The model.
+    shapes
+        Other nonlinear parameters, by number of the term and name.
+    """
     stanzas: list[Stanza] = list(state.study.robot.effects)
     for k, term in enumerate(effect_terms(state.study.model)):
         number = stanza_number(state.study.robot, k)
@@ -299,5 +372,5 @@ def with_values(state: State, shapes: Mapping[int, Mapping[str, float]] | None =
 
 
 def places_of(state: State) -> Places:
-    """What the model of a state has beyond the rigid one, and where, whatever the values and the order."""
+    """Effects of a model and their places, whatever the values and the order."""
     return tuple(sorted((e.effect, e.joint, e.other or "") for e in state.study.robot.effects))

@@ -1,4 +1,4 @@
-"""Uninterrupted stretches of motion that a model is fitted to or judged by."""
+"""Uninterrupted stretches of motion for fit and test."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from armident.identify.signals.differentiate import Derivatives
 Array = NDArray[np.float64]
 
 KINDS = ("measured", "simulated")
-"""Of the motion of a stretch."""
+"""Kinds of motion of a stretch."""
 
 
 @dataclass(frozen=True)
@@ -25,20 +25,20 @@ class Stretch:
     simulated
         The same motion without noise, of the simulated closed loop: instruments.
     y
-        Torques (M, n) in the band of the comparison.
+        Torques (M, n) in the band of the comparison, N m or N.
     torque
-        The same at the working rate, with all they hold beyond that band, (N, n).
+        Torques at the working rate, not limited to that band, (N, n), N m or N.
     t
-        Their instants, s, (M,).
+        Instants of ``y``, s, (M,).
     experiment
         Number of the experiment that it is cut from.
     rows
         Its samples in that experiment, (N,).
     span
-        The same after the thinning.
+        Its samples after decimation to the working rate.
     before
-        Measured and simulated motion that came before, where the experiment did not begin here: what has a memory
-        begins there.
+        Measured and simulated motion before the stretch, where the experiment starts earlier. Effects with internal
+        states start there.
     """
 
     measured: Derivatives
@@ -52,7 +52,17 @@ class Stretch:
     before: tuple[Derivatives, Derivatives] | None = None
 
     def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "Stretch":
-        """With another simulation of the whole experiment, at its sampling period ``dt``."""
+        """Stretch with another simulation of the whole experiment.
+
+        Parameters
+        ----------
+        motion
+            Simulated motion of the experiment.
+        dt
+            Its sampling period, s.
+        factor
+            Decimation factor to the working rate.
+        """
         simulated = replace(at_rows(motion, self.rows, dt, factor), start=self.simulated.start)
         if self.before is None:
             return replace(self, simulated=simulated)
@@ -64,7 +74,19 @@ class Stretch:
 
 
 def at_rows(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: int) -> Derivatives:
-    """Signals at some of their samples."""
+    """Signals at some of their samples.
+
+    Parameters
+    ----------
+    signals
+        Positions and derivatives.
+    rows
+        Numbers of the samples, (N,).
+    dt
+        Sampling period of the signals, s.
+    factor
+        Distance of the chosen samples.
+    """
     return Derivatives(
         np.ascontiguousarray(signals.q[rows]),
         np.ascontiguousarray(signals.qd[rows]),
@@ -76,7 +98,15 @@ def at_rows(signals: Derivatives, rows: NDArray[np.int64], dt: float, factor: in
 
 
 def rows_before(kept: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """As many samples before a stretch as it has itself, if there are."""
+    """Samples before a stretch, as many as it has itself if there are enough.
+
+    Parameters
+    ----------
+    kept
+        Samples of the experiment at the working rate.
+    rows
+        Samples of the stretch, (N,).
+    """
     first = int(np.searchsorted(kept, rows[0]))
     return kept[max(first - rows.size, 0) : first]
 

@@ -1,4 +1,4 @@
-"""What a diagnosis works on: training and held-out stretches of motion, with their torques in one band."""
+"""Data of a diagnosis: training and held-out stretches of motion, with their torques in one band."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ from armident.identify.signals.differentiate import Derivatives, differentiate
 Array = NDArray[np.float64]
 
 HELD_OUT_SHARE = 0.35
-"""Last part of every experiment kept for judging, where no other recording is given for it."""
+"""Share at the end of every experiment that is held out, where no recording for validation is given."""
 
 BAND = 5.0
 """Frequency up to which model and data are compared, as a multiple of the closed-loop bandwidth."""
@@ -38,9 +38,9 @@ WORKING_RATE = 20.0
 
 
 ALIKE = 0.9
-"""Squared error of one loop's motion over that of another down to which they tell nothing."""
+"""Indifference ratio of squared closed-loop velocity errors."""
 STIFF_LOOP = 1.5
-"""Squared error of the motion of a stand-in's loop over that without the model's terms up to which it is no worse."""
+"""Ratio of squared velocity errors, with over without terms, allowed in the loop of a stiff nominal controller."""
 
 
 @dataclass(frozen=True)
@@ -54,23 +54,27 @@ class Study:
     model
         Its model.
     decimation
-        From the working rate to the rate of the comparison.
+        Filter and decimation from the working rate to the rate of the comparison.
     dt
-        Of the working rate, s.
+        Sampling period of the working rate, s.
     duration
-        Of all recordings, s.
+        Duration of all recordings, s.
+    train, held
+        Training and held-out stretches.
     loop
-        Which closed loop the instruments come from.
+        Kind of controller of the closed loop that gives the instruments.
     auxiliary
-        That loop, of the rigid arm as least squares have it.
+        That loop, with the IDIM-LS estimate of the rigid arm.
     thinning
-        From the recorded to the working rate.
+        Filter and decimation from the recorded to the working rate.
     sources
-        Recordings for training and for validation, as they are.
+        Recordings for training and for validation, without corrections.
     signals
         Derivatives of their positions at the recorded rate.
+    warnings
+        Lines for the user.
     rigid
-        Regressors that all models of the study share, made once; see
+        Cache of the regressors that all models of the study share; see
         `armident.identify.diagnosis.regression.regressors`.
     """
 
@@ -93,11 +97,11 @@ class Study:
 
     @property
     def recorded(self) -> tuple[Stanza, ...]:
-        """Stanzas by which the recordings have been put right."""
+        """Effect entries that correct the recordings."""
         return tuple(stanza for stanza in self.robot.effects if of_recording(stanza))
 
     def of_robot(self, robot: RobotConfig) -> "Study":
-        """The same recordings for another model, put right anew where its stanzas say other things of them.
+        """The same recordings for another model, corrected again where its effect entries require other corrections.
 
         Raises
         ------
@@ -111,9 +115,17 @@ class Study:
         return build_study(*self.sources, robot, self.signals if wiring[0] == wiring[1] else None)
 
     def moves_more_like_the_arm_than(self, other: "Study", *, held: bool) -> bool:
-        """Whether the simulated loop is a better likeness of the arm than that of another study of the same recordings.
+        """True if the simulated loop follows the arm better than that of another study of the same recordings.
 
-        One whose controller was identified is, beside a stand-in: that follows the measured motion whatever the arm.
+        A loop with an identified controller counts as better than a stiff nominal one, which follows the measured
+        motion whatever the arm.
+
+        Parameters
+        ----------
+        other
+            Study to compare with.
+        held
+            True for the held-out data, false for the training data.
         """
         ours, theirs = self.loop in CONTROLLERS, other.loop in CONTROLLERS
         if ours != theirs:
@@ -122,9 +134,18 @@ class Study:
         return bool(distances(one).sum() < distances(two).sum())
 
     def likeness_lost(self, other: "Study", joints: Sequence[int], *, held: bool) -> float:
-        """Squared error of this simulated loop's motion at some joints over that of another's.
+        """Ratio of squared velocity errors of this simulated loop and another one, at some joints.
 
-        Infinite where one of the two is a stand-in, which follows what it sees, and the other one is not.
+        Infinite where only one of the two has an identified controller: a stiff nominal controller follows any motion.
+
+        Parameters
+        ----------
+        other
+            Study to compare with.
+        joints
+            Numbers of the joints.
+        held
+            True for the held-out data, false for the training data.
         """
         if (self.loop in CONTROLLERS) != (other.loop in CONTROLLERS):
             return float("inf")
@@ -142,7 +163,17 @@ class Study:
         return [joint.name for joint in self.robot.joints]
 
     def motion(self, stretch: Stretch, kind: str, theta: Array | None) -> Motion:
-        """A stretch as effects see it, ``measured`` or ``simulated``; with what came before."""
+        """Signals of a stretch on which effects depend, with the motion before it.
+
+        Parameters
+        ----------
+        stretch
+            A stretch of the study.
+        kind
+            ``measured`` or ``simulated``.
+        theta
+            Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+        """
         parts: list[Derivatives] = [getattr(stretch, kind)]
         if stretch.before is not None:
             parts.insert(0, stretch.before[KINDS.index(kind)])
@@ -151,12 +182,32 @@ class Study:
         return Motion(self.model, q, qd, qdd, self.dt, parts[0].start, theta, self.duration, lead=lead)
 
     def terms(self, stretch: Stretch, kind: str, theta: Array | None) -> Array:
-        """Columns (N, n, e) of the model's terms along a stretch."""
+        """Columns (N, n, e) of the model's terms along a stretch.
+
+        Parameters
+        ----------
+        stretch
+            A stretch of the study.
+        kind
+            ``measured`` or ``simulated``.
+        theta
+            Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+        """
         motion = self.motion(stretch, kind, theta)
         return self.model.term_regressor(motion)[motion.lead :]
 
     def torques(self, stretch: Stretch, kind: str, theta: Array) -> Array:
-        """Torques (N, n) of the model along a stretch, terms included."""
+        """Torques (N, n) of the model along a stretch, terms included, N m or N.
+
+        Parameters
+        ----------
+        stretch
+            A stretch of the study.
+        kind
+            ``measured`` or ``simulated``.
+        theta
+            Parameters of the model, (b,).
+        """
         signals: Derivatives = getattr(stretch, kind)
         rigid = self.model.inverse_dynamics(theta, signals.q, signals.qd, signals.qdd)
         return rigid + self.terms(stretch, kind, theta) @ theta[-self.model.e :] if self.model.e else rigid
@@ -189,7 +240,7 @@ class Study:
             return tuple(s.resimulated(motions[s.experiment], dt, factor) for s in stretches)
 
         train = moved(self.train)
-        # A stand-in follows the measured motion whatever the arm: there it must only not be led astray.
+        # A stiff nominal controller follows the motion whatever the arm: its loop must only not get much worse.
         bound = distances(self.train).sum() * (worse if self.loop in CONTROLLERS else STIFF_LOOP)
         if not distances(train).sum() < bound:
             return self
@@ -209,9 +260,11 @@ def build_study(
     training
         Experiments to fit; without ``validation`` their last part is held out.
     validation
-        Experiments to judge by, or none.
+        Experiments for the tests, or none.
+    robot
+        Configuration, with effect entries that correct recordings.
     known_signals
-        Derivatives of the positions of both, if they have been made.
+        Derivatives of the positions of both, if they were computed before.
 
     Raises
     ------
@@ -278,10 +331,10 @@ def _simulated(
 
 
 def _seen(q: Array, measured: Derivatives, dt: float) -> Derivatives:
-    """A simulated motion as the smoother that the measured one went through sees it.
+    """Simulated motion after the smoother of the measured one.
 
-    Set points arrive in steps, which a simulated acceleration shows and a smoothed one does not: what effects make of
-    either should differ by the noise alone.
+    Set points arrive in steps, which a simulated acceleration shows and a smoothed one does not. The columns of effects
+    at either should differ by the noise alone.
     """
     assert measured.nvr is not None
     return replace(differentiate(q, dt, nvr=measured.nvr[:, 0]), start=measured.start)

@@ -1,4 +1,4 @@
-"""One candidate beside the model: fitted on the training data, judged by what it predicts on data it has not seen."""
+"""Test of one candidate: fitted on the training data, tested by its prediction on held-out data."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,54 +16,54 @@ from armident.identify.regression.hac import newey_west
 Array = NDArray[np.float64]
 
 CLOSE = float(np.log(20.0))
-"""Difference in log-likelihood below which a rival cannot be told apart: odds of less than 20 to 1."""
+"""Difference in log-likelihood below which two candidates are ambiguous: odds of less than 20 to 1."""
 NEWEY_WEST_LAGS = 20
 LEAP = 4.0
 """Standard deviations beyond which a residual is no noise."""
 MAD_TO_STD = 1.4826
 """Standard deviation of normal noise over its median absolute deviation."""
 RANK_TOLERANCE = 1e-3
-"""Columns that the model nearly contains (relative norm left beside it) cannot be tested."""
+"""Relative norm orthogonal to the model below which columns cannot be tested."""
 ALONE = 1e-2
-"""Part of a column in the directions beside the model below which the model contains it."""
+"""Share of a column in the directions orthogonal to the model below which the model contains it."""
 UNCHANGED = 1e-3
-"""Power of a change over that of the errors up to which their noise model stays."""
+"""Power of a change over that of the errors below which their noise model is kept."""
 CALM_PASSES = 2
-"""Between a candidate's parameters and the noise models that go with it, from calm ones."""
+"""Iterations between the parameters of a candidate and the noise models, from unbiased noise models."""
 REFINEMENTS = 12
 """Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """How a candidate did.
+    """Result of the test of a candidate.
 
     Parameters
     ----------
     candidate, shapes
-        What was tried.
+        Candidate and its nonlinear parameters.
     values, std
-        Linear parameters fitted on the training data beside the model, and their standard deviations, (k,).
+        Linear parameters fitted on the training data together with the model, and their standard deviations, (k,).
     statistic
         Score statistic on the training data, chi-square of k degrees of freedom without merit.
     held_statistic
-        Standardised projection of the held-out residual on the change of prediction that the candidate asks for:
-        standard normal without merit, large with it.
+        Standardised projection of the held-out residual on the change of prediction by the candidate: standard normal
+        without merit, large with it.
     gain
         Drop of the sum of squares of the whitened held-out residuals by that change.
     inflation
         Variance of the whitened residuals along the change, over that of white noise; at least 1.
     away
-        Change of the model's own parameters that goes with it, (b,).
+        Decrease of the model's own parameters with the candidate, (b,).
     beside
-        The model's own parameters with it, (b,).
+        The model's own parameters with the candidate, (b,).
     share
-        Share of the whitened held-out residual's power that the change takes away at a joint: where it is largest; of
-        what leaps, at the joint that it changes most.
+        Share of the whitened held-out residual's power that the change removes at a joint: at the joint with the
+        largest share or, for effects with jumps, at the joint that it changes most.
     score
-        Gain in log-likelihood over both parts, less what fitting alone gains on the training part.
+        Gain in log-likelihood over both parts, less the gain by fitting alone on the training part.
     contained
-        Of every linear parameter, whether the model has it already; its value is zero then.
+        Of every linear parameter, true if the model contains it; its value is zero then.
     """
 
     candidate: Candidate
@@ -88,29 +88,38 @@ class Trial:
 
     @property
     def forbidden(self) -> bool:
-        """Whether a linear parameter has a sign or a size that physics does not allow."""
+        """True if a linear parameter has a sign or a size that physics does not allow."""
         return not self.candidate.effect.allows(self.values, self.std, dict(self.shapes))
 
     @property
     def p_value(self) -> float:
-        """Both p-values combined (Fisher's method): that a candidate without merit does so well on both parts."""
+        """P-value of a candidate without merit on both parts (Fisher's method)."""
         both = [max(self.p_train, 1e-300), max(self.p_held, 1e-300)]
         return float(stats.combine_pvalues(both, method="fisher").pvalue)
 
     @property
     def p_train(self) -> float:
-        """That a candidate without merit fits the training residual so well, at the best of all shapes tried."""
+        """P-value of the fit of the training residual, corrected for the number of combinations tried."""
         p = float(stats.chi2.sf(self.statistic / self.inflation, self.values.size))
         return min(1.0, p * max(len(self.candidate.grid), 1))
 
     @property
     def p_held(self) -> float:
-        """That a candidate without merit predicts the held-out residual so well."""
+        """P-value of the prediction of the held-out residual."""
         return float(stats.norm.sf(self.held_statistic))
 
 
 def best_trial(fit: Fit, candidate: Candidate, workshop: Workshop) -> Trial | None:
-    """The candidate at the shapes that fit the training data best.
+    """Trial of a candidate at the nonlinear parameters that fit the training data best.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    candidate
+        Candidate with its grid.
+    workshop
+        Cache of the columns of the same fit.
 
     Returns
     -------
@@ -124,10 +133,20 @@ def best_trial(fit: Fit, candidate: Candidate, workshop: Workshop) -> Trial | No
 
 
 def screened(fit: Fit, candidate: Candidate, workshop: Workshop) -> tuple[float, Shapes] | None:
-    """Score statistic of a candidate at the shapes of its grid that fit the training data best, and these shapes."""
+    """Best score statistic of a candidate on its grid, by the training data, and the nonlinear parameters there.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    candidate
+        Candidate with its grid.
+    workshop
+        Cache of the columns of the same fit.
+    """
     if not candidate.grid:
         return None
-    # Columns that go with theta are of no use to the next model, and a grid of them is large.
+    # Columns that depend on theta are useless for the next model, and a grid of them is large.
     keep = not candidate.effect.predicts
     columns = workshop.grid(candidate.effect, candidate.place, candidate.grid, fit.noise, keep=keep)
     statistics = score_statistics(fit, columns, len(candidate.grid))
@@ -138,19 +157,21 @@ def screened(fit: Fit, candidate: Candidate, workshop: Workshop) -> tuple[float,
 
 
 def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int) -> Array:
-    """Power of the training residual along groups of instruments beside the model's own, (G,).
+    """Power of the training residual along groups of instruments orthogonal to the model's own, (G,).
 
     Parameters
     ----------
+    fit
+        Fit of the model.
     columns
-        Whitened instruments (R, G k) of each joint that they act on, by its number, group after group.
+        Whitened instruments (R, G k) of each joint on which they act, with its number, group after group.
     count
-        G.
+        Number of groups, G.
 
     Returns
     -------
     ndarray
-        Not a number where nothing is left of a group.
+        Not a number where the model contains a group.
     """
     if not columns:
         return np.full(count, np.nan)
@@ -168,7 +189,15 @@ def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int)
 
 
 def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]]) -> float | None:
-    """The same of one group of instruments; ``None`` if nothing is left of it."""
+    """Score statistic of one group of instruments; ``None`` if the model contains it.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    columns
+        Whitened instruments (R, k) of each joint on which they act, with its number.
+    """
     found = float(score_statistics(fit, columns, 1)[0])
     return None if np.isnan(found) else found
 
@@ -176,18 +205,24 @@ def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]]) -> float | N
 def judge(
     fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, calm: Sequence[ArModel] | None = None
 ) -> Trial | None:
-    """Fit a candidate by instrumental variables beside the model and judge it on the held-out data.
+    """Trial of a candidate: fit by instrumental variables together with the model, and test on the held-out data.
 
-    The judge is the projection of the held-out residual of the model without the candidate on the change of prediction
-    that the candidate asks for, at simulated signals: noise that the motion has followed has no part in it. Without
-    merit it has mean zero; its spread comes from the noise, from what serial correlation is left (Newey-West), and from
-    theta, estimated from the training data.
+    The test statistic is the projection of the held-out residual of the model without the candidate on the change of
+    prediction by the candidate at simulated signals, which are independent of the noise. Without merit it has mean
+    zero. Its variance comes from the noise, from the remaining serial correlation (Newey-West), and from theta,
+    estimated from the training data.
 
     Parameters
     ----------
+    fit
+        Fit of the model.
+    candidate, shapes
+        Candidate and its nonlinear parameters.
+    workshop
+        Cache of the columns of the same fit.
     calm
-        Noise models that the gap cannot fool, to start from, too, at the joints that the candidate acts on: those of
-        ``fit`` may hold the gap for noise and whiten it away. The likelier end of both starts counts.
+        Noise models without the bias by the missing effect, as a second start at the joints on which the candidate
+        acts: those of ``fit`` may take the missing effect for noise and whiten it away. The likelier result counts.
     """
     tried = [_judged(fit, fit, candidate, shapes, workshop, 1)]
     if calm is not None:
@@ -200,7 +235,7 @@ def _judged(
     alone: Fit, fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, passes: int
 ) -> Trial | None:
     """See `judge`; with the noise models of ``fit`` to start from."""
-    # What the model lacks must not pass for noise: the noise is that of the residual with the candidate in the model.
+    # A missing effect must not count as noise: noise models come from the residual with the candidate in the model.
     for _ in range(passes):
         screening = _beside_model(fit, candidate, shapes, workshop)
         if screening is None:
@@ -243,7 +278,15 @@ def _judged(
 
 
 def inflation_along(change: Array, residual: Array) -> float:
-    """Variance of whitened residuals (R,) along a change of prediction, over that of white noise; at least 1."""
+    """Variance of whitened residuals along a change of prediction, over that of white noise; at least 1.
+
+    Parameters
+    ----------
+    change
+        Change of prediction, (R,).
+    residual
+        Whitened residuals, (R,).
+    """
     return max(1.0, variance_of_sum(change * _without_leaps(residual)) / float(change @ change))
 
 
@@ -253,22 +296,32 @@ def variance_of_sum(products: Array) -> float:
 
 
 def deviations(fit: Fit, columns: Columns) -> Array | None:
-    """Standard deviations (k,) that linear parameters would have beside the model, zero of those that it contains."""
+    """Standard deviations (k,) of linear parameters fitted together with the model, zero of those that it contains.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    columns
+        Whitened columns of the parameters.
+    """
     solution = _values(fit, columns)
     return None if solution is None else np.where(solution[1] == 0.0, 0.0, solution[2])
 
 
 def joints_reached(candidate: Candidate, change: Array, joints: Sequence[slice]) -> list[slice]:
-    """Rows of the joints at which an effect may show that it is worth a finding.
+    """Rows of the joints at which the share of an effect is evaluated.
 
-    All of them: a link on a spring stirs the joint before it more than its own, and the model's own parameters may have
-    made a compromise at other joints. Leaps, which are their own instruments, have to show at the joint that they
-    change most.
+    All joints: an elastic link changes the joint before it more than its own, and the model's own parameters may have
+    adapted at other joints. Effects with jumps, which are their own instruments, count at the joint that they change
+    most.
 
     Parameters
     ----------
+    candidate
+        Candidate.
     change
-        Of the held-out prediction, the model's own parameters included, (R,).
+        Change of the held-out prediction, the model's own parameters included, (R,).
     joints
         Rows of every joint.
     """
@@ -278,7 +331,7 @@ def joints_reached(candidate: Candidate, change: Array, joints: Sequence[slice])
 
 
 def _calmed(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, calm: Sequence[ArModel]) -> Fit:
-    """The fit with calm noise models at the joints that a candidate acts on."""
+    """Fit with the unbiased noise models at the joints on which a candidate acts."""
     columns = workshop.band(candidate.effect, candidate.place, shapes, "train", "simulated")
     acts = {j for c in columns for j in joints_of(c)}
     return fit.renoised([calm[j] if j in acts else own for j, own in enumerate(fit.noise)])
@@ -296,9 +349,22 @@ def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Work
 def noise_with(
     fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, values: Array, away: Array
 ) -> list[ArModel]:
-    """Noise models of what is left of the training data with a candidate in the model.
+    """Noise models of the training residual with a candidate in the model.
 
     Joints whose errors hardly change keep theirs.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    candidate, shapes
+        Candidate and its nonlinear parameters.
+    workshop
+        Cache of the columns of the same fit.
+    values
+        Linear parameters of the candidate, (k,).
+    away
+        Parameters (b,) by which the model's own decrease with it.
     """
     columns = workshop.band(candidate.effect, candidate.place, shapes, "train", "measured")
     change = [applied(c, values) - applied(x, away) for (x, _, _), c in zip(fit.equations.train, columns, strict=True)]
@@ -312,15 +378,15 @@ def noise_with(
 
 
 def _values(fit: Fit, columns: Columns) -> tuple[float, Array, Array] | None:
-    """Score statistic, linear parameters and their standard deviations; ``None`` if nothing can be said of them."""
+    """Score statistic, linear parameters and their standard deviations; ``None`` if they are undetermined."""
     basis = directions_beside(fit, columns.z)
     if basis is None:
         return None
     u, right, scale = basis
-    # A column of its own that the model contains has no part in any direction that is kept.
+    # A column that the model contains has no share in any direction that is kept.
     alone = np.linalg.norm(right, axis=1) > ALONE
     score = u.T @ fit.residual
-    # (D~' C) in the coordinates of u: how much of the instrument's direction the measured columns have.
+    # (D~' C) in the coordinates of u: projection of the measured columns on the instruments.
     gram = u.T @ (columns.x / scale) @ right
     try:
         inverse = np.linalg.inv(gram)
@@ -332,7 +398,15 @@ def _values(fit: Fit, columns: Columns) -> tuple[float, Array, Array] | None:
 
 
 def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
-    """Orthonormal directions (R, r) of instruments beside the model's, and how they map back."""
+    """Orthonormal directions (R, r) of instruments orthogonal to the model's, and their map (k, r) with scales (k,).
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    instruments
+        Whitened instruments, (R, k).
+    """
     scale = np.linalg.norm(instruments, axis=0)
     if np.any(scale == 0) or not np.isfinite(scale).all():
         return None
@@ -347,7 +421,19 @@ def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array
 
 
 def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[float, Shapes]) -> Shapes:
-    """Shapes between those of the grid, one continuous parameter after the other, on a logarithmic scale."""
+    """Nonlinear parameters between those of the grid, one continuous parameter after the other, on a logarithmic scale.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    candidate
+        Candidate with its grid.
+    workshop
+        Cache of the columns of the same fit.
+    best
+        Score statistic and nonlinear parameters of the grid, the start.
+    """
     found = best
     for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
         values = sorted({grid[k][1] for grid in candidate.grid})
@@ -374,14 +460,22 @@ def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[floa
 
 
 def replaced(shapes: Shapes, k: int, value: float) -> Shapes:
-    """Shapes with another value of the k-th."""
+    """Nonlinear parameters with another value of the k-th.
+
+    Parameters
+    ----------
+    shapes
+        Pairs of name and value.
+    k, value
+        Number of the parameter, and its new value.
+    """
     return (*shapes[:k], (shapes[k][0], value), *shapes[k + 1 :])
 
 
 def _without_leaps(residual: Array) -> Array:
-    """A whitened residual (R,), cut off where noise does not reach.
+    """Whitened residual (R,), clipped where noise does not reach.
 
-    What a right candidate leaves of a few hard impacts is in step with it, and would count as its doubt.
+    The remainder of a few hard impacts is correlated with a right candidate, and would inflate its variance.
     """
     deviation = MAD_TO_STD * float(np.median(np.abs(residual)))
     return np.clip(residual, -LEAP * deviation, LEAP * deviation)

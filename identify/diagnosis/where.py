@@ -1,4 +1,4 @@
-"""Where model and data disagree: what the residual of each joint depends on, and with which shape."""
+"""Dependences of the residual of each joint on each variable, with their shapes (thesis 7.3.2)."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -24,13 +24,13 @@ from armident.identify.regression.ar_noise import ArModel
 Array = NDArray[np.float64]
 
 HELD_OUT_LEVEL = 0.05
-"""The held-out data alone must speak for a dependence at this level."""
+"""Significance level of the held-out data alone for a dependence."""
 
 SCREEN = 1e-3
-"""Maps that do not even fit the training residual at this level are not judged on the held-out data."""
+"""Significance level on the training residual for a test on the held-out data."""
 
 LOOKS = 6
-"""Most maps of one joint that are judged, those first that fit the training residual best."""
+"""Most maps of one joint with a test on held-out data, best fit of the training residual first."""
 
 MATERIAL = 0.02
 """Share of a joint's held-out residual power that an unexplained dependence must have to be reported."""
@@ -54,7 +54,7 @@ class Curve:
     x
         Values of the variable, (G,).
     value
-        Torque that the model lacks there, N m or N, (G,).
+        Missing torque of the model there, N m or N, (G,).
     band
         Two standard deviations, (G,).
     """
@@ -66,25 +66,26 @@ class Curve:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A dependence of one joint's residual on one variable.
+    """Dependence of one joint's residual on one variable.
 
     Parameters
     ----------
     joint
         Its name.
     kind, other
-        What the residual varies with; the joint or motor that the variable belongs to, if it is another one.
+        Variable; the joint or motor to which it belongs, if it is another one.
     unit
-        Of the variable.
+        Unit of the variable.
     share
-        Share of the power of the joint's held-out residual, as whitened, that the dependence predicts as fitted on the
-        training data; of a frequency its share of the residual at the working rate; of the motion what is not noise;
-        of bursts what of the residual, as smoothed, is more than noise of its usual power.
+        Share of the power of the joint's whitened held-out residual that the dependence, fitted on the training data,
+        predicts. For a frequency: share of the residual at the working rate. For the motion: share that is not noise.
+        For transients: share of the smoothed residual beyond noise of its usual power.
     p_value
-        That a joint without the dependence shows it so clearly, of this one test.
+        Probability of so clear a result without the dependence, of this one test.
     curve
-        Its shape; of a frequency the spectrum around it; of the motion the root of the residual's density, per root of
-        a hertz, and the noise's for a band; of bursts the root mean square in each moment, and that of noise.
+        Its shape. For a frequency: the spectrum around it. For the motion: the root of the spectral density of the
+        residual, per root of a hertz, with that of the noise as band. For transients: the root mean square in each
+        window, with that of noise as band.
     """
 
     joint: str
@@ -106,12 +107,12 @@ class Disagreement:
 
     @property
     def of_noise(self) -> bool:
-        """Whether the band of the curve is what noise reaches, instead of the curve's own uncertainty."""
+        """True if the band of the curve is the level of noise instead of the uncertainty of the curve."""
         return self.kind in ("frequency", "motion", "transients")
 
     @property
     def hint(self) -> str:
-        """What to look for, for whoever stands at the machine."""
+        """Maintenance hint: probable causes and checks at the machine."""
         height = np.abs(self.curve.value)
         if self.kind in ("motion", "transients"):
             height = height / np.maximum(self.curve.band, 1e-300)
@@ -121,7 +122,19 @@ class Disagreement:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Everything that a fit's residual significantly depends on, tried once for both questions below."""
+    """All significant dependences of the residual of a fit.
+
+    Parameters
+    ----------
+    bench
+        Cache of the columns of the maps.
+    level
+        Significance level of one test.
+    significant
+        Maps with significant trials.
+    lines
+        Spectral lines.
+    """
 
     bench: Workshop
     level: float
@@ -130,7 +143,17 @@ class Survey:
 
 
 def survey(fit: Fit, workshop: Workshop, alpha: float = 0.01) -> Survey:
-    """Try all variables on all joints; see `where` for the arguments."""
+    """All significant dependences of the residual of a fit, over all variables and joints.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    workshop
+        Cache of the columns of the same fit.
+    alpha
+        Probability of a false alarm over all variables and joints.
+    """
     own = _bench(workshop)
     level = alpha / _tests(fit, own)
     return Survey(
@@ -139,21 +162,21 @@ def survey(fit: Fit, workshop: Workshop, alpha: float = 0.01) -> Survey:
 
 
 def where(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Survey | None = None) -> list[Disagreement]:
-    """All variables on which a residual depends, those first that explain most of it on unseen data.
+    """All variables on which a residual depends, ordered by the share they explain on held-out data.
 
-    Every variable is one anonymous effect with a free shape, and passes the same judge as the effects of the
-    catalogue. Lines in the spectrum are judged against the spectrum around them.
+    Every variable is one effect with a free shape, and passes the same test as the effects of the catalogue. Lines in
+    the spectrum are tested against the spectrum around them.
 
     Parameters
     ----------
     fit
-        Of the model as it stands.
+        Fit of the model.
     workshop
-        Of the same fit.
+        Cache of the columns of the same fit.
     alpha
-        Chance that a plant whose model is right shows any disagreement, over all variables and joints.
+        Probability of a false alarm over all variables and joints.
     seen
-        The survey of this fit, if there is one already.
+        Survey of this fit, if there is one.
     """
     seen = seen or survey(fit, workshop, alpha)
     best: dict[tuple[int, Kind, int | None], _Found] = {}
@@ -164,10 +187,20 @@ def where(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Survey | N
 
 
 def unexplained(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Survey | None = None) -> list[Disagreement]:
-    """What is left and matters, at most `MOST` dependences of each joint, each beside the ones before it.
+    """Remaining material dependences, at most `MOST` of each joint, each in addition to the ones before it.
 
-    A variable that merely goes along with a stronger one (speed with torque, say) is not named again. Arguments as
-    those of `where`.
+    A variable that is merely correlated with a stronger one (speed with torque, for example) is not listed again.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    workshop
+        Cache of the columns of the same fit.
+    alpha
+        Probability of a false alarm over all variables and joints.
+    seen
+        Survey of this fit, if there is one.
     """
     study, seen = fit.study, seen or survey(fit, workshop, alpha)
     own, level, significant, lines = seen.bench, seen.level, seen.significant, seen.lines
@@ -187,9 +220,20 @@ def unexplained(fit: Fit, workshop: Workshop, alpha: float = 0.01, *, seen: Surv
 
 
 def strangers(fit: Fit, workshop: Workshop, joints: Collection[int], alpha: float = 0.01) -> list["Stranger"]:
-    """What the residuals of some joints depend on that belongs to another joint, whatever the shape.
+    """Dependences of the residuals of some joints on variables of other joints, of any shape.
 
-    Rivals without a name of what the catalogue finds there: their scores are comparable. Arguments as those of `where`.
+    They are unnamed rivals of effects of the catalogue at these joints: their scores are comparable.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    workshop
+        Cache of the columns of the same fit.
+    joints
+        Numbers of the joints.
+    alpha
+        Probability of a false alarm over all variables and joints.
     """
     own = _bench(workshop)
     every = _maps(fit, workshop)
@@ -198,19 +242,19 @@ def strangers(fit: Fit, workshop: Workshop, joints: Collection[int], alpha: floa
 
 
 def beyond_noise(fit: Fit, left: Sequence[Disagreement], alpha: float = 0.01) -> list[Disagreement]:
-    """What is left, with the joints whose residual is more than noise although nothing named explains most of that.
+    """Remaining dependences, with the joints whose lack of fit no named dependence explains for the most part.
 
-    Joints with nothing else left are looked at for lines among the frequencies of the motion and for bursts, too:
-    what a model lacks otherwise may leave either.
+    Joints without any dependence are also tested for lines among the frequencies of the motion and for transients; a
+    missing effect of another kind may cause either.
 
     Parameters
     ----------
     fit
-        Of the model as it stands.
+        Fit of the model.
     left
-        What is left of it by name.
+        Remaining named dependences.
     alpha
-        Chance of a false alarm over all joints and tests.
+        Probability of a false alarm over all joints and tests.
     """
     found = list(left)
     for excess in excesses(fit, alpha / 2):
@@ -220,7 +264,7 @@ def beyond_noise(fit: Fit, left: Sequence[Disagreement], alpha: float = 0.01) ->
             found.append(_moving(joint, excess))
     slow = _lines(fit, alpha / 6 / fit.study.robot.n, SLOWEST * lowest_frequency(fit.study))
     found += [line for line in slow if line.share >= MATERIAL and line.joint not in {d.joint for d in found}]
-    # What leaps has tails of its own.
+    # Effects with jumps have heavy tails themselves.
     told = {d.joint for d in found} | {
         fit.study.joints[t.place.joint] for t in effect_terms(fit.study.model) if t.effect.sudden
     }
@@ -246,7 +290,7 @@ def _bursting(joint: str, own: Bursts) -> Disagreement:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """A map and how it did."""
+    """A map and its trial."""
 
     map: Map
     trial: Trial
@@ -262,7 +306,7 @@ class _Found:
         basis = m.shape(x, side)
         own = fit.renoised(_noise(fit, self.trial, workshop))
         columns = workshop.columns(m.effect(), Place(m.joint), (), own.noise)
-        # The kink that dry friction makes at standstill is no roughness.
+        # The kink of dry friction at standstill is no roughness.
         pieces = [basis[x <= 0], basis[x >= 0]] if m.kind == "velocity" else [basis]
         value, band = smoothed(own, columns, basis, pieces)
         return Disagreement(
@@ -278,7 +322,17 @@ class _Found:
 
 @dataclass(frozen=True, eq=False)
 class Stranger:
-    """A dependence of a fit's residual on what another joint does."""
+    """Dependence of a residual on a variable of another joint.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    found
+        Map and its trial.
+    bench
+        Cache of the columns of the maps.
+    """
 
     fit: Fit
     found: _Found
@@ -286,21 +340,29 @@ class Stranger:
 
     @property
     def score(self) -> float:
-        """As that of a trial."""
+        """Score of its trial."""
         return self.found.trial.score
 
     def disagreement(self) -> Disagreement:
-        """As what is left is told."""
+        """The dependence with its curve."""
         return self.found.disagreement(self.fit, self.bench)
 
     def beside(self, fit: Fit, workshop: Workshop) -> float:
-        """What it scores beside another model."""
+        """Score of the map in addition to another model; zero if it has none.
+
+        Parameters
+        ----------
+        fit
+            Fit of the other model.
+        workshop
+            Cache of the columns of the other fit.
+        """
         again = _judged(fit, self.found.map, _bench(workshop))
         return 0.0 if again is None else max(again.trial.score, 0.0)
 
 
 def _bench(workshop: Workshop) -> Workshop:
-    """The same motions, with room for columns that belong to no effect of the catalogue."""
+    """Cache with the same motions, without columns of effects of the catalogue."""
     return replace(workshop, kept={})
 
 
@@ -309,12 +371,12 @@ def _maps(fit: Fit, workshop: Workshop) -> list[Map]:
 
 
 def _tests(fit: Fit, workshop: Workshop) -> int:
-    """How many tests share the error rate: every map, and the spectrum of every joint."""
+    """Number of tests that share the error rate: every map, and the spectrum of every joint."""
     return len(_maps(fit, workshop)) + fit.study.robot.n
 
 
 def _significant(fit: Fit, workshop: Workshop, level: float) -> list[_Found]:
-    """Maps that pass, of those that a quick look at the training data finds worth a trial."""
+    """Maps with significant trials, among those selected by the training data."""
     return _passing(fit, _maps(fit, workshop), workshop, level)
 
 
@@ -344,7 +406,7 @@ def _noise(fit: Fit, trial: Trial, workshop: Workshop) -> list[ArModel]:
 
 
 def _with(fit: Fit, found: _Found, workshop: Workshop) -> Fit:
-    """The fit with a map among the terms of the model, without what the model contained of it before."""
+    """Fit with a map among the terms, without the part that the model contained before."""
     effect, place = found.map.effect(), Place(found.map.joint)
     own = fit.renoised(_noise(fit, found.trial, workshop))
     basis = directions_beside(own, workshop.instruments(effect, place, (), own.noise))

@@ -1,6 +1,6 @@
 """Autoregressive noise of all joints at once: models, whitening and its transpose.
 
-The same estimates as `armident.identify.regression.ar_noise`, for a search that makes them by the thousand.
+The same estimates as `armident.identify.regression.ar_noise`, fast enough for thousands of candidates.
 """
 
 import math
@@ -40,14 +40,22 @@ def ar_models(errors: Sequence[Array], max_order: int) -> list[ArModel]:
 
 
 def whitened(values: Sequence[Array], noise: Sequence[ArModel]) -> Array:
-    """Stack (M, n) or (M, n, k) joint by joint, each joint whitened by its noise model."""
+    """Values of all joints, one below the other, each whitened by its noise model, shape (R,) or (R, k).
+
+    Parameters
+    ----------
+    values
+        One (M, n) or (M, n, k) array per stretch.
+    noise
+        Noise model of each joint.
+    """
     lengths = [[value.shape[0] - ar.order for value in values] for ar in noise]
     out = np.zeros((sum(map(sum, lengths)), *values[0].shape[2:]))
     acts = [range(len(noise)) if value.ndim == 2 else joints_of(value) for value in values]
     begin = 0
     for j, (ar, sizes) in enumerate(zip(noise, lengths, strict=True)):
         for value, there, size in zip(values, acts, sizes, strict=True):
-            # What acts on one joint is zero at all others.
+            # Columns of one joint are zero at all others.
             if j in there:
                 out[begin : begin + size] = ar.whiten(value[:, j])
             begin += size
@@ -60,7 +68,15 @@ def joints_of(columns: Array) -> list[int]:
 
 
 def rows_of_joints(lengths: Sequence[int], noise: Sequence[ArModel]) -> list[slice]:
-    """Where the rows of each joint are in what `whitened` makes of stretches of these lengths."""
+    """Rows of each joint in the result of `whitened`.
+
+    Parameters
+    ----------
+    lengths
+        M of every stretch.
+    noise
+        Noise model of each joint.
+    """
     ends = np.cumsum([sum(length - ar.order for length in lengths) for ar in noise])
     return [slice(int(begin), int(end)) for begin, end in zip([0, *ends[:-1]], ends, strict=True)]
 
@@ -71,7 +87,9 @@ def summed_backwards(direction: Array, noise: Sequence[ArModel], lengths: Sequen
     Parameters
     ----------
     direction
-        As long as the whitened rows, (R,).
+        Weights of the whitened rows, (R,).
+    noise
+        Noise model of each joint.
     lengths
         M of every stretch.
     """

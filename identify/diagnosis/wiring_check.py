@@ -30,17 +30,17 @@ from armident.identify.signals.differentiate import Derivatives, differentiate
 Array = NDArray[np.float64]
 
 ALPHA = 0.01
-"""Chance of a false alarm, of all hypotheses together."""
+"""Probability of a false alarm, of all hypotheses together."""
 
 LEAST_GAIN = 2.0
-"""Sum over the drives of the logarithm of the drop of their unexplained power that makes a mistake."""
+"""Least sum over the drives of the logarithm of the drop of their unexplained power, for a wiring error."""
 
 LEAST_DROP = 2.0
 """Factor by which the unexplained shares of all drives together must drop, too."""
 
 MAX_MISTAKES = 6
 BLOCKS = 30
-"""Stretches of time whose votes are compared; within one the residual is correlated."""
+"""Number of time intervals that are compared; within one the residual is correlated."""
 
 WORKING_RATE = 8.0
 """Rate at which regressors are evaluated, over the cut-off of the comparison."""
@@ -49,31 +49,33 @@ POSTURES = 200
 """Postures over which moments of inertia are averaged."""
 
 PASSES = 3
-"""Between parameters and the weights of the drives."""
+"""Iterations between parameters and the weights of the drives."""
 
 FLOOR = 1e-6
-"""Share of a drive's torque power below which nothing is compared."""
+"""Least share of a drive's torque power for a comparison."""
 
 RIDGE = 1e-9
-"""Of the column-normalised normal equations: parameters that a motion does not determine stay small."""
+"""Ridge of the column-normalised normal equations: parameters that a motion does not determine stay small."""
 
 
 @dataclass(frozen=True)
 class WiringFinding:
-    """Mistakes that the recordings show.
+    """Wiring errors that the recordings show.
 
     Parameters
     ----------
     stanzas
-        For the ``effects`` of a robot configuration: `armident.identify.effects.wiring.rewired` undoes them.
+        Effect entries of a robot configuration: `armident.identify.effects.wiring.rewired` corrects them.
     words
-        What each means, in plain language.
+        Meaning of each, in plain language.
     p_values
-        Chance that a recording without the mistake prefers it so consistently, all hypotheses counted.
+        Probability that a recording without the error favours it so consistently, corrected for all hypotheses.
     unexplained_before, unexplained_after
-        Shares of each motor's torque power that a physical model leaves, (n,): as recorded, with all mistakes undone.
+        Residual share of each motor's torque power with a physical model, (n,): as recorded, with all errors corrected.
     alternatives
-        Other single mistakes that explain the recordings equally well as each, in words.
+        Other single errors that explain the recordings equally well as each, in words.
+    certain
+        True if the fits as recorded are so much worse that no effect of the model can be the cause.
     """
 
     stanzas: tuple[Stanza, ...]
@@ -83,12 +85,11 @@ class WiringFinding:
     unexplained_after: Array
     alternatives: tuple[tuple[str, ...], ...]
     certain: bool = True
-    """Whether the fits as recorded are so much worse that no effect could be to blame instead."""
 
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """A mistake: what undoes it in the motors' positions and torques, (n, n) each; see `exchanges`."""
+    """A wiring error: its correction of the motors' positions and torques, (n, n) each; see `exchanges`."""
 
     stanza: Stanza
     position: Array
@@ -135,16 +136,16 @@ class _Fit:
 
     @property
     def misfit(self) -> float:
-        """What hypotheses compete in: twice the negative log-likelihood per sample, up to a constant."""
+        """Criterion of the hypotheses: twice the negative log-likelihood per sample, up to a constant."""
         return float(np.log(self.shares).sum())
 
     def beats(self, other: "_Fit") -> bool:
-        """Whether it is better by so much that the other one must be mistaken."""
+        """True if it is better by a margin that rules out the other hypothesis."""
         drop = float(other.shares.sum()) / float(self.shares.sum())
         return other.misfit - self.misfit >= LEAST_GAIN and drop >= LEAST_DROP
 
     def nearer(self, other: "_Fit") -> bool:
-        """Whether it is better both by likelihood and by what the drives together leave unexplained."""
+        """True if both its likelihood is higher and the unexplained power of all drives together is lower."""
         return self.misfit < other.misfit and float(self.shares.sum()) < float(other.shares.sum())
 
 
@@ -173,7 +174,7 @@ class _Bench:
         for s in self.signals:
             q, qd, qdd = s.q @ moved, s.qd @ moved, s.qdd @ moved
             at_motors = to_motors @ self.decimation(self.model.rigid_regressor(q, qd, qdd))
-            # Springs on the joints: their torques in phase with the motion would pass for negative inertia.
+            # Springs on the joints: their torques in phase with the motion would resemble negative inertia.
             springs = self.decimation(q)[:, None, :] * to_motors
             parts.append(np.concatenate([at_motors, springs], axis=2))
             postures.append(q)
