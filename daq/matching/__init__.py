@@ -1,1 +1,1 @@
-"""Assignment of received PDOs to their SYNC, and gaps."""
+"""Matching of received PDOs to their SYNC, and detection of gaps."""

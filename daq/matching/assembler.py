@@ -1,4 +1,4 @@
-"""Turns the frames of the bus into rows per SYNC, and accounts for every SYNC: received, or in the gap list."""
+"""Assembles bus frames into rows per SYNC; every SYNC is either received or in the gap list."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -31,30 +31,45 @@ from armident.daq.recording import Gap
 from armident.drivers.canopen.objects import COB_SDO_REQUEST
 
 UNSENT = "pack not complete"
-"""SYNCs after the last packed TPDO: no drive was to send their samples any more."""
+"""Reason of the gap after the last packed TPDO: no drive had to send these samples."""
 __all__ = ["LATE_S", "SYNC_LOST", "UNSENT", "Assembler", "Batch", "Rows", "TpdoStream"]
 
 LATE_S = 4.0
-"""A drive that owes an answer for longer than this while others have answered has lost it, s."""
+"""Time after which a missing answer counts as lost while other drives have answered, s."""
 IN_STEP_S = 0.02
-"""The same where it answers every SYNC again beside a drive that owes nothing, s; twice that if it answers none at all.
+"""The same if the drive answers every SYNC again beside a drive without missing answers, s; twice that if it is silent.
 
-Rows wait in memory for so long, and a kill costs those that do."""
+Rows wait in memory for this time; a killed process loses them."""
 PATIENCE_S = 120.0
-"""The same where all drives are behind and no frame is known to be missing: a busy host can hold up virtual drives.
+"""The same if all drives are behind and no frame is known to be missing, s: a busy host can delay virtual drives.
 
-Only drives that owe nothing at some SYNC prove that nothing was lost, so what came since the last such SYNC is kept."""
+Only a SYNC without missing answers proves that nothing was lost, so answers since the last such SYNC are kept."""
 _FEWEST_LATE = 8
 _LONGEST_OUTAGE_S = 60.0
 _MISALIGNED = 20
-"""So many first SYNCs of a bus with another number than that of the others are another master's, fewer a late stamp."""
+"""Number of mismatched first SYNCs of a bus from which they come from another master; fewer are late time stamps."""
 
 
 @dataclass(frozen=True)
 class TpdoStream:
-    """What the assembler has to know of a stream: the COB-ID of each joint's TPDO, how often, how many bytes.
+    """TPDOs of a stream on the bus.
 
-    A frame of ``length`` bytes holds ``pack`` samples of ``size`` bytes (0: all of it), one of every SYNC.
+    A frame of ``length`` bytes holds ``pack`` samples of ``size`` bytes, one of every SYNC.
+
+    Parameters
+    ----------
+    name
+        Name of the stream.
+    every
+        Number of SYNCs from one sample to the next.
+    cob_ids
+        COB-ID of each joint's TPDO.
+    length
+        Bytes of a frame.
+    pack
+        Samples in a frame.
+    size
+        Bytes of a sample; 0: all of the frame.
     """
 
     name: str
@@ -66,13 +81,23 @@ class TpdoStream:
 
     @property
     def shape(self) -> StreamShape:
-        """How its frames come."""
+        """Shape of the stream's frames for the matcher."""
         return StreamShape(max(self.every, self.pack), self.pack, self.size or self.length, self.length)
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Complete rows: ``sync`` and ``t_ns`` (N,), ``data`` (N, n, 8) or wider the bytes of each joint's sample."""
+    """Complete rows.
+
+    Parameters
+    ----------
+    sync
+        SYNC numbers, (N,).
+    t_ns
+        Receive times of the SYNCs, ns UTC, (N,).
+    data
+        Bytes of each joint's sample, (N, n, 8) or wider.
+    """
 
     sync: NDArray[np.int64]
     t_ns: NDArray[np.int64]
@@ -81,19 +106,27 @@ class Rows:
 
 @dataclass(frozen=True)
 class Batch:
-    """What became certain: complete rows per stream, and gaps that are over."""
+    """Result of a batch of frames.
+
+    Parameters
+    ----------
+    rows
+        Complete rows by stream.
+    gaps
+        Gaps that have ended.
+    """
 
     rows: dict[str, Rows]
     gaps: tuple[Gap, ...]
 
 
 class Assembler:
-    """Matches SYNC and TPDO frames; the result does not depend on how a bus's frames are split into batches.
+    """Matches SYNC and TPDO frames; the result does not depend on the division of a bus's frames into batches.
 
     Parameters
     ----------
     streams
-        The TPDOs to match, all with the same joints.
+        TPDOs to match, all with the same joints.
     joints
         Names of the joints, in the order of the COB-IDs.
     period_ns
@@ -101,14 +134,14 @@ class Assembler:
     overflow
         Synchronous counter overflow value (CiA 301, 1019h).
     first_counter
-        Counter of SYNC 0 where that is known (own producer); ``None``: the first SYNC seen is SYNC 0.
+        Counter of SYNC 0 if it is known (own producer); ``None``: the first SYNC received is SYNC 0.
     sync_id
         COB-ID of SYNC.
     bus_of
-        Number of the bus that each joint's drive is on; empty: all on one.
+        Number of the bus of each joint's drive; empty: all on one bus.
     nodes
-        Node of each joint's drive, if SDO requests are looked at: whoever writes there what a TPDO holds makes it
-        suspect, until :meth:`suspect` says how long.
+        Node ID of each joint's drive, if SDO requests are watched: a write to TPDO parameters makes the TPDOs suspect
+        until :meth:`suspect` gives the time span.
     """
 
     def __init__(
@@ -145,7 +178,7 @@ class Assembler:
             self._books.state[:, ORIGIN] = first_counter
         self._lossy = np.zeros(len(channel_of), bool)
         self.when_sent: Callable[[int], tuple[int, NDArray[np.int64]]] | None = None
-        """Where we send SYNC: tells when, as :meth:`SyncProducer.sent_at` does."""
+        """Send times of the own SYNC producer (:meth:`SyncProducer.sent_at`); ``None`` if there is none."""
         self._asked_from = 0
         self._gaps = OpenGaps(self._joints)
         self._given = [0] * len(streams)
@@ -155,27 +188,27 @@ class Assembler:
 
     @property
     def last_sync(self) -> int:
-        """Number of the last SYNC known of; -1 before the first."""
+        """Number of the last SYNC known; -1 before the first."""
         return int(self._books.state[:, SYNC].max())
 
     @property
     def owed(self) -> int:
-        """Most SYNCs that any drive has still to answer."""
+        """Largest number of SYNCs that a drive has not answered yet."""
         return int(self._debts().max())
 
     @property
     def owed_by_all(self) -> int:
-        """SYNCs that every drive has still to answer, in every stream: they are behind together."""
+        """Number of SYNCs that no drive has answered yet, in any stream: the bus or the host is delayed."""
         return max(int(self._debts().min()), 0)
 
     def _debts(self) -> NDArray[np.int64]:
-        """SYNCs that are not answered yet, (streams, drives)."""
+        """Return the number of unanswered SYNCs, (streams, drives)."""
         debts: NDArray[np.int64] = self._books.head[self._books.bus_of].T - self._books.settled - self._books.pending
         return debts
 
     @property
     def wrong_lengths(self) -> dict[tuple[str, str], int]:
-        """How many TPDOs of another length than their mapping's have come, by stream and joint; those that did."""
+        """Number of TPDOs whose length differs from the mapping, by stream and joint, where not zero."""
         return {
             (self._streams[s].name, self._joints[j]): int(self._books.wrong[s, j])
             for s, j in np.argwhere(self._books.wrong > 0)
@@ -183,27 +216,32 @@ class Assembler:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Counts of frames, SYNCs and samples.
+        """Counters of frames, SYNCs and samples.
 
-        Per stream, ``expected`` rows are ``rows`` (complete) or ``in_gaps``; ``discarded`` counts the samples of
-        single joints that did arrive for rows in gaps.
+        Per stream, ``expected`` rows are ``rows`` (complete) or ``in_gaps``. ``discarded`` is the number of samples of
+        single joints that were received for rows in gaps.
         """
         counts = dict(zip(COUNT_NAMES, (int(c) for c in self._books.counts), strict=True))
         return counts | self._totals
 
     def push(self, frames: NDArray[Any], sent: int | None = None, dropped: bool = False, bus: int = 0) -> Batch:
-        """Take frames of one bus in the order they came.
+        """Match frames of one bus, in the order of reception.
 
         Parameters
         ----------
         frames
-            Structured array with ``t_ns``, ``can_id``, ``length`` and ``data`` (8 or 64 bytes), as the socket gives it.
+            Structured array (N,) with ``t_ns``, ``can_id``, ``length`` and ``data`` (8 or 64 bytes), as received.
         sent
-            How many SYNC were sent so far, where we send them: no gap is longer than that.
+            Number of SYNCs sent so far by the own producer, an upper limit for gaps; ``None``: another producer.
         dropped
-            Whether frames of this bus were lost between the last call and the end of these, as the kernel knows.
+            Frames of this bus were lost between the last call and the end of these, according to the kernel.
         bus
-            The bus they came from.
+            Number of the bus.
+
+        Returns
+        -------
+        Batch
+            Rows and gaps that are certain now.
 
         Raises
         ------
@@ -213,12 +251,12 @@ class Assembler:
         arguments = (*_columns(frames), *self._timing, bus)
         self._lossy[bus] |= dropped
         if frames.size:
-            # Whoever speaks is not silent.
+            # A bus with frames is not silent.
             self._books.slack[bus] = self._slack
         last = int(self._books.state[bus, SYNC])
         longest = self._longest if sent is None else min(self._longest, sent - last)
         if sent is not None and not self._lossy[bus]:
-            # Our own SYNCs reach us unless the kernel drops them: time that passed is a producer held up, no loss.
+            # Own SYNCs are received unless the kernel drops frames: a long time is a delayed producer, no loss.
             longest = 0
         self._look_when_sent(self._lossy[bus])
         if dropped:
@@ -238,7 +276,7 @@ class Assembler:
         return self._batch(out, False)
 
     def _look_when_sent(self, lossy: bool) -> None:
-        """Where frames are lost, have at hand when we sent what has come: a producer held up keeps to no period."""
+        """Get the send times of own SYNCs if frames are lost: a delayed producer keeps no period."""
         sent = self._books.sent
         sent[0] = -1
         if lossy and self.when_sent is not None:
@@ -248,31 +286,47 @@ class Assembler:
             sent[0] = self._asked_from = first + times.size
 
     def silence(self, bus: int, silent: bool) -> None:
-        """Say that a bus is known to be down, or back: its drives owe nothing meanwhile, and the others go on."""
+        """Set whether a bus is known to be down: its drives have nothing to answer, and other buses do not wait for it.
+
+        Parameters
+        ----------
+        bus
+            Number of the bus.
+        silent
+            The bus is down.
+        """
         self._books.slack[bus] = 0 if silent else self._slack
         self._lossy[bus] |= silent
         self.torn(bus)
 
     def torn(self, bus: int) -> None:
-        """Say that frames of a bus may be missing behind the last one, however its SYNC counter goes on."""
+        """Note that frames of a bus may be missing after the last one, even if its SYNC counter is consecutive."""
         self._books.state[bus, TORN] = 1
 
     def suspect(self, joint: str, since_ns: int, until_ns: int) -> None:
-        """Say that TPDOs of a joint that came in this time (ns, UTC) hold something else than the session says."""
+        """Set the time span in which TPDOs of a joint may have another mapping than that of the session.
+
+        Parameters
+        ----------
+        joint
+            Name of the joint.
+        since_ns, until_ns
+            Begin and end, ns UTC.
+        """
         span = self._books.suspect[self._joints.index(joint)]
         if span[0] < span[1] and span[1] == EVER:
             since_ns = min(since_ns, int(span[0]))
         span[:] = since_ns, until_ns
 
     def unseen(self, dropped: Sequence[int], now_ns: int) -> int:
-        """SYNCs that there may have been at most behind the last one.
+        """Return the largest number of SYNCs that may have been sent after the last one received.
 
         Parameters
         ----------
         dropped
-            Frames of each bus that were lost behind the last one received, as the kernel knows.
+            Frames of each bus lost after the last one received, according to the kernel.
         now_ns
-            Time of the kernel's stamps, ns UTC.
+            Present time of the kernel's clock, ns UTC.
         """
         numbers, times = self._books.state[:, SYNC], self._books.state[:, TIME]
         known = times != NEVER
@@ -281,14 +335,20 @@ class Assembler:
         return int(max(0, last.max(initial=self.last_sync) - self.last_sync))
 
     def finish(self, sent: int | None = None) -> Batch:
-        """No more frames come; ``sent`` SYNC were sent in all, if we know."""
+        """Return the remaining rows and gaps after the last frame.
+
+        Parameters
+        ----------
+        sent
+            Total number of SYNCs sent; ``None`` if unknown.
+        """
         total = self.last_sync + 1 if sent is None else max(sent, self.last_sync + 1)
         out = output_buffers(self._books, total - self.last_sync)
         _finish(total, self._books, out)
         return self._batch(out, True)
 
     def warm_up(self, frames: NDArray[Any]) -> None:
-        """Compile the loops for frames like these, so that no SYNC waits for the compiler."""
+        """Compile the loops for frames of this dtype, so that no SYNC waits for the compiler."""
         few = [_FEWEST_LATE] * len(self._shapes)
         nobody = np.full((self._lossy.size, 1), -1, np.int64)
         scratch = new_state(self._shapes, few, few, few, self._books.bus_of.tolist(), nobody, nobody)
@@ -322,7 +382,7 @@ class Assembler:
         return Batch(rows, tuple(sorted(gaps, key=lambda g: (g.first, g.stream, g.joint or ""))))
 
     def _unsent(self, s: int) -> list[Gap]:
-        """The SYNCs since the last packed TPDO, as a gap."""
+        """Return the SYNCs since the last packed TPDO as a gap."""
         stream, first, last = self._streams[s], self._given[s], self.last_sync
         if first > last:
             return []
@@ -331,17 +391,17 @@ class Assembler:
         return [Gap(stream.name, first, last, None, UNSENT)]
 
 
-# numba's dispatchers are typed by their Python signatures, which a tuple of columns cannot be checked against.
+# mypy checks numba functions by their Python signatures, which a tuple of columns does not match.
 _match: Any = match
 _count_sync: Any = count_sync
 _finish: Any = finish
 
 
 def _columns(frames: NDArray[Any]) -> tuple[Any, ...]:
-    """Count of frames, and their identifiers, lengths, times and data (as numbers of eight bytes)."""
+    """Return the number of frames, and their identifiers, lengths, times and data (as 64-bit words)."""
     count = frames.size
     if count < 2:
-        # Columns of one frame or none count as contiguous, which would compile the loops anew.
+        # Columns of fewer than two frames count as contiguous, which would compile the loops again.
         room = np.zeros(2, frames.dtype)
         room[:count] = frames
         frames = room
@@ -349,5 +409,5 @@ def _columns(frames: NDArray[Any]) -> tuple[Any, ...]:
 
 
 def _bytes(data: NDArray[np.uint64]) -> NDArray[np.uint8]:
-    """Numbers (N, n, words) as the bytes (N, n, 8 words) they were read from."""
+    """Return 64-bit words (N, n, words) as the bytes (N, n, 8 words) they were read from."""
     return np.ascontiguousarray(data).view(np.uint8)

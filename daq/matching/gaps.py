@@ -1,4 +1,4 @@
-"""Gaps that grow from batch to batch, and become known when they are over."""
+"""Gaps that extend over several batches, reported when they end."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,7 @@ REASONS = {
 
 
 class OpenGaps:
-    """The gaps that may still go on, by stream, joint (``None``: all of them) and reason.
+    """Gaps that may still continue, by stream, joint (``None``: all joints) and reason.
 
     Parameters
     ----------
@@ -32,7 +32,19 @@ class OpenGaps:
         self._open: dict[tuple[str, str | None, str], tuple[int, int]] = {}
 
     def add(self, stream: str, every: int, sync: NDArray[np.int64], code: NDArray[np.uint8]) -> list[Gap]:
-        """Take incomplete rows: ``sync`` (N,) and what is known of each joint, ``code`` (N, n); gaps that are over."""
+        """Add incomplete rows and return the gaps that have ended.
+
+        Parameters
+        ----------
+        stream
+            Name of the stream.
+        every
+            Number of SYNCs from one row to the next.
+        sync
+            SYNC numbers of the rows, (N,), increasing.
+        code
+            State of each joint's sample (`state.LOST` and so on), (N, n).
+        """
         found: list[tuple[str | None, str, NDArray[np.int64]]] = []
         for value, reason in REASONS.items():
             hit = code == value
@@ -57,7 +69,17 @@ class OpenGaps:
         return gaps
 
     def over(self, stream: str, last: int | None, final: bool) -> list[Gap]:
-        """Gaps of the stream that the rows up to ``last`` do not continue; all of them at the end."""
+        """Return the gaps of a stream that have ended.
+
+        Parameters
+        ----------
+        stream
+            Name of the stream.
+        last
+            Last SYNC number known; a gap that ends before it has ended. ``None``: none.
+        final
+            Return all gaps of the stream: no more rows follow.
+        """
         gaps = []
         for key, (begin, end) in list(self._open.items()):
             if key[0] == stream and (final or (last is not None and last > end)):

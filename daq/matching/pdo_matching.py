@@ -1,20 +1,25 @@
-"""The compiled part of the assembler: which TPDO answers which SYNC.
+"""Compiled matching of TPDOs to the SYNCs that they answer.
 
-A TPDO carries no number, only an order: each drive answers its SYNCs one after the other. So per drive and TPDO,
-SYNCs and answers are matched first to first. As long as a drive owes nothing when the books are closed (at the next
-SYNC of its bus) the match is certain, however late the answers came. A drive that answers every SYNC again and still
-owes while another on its bus owes nothing has lost something, and so has one that stays silent beside such another, or
-owes for longer than a window of SYNCs. Then every answer is taken as prompt (the latest SYNC it can belong to), and
-where answers also came in bursts the matter is undecidable and the samples in question are given up as ``AMBIGUOUS``,
-never guessed. While all drives owe at every SYNC and no frame is known to be missing, the buses are behind and nothing
-is lost: then the window is ``patience`` SYNCs.
+A TPDO has no number, only an order: each drive answers its SYNCs one after the other. So per drive and TPDO, SYNCs and
+answers are matched first to first. If a drive has answered all SYNCs when the match is evaluated (at the next SYNC of
+its bus), the match is certain, however late the answers were. An answer is lost if a drive
 
-Answers to rows that were given up, of a drive that was silent or a bus that was off, may come all the same. So until
-such a drive keeps step for some SYNCs, as many answers as SYNCs prove nothing; the first ones too many are then those.
+- answers every SYNC again and still lacks answers while another drive on its bus lacks none,
+- is silent beside such a drive, or
+- lacks answers for longer than a window of SYNCs.
 
-Several buses carry the same SYNC numbers: a row is one SYNC of all axes. Where SYNC is not ours the buses are aligned
-by its counter and the time at which it came. A bus on which no SYNC comes while others go on is silent: its SYNCs are
-missing, and its drives owe nothing for them.
+Then every answer is taken as prompt (the latest SYNC that it can belong to). If answers also came in bursts, the match
+is ambiguous and the samples in question are discarded as ``AMBIGUOUS``, never guessed. While all drives lack answers
+at every SYNC and no frame is known to be missing, the buses are delayed and nothing is lost: then the window is
+``patience`` SYNCs.
+
+Answers to discarded rows, of a drive that was silent or a bus that was off, may still arrive. Until such a drive has
+answered each of some consecutive SYNCs, equal numbers of answers and SYNCs prove nothing; the first surplus answers
+belong to discarded rows.
+
+Several buses carry the same SYNC numbers: a row is one SYNC of all axes. If SYNC comes from another master, buses are
+aligned by its counter and receive time. A bus without SYNC while others receive SYNCs is silent: its SYNCs are
+missing, and its drives have nothing to answer.
 """
 
 from typing import Any
@@ -55,11 +60,12 @@ from armident.daq.matching.sync_unwrap import advance
 from armident.drivers.canopen.objects import PDOS, SDO_DOWNLOAD, TPDO_COMMUNICATION, TPDO_MAPPING
 
 EVER = int(np.iinfo(np.int64).max)
+"""End of a time span that is still open, ns."""
 
 
 @njit(cache=True, nogil=True)
 def _owe(b: MatcherState, bus: int, k: int, s: int) -> None:
-    """SYNC ``k`` of a bus asks for an answer, if the stream sends on it."""
+    """Add SYNC ``k`` of a bus to the rows to be answered, if the stream sends on it."""
     if (b.state[bus, ORIGIN] + k) % b.kind[s, EVERY]:
         return
     slot = slot_of(b, s, b.head[bus, s])
@@ -79,7 +85,7 @@ def _owe(b: MatcherState, bus: int, k: int, s: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _miss(b: MatcherState, bus: int, first: int, until: int, out: MatchedSamples) -> None:
-    """SYNCs ``first`` to before ``until`` were sent on the bus, but not received."""
+    """Count SYNCs ``first`` to before ``until`` of a bus as sent, but not received."""
     if until <= first:
         return
     streams = b.kind.shape[0]
@@ -97,7 +103,7 @@ def _miss(b: MatcherState, bus: int, first: int, until: int, out: MatchedSamples
     for s in range(streams):
         if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2 or b.head[bus, s] == before[s]:
             continue
-        # What came since the last SYNC seen may answer the missed ones too.
+        # Answers since the last received SYNC may belong to the missed SYNCs too.
         for j in range(b.settled.shape[1]):
             if b.bus_of[j] == bus:
                 for i in range(b.pending[s, j] - b.fresh[s, j], b.pending[s, j]):
@@ -108,7 +114,7 @@ def _miss(b: MatcherState, bus: int, first: int, until: int, out: MatchedSamples
 def _skip_silent(
     b: MatcherState, bus: int, k: int, t_ns: int, period_ns: int, overflow: int, out: MatchedSamples
 ) -> None:
-    """With SYNC ``k`` of a bus, those are missing that buses farther behind than their slack should have had."""
+    """At SYNC ``k`` of a bus, count the SYNCs of buses that are farther behind than their slack as missing."""
     for other in range(b.state.shape[0]):
         last = b.state[other, SYNC]
         until = k + 1 - b.slack[other]
@@ -116,7 +122,7 @@ def _skip_silent(
             continue
         if last < 0:
             b.state[other, ORIGIN] = b.state[bus, ORIGIN]
-        # What has come answers SYNCs that were seen, not those that are missing.
+        # Answers received so far belong to received SYNCs, not to missing ones.
         for s in range(b.kind.shape[0]):
             settle_all(b, other, s, True, out)
         _miss(b, other, last + 1, until, out)
@@ -128,13 +134,13 @@ def _skip_silent(
             b.state[other, COUNTER] = (b.state[other, ORIGIN] + until - 1) % overflow
         for s in range(b.kind.shape[0]):
             settle_all(b, other, s, True, out)
-            # All rows of the hole are settled: on those behind it the bus was up.
+            # All rows of the outage are settled; the bus was up for later ones.
             b.hole[other, s] = min(b.hole[other, s], b.head[other, s])
 
 
 @njit(cache=True, nogil=True)
 def _notice_write(b: MatcherState, j: int, request: Any, t_ns: int) -> None:
-    """An SDO request to the drive of a joint: one that writes what its TPDOs hold makes them suspect from now on."""
+    """Mark a joint's TPDOs as suspect from now on if an SDO request writes their parameters (CiA 301, 1800h-1BFFh)."""
     index = np.int64((request >> np.uint64(8)) & np.uint64(0xFFFF))
     writes = np.int64((request >> np.uint64(5)) & np.uint64(7)) == SDO_DOWNLOAD
     if writes and TPDO_COMMUNICATION <= index < TPDO_MAPPING + PDOS and t_ns > b.suspect[j, 1]:
@@ -147,7 +153,29 @@ def count_sync(
     count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
     bus: int, longest: int, b: MatcherState,
 ) -> int:  # fmt: skip
-    """How many SYNC numbers the frames may cover; changes nothing."""
+    """Return the number of SYNC numbers that the frames may cover, without a change of the state.
+
+    Parameters
+    ----------
+    count
+        Number of frames.
+    can_id, length, t_ns
+        COB-IDs, data lengths and receive times (ns UTC) of the frames, (count,) or longer.
+    data
+        Data of the frames as 64-bit words, (count, words).
+    sync_id
+        COB-ID of SYNC.
+    period_ns
+        SYNC period, ns.
+    overflow
+        Synchronous counter overflow value (CiA 301, 1019h).
+    bus
+        Number of the bus.
+    longest
+        Largest advance with whole counter turns, SYNCs.
+    b
+        State of the matcher.
+    """
     total, state = 0, b.state.copy()
     for i in range(count):
         if can_id[i] == sync_id:
@@ -161,7 +189,31 @@ def match(
     count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
     bus: int, longest: int, b: MatcherState, out: MatchedSamples,
 ) -> None:  # fmt: skip
-    """Take ``count`` frames of one bus in the order they came; samples whose fate is decided go to ``out``."""
+    """Match frames of one bus, in the order of reception, and append the decided samples to ``out``.
+
+    Parameters
+    ----------
+    count
+        Number of frames.
+    can_id, length, t_ns
+        COB-IDs, data lengths and receive times (ns UTC) of the frames, (count,) or longer.
+    data
+        Data of the frames as 64-bit words, (count, words).
+    sync_id
+        COB-ID of SYNC.
+    period_ns
+        SYNC period, ns.
+    overflow
+        Synchronous counter overflow value (CiA 301, 1019h).
+    bus
+        Number of the bus.
+    longest
+        Largest advance with whole counter turns, SYNCs.
+    b
+        State of the matcher.
+    out
+        Output of decided samples.
+    """
     n = b.settled.shape[1]
     words = min(data.shape[1], b.answer.shape[3])
     for i in range(count):
@@ -184,7 +236,7 @@ def match(
                 _owe(b, bus, k, s)
             b.counts[SYNC_SEEN] += 1
             b.counts[SYNC_MISSING] += step - 1
-            # A call hands all the books over, which costs more than most of what it does.
+            # Skip the call on a single bus: passing the state costs more than the function itself.
             if b.state.shape[0] > 1:
                 _skip_silent(b, bus, k, t_ns[i], period_ns, overflow, out)
             continue
@@ -218,7 +270,17 @@ def match(
 
 @njit(cache=True, nogil=True)
 def finish(total: int, b: MatcherState, out: MatchedSamples) -> None:
-    """No more frames come: SYNCs ``0 .. total - 1`` were sent, and what is still owed is lost."""
+    """Settle all rows after the last frame: unanswered SYNCs are lost.
+
+    Parameters
+    ----------
+    total
+        Number of SYNCs that were sent.
+    b
+        State of the matcher.
+    out
+        Output of decided samples.
+    """
     for bus in range(b.state.shape[0]):
         last = b.state[bus, SYNC]
         for other in range(b.state.shape[0] if last < 0 else 0):

@@ -1,4 +1,4 @@
-"""The compiled part that closes the books: which answers are certain, which given up, and the samples given out."""
+"""Compiled decision about answers: certain, ambiguous or lost, and output of the decided rows."""
 
 from typing import Any
 
@@ -38,13 +38,23 @@ from armident.daq.matching.state import (
 
 @njit(cache=True, nogil=True)
 def slot_of(b: MatcherState, s: int, u: int) -> int:
-    """Where row ``u`` stands in the ring of its stream."""
+    """Return the ring slot of a row.
+
+    Parameters
+    ----------
+    b
+        State of the matcher.
+    s
+        Number of the stream.
+    u
+        Ordinal of the row.
+    """
     return int((u - b.mark[s, BASE]) % b.row_sync.shape[1])
 
 
 @njit(cache=True, nogil=True)
 def _seen(b: MatcherState, s: int, j: int, u: int) -> bool:
-    """Whether the SYNC of row ``u`` was received on the bus of a joint."""
+    """Return whether the SYNC of row ``u`` was received on the bus of a joint."""
     return bool(b.row_t[s, slot_of(b, s, u), b.kind[s, PACK] - 1, b.bus_of[j]] != NEVER)
 
 
@@ -60,10 +70,10 @@ def _place(b: MatcherState, s: int, j: int, u: int, i: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _same(b: MatcherState, s: int, j: int, i: int, k: int) -> bool:
-    """Whether two answers of a drive have the same bytes."""
+    """Return whether two answers of a drive have the same bytes."""
     same = b.answer_code[s, j, i] == b.answer_code[s, j, k]
     for w in range(-(-b.kind[s, LENGTH] // 8)):
-        # What stands behind the data of a short frame is no part of it.
+        # Bytes behind the data of a short frame are undefined.
         unused = np.uint64(8 * max(0, 8 * w + 8 - b.kind[s, LENGTH]))
         same = same and ((b.answer[s, j, i, w] ^ b.answer[s, j, k, w]) << unused) == 0
     return bool(same)
@@ -71,7 +81,7 @@ def _same(b: MatcherState, s: int, j: int, i: int, k: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def _without_repeats(b: MatcherState, s: int, j: int, owed: int) -> None:
-    """More answers than SYNCs: frames that were sent twice are dropped; where they cannot be told, all are in doubt."""
+    """Drop repeated frames if there are more answers than SYNCs; mark all as uncertain if they cannot be identified."""
     count = b.pending[s, j]
     b.counts[TPDO_DUPLICATE] += count - owed
     unlike = 0
@@ -94,7 +104,7 @@ def _without_repeats(b: MatcherState, s: int, j: int, owed: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _was_behind(b: MatcherState, s: int, j: int, rows: int) -> None:
-    """A drive owed the answers to so many SYNCs at once."""
+    """Record that a drive had this number of outstanding answers."""
     if rows >= b.behind[s, j] or b.head[b.bus_of[j], s] - b.behind_at[s, j] > 2 * b.kind[s, WINDOW]:
         b.behind[s, j] = rows
         b.behind_at[s, j] = b.head[b.bus_of[j], s]
@@ -102,7 +112,7 @@ def _was_behind(b: MatcherState, s: int, j: int, rows: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _keep_pace(b: MatcherState, s: int, j: int) -> None:
-    """See how a drive keeps up: how far it is behind the rows at its best, and for how long it stays there."""
+    """Update the progress of a drive: its best balance of answers and rows, and for how many rows it has kept it."""
     head = b.head[b.bus_of[j], s]
     balance = b.pending[s, j] - (head - b.settled[s, j])
     best = b.pace[s, j, BEST]
@@ -117,14 +127,14 @@ def _keep_pace(b: MatcherState, s: int, j: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _close(b: MatcherState, s: int, j: int, until: int, unsure: bool) -> None:
-    """The rows before ``until`` are settled, all answers taken; whether some may still come to rows given up."""
+    """Settle the rows before ``until``; ``unsure``: answers to discarded rows may still arrive."""
     b.settled[s, j], b.pending[s, j] = until, 0
     b.pace[s, j, BEST], b.pace[s, j, STOOD], b.pace[s, j, UNSURE] = NEVER, 0, int(unsure)
 
 
 @njit(cache=True, nogil=True)
 def _drop_first(b: MatcherState, s: int, j: int, count: int) -> None:
-    """The first answers are to rows that were given up; where frames were sent twice nobody can say how many are."""
+    """Drop the first answers, which belong to discarded rows; with repeated frames, their number is uncertain."""
     for i in range(1, b.pending[s, j]):
         if _same(b, s, j, i, i - 1):
             b.doubt[s, j] = max(b.doubt[s, j], b.settled[s, j] + b.pending[s, j] - count)
@@ -139,7 +149,7 @@ def _drop_first(b: MatcherState, s: int, j: int, count: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _may_repeat(b: MatcherState, s: int, j: int) -> bool:
-    """Whether late answers came together that may be one sent twice: the next SYNC shows if there are too many."""
+    """Return whether late answers came together of which one may be a repetition; the next SYNC shows a surplus."""
     found = False
     for i in range(1, b.pending[s, j]):
         found = found or (b.label[s, j, i] == b.label[s, j, i - 1] and _same(b, s, j, i, i - 1))
@@ -148,14 +158,14 @@ def _may_repeat(b: MatcherState, s: int, j: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def _not_behind(b: MatcherState, s: int, j: int) -> int:
-    """How many of its answers a drive has certainly sent in time, or all where it is not known to have been behind."""
+    """Return the number of answers certainly sent in time; all if the drive is not known to have been behind."""
     count, prompt = b.pending[s, j], 0
     while prompt < count and not b.pace[s, j, UNSURE] and b.label[s, j, prompt] == b.settled[s, j] + prompt:
         prompt += 1
     behind = b.behind[s, j] > 0 and b.head[b.bus_of[j], s] - b.behind_at[s, j] <= 2 * b.kind[s, WINDOW]
     previous = b.settled[s, j] + prompt - 1
     for i in range(prompt, count):
-        # Two at once; or so many missing in a row that it rather stood still.
+        # Two answers at once, or so many consecutive rows missing that the drive has paused.
         behind = behind or b.label[s, j, i] == previous or b.label[s, j, i] - previous > STILL
         previous = b.label[s, j, i]
     return prompt if behind else count
@@ -163,7 +173,7 @@ def _not_behind(b: MatcherState, s: int, j: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _settle(b: MatcherState, s: int, j: int, final: bool, witness: bool) -> None:
-    """Close the books of one TPDO of one drive: match what is certain, give up what nobody answers any more."""
+    """Decide the open rows of one TPDO of one drive: match certain answers, discard rows no longer answered."""
     bus = b.bus_of[j]
     head, unsure = b.head[bus, s], b.pace[s, j, UNSURE] != 0
     owed = head - b.settled[s, j]
@@ -171,7 +181,7 @@ def _settle(b: MatcherState, s: int, j: int, final: bool, witness: bool) -> None
         _without_repeats(b, s, j, owed)
     b.fresh[s, j] = 0
     balance, stood = b.pending[s, j] - owed, b.pace[s, j, STOOD]
-    # Where answers to rows given up may come in between, as many as SYNCs prove nothing before they keep step.
+    # If answers to discarded rows may arrive, equal numbers prove nothing until the drive is in step.
     if (balance == 0 and not unsure) or (balance >= 0 and unsure and stood >= ALIGNED_SYNCS):
         if balance > 0:
             _drop_first(b, s, j, balance)
@@ -188,7 +198,7 @@ def _settle(b: MatcherState, s: int, j: int, final: bool, witness: bool) -> None
         return
     count = b.pending[s, j]
     last = b.label[s, j, count - 1] + 1 if count else b.settled[s, j]
-    # It answers every SYNC, and no better than that while others owe nothing: what it still owes is lost.
+    # The drive answers every SYNC but does not catch up, while others lack no answer: its missing answers are lost.
     in_step = balance < 0 and stood >= ALIGNED_SYNCS and head - b.pace[s, j, BEST_AT] >= b.kind[s, SHORT]
     in_step = in_step and (witness or b.settled[s, j] < b.hole[bus, s])
     silent = witness and head - last > 2 * b.kind[s, SHORT]
@@ -209,25 +219,25 @@ def _settle(b: MatcherState, s: int, j: int, final: bool, witness: bool) -> None
         after, u = u, min(b.label[s, j, i], u - 1)
         answered = max(answered, u + 1)
         _place(b, s, j, u, i)
-        # Who has been behind may be so before silence: what it sent last is late, or what it did not send is lost.
+        # A drive that was behind before it fell silent: its last answers may be late, or earlier ones lost.
         for v in range(u + 1, after):
             ends = ends or not _seen(b, s, j, v)
         if ends and i >= caught_up:
             b.row_code[s, slot_of(b, s, u), j] = AMBIGUOUS
-        # A frame sent twice looks like two late answers, which move those before them.
+        # A repeated frame looks like two late answers, which shifts the ones before.
         twice = u < b.label[s, j, i] and (
             twice or (b.label[s, j, i] == b.label[s, j, i + 1] and _same(b, s, j, i, i + 1))
         )
         if twice:
             b.row_code[s, slot_of(b, s, u), j] = AMBIGUOUS
     _give_up_doubtful(b, s, j, count)
-    # A drive answers in order: behind an answer none can come to what is before it.
+    # A drive answers in order: no answer to an earlier row can follow.
     _close(b, s, j, max(keep, answered), keep > answered or (unsure and not in_step))
 
 
 @njit(cache=True, nogil=True)
 def _give_up_refilled(b: MatcherState, s: int, j: int, count: int) -> None:
-    """As many answers as SYNCs, where frames were missing lately, may be one lost and a later one sent twice."""
+    """Discard answers as ambiguous where frames were missing recently: one may be lost and a later one repeated."""
     repeated, unlike = -1, False
     for i in range(1, count):
         if b.label[s, j, i] == b.label[s, j, i - 1] and _same(b, s, j, i, i - 1):
@@ -240,8 +250,8 @@ def _give_up_refilled(b: MatcherState, s: int, j: int, count: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _give_up_doubtful(b: MatcherState, s: int, j: int, count: int) -> None:
-    """Of answers taken as prompt where one was lost, those that need not have been."""
-    # Answers that came in a burst after a silence: with one of them lost, none can be told from the next.
+    """Discard answers that were taken as prompt but may be late, where one was lost."""
+    # Answers in a burst after a pause: with one of them lost, they cannot be told apart.
     previous = b.settled[s, j] - 1
     for i in range(count):
         label = b.label[s, j, i]
@@ -252,14 +262,14 @@ def _give_up_doubtful(b: MatcherState, s: int, j: int, count: int) -> None:
                 b.row_code[s, slot_of(b, s, v), j] = AMBIGUOUS
         else:
             previous = label
-    # A drive that was behind lately may have been so again when an answer was lost: then those after it are late ones.
+    # A drive that was behind recently may have been behind when an answer was lost: later answers are then late.
     if b.head[b.bus_of[j], s] - b.behind_at[s, j] > 2 * b.kind[s, WINDOW]:
         b.behind[s, j] = 0
     previous = b.settled[s, j] - 1
     for i in range(count):
         label = b.label[s, j, i]
         if i + 1 < count and b.label[s, j, i + 1] == label:
-            # With a burst it has caught up.
+            # After a burst the drive has caught up.
             b.doubt[s, j] = min(b.doubt[s, j], label + 1)
         elif b.behind[s, j] > 1 and label > previous + 1:
             b.doubt[s, j] = max(b.doubt[s, j], label + b.behind[s, j] - 1)
@@ -271,7 +281,7 @@ def _give_up_doubtful(b: MatcherState, s: int, j: int, count: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _sample(b: MatcherState, s: int, slot: int, j: int, i: int, word: int) -> Any:
-    """Eight bytes of sample ``i`` of a packed answer."""
+    """Return eight bytes of sample ``i`` of a packed answer."""
     value = np.uint64(0)
     for octet in range(8 * word, min(b.kind[s, SIZE], 8 * word + 8)):
         at = i * b.kind[s, SIZE] + octet
@@ -282,7 +292,7 @@ def _sample(b: MatcherState, s: int, slot: int, j: int, i: int, word: int) -> An
 
 @njit(cache=True, nogil=True)
 def _emit(b: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
-    """Give out the rows before ``end``; a packed one is as many samples."""
+    """Output the rows before ``end``; a packed row is several samples."""
     pack, buses = b.kind[s, PACK], b.state.shape[0]
     words = -(-b.kind[s, SIZE] // 8)
     while b.mark[s, EMITTED] < end:
@@ -310,7 +320,21 @@ def _emit(b: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
 
 @njit(cache=True, nogil=True)
 def settle_all(b: MatcherState, bus: int, s: int, final: bool, out: MatchedSamples) -> None:
-    """Close the books of the drives on one bus, and give out what all drives have settled."""
+    """Decide the open rows of the drives on one bus, and output the rows that all drives have settled.
+
+    Parameters
+    ----------
+    b
+        State of the matcher.
+    bus
+        Number of the bus.
+    s
+        Number of the stream.
+    final
+        No more answers follow.
+    out
+        Output of decided samples.
+    """
     n = b.settled.shape[1]
     head = b.head[bus, s]
     slot = (head - 1 - b.mark[s, BASE]) % b.row_sync.shape[1]
@@ -319,7 +343,7 @@ def settle_all(b: MatcherState, bus: int, s: int, final: bool, out: MatchedSampl
     for j in range(n):
         if b.bus_of[j] == bus:
             here += 1
-            # The one answer to the one SYNC: done here, as a call that hands over the books costs more than all of it.
+            # Common case, one answer to one SYNC, inline: passing the state to a function costs more than all of it.
             if (
                 b.pending[s, j] == 1
                 and b.settled[s, j] == head - 1
@@ -338,7 +362,7 @@ def settle_all(b: MatcherState, bus: int, s: int, final: bool, out: MatchedSampl
                 _keep_pace(b, s, j)
         all_owe = all_owe and b.settled[s, j] + b.pending[s, j] < b.head[b.bus_of[j], s]
         whole = whole and b.settled[s, j] >= b.hole[b.bus_of[j], s]
-        # Buses are read one after the other: what another one was like before, or has become since, says nothing.
+        # Buses are read one after the other: only the state of another bus at this row counts.
         begun, ended = b.pace[s, j, PACED] - b.pace[s, j, CALM], b.pace[s, j, PACED]
         if begun <= head - ALIGNED_SYNCS and ended >= head - 1:
             calm += 1
@@ -348,7 +372,7 @@ def settle_all(b: MatcherState, bus: int, s: int, final: bool, out: MatchedSampl
     end = b.mark[s, TOP]
     for j in range(n):
         if b.bus_of[j] == bus and (b.settled[s, j] < head or b.pending[s, j]):
-            # Who owes nothing shows that neither the host nor the bus is behind.
+            # A drive without outstanding answers shows that neither the host nor the bus is delayed.
             _settle(b, s, j, final, calm_here > 0 if here > 1 else calm > 0)
         end = min(end, b.settled[s, j])
     if end > b.mark[s, EMITTED]:

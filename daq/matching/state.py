@@ -1,4 +1,4 @@
-"""The books of the assembler: what every SYNC of every bus asked of every drive, and what has come."""
+"""State of the matcher: the SYNCs of every bus that drives have to answer, and the answers received."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,36 +7,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 LOST, RECEIVED, WRONG_LENGTH, AMBIGUOUS, NO_SYNC, WRONG_MAPPING = range(6)
-"""What is known of one joint's sample at one SYNC."""
+"""States of one joint's sample at one SYNC."""
 
 NEVER = int(np.iinfo(np.int64).min)
-"""The time of a SYNC that was not received."""
+"""Time of a SYNC that was not received."""
 
-# Positions in Books.state, per bus: number, counter and time of the last SYNC, counter of SYNC 0, whether the last
-# SYNC is one of other buses, which this one lacks, whether frames are known to be missing (1 behind the last SYNC, 2
-# somewhere among those that come now), and how often SYNC has been late or early lately, times two to the `FORGOTTEN`.
+# Positions in MatcherState.state, per bus: number, counter and time (ns UTC) of the last SYNC; counter of SYNC 0; 1 if
+# the last SYNC number comes from other buses and was not received on this one; frames known to be missing (1: after
+# the last SYNC, 2: among the present frames); recent number of late or early SYNCs, times two to the `FORGOTTEN`.
 SYNC, COUNTER, TIME, ORIGIN, BORROWED, TORN, STRAYED = range(7)
 
-# Columns of Books.kind: every how many SYNCs a frame is due, its samples, their bytes, its bytes, and for how many rows
-# an answer may be late: where its drive has not been in step since, where all are late, and where it is in step again
-# beside others.
+# Columns of MatcherState.kind: SYNCs per frame, samples per frame, bytes per sample, bytes per frame, and the number of
+# rows by which an answer may be late: if its drive has not been in step since, if all drives are late, and if it is in
+# step again beside others.
 EVERY, PACK, SIZE, LENGTH, WINDOW, PATIENCE, SHORT = range(7)
 
-# Columns of Books.mark, ordinals of each stream: rows asked for, row in the first slot of the ring, last row at which
-# all joints owed, rows given out.
+# Columns of MatcherState.mark, row ordinals of each stream: rows to be answered, row in the first slot of the ring,
+# last row at which all joints lacked answers, rows given out.
 TOP, BASE, BEHIND, EMITTED = range(4)
 
-# Columns of Books.pace, per stream and joint: answers less rows at the drive's best lately, the row at which that was
-# reached, for how many rows in a row it has stood there, for how many nothing has been owed, the row at which this was
-# counted last, whether answers to rows that were given up may still come, and the row at which late ones were kept
-# because one of them may have been sent twice.
+# Columns of MatcherState.pace, per stream and joint: recent maximum of answers minus rows; row at which it was reached;
+# number of consecutive rows at this maximum; number of consecutive rows without outstanding answers; row at which these
+# were counted last; 1 if answers to discarded rows may still arrive; row at which late answers were held back because
+# one of them may be a repetition.
 BEST, BEST_AT, STOOD, CALM, PACED, UNSURE, HELD = range(7)
 
 ALIGNED_SYNCS = 8
-"""A drive whose balance stands for so many rows answers each of them."""
+"""Number of consecutive rows with unchanged balance after which a drive counts as answering every SYNC."""
 
 STILL = 3
-"""A drive that leaves out so many rows one after the other rather stood still than lost each of its answers."""
+"""Number of consecutive unanswered rows above which a drive has paused rather than lost each answer."""
 
 COUNT_NAMES = (
     "sync_seen",
@@ -56,27 +56,77 @@ COUNT_NAMES = (
 ) = range(10)  # fmt: skip
 
 FORGOTTEN = 14
-"""That a SYNC was late is forgotten bit by bit over the next two to this."""
+"""Base-2 logarithm of the number of SYNCs over which `STRAYED` decays."""
 
 RECENT = 256
-"""Times of at least so many SYNCs are kept for packed samples: a turn of the counter and more.
+"""Least number of SYNC times kept, for packed samples: more than a turn of the counter (CiA 301, 1019h: up to 240).
 
-Several buses keep as many as one may be behind another, twice: a bus whose frames waited finds its numbers by them."""
+With several buses, twice the slack is added: a bus with delayed frames finds its numbers by them."""
 
 SENT_AT = 1 << 16
-"""SYNCs of our own have the times kept at which they were sent."""
+"""Number of SYNCs of the own producer whose send times are kept."""
 
 
 class MatcherState(NamedTuple):
-    """What is owed and what has come; buses ``b``, streams ``s``, joints ``j``, a stream's own SYNCs as ordinals ``u``.
+    """Rows to be answered and answers received; B buses, S streams, n joints, rows as ordinals ``u`` per stream.
 
-    Rows ``u`` of stream ``s`` stand in ring slots ``(u - base) % C`` until every joint has settled them; with nothing
-    open the ring begins anew, so that memory is only touched where answers are late. ``head`` counts the rows that the
-    SYNCs of a bus have asked for, ``TOP`` of ``mark`` those of the bus that is ahead. A bus may be ``slack`` SYNCs
-    behind another one before it is taken for silent. ``behind`` is how many answers a drive has owed at once lately,
-    and at which row (``behind_at``); what is placed before row ``doubt`` is not certain. Before row ``hole`` of a bus a
-    frame is known to be missing on it. TPDOs that came in the time ``suspect`` (n, 2) were mapped by others. Where we
-    send SYNC and lose some, ``sent_at`` is a ring of the times by which those before number ``sent`` (1,) were sent.
+    Row ``u`` of stream ``s`` is in ring slot ``(u - mark[s, BASE]) % C`` until every joint has settled it. When no row
+    is open the ring restarts, so that memory is only touched if answers are late.
+
+    Parameters
+    ----------
+    state
+        State of each bus (`SYNC` and following), (B, 7).
+    slack
+        SYNCs by which a bus may be behind another one before it counts as silent, (B,).
+    recent
+        Ring of receive times by SYNC number, ns UTC, (B, R).
+    sent_at
+        Ring of send times of the own producer, ns UTC, (`SENT_AT`,); used where SYNCs are lost.
+    sent
+        Number of SYNCs before which ``sent_at`` is valid, (1,); -1: none.
+    counts
+        Counters (`COUNT_NAMES`).
+    kind
+        Shape and windows of each stream (`EVERY` and following), (S, 7).
+    mark
+        Row ordinals of each stream (`TOP` and following), (S, 4).
+    bus_of
+        Bus of each joint's drive, (n,).
+    channel_of
+        ``s n + j`` by bus and COB-ID of a TPDO, or -1, (B, 2048).
+    writes_to
+        Joint by bus and COB-ID of an SDO request, or -1, (B, 2048).
+    head
+        Rows to be answered by the SYNCs of each bus, (B, S).
+    hole
+        Row before which a frame is known to be missing, (B, S).
+    pace
+        Progress of each drive (`BEST` and following), (S, n, 7).
+    settled
+        Rows settled, (S, n).
+    pending
+        Answers received for later rows, (S, n).
+    fresh
+        Those received since the last SYNC, (S, n).
+    wrong
+        TPDOs of the wrong length, (S, n).
+    behind, behind_at
+        Largest recent number of outstanding answers, and its row, (S, n).
+    doubt
+        Row before which a match is not certain, (S, n).
+    suspect
+        Time span in which TPDOs may have another mapping, ns UTC, (n, 2).
+    label
+        Last row of the bus when each pending answer was received, (S, n, A).
+    answer, answer_code
+        Data as 64-bit words, (S, n, A, words), and state of each pending answer, (S, n, A).
+    row_sync
+        SYNC number of each row, (S, C).
+    row_t
+        Receive times of the SYNCs of each row, (S, C, pack, B); `NEVER` if not received.
+    row_code, row_data
+        State, (S, C, n), and data as 64-bit words, (S, C, n, words), of each row.
     """
 
     state: NDArray[np.int64]
@@ -111,7 +161,21 @@ class MatcherState(NamedTuple):
 
 
 class MatchedSamples(NamedTuple):
-    """Samples whose fate is decided, ``rows[s]`` of each stream; ``t_ns`` is that of the first bus with the SYNC."""
+    """Decided samples; S streams, n joints, room for N rows.
+
+    Parameters
+    ----------
+    rows
+        Number of rows of each stream, (S,).
+    sync
+        SYNC numbers, (S, N).
+    t_ns
+        Receive time on the first bus that received the SYNC, ns UTC, (S, N).
+    code
+        State of each sample, (S, N, n).
+    data
+        Data as 64-bit words, (S, N, n, words).
+    """
 
     rows: NDArray[np.int64]
     sync: NDArray[np.int64]
@@ -121,7 +185,19 @@ class MatchedSamples(NamedTuple):
 
 
 class StreamShape(NamedTuple):
-    """What a stream is made of: every how many SYNCs a frame is due, its samples, and the bytes of sample and frame."""
+    """Frames of a stream.
+
+    Parameters
+    ----------
+    every
+        Number of SYNCs from one frame to the next.
+    pack
+        Samples in a frame.
+    size
+        Bytes of a sample.
+    length
+        Bytes of a frame.
+    """
 
     every: int
     pack: int
@@ -138,9 +214,21 @@ def new_state(
     channel_of: NDArray[np.int64],
     writes_to: NDArray[np.int64],
 ) -> MatcherState:
-    """Empty books; ``channel_of`` (buses, identifiers) maps a COB-ID on a bus to ``s n + j``, or -1.
+    """Return the state before the first frame.
 
-    ``writes_to`` maps that of an SDO request likewise to the joint ``j``.
+    Parameters
+    ----------
+    shapes
+        Frames of each stream.
+    window, patience, short
+        Of each stream, the rows by which an answer may be late: in general, if all drives are late, and if the drive is
+        in step again beside others.
+    bus_of
+        Number of the bus of each joint's drive, (n,).
+    channel_of
+        ``s n + j`` by bus and COB-ID of a TPDO, or -1, (B, 2048).
+    writes_to
+        Joint by bus and COB-ID of an SDO request, or -1, (B, 2048).
     """
     buses, streams, n = len(channel_of), len(shapes), len(bus_of)
     rows = 2 * max(patience) + 8
@@ -189,7 +277,15 @@ def new_state(
 
 
 def output_buffers(books: MatcherState, syncs: int) -> MatchedSamples:
-    """Room for what can be decided when ``syncs`` more SYNC are known of."""
+    """Return buffers for all samples that can be decided after more SYNCs.
+
+    Parameters
+    ----------
+    books
+        State of the matcher.
+    syncs
+        Largest number of SYNCs to come.
+    """
     streams, _, n = books.row_code.shape
     rows = int(((books.mark[:, TOP] - books.mark[:, EMITTED] + 1) * books.kind[:, PACK]).max()) + syncs
     words = int(-(-books.kind[:, SIZE] // 8).max())

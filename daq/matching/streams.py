@@ -1,4 +1,4 @@
-"""What a session's streams are made of: TPDOs on the bus, fields in the recording."""
+"""Streams of a session: their TPDOs on the bus and their fields in the recording."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,20 +19,37 @@ from armident.drivers.canopen.objects import OBJECTS, TpdoLayout, tpdo_cob
 
 @dataclass(frozen=True)
 class CapturedStream:
-    """One stream: how its TPDOs look on the bus, and how its rows look in the recording."""
+    """One stream on the bus and in the recording.
+
+    Parameters
+    ----------
+    tpdo
+        Layout of the objects in a TPDO.
+    bus
+        COB-IDs and frame lengths for the matcher.
+    layout
+        Layout in the recording.
+    """
 
     tpdo: TpdoLayout
     bus: TpdoStream
     layout: StreamLayout
 
     def decode(self, rows: Rows) -> dict[str, NDArray[Any]]:
-        """Raw values of each field, (N, n), from the bytes of the TPDOs."""
+        """Return the raw values of each field, (N, n), from the bytes of the TPDOs."""
         records = rows.data.view(self.tpdo.dtype)[:, :, 0]
         return {name: np.ascontiguousarray(records[name]) for name in self.tpdo.dtype.names or ()}
 
 
 def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[CapturedStream, ...]:
-    """The streams of a session, joints in the robot's order.
+    """Return the streams of a session, with the joints in the robot's order.
+
+    Parameters
+    ----------
+    session
+        Configuration of the capture.
+    robot
+        The robot, for joints, transmission and encoder scales.
 
     Raises
     ------
@@ -54,7 +71,14 @@ def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[Captur
 
 
 def node_ids(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
-    """Node of each joint's drive, in the robot's order.
+    """Return the node ID of each joint's drive, in the robot's order.
+
+    Parameters
+    ----------
+    session
+        Configuration of the capture, with its drives.
+    robot
+        The robot, for its joints.
 
     Raises
     ------
@@ -69,14 +93,30 @@ def node_ids(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
 
 
 def bus_numbers(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
-    """Number of the bus that each joint's drive is on, in the robot's order."""
+    """Return the number of the bus of each joint's drive, in the robot's order.
+
+    Parameters
+    ----------
+    session
+        Configuration of the capture, with its buses and drives.
+    robot
+        The robot, for its joints.
+    """
     buses = session.all_buses
     by_joint = {drive.joint: buses.index(session.bus_of(drive)) for drive in session.drives}
     return tuple(by_joint[joint.name] for joint in robot.joints)
 
 
 def field_of(name: ObjectName, robot: RobotConfig) -> Field:
-    """Meaning and scale of an object that drives report (CiA 402 part 2; 6078h and 6077h in per mille of rated)."""
+    """Return quantity, unit and scale of an object (CiA 402 part 2; 6078h and 6077h in per mille of rated).
+
+    Parameters
+    ----------
+    name
+        Name of the object.
+    robot
+        The robot, for rated values and encoder scales.
+    """
     one = (1.0,) * robot.n
     if name == "status":
         return Field(name, "status", "", "motor", one)

@@ -1,4 +1,4 @@
-"""The compiled part that numbers the SYNCs of every bus: by their counter, and where that is not enough by time."""
+"""Compiled numbering of the SYNCs of every bus, by their counter and, where it is ambiguous, by their time."""
 
 from typing import Any
 
@@ -8,30 +8,40 @@ from numba import njit
 from armident.daq.matching.state import BORROWED, COUNTER, FORGOTTEN, NEVER, ORIGIN, STRAYED, SYNC, TIME, TORN
 
 _EARLY = 0.25
-"""By how much of a turn of the counter the time between two SYNCs may be too short, as their stamps say."""
+"""Share of a counter turn by which the time between two SYNCs may be too short, by their time stamps."""
 _DISORDER = 8
 """A SYNC counter that goes back by less than this is a repeated SYNC, not a long gap."""
 _ON_TIME, _DRIFT = 2.0, 1e-4
-"""By how many periods, and which share of the time since, SYNC comes earlier or later than its grid at most."""
+"""Largest deviation of a SYNC from its period grid: periods, and share of the time since the last SYNC."""
 NOWHERE = -(1 << 60)
-"""No step at all."""
+"""Value of a step that could not be determined."""
 _OFTEN = (3 << FORGOTTEN) // 2
-"""A master that has been late more often than this lately is late all the time: twice in a few seconds at 5 kHz."""
+"""Limit of ``STRAYED`` above which a master counts as always irregular: two late SYNCs in a few seconds at 5 kHz."""
 _MISALIGNED = 2.0
-"""SYNCs of equal counters on two buses that are farther apart than so many periods are not the same SYNC."""
+"""Largest time between the same SYNC on two buses, periods."""
 
 
 @njit(cache=True, nogil=True)
 def turns_in(periods: float, overflow: int) -> int:
-    """Whole turns of the counter in a time: SYNCs come late, when their master was held up, but not too early."""
+    """Return the number of whole counter turns in a time.
+
+    SYNCs may be late, when their master was delayed, but at most a quarter of a turn early.
+
+    Parameters
+    ----------
+    periods
+        Time in SYNC periods.
+    overflow
+        Synchronous counter overflow value (CiA 301, 1019h).
+    """
     return int(np.floor(periods / overflow + _EARLY))
 
 
 @njit(cache=True, nogil=True)
 def _was_held_up(counter: int, previous: int, elapsed: float, often: bool, overflow: int) -> bool:
-    """Whether a counter that goes on without a seam is that of a master that was held up: not a time of whole turns.
+    """Return whether the master of consecutive counters was delayed: the time is no multiple of counter turns.
 
-    Of one that is held up ``often`` no time says anything else.
+    The time of a master that is ``often`` delayed is no evidence for missing turns.
     """
     step = (counter - previous) % overflow
     off = elapsed - step - turns_in(elapsed - step, overflow) * overflow
@@ -40,9 +50,20 @@ def _was_held_up(counter: int, previous: int, elapsed: float, often: bool, overf
 
 @njit(cache=True, nogil=True)
 def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longest: int) -> int:
-    """By how many SYNCs the counter advanced; zero or less for a repeated SYNC.
+    """Return the number of SYNCs by which the counter advanced; zero or less for a repeated SYNC.
 
-    Known modulo ``overflow``; whole turns of the counter are told from ``elapsed`` periods, up to ``longest``.
+    The counter gives it modulo ``overflow``, the time the whole turns.
+
+    Parameters
+    ----------
+    counter, previous
+        Counters of this SYNC and the last one.
+    elapsed
+        Time between them, SYNC periods.
+    overflow
+        Synchronous counter overflow value (CiA 301, 1019h).
+    longest
+        Largest advance with whole turns, SYNCs.
     """
     step = (counter - previous) % overflow
     turns = turns_in(elapsed - step, overflow)
@@ -55,9 +76,9 @@ def sync_step(counter: int, previous: int, elapsed: float, overflow: int, longes
 
 @njit(cache=True, nogil=True)
 def _begin(state: Any, recent: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
-    """The first SYNC of a bus: number 0, or what those of another bus say; the step to it, 0 for one before number 0.
+    """Number the first SYNC of a bus: 0, or by the numbers of another bus.
 
-    Less than 0 where counters of the buses do not agree.
+    Return the step to it, 0 for a SYNC before number 0, less than 0 if the counters of the buses do not agree.
     """
     for other in range(state.shape[0]):
         if state[other, SYNC] < 0:
@@ -71,7 +92,7 @@ def _begin(state: Any, recent: Any, bus: int, counter: int, t_ns: int, period_ns
             k = state[other, SYNC] + ahead
             room = recent.shape[1]
             if ahead <= 0 <= k and ahead > -room and recent[other, k % room] != NEVER:
-                # Known when the other bus had it: a master that was held up since does not matter.
+                # Receive time on the other bus is known: later delays of the master do not matter.
                 apart = abs(t_ns - recent[other, k % room]) / period_ns
             if apart > _MISALIGNED:
                 return -1
@@ -84,17 +105,17 @@ def _begin(state: Any, recent: Any, bus: int, counter: int, t_ns: int, period_ns
 
 @njit(cache=True, nogil=True)
 def _heard_elsewhere(state: Any, recent: Any, bus: int, step: int, t_ns: int, period_ns: int, overflow: int) -> int:
-    """By how many SYNCs, ``step`` and whole turns, a bus advances to the SYNC that another one had at this time.
+    """Advance of a bus, ``step`` and whole turns, to the SYNC that another bus received at this time.
 
-    A master that is held up keeps to no period, but all buses have its SYNC at once, or one of them between two that
-    another has if it is held up between buses. ``NOWHERE`` if none had one.
+    A delayed master keeps no period, but all buses receive its SYNC at the same time. If the delay is between buses,
+    this SYNC lies between two that another bus received. ``NOWHERE`` if no bus received one.
     """
     best, nearest, room = NOWHERE, _MISALIGNED * period_ns, recent.shape[1]
     for other in range(state.shape[0]):
         last = state[other, SYNC]
         if other == bus or last < 0:
             continue
-        # The first such number that the other bus may still have the time of.
+        # First number with this counter whose time the other bus may still have.
         k = max(0, last - room + 1)
         k += (state[bus, SYNC] + step - k) % overflow
         while k <= last:
@@ -111,7 +132,7 @@ def _heard_elsewhere(state: Any, recent: Any, bus: int, step: int, t_ns: int, pe
 
 @njit(cache=True, nogil=True)
 def _is_apart(state: Any, bus: int, number: int, t_ns: int, period_ns: int, overflow: int) -> int:
-    """Another bus that had later SYNCs than one that comes now, by more than there was time for; -1 if none had."""
+    """Return a bus that is farther ahead of this SYNC's number than the time allows; -1 if there is none."""
     for other in range(state.shape[0]):
         ahead = state[other, SYNC] - number
         if ahead <= overflow // 2 or other == bus or state[other, BORROWED]:
@@ -123,7 +144,7 @@ def _is_apart(state: Any, bus: int, number: int, t_ns: int, period_ns: int, over
 
 @njit(cache=True, nogil=True)
 def _together(state: Any, bus: int, other: int, counter: int, t_ns: int, period_ns: int, overflow: int) -> int:
-    """By how many SYNCs a bus advances to the one nearest in time to the last of another bus."""
+    """Return the advance of a bus to the SYNC that is nearest in time to the last one of another bus."""
     elapsed = (t_ns - state[other, TIME]) / period_ns
     step = (counter - state[other, COUNTER]) % overflow
     return int(state[other, SYNC] + step + overflow * np.rint((elapsed - step) / overflow) - state[bus, SYNC])
@@ -131,14 +152,14 @@ def _together(state: Any, bus: int, other: int, counter: int, t_ns: int, period_
 
 @njit(cache=True, nogil=True)
 def _sent_then(sent_at: Any, sent: int, last: int, step: int, t_ns: int, half_turn_ns: int, overflow: int) -> int:
-    """By how many SYNCs, ``step`` and whole turns, a bus advances to the one that we had sent by this time.
+    """Advance of a bus, ``step`` and whole turns, to the SYNC sent by this program at this time.
 
-    It is the first that was sent by no earlier time than it came, give or take what the bus and clocks need; a turn
-    before it another one had been sent long ago. ``NOWHERE`` if there is none, or if the one before that was sent
-    later: then it is older than the last of this bus, whose number is borrowed from others.
+    It is the first SYNC sent no earlier than half a turn before it was received; the one a turn earlier is much older.
+    ``NOWHERE`` if there is none, or if the SYNC before it was sent later: then the received SYNC is older than the last
+    number of this bus, which was taken from other buses.
     """
     k, room = last + step, sent_at.size
-    # The one that is being sent has no time yet.
+    # The SYNC being sent has no time yet.
     while k < sent and (k < sent - room or sent_at[k % room] < t_ns - half_turn_ns):
         k += overflow
     if k > sent or (k - 1 >= max(0, sent - room) and sent_at[(k - 1) % room] > t_ns + half_turn_ns):
@@ -150,7 +171,7 @@ def _sent_then(sent_at: Any, sent: int, last: int, step: int, t_ns: int, half_tu
 def _told_by_counter(
     state: Any, b: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int
 ) -> int:
-    """By how many SYNCs a bus advances whose SYNC has a counter, as had the one before it."""
+    """Return the advance of a bus whose last and present SYNC have a counter."""
     elapsed = (t_ns - state[bus, TIME]) / period_ns if state[bus, TIME] != NEVER else 0.0
     step = (counter - state[bus, COUNTER]) % overflow
     if b.sent[0] > state[bus, SYNC]:
@@ -159,7 +180,7 @@ def _told_by_counter(
         if sent != NOWHERE:
             return sent
     if state[bus, BORROWED]:
-        # What had waited on this bus may be older than what others had meanwhile.
+        # Delayed frames of this bus may be older than SYNCs that other buses have received since.
         found = _heard_elsewhere(state, b.recent, bus, step, t_ns, period_ns, overflow)
         return found if found != NOWHERE else int(step + overflow * turns_in(elapsed - step, overflow))
     often = state[bus, STRAYED] > _OFTEN
@@ -170,7 +191,7 @@ def _told_by_counter(
     if told > overflow:
         found = _heard_elsewhere(state, b.recent, bus, step, t_ns, period_ns, overflow)
     else:
-        # Time may have deceived one of them; who is behind can still leave numbers out.
+        # The time of one bus may be wrong; the bus that is behind can still skip numbers.
         other = _is_apart(state, bus, state[bus, SYNC] + told, t_ns, period_ns, overflow)
         if other >= 0 and state[other, COUNTER] >= 0:
             found = _together(state, bus, other, counter, t_ns, period_ns, overflow)
@@ -179,9 +200,28 @@ def _told_by_counter(
 
 @njit(cache=True, nogil=True)
 def advance(state: Any, b: Any, bus: int, counter: int, t_ns: int, period_ns: int, overflow: int, longest: int) -> int:
-    """By how many SYNCs a bus advances with this one, after which ``state`` says so; nothing changes if it does not.
+    """Number a received SYNC and update ``state``; return the number of SYNCs by which its bus advances.
 
-    ``state`` is that of the books ``b``, or a copy.
+    With zero or less, nothing changes: the SYNC is repeated, or the buses do not agree.
+
+    Parameters
+    ----------
+    state
+        ``MatcherState.state`` of ``b``, or a copy.
+    b
+        State of the matcher.
+    bus
+        Number of the bus.
+    counter
+        Counter of the SYNC; -1 if it has none.
+    t_ns
+        Receive time, ns UTC.
+    period_ns
+        SYNC period, ns.
+    overflow
+        Synchronous counter overflow value (CiA 301, 1019h).
+    longest
+        Largest advance with whole counter turns, SYNCs.
     """
     if state[bus, SYNC] < 0 and state[bus, COUNTER] < 0:
         step = _begin(state, b.recent, bus, counter, t_ns, period_ns, overflow)
