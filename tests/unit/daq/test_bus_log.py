@@ -1,4 +1,4 @@
-"""Logs of CAN tools become recordings, and recordings become such logs."""
+"""Conversion between logs of CAN tools and recordings."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ T0 = 1_700_000_000_000_000_000
 
 
 def captured(rows: int = 3000, lost: slice = slice(0)) -> Recording:
-    """A recording of the session's streams as a capture makes it, some of its SYNCs lost."""
+    """Return a recording of the session's streams like that of a capture, without the ``lost`` SYNCs."""
     rng = np.random.default_rng(5)
     streams = {}
     for stream in captured_streams(SESSION, ROBOT):
@@ -65,7 +65,7 @@ def test_a_sync_that_the_log_lacks_is_a_gap(tmp_path: Path) -> None:
     assert read.counters["samples.expected"] == 3000
     assert read.counters["samples.rows"] + read.counters["samples.in_gaps"] == 3000
     missing = {n for g in read.gaps if g.stream == "samples" for n in range(g.first, g.last + 1)}
-    # Whether the answers around the hole belong to the SYNC before it cannot be told for certain.
+    # The answers beside the gap may or may not belong to the SYNC before it.
     assert set(range(1000, 1030)) <= missing <= set(range(999, 1031))
     assert not missing & set(read.samples.sync.tolist())
 

@@ -1,4 +1,4 @@
-"""The root of the command line: finds commands, loads only what is called, one line for every error."""
+"""Root of the command line: finds commands, imports only the one called, one line for every error."""
 
 import importlib.metadata
 import subprocess

@@ -1,4 +1,4 @@
-"""Import and export: the same numbers in and out, and one clear line for what is wrong."""
+"""Import and export: numbers survive the round trip, and every error has one clear line."""
 
 from pathlib import Path
 
@@ -141,7 +141,7 @@ PANDA = load_robot("panda.yaml")
 
 
 def moving_panda(rate_hz: float = 1000.0, seconds: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and torques (N, 7) of a motion that rests in the beginning."""
+    """Return positions and torques (N, 7) of a motion that begins at standstill."""
     t = np.arange(0.0, seconds, 1 / rate_hz)[:, None]
     share = np.clip(t - 0.2, 0.0, 1.0)
     phase = np.arange(7.0)
@@ -153,7 +153,7 @@ def moving_panda(rate_hz: float = 1000.0, seconds: float = 4.0) -> tuple[np.ndar
 def test_rows_read_without_waiting_are_put_back_on_the_clock_of_the_controller(tmp_path: Path) -> None:
     q, tau = moving_panda()
     rng = np.random.default_rng(5)
-    # What a program sees that asks too early or too late: one row in 15 again, one in 12 missed, a stall of 8.
+    # Rows of a program that polls too early or too late: one in 15 repeated, one in 12 missed, a stall of 8.
     asked = np.sort(np.append(np.arange(len(q)), rng.integers(0, len(q), len(q) // 15)))
     missed = rng.random(len(asked)) < 1 / 12
     missed[2000:2008] = True
@@ -163,11 +163,11 @@ def test_rows_read_without_waiting_are_put_back_on_the_clock_of_the_controller(t
         np.savetxt(tmp_path / f"{name}.txt", values[rows].ravel(), fmt="%.6g")
     recording = import_recording(tmp_path / "q.txt", PANDA, effort=tmp_path / "tau.txt", rate_hz=1000.0, polled=True)
     samples = recording.samples.raw
-    # The rest at the beginning tells no time: it may be off by what was missed or repeated in 0.2 s.
+    # Standstill at the beginning has no time information: rows missed or repeated in 0.2 s shift the rest.
     lag = len(samples["position"]) - len(q)
     assert abs(lag) < 30
     late, size = slice(1000, 3900), slice(1000 + lag, 3900 + lag)
-    # 1e-5: six digits were written.
+    # 1e-5, since six digits were written.
     assert np.abs(samples["position"][size] - q[late]).max() < 2e-5
     assert np.abs(samples["torque"][size] - tau[late]).max() < 1e-3
     assert int(recording.metadata["polled.repeated"]) + int(recording.metadata["polled.interpolated"]) > 300
@@ -203,7 +203,7 @@ def test_a_demand_in_another_unit_is_refused_and_can_be_left_out(tmp_path: Path)
 
 @pytest.mark.parametrize("kind", ["csv", "npz", "mat", "parquet"])
 def test_a_demand_that_begins_later_and_ends_sooner_comes_back(tmp_path: Path, kind: str) -> None:
-    """As that of every capture does: it is on every fifth SYNC."""
+    """Like the demand of every capture, which is on every fifth SYNC."""
     values = table()
     demand = values[:, 1:7] + 0.001
     demand[:4], demand[-3:] = np.nan, np.nan

@@ -1,4 +1,4 @@
-"""What nobody can tell is given up: answers beside lost ones, frames sent twice, TPDOs that others have mapped."""
+"""Ambiguous samples are discarded: answers beside lost ones, repeated frames, TPDOs with a changed mapping."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ STREAMS = (TpdoStream("samples", 1, (0x181, 0x182), 8),)
 def assembled(
     events: list[tuple[int, int, bytes]], sent: int
 ) -> tuple[Assembler, NDArray[np.int64], NDArray[np.int64]]:
-    """What becomes of frames (time in us, identifier, data): SYNC numbers, and what joint 1 sent at each."""
+    """Match frames (time in us, identifier, data); return assembler, SYNC numbers and joint 1's values at these."""
     assembler = Assembler(STREAMS, ("a", "b"), PERIOD, nodes=(1, 2))
     batch = frames(len(events))
     for i, (t_us, can_id, data) in enumerate(events):
@@ -27,7 +27,7 @@ def assembled(
 
 
 def bus(count: int, first: dict[int, list[tuple[int, int]]]) -> list[tuple[int, int, bytes]]:
-    """SYNCs and prompt answers; ``first``: when (us after the SYNC) joint 1 sends which numbers instead of its own."""
+    """Return SYNCs and prompt answers; ``first``: times (us after SYNC) and values of joint 1's frames at a SYNC."""
     events = []
     for k in range(count):
         events.append((1000 * k, 0x80, bytes([k % 240 + 1])))
@@ -50,14 +50,14 @@ def test_a_frame_sent_twice_is_dropped_where_its_bytes_tell() -> None:
 
 
 def test_a_late_answer_that_is_sent_twice_is_not_taken_for_the_next_one() -> None:
-    """Nor is the next one, which is late, too, for that behind it."""
+    """The next answer, which is late too, is not taken for the one after it."""
     _, sync, value = assembled(bus(60, {30: [], 31: [(40, 30), (50, 30)], 32: [(40, 31), (50, 32)]}), 60)
     assert np.array_equal(value, sync)
     assert sync.size == 60
 
 
 def test_late_answers_of_a_drive_that_rests_are_given_out_all_the_same() -> None:
-    """They have the same bytes, sent twice or not."""
+    """At standstill all answers have the same bytes, repeated or not."""
     late = {k: [] if k % 4 else [(10 * i, 7) for i in range(4)] for k in range(17, 37)}
     rest = {k: [(50, 7)] for k in range(60)}
     assembler, sync, value = assembled(bus(60, rest | late), 60)
@@ -67,7 +67,7 @@ def test_late_answers_of_a_drive_that_rests_are_given_out_all_the_same() -> None
 
 
 def test_a_late_answer_before_a_lost_one_is_given_up_by_a_drive_that_is_late_at_times() -> None:
-    """Answer 10 comes late, 11 with it: known to happen. Then 30 comes late and 31 never."""
+    """Answer 10 is late and arrives with 11, so late answers are known to occur. Then 30 is late and 31 is lost."""
     late = {10: [], 11: [(40, 10), (50, 11)], 30: [], 31: [(50, 30)]}
     _, sync, value = assembled(bus(60, late), 60)
     assert np.array_equal(value, sync)
@@ -75,7 +75,7 @@ def test_a_late_answer_before_a_lost_one_is_given_up_by_a_drive_that_is_late_at_
 
 
 def test_late_answers_before_a_silence_are_not_taken_for_prompt_ones() -> None:
-    """From 40 on each answer comes behind the next SYNC, twice two at once, and the last two never come."""
+    """From 40 on each answer follows the next SYNC, two of them in pairs, and the last two are lost."""
     late = {40: [], 41: [(50, 40)], 42: [(50, 41)], 43: [(50, 42), (60, 43)], 44: [], 45: [(50, 44)], 46: [(50, 45)]}
     late |= {47: [], 48: [(40, 46), (50, 47)], 49: [(50, 48)], 50: [(50, 49)], 51: [(50, 50)]}
     _, sync, value = assembled(bus(53, late | {52: []}), 53)
@@ -84,14 +84,14 @@ def test_late_answers_before_a_silence_are_not_taken_for_prompt_ones() -> None:
 
 
 def test_prompt_answers_before_a_silence_are_kept() -> None:
-    """The last two never come; nothing was late before."""
+    """The last two answers are lost; no answer before was late."""
     _, sync, value = assembled(bus(53, {51: [], 52: []}), 53)
     assert np.array_equal(value, sync)
     assert np.array_equal(sync, np.arange(51))
 
 
 def test_a_frame_sent_twice_does_not_move_those_before_it() -> None:
-    """30 is lost, 45 sent twice: as many frames as SYNCs, or two late ones."""
+    """Answer 30 is lost, 45 is repeated: as many frames as SYNCs, like two late answers."""
     _, sync, value = assembled(bus(60, {30: [], 31: [], 45: [(50, 45), (60, 45)]}), 60)
     assert np.array_equal(value, sync)
     assert set(range(30)) | set(range(46, 60)) <= set(sync.tolist())

@@ -1,4 +1,4 @@
-"""Rows wait for answers no longer than there is something to wait for, and never get those of other SYNCs."""
+"""Rows wait for late answers only as long as necessary, and never get answers of other SYNCs."""
 
 import numpy as np
 import pytest
@@ -12,11 +12,11 @@ PERIOD_S = PERIOD_NS * 1e-9
 T0 = 1_700_000_000_000_000_000
 LONGEST_WAIT = 3 * round(IN_STEP_S / PERIOD_S) + 2
 Sent = list[tuple[int, int]]
-"""Identifier and number of frames that come behind a SYNC."""
+"""Identifier and value of the frames after a SYNC."""
 
 
 def frames_of(k: int, sent: Sent, with_sync: bool = True, at_ns: int | None = None) -> Frames:
-    """SYNC ``k`` and what comes behind it."""
+    """Return SYNC ``k`` and the frames after it."""
     out = frames(with_sync + len(sent))
     out["t_ns"] = (T0 + k * PERIOD_NS if at_ns is None else at_ns) + 1000 * np.arange(out.size)
     if with_sync:
@@ -28,7 +28,7 @@ def frames_of(k: int, sent: Sent, with_sync: bool = True, at_ns: int | None = No
 
 
 class Bench:
-    """Joints a, b on the first bus, c, d on the second if there is one; what is decided, SYNC by SYNC."""
+    """Matcher for joints a, b on the first bus and, with two buses, c, d on the second; collects rows and gaps."""
 
     def __init__(self, buses: int = 1, foreign: bool = False) -> None:
         self.joints = ("a", "b", "c", "d")[: 2 * buses]
@@ -41,19 +41,19 @@ class Bench:
         self.waited = 0
 
     def push(self, k: int, *sent: Sent, with_sync: bool = True) -> None:
-        """One SYNC on every bus with what comes behind it."""
+        """Add a SYNC on every bus with the frames after it."""
         for bus, some in enumerate(sent):
             self._take(self.assembler.push(frames_of(k, some, with_sync), sent=k + 1, bus=bus))
         self.waited = max(self.waited, k - self.decided)
 
     @property
     def decided(self) -> int:
-        """The last SYNC whose row or gap is known; gaps that go on are."""
+        """Last SYNC whose row or gap is decided; gaps may continue."""
         totals = self.assembler.counters
         return totals["samples.expected"] - 1
 
     def finish(self, sent: int) -> None:
-        """No more comes."""
+        """End the input after ``sent`` SYNCs."""
         self._take(self.assembler.finish(sent))
 
     def _take(self, batch: Batch) -> None:
@@ -64,13 +64,13 @@ class Bench:
         self.gaps += batch.gaps
 
     def missing(self, count: int) -> set[int]:
-        """SYNCs without a row, of the first ``count``."""
+        """Return the SYNCs without a row among the first ``count``."""
         assert self.assembler.counters["samples.expected"] == count
         return set(range(count)) - set(self.sync)
 
 
 def answers(k: int) -> Sent:
-    """Of both drives of a bus."""
+    """Return the answers of both drives of a bus to SYNC ``k``."""
     return [(0x181, k), (0x182, k)]
 
 
@@ -115,7 +115,7 @@ def test_a_drive_that_holds_its_answers_back_for_a_moment_loses_none(held: int) 
 
 @pytest.mark.parametrize("rate", [2, 7, 60])
 def test_answers_that_come_after_they_were_given_up_are_nobody_elses(rate: int) -> None:
-    """A drive is silent for 120 SYNCs, then sends all of it, so many in a period, and is prompt again."""
+    """A drive is silent for 120 SYNCs, then sends all answers at ``rate`` per period, and is prompt again."""
     bench, queue = Bench(), list[int]()
     for k in range(700):
         queue.append(k)
@@ -129,7 +129,7 @@ def test_answers_that_come_after_they_were_given_up_are_nobody_elses(rate: int) 
 
 @pytest.mark.parametrize("stale", [0, 3, 42])
 def test_after_an_outage_what_is_late_is_matched_and_what_is_stale_is_dropped(stale: int) -> None:
-    """Bus 2 is off for 200 SYNCs; its drives owe some answers, send them afterwards and are late by 300 SYNCs."""
+    """Bus 2 is off for 200 SYNCs; its drives send ``stale`` earlier answers afterwards and are late by 300 SYNCs."""
     bench, queue = Bench(buses=2), list[int]()
     for k in range(1500):
         if k in (300, 500):
@@ -150,7 +150,7 @@ def test_after_an_outage_what_is_late_is_matched_and_what_is_stale_is_dropped(st
 
 @pytest.mark.parametrize("burst", [0, 60])
 def test_drives_that_are_late_on_buses_of_their_own_are_no_witnesses_against_each_other(burst: int) -> None:
-    """All stop for 150 SYNCs, and the host with them: each bus is read for so long at once."""
+    """All drives pause for 150 SYNCs, and the host with them: each bus is read in long batches."""
     stream = TpdoStream("samples", 1, (0x181, 0x181, 0x181), 8)
     assembler = Assembler((stream,), ("a", "b", "c"), PERIOD_NS, bus_of=(0, 1, 2))
     parts = []
@@ -166,7 +166,7 @@ def test_drives_that_are_late_on_buses_of_their_own_are_no_witnesses_against_eac
 
 
 def test_what_is_missing_on_one_bus_casts_no_doubt_on_another() -> None:
-    """Joint a stands still and is late in a burst just after an outage of bus 2."""
+    """Joint a pauses and answers in a burst shortly after an outage of bus 2."""
     bench = Bench(buses=2)
     stream = TpdoStream("samples", 1, (0x181, 0x182, 0x181, 0x182), 8)
     assembler = Assembler((stream,), bench.joints, PERIOD_NS, bus_of=(0, 0, 1, 1))
@@ -182,7 +182,7 @@ def test_what_is_missing_on_one_bus_casts_no_doubt_on_another() -> None:
 
 
 def test_a_foreign_master_that_was_held_up_at_its_first_syncs_is_one_master() -> None:
-    """The second bus is read when the first has had more SYNCs, with a pause among them."""
+    """The second bus is read after the first has had more SYNCs, with a pause among them."""
     bench = Bench(buses=2, foreign=True)
     held = [T0 + k * PERIOD_NS + (k >= 30) * 9 * PERIOD_NS for k in range(300)]
     for first, last in ((0, 100), (100, 300)):

@@ -1,4 +1,4 @@
-"""Discovery of TPDOs by listening: what is discovered, and what is refused."""
+"""Discovery of TPDOs by listening: discovered streams and refused bus traffic."""
 
 import logging
 

@@ -1,4 +1,4 @@
-"""Channels for looking: SI units at the joints, at a low rate, that viewers show and readers of ours leave alone."""
+"""Preview channels: SI units at the joints, at a low rate, shown by viewers and ignored by our reader."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Recordings: what is written is what is read, by us and by anyone's MCAP reader."""
+"""Recordings: written and read content agree, with our reader and the mcap library."""
 
 import json
 import os
@@ -36,7 +36,7 @@ T0 = 1_700_000_000_000_000_000
 
 
 def make_recording(rows: int = 1500, seed: int = 0) -> Recording:
-    """A recording like those of the cell: samples on every SYNC but a few, demand on every fifth."""
+    """Return a recording like that of a cell: samples on every SYNC but a few, demand on every fifth."""
     rng = np.random.default_rng(seed)
     robot = load_robot("tx40.yaml")
     session = parse(config_path("tx40_cell.yaml").read_text(), SessionConfig, "tx40_cell.yaml")
@@ -82,7 +82,7 @@ def make_recording(rows: int = 1500, seed: int = 0) -> Recording:
 
 
 def assert_same(a: Recording, b: Recording) -> None:
-    """Everything but the path is the same."""
+    """Compare two recordings in everything but the path."""
     assert a.sha256 == b.sha256
     assert (a.robot, a.session, a.sample_rate_hz) == (b.robot, b.session, b.sample_rate_hz)
     assert (a.gaps, a.marks, a.counters, a.metadata) == (b.gaps, b.marks, b.counters, b.metadata)
@@ -148,14 +148,14 @@ def test_the_stock_reader_finds_a_time_span_by_the_index(tmp_path: Path) -> None
 
 
 def started(recording: Recording, path: Path, chunk_ns: int = 20_000_000) -> RecordingWriter:
-    """A file with its head."""
+    """Return a writer that has written the head of a file."""
     joints = [j.name for j in recording.robot.joints]
     layouts = [StreamLayout.of(s, joints) for s in recording.streams.values()]
     return RecordingWriter(path, recording.robot, recording.session, 5000.0, layouts, recording.metadata, chunk_ns)
 
 
 def write_chunked(recording: Recording, path: Path, chunk_ns: int = 20_000_000) -> RecordingWriter:
-    """As capture does: batches of some rows, many chunks; not yet closed."""
+    """Write a recording like a capture, in small batches and many chunks; the file is not closed."""
     writer = started(recording, path, chunk_ns)
     for first in range(0, int(recording.samples.sync[-1]) + 1, 50):
         for stream in recording.streams.values():
@@ -245,7 +245,7 @@ def test_a_place_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_a_file_has_its_head_as_soon_as_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed while it writes the head, after one call of the system or another."""
+    """The process is killed at each of the system calls that write the head."""
     recording, write = make_recording(10), os.write
     left = 0
 
@@ -272,7 +272,7 @@ def test_a_file_has_its_head_as_soon_as_it_has_its_name(tmp_path: Path, monkeypa
 @pytest.mark.parametrize("links", [True, False])
 def test_what_is_there_is_not_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, links: bool) -> None:
     if not links:
-        # As a memory card's file system answers.
+        # Error of a memory card's file system.
         monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(PermissionError(1, "Operation not permitted")))
     write_chunked(make_recording(10), tmp_path / "r.mcap")
     before = (tmp_path / "r.mcap").read_bytes()
@@ -299,7 +299,7 @@ def test_a_full_disk_keeps_the_file_whole_and_counts_the_loss(tmp_path: Path) ->
 
 
 def with_chunks(data: bytes, change: Callable[[bytearray], None]) -> bytes:
-    """A recording whose chunk records were changed, all lengths made right again."""
+    """Return a recording with changed chunk records and corrected lengths."""
     out = bytearray(mcap.MAGIC)
     for opcode, _, body in mcap.records(memoryview(data), len(mcap.MAGIC)):
         content = bytearray(body)
@@ -331,7 +331,7 @@ def test_a_recording_that_lies_about_its_number_of_rows_is_read_all_the_same(tmp
     data = (tmp_path / "r.mcap").read_bytes()
     place = next(at for op, at, _ in mcap.records(memoryview(data), len(mcap.MAGIC)) if op == Opcode.STATISTICS)
     forged = bytearray(data)
-    # The counts by channel are the last of the statistics: make the first of them enormous, and the checksum none.
+    # The counts by channel are the last of the statistics: make the first one enormous, and remove the checksum.
     struct.pack_into("<Q", forged, place + mcap.RECORD_HEAD.size + 46 + 2, 2**60)
     struct.pack_into("<I", forged, len(forged) - len(mcap.MAGIC) - 4, 0)
     (tmp_path / "f.mcap").write_bytes(forged)
@@ -343,7 +343,7 @@ def test_a_recording_that_lies_about_its_number_of_rows_is_read_all_the_same(tmp
 
 @pytest.mark.parametrize("at", ["robot", "scale", "sample_rate_hz"])
 def test_a_flipped_bit_in_the_head_is_found(at: str, tmp_path: Path) -> None:
-    """What rows mean stands there once, and chunks have checksums of their own alone."""
+    """The meaning of rows is only in the head, which the checksums of chunks do not cover."""
     write_chunked(make_recording(300), tmp_path / "r.mcap").close({})
     data = bytearray((tmp_path / "r.mcap").read_bytes())
     word = {"robot": b'"torque":', "scale": b'"scale": [', "sample_rate_hz": b"sample_rate_hz"}[at]

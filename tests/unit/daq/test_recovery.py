@@ -1,4 +1,4 @@
-"""Torn recordings are given their end: every reader opens them, and nothing whole is lost."""
+"""Recovery of truncated recordings: every reader opens them, and no complete chunk is lost."""
 
 import json
 import signal
@@ -21,7 +21,7 @@ from tests.unit.daq.test_recording import make_recording, write_chunked
 
 
 def torn(recording: Recording, path: Path, share: float) -> bytes:
-    """The first share of the bytes of a recording, under a name."""
+    """Write the first share of a recording's bytes to a file, and return them."""
     write_chunked(recording, path.with_suffix(".whole")).close({"frames": 5})
     data = path.with_suffix(".whole").read_bytes()
     data = data[: int(share * len(data))]
@@ -30,7 +30,7 @@ def torn(recording: Recording, path: Path, share: float) -> bytes:
 
 
 def stock_count(path: Path) -> int:
-    """Messages that the stock reader finds by the index, each of them decoded, every checksum verified."""
+    """Return the number of messages that the mcap reader finds by the index and decodes, with verified checksums."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
@@ -200,7 +200,7 @@ def test_a_writer_killed_at_any_moment_leaves_a_file_that_heals(tmp_path: Path) 
         healed = recover_recording(path)
         kept = read_recording(path).samples
         assert healed.missing == read_recording(path).missing
-        # A chunk is 100 rows: what was said to be handed over is on the disk but for the chunk that was being filled.
+        # A chunk has 100 rows: all rows reported as handed over are on the disk, except the unfinished chunk.
         assert kept.sync.size >= said - 101
         assert np.array_equal(kept.sync, whole.sync[: kept.sync.size])
         assert np.array_equal(kept.raw["position"], whole.raw["position"][: kept.sync.size])

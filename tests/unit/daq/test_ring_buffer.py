@@ -1,4 +1,4 @@
-"""Only what happens around an event is written, and nothing of it is missing."""
+"""Series on triggers: only the rows around an event are written, and all of them."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def triggered(recording: Recording, folder: Path, **limits: int) -> TriggeredSer
 def feed(
     series: TriggeredSeries, recording: Recording, triggers: list[int], step: int = 25, span: tuple[int, int] = (0, -1)
 ) -> None:
-    """Append a recording, or a span of its rows, in batches of SYNCs, triggers at the SYNC numbers given."""
+    """Append a recording, or a span of its rows, in batches of SYNCs, with triggers at these SYNC numbers."""
     samples = recording.samples
     for first in range(span[0], samples.sync.size if span[1] < 0 else span[1], step):
         part = slice(first, first + step)
@@ -143,7 +143,7 @@ def test_a_disk_that_refuses_is_told_and_tried_again(tmp_path: Path) -> None:
     series.turn(int(recording.samples.t_ns[-1]) + 11_000_000_000)
     assert tried == [1, 1]
     series.close({})
-    # What was kept last is there; what had fallen out of the memory meanwhile is not.
+    # The file has the last rows; older ones had left the ring buffer.
     ((first, last),) = spans(series)
     assert last == recording.samples.sync[-1]
     assert first >= last - 600

@@ -1,4 +1,4 @@
-"""Joint states of ROS 2: by name, by their stamps, and one clear line for what is wrong."""
+"""Joint states of ROS 2: order by name, times by stamps, and one clear line for every error."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A capture in several files, old files making room, and a disk that refuses."""
+"""Capture in several files, deletion of old files, and write errors."""
 
 import datetime
 import fcntl
@@ -37,7 +37,7 @@ def beginner(recording: Recording, chunk_ns: int = 20_000_000) -> Callable[[Path
 
 
 def write(series: RecordingSeries | QueuedSeries, recording: Recording, step: int = 50) -> list[Path]:
-    """Append a recording as a capture does, in batches; the files that were finished on the way."""
+    """Append a recording like a capture, in batches; return the files that were finished meanwhile."""
     finished = []
     samples, demand = recording.streams["samples"], recording.streams["demand"]
     for first in range(0, samples.sync.size, step):
@@ -138,7 +138,7 @@ def test_a_full_disk_costs_rows_and_not_the_rest(tmp_path: Path) -> None:
     assert kept[:third].all()
     assert kept[2 * third : 3 * third].all()
     np.testing.assert_array_equal(read.samples.raw["position"], samples.raw["position"][kept])
-    # What is not there is in the gap list, and what was said meanwhile is there.
+    # Missing rows are in the gap list, and the mark added meanwhile is present.
     gaps = [g for g in read.gaps if g.reason == "not written"]
     numbers = samples.sync[: 3 * third]
     covered = np.any([(numbers >= g.first) & (numbers <= g.last) for g in gaps], axis=0)

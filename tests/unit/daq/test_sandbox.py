@@ -1,4 +1,4 @@
-"""Readers of other tools' files run apart: what they return arrives, and what becomes of them is said."""
+"""Readers of other tools' files in a subprocess: their arrays, errors, crashes and time limit."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Units and cron lines that come with armident: systemd takes them, and their commands are ours."""
+"""Units and cron lines shipped with armident: systemd accepts them, and their commands exist."""
 
 import re
 import shlex
@@ -19,7 +19,7 @@ CRON = HERE / "cron" / "armident-reidentify.cron"
 
 
 class Unit(ConfigParser):
-    """A unit file: keys may repeat, and are written as they are."""
+    """Parser of a unit file, in which keys may repeat and keep their case."""
 
     def optionxform(self, optionstr: str) -> str:
         return optionstr
@@ -54,7 +54,7 @@ def commands(path: Path) -> list[list[str]]:
 
 @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
 def test_systemd_takes_every_unit(path: Path, tmp_path: Path) -> None:
-    """By systemd's own judgement where it is installed; its sections and keys are read in any case."""
+    """Verified by systemd where it is installed; sections and keys are read in any case."""
     unit = Unit(path)
     wanted = {".service": ["Unit", "Service"], ".timer": ["Unit", "Timer", "Install"]}[path.suffix]
     assert unit.sections()[: len(wanted)] == wanted
@@ -79,7 +79,7 @@ def test_commands_of_units_are_ours(path: Path) -> None:
 
 
 def test_the_timer_runs_weekly_the_service_of_its_name_and_never_late() -> None:
-    """An arm does not move because a machine was switched on."""
+    """An arm must not move because a machine was switched on."""
     timer = Unit(HERE / "systemd" / "armident-reidentify@.timer")["Timer"]
     assert timer["OnCalendar"].startswith("Sun ")
     assert timer["Persistent"] == "false"

@@ -1,4 +1,4 @@
-"""Rows that come at once, because drives lagged, are written and published in pieces."""
+"""Rows of lagging drives that become complete at once are written and published in pieces."""
 
 from itertools import pairwise
 

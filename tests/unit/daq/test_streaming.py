@@ -1,4 +1,4 @@
-"""What goes over Zenoh comes out as the file has it; what is malformed is refused in words."""
+"""Zenoh interface: published captures equal their files, and malformed data is refused with a description."""
 
 import json
 import struct
@@ -198,7 +198,7 @@ def test_a_full_queue_drops_blocks_and_counts_them() -> None:
 def test_events_that_nobody_takes_are_bounded_and_of_health_the_last_waits() -> None:
     session = cell("many_events")
     publisher = Publisher(session, Keys(session.cell, "tx40"))
-    # Who holds the queue keeps the thread that sends from it, as a listener does that holds up a put.
+    # Holding the queue's lock blocks the sending thread, like a listener that delays a put.
     with publisher._ready:
         for k in range(6000):
             publisher.event(b"{}")

@@ -1,4 +1,4 @@
-"""A SYNC counter wraps: what a pause in it means, and what may be missing behind the last frame."""
+"""Numbering of SYNCs by a counter that wraps: pauses, outages, several buses and frames missing at the end."""
 
 from collections.abc import Callable
 
@@ -16,30 +16,30 @@ T0 = 1_700_000_000_000_000_000
 
 
 class Listener:
-    """An assembler that hears another master, and the gaps it has told."""
+    """Assembler on the bus of another master, with the gaps found so far."""
 
     def __init__(self) -> None:
         self.assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, None)
         self.gaps: list[Gap] = []
 
     def push(self, part: Frames, dropped: bool = False) -> None:
-        """Take frames."""
+        """Add frames."""
         self.gaps += self.assembler.push(part, dropped=dropped).gaps
 
     def finish(self, sent: int | None = None) -> list[Gap]:
-        """No more frames come; all gaps."""
+        """End the input and return all gaps."""
         return [*self.gaps, *self.assembler.finish(sent).gaps]
 
 
 def outages(gaps: list[Gap]) -> list[tuple[int, int]]:
-    """First and last SYNC of what was not received; beside it, only the row before may be in doubt."""
+    """Return first and last SYNC of gaps without SYNC; other gaps may only contain the row before."""
     missing = [(gap.first, gap.last) for gap in gaps if gap.reason == SYNC_LOST]
     assert {gap.first for gap in gaps if gap.reason != SYNC_LOST} <= {first - 1 for first, _ in missing}
     return missing
 
 
 def answered(numbers: list[int], late_ns: Callable[[int], int] = lambda k: 0) -> Frames:
-    """SYNCs of these numbers, each with its two answers."""
+    """Return SYNCs of these numbers, each with its two answers."""
     out = frames(3 * len(numbers))
     k = np.array(numbers)
     out["t_ns"] = np.repeat(T0 + k * PERIOD_NS + np.array([late_ns(int(i)) for i in k]), 3)
@@ -50,7 +50,7 @@ def answered(numbers: list[int], late_ns: Callable[[int], int] = lambda k: 0) ->
 
 
 def test_a_master_that_is_held_up_at_times_has_never_been_so_for_a_turn_of_the_counter_by_chance() -> None:
-    """Once its stamps tell nothing, a pause of a turn to the microsecond tells nothing either."""
+    """If the time stamps are irregular, a pause of exactly one turn is no evidence for missing SYNCs either."""
     listener = Listener()
     stalls = {400: 37, 700: 90, 900: OVERFLOW, 1500: 2 * OVERFLOW}
     listener.push(answered(list(range(2000)), lambda k: sum(n for at, n in stalls.items() if k >= at) * PERIOD_NS))
@@ -129,7 +129,7 @@ def test_what_one_bus_had_to_drop_another_one_may_have_received() -> None:
 
 @pytest.mark.parametrize("held_up", [0.0, 0.3, 0.9, 5.0])
 def test_a_bus_whose_frames_waited_finds_its_numbers_by_the_times_of_another(held_up: float) -> None:
-    """The master is held up for turns of its counter while one bus waits: nominal periods would be turns off."""
+    """The master is delayed by turns of its counter while one bus waits: nominal periods would give wrong turns."""
     count, before, after = 60_000, 22_000, 30_000
     assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, 1, bus_of=(0, 1))
     late = round(held_up * OVERFLOW) * PERIOD_NS
@@ -156,7 +156,7 @@ def test_our_own_syncs_are_told_by_when_we_sent_them_where_frames_are_lost(
     assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW)
     stall = round(turns * OVERFLOW) * PERIOD_NS
     sent = answered(list(range(2000)), lambda k: stall if k >= 500 else 0)
-    # The bus and the kernel's stamp take a while; a producer may be held up before it notes when it was done.
+    # Bus and kernel add a delay; a producer may be delayed before it stores the send time.
     times = sent["t_ns"][::3] - 300_000
     times[499] += min(round(held_up * OVERFLOW) * PERIOD_NS, stall)
     # The last SYNC is being sent.
@@ -171,7 +171,7 @@ def test_our_own_syncs_are_told_by_when_we_sent_them_where_frames_are_lost(
 @pytest.mark.parametrize("back", [502, 762, 1400])
 @pytest.mark.parametrize("known", [False, True])
 def test_what_waited_behind_an_outage_is_older_than_what_another_bus_had_meanwhile(back: int, known: bool) -> None:
-    """Whoever reads the buses was held up: one is read on to SYNC 1900 before what the other had since its return."""
+    """One bus is read up to SYNC 1900 before the frames that the other has received since its return."""
     assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, 1, bus_of=(0, 1))
     sent = answered(list(range(2000)))
     times = sent["t_ns"][::3] + 20_000

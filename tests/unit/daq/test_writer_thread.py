@@ -1,4 +1,4 @@
-"""A series that is written by a thread of its own: nobody waits for the disk, and what it has no time for is told."""
+"""Series written by a thread: no caller waits for the disk, and rows that are left out are counted and become gaps."""
 
 import os
 import threading
@@ -33,7 +33,7 @@ CHUNK_NS = 20_000_000
 
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
-    """Whether the disk works; while it does not, it keeps whoever writes waiting."""
+    """Return an event that is set while the disk works; while it is not set, every write to the disk blocks."""
     works, sync = threading.Event(), os.fdatasync
     works.set()
 
@@ -47,14 +47,14 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
 
 
 def append(series: QueuedSeries, stream: Stream, first: int, last: int) -> None:
-    """Add the rows from SYNC ``first`` on, and before ``last``."""
+    """Add the rows from SYNC ``first`` to before ``last``."""
     here = (stream.sync >= first) & (stream.sync < last)
     rows = {name: values[here] for name, values in stream.raw.items()}
     series.append(stream.name, stream.sync[here], stream.t_ns[here], rows)
 
 
 def until(true: Callable[[], bool]) -> None:
-    """Wait for something that another thread does."""
+    """Wait until another thread has made the condition true."""
     deadline = time.monotonic() + 30
     while not true():
         assert time.monotonic() < deadline
@@ -91,7 +91,7 @@ def test_a_killed_capture_loses_no_more_than_a_chunk(tmp_path: Path) -> None:
         for first in range(0, 1500, 10):
             append(series, recording.samples, first, first + 10)
             until(lambda: series.waiting_rows == 0)
-            # What is on the disk by now, if it ended here.
+            # Content of the file if the process were killed now.
             rows = read_recording(series.paths[0]).samples.t_ns if first > 150 else None
             assert rows is None or recording.samples.t_ns[first] - rows[-1] <= CHUNK_NS + 2_000_000
 
@@ -103,7 +103,7 @@ def test_a_disk_that_stands_still_costs_no_row(tmp_path: Path, disk: threading.E
         disk.clear()
         begun = time.monotonic()
         write(series, recording)
-        # All of it was taken, though not one chunk is on the disk.
+        # All rows were accepted, although no chunk is on the disk.
         assert 3000 <= series.waiting_rows <= 3600
         assert series.lost_rows == 0
         assert time.monotonic() - begun < 30
@@ -116,12 +116,12 @@ def test_a_disk_that_stands_still_costs_no_row(tmp_path: Path, disk: threading.E
 
 
 def test_what_has_waited_is_not_written_all_at_once(tmp_path: Path, disk: threading.Event) -> None:
-    """Whoever drains the buses wants the processor, too, when the disk is back."""
+    """Reading the buses needs processor time, too, when the disk works again."""
     recording = make_recording(1500)
     series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
     with series:
         disk.clear()
-        # At least as long as they took at 5 kHz: 0.3 s.
+        # At least the duration at 5 kHz: 0.3 s.
         for first in range(0, 1500, 25):
             append(series, recording.samples, first, first + 25)
             time.sleep(0.005)
@@ -154,7 +154,7 @@ def test_a_clock_that_is_set_keeps_nothing_waiting(tmp_path: Path, disk: threadi
 def test_the_end_waits_for_nothing_but_the_disk(
     tmp_path: Path, disk: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At the pace of this test what has waited would take hours."""
+    """With the write rate of this test, the waiting rows would take hours."""
     monkeypatch.setattr(queued, "CATCH_UP", 1e-7)
     recording = make_recording(3000)
     series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
@@ -241,7 +241,7 @@ def test_an_event_tells_what_its_last_seconds_lack(tmp_path: Path, disk: threadi
         series.trigger(int(recording.samples.t_ns[199]))
         series.flush()
         disk.clear()
-        # The end of the first event waits for the disk, and what comes behind it for that.
+        # The end of the first event waits for the disk, and all later work waits for it.
         for first in range(200, 2500, 50):
             series.turn(int(recording.samples.t_ns[first]))
             append(series, recording.samples, first, first + 50)
