@@ -160,7 +160,17 @@ class _Log:
     foreign: int
 
     def of(self, path: Path, bus: str, several: bool) -> Frames:
-        """Return the frames of one bus; those of the only bus in the log, unless the session has ``several``."""
+        """Return the frames of one bus.
+
+        Parameters
+        ----------
+        path
+            The log, for messages.
+        bus
+            Name of the bus.
+        several
+            The session has several buses; otherwise the frames of the only bus in the log are returned.
+        """
         if len(self.buses) < 2 and not (self.buses and several):
             return self.frames
         if bus not in self.buses:

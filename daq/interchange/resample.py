@@ -1,8 +1,8 @@
 """Resampling of polled samples onto the even clock of the controller.
 
 A program that polls the state of an arm as fast as it can gets some samples twice and misses others. Its own times
-say little about the controller's sampling times. The motion does: from one sample to the next, the joints advance by
-a whole multiple of their usual increments at that time.
+are no measure of the controller's sampling times. The motion is one: from one sample to the next, the joints advance
+by a whole multiple of their usual increments at that time.
 """
 
 from collections.abc import Mapping

@@ -1,8 +1,8 @@
 """Compiled matching of TPDOs to the SYNCs that they answer.
 
 A TPDO has no number, only an order: each drive answers its SYNCs one after the other. So per drive and TPDO, SYNCs and
-answers are matched first to first. If a drive has answered all SYNCs when the match is evaluated (at the next SYNC of
-its bus), the match is certain, however late the answers were. An answer is lost if a drive
+answers are matched first to first. The match is evaluated at the next SYNC of the bus. If the drive has then answered
+all SYNCs, the match is certain, however late the answers were. An answer is lost if a drive
 
 - answers every SYNC again and still lacks answers while another drive on its bus lacks none,
 - is silent beside such a drive, or

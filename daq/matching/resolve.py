@@ -251,7 +251,7 @@ def _give_up_refilled(b: MatcherState, s: int, j: int, count: int) -> None:
 @njit(cache=True, nogil=True)
 def _give_up_doubtful(b: MatcherState, s: int, j: int, count: int) -> None:
     """Discard answers that were taken as prompt but may be late, where one was lost."""
-    # Answers in a burst after a pause: with one of them lost, they cannot be told apart.
+    # Answers in a burst after a pause: with one of them lost, their SYNCs are ambiguous.
     previous = b.settled[s, j] - 1
     for i in range(count):
         label = b.label[s, j, i]

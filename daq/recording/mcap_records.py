@@ -161,7 +161,21 @@ def chunk(start_ns: int, end_ns: int, raw: bytes, compressed: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class ChunkContent:
-    """Content of a chunk record; ``data`` is compressed, ``size`` and ``crc`` are those of the uncompressed records."""
+    """Content of a chunk record.
+
+    Parameters
+    ----------
+    start_ns, end_ns
+        Earliest and latest log time of the messages, ns.
+    size
+        Size of the uncompressed records, bytes.
+    crc
+        CRC-32 of the uncompressed records; 0 if there is none.
+    compression
+        Name of the compression.
+    data
+        Compressed records.
+    """
 
     start_ns: int
     end_ns: int

@@ -142,7 +142,15 @@ class _Chunk:
         return self.index.chunk_start_offset + self.index.chunk_length
 
     def add_index(self, content: MessageIndexContent, start: int, end: int) -> None:
-        """Add a message index in bytes ``start`` to ``end``."""
+        """Add a message index of the chunk.
+
+        Parameters
+        ----------
+        content
+            Channel and number of entries.
+        start, end
+            Position of the record in the file, bytes.
+        """
         self.index.message_index_offsets[content.channel_id] = start
         self.index.message_index_length += end - start
         self.indexed[content.channel_id], self.end = content.number, end

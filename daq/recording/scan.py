@@ -40,7 +40,17 @@ _IN_DATA = frozenset(
 
 
 class MessageRun(NamedTuple):
-    """Consecutive messages of one channel: ``number`` records in bytes ``start`` to ``end`` of a chunk."""
+    """Consecutive messages of one channel in a chunk.
+
+    Parameters
+    ----------
+    channel_id
+        The channel.
+    start, end
+        Position in the uncompressed chunk, bytes.
+    number
+        Number of messages.
+    """
 
     channel_id: int
     start: int
@@ -49,7 +59,15 @@ class MessageRun(NamedTuple):
 
 
 class MessageIndexContent(NamedTuple):
-    """Channel and number of entries of a message index."""
+    """Content of a message index record.
+
+    Parameters
+    ----------
+    channel_id
+        The channel.
+    number
+        Number of entries.
+    """
 
     channel_id: int
     number: int
@@ -57,7 +75,17 @@ class MessageIndexContent(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordItem:
-    """A valid record other than a chunk, in bytes ``start`` to ``end`` of the file; ``content`` if it was decoded."""
+    """Valid record other than a chunk.
+
+    Parameters
+    ----------
+    opcode
+        MCAP opcode.
+    start, end
+        Position in the file, bytes.
+    content
+        The decoded record; ``None`` if it was not decoded.
+    """
 
     opcode: int
     start: int
@@ -97,7 +125,15 @@ class ChunkItem:
 
 @dataclass(frozen=True)
 class DamageItem:
-    """A damaged record in bytes ``start`` to ``end`` of the file."""
+    """Damaged record.
+
+    Parameters
+    ----------
+    opcode
+        MCAP opcode.
+    start, end
+        Position in the file, bytes.
+    """
 
     opcode: int
     start: int
@@ -109,7 +145,7 @@ _Pending = tuple[int, int, memoryview, "Future[bytes | None] | None"]
 
 
 class RecordingScan:
-    """Iterates over the records up to the end of the data, and keeps what they say of the file.
+    """Iterates over the records up to the end of the data, and collects the content of those other than chunks.
 
     A damaged record behind the head is skipped and described in ``damage``. Other threads decompress chunks ahead of
     the iteration.
