@@ -17,7 +17,7 @@ from armident.virtual_robot.offline import simulate_recording
 pytestmark = pytest.mark.slow
 
 SLOW = 0.002
-"""Sampling period, s, at which the identified controller of the TX40 swings in simulation."""
+"""Sampling period, s, at which the identified controller of the TX40 oscillates in simulation."""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def at_500_hz() -> list[Experiment]:
 
 @pytest.mark.parametrize("method", ["idim-iv", "idim-piv"])
 def test_a_loop_at_the_edge_of_stability_is_replaced(at_500_hz: list[Experiment], method: Method) -> None:
-    """The iterates wander with the identified controller, and converge near least squares with a stiff one."""
+    """The iterates do not settle with the identified controller; with a stiff one they converge near least squares."""
     found = identify_experiment(at_500_hz, load_robot("tx40.yaml"), Options(method=method))
     assert found.converged
     assert found.controller["kind"] == "nominal"
@@ -51,5 +51,5 @@ def test_idim_iv_replaces_a_prefilter_that_does_not_converge(
     assert any("IDIM-PIV did not converge (stopped after 1 iterations)" in warning for warning in found.warnings)
     without = identify_experiment(at_500_hz, robot, Options(method="idim-iv"))
     np.testing.assert_allclose(found.theta, without.theta, rtol=0, atol=1e-9)
-    # Serial correlation counts, which plain IDIM-IV leaves out.
+    # The covariance allows for serial correlation, which plain IDIM-IV neglects.
     assert np.median(found.std / without.std) > 1.0

@@ -1,4 +1,4 @@
-"""Every estimator of the thesis on a small arm: exact without noise, alike with it, and plain about what is wrong."""
+"""Every estimator of the thesis on a small arm: exact without noise, consistent with it, clear error messages."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -68,7 +68,7 @@ def test_two_experiments_without_noise_give_the_truth(method: str) -> None:
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "clie"])
 def test_standard_deviations_are_those_of_the_scatter(method: str) -> None:
     deviations = []
-    # White up to the Nyquist frequency of the equations, so the samples stay uncorrelated.
+    # White up to the Nyquist frequency of the equations: the samples stay uncorrelated.
     for seed in range(12):
         data = recorded(seconds=3.0, seed=seed, torque_noise=0.5, cutoff_hz=None)
         thinned = thin(data, 10)
@@ -86,7 +86,7 @@ def test_scatter_of_didim_is_that_of_the_true_sensitivities() -> None:
     published = didim(data.blocks, data.loop, start()).std
     exact = didim(data.blocks, data.loop, start(), true_sensitivities=True).std
     scatter = np.std(estimates, axis=0)
-    # 24 runs know each standard deviation to 15 %; the greatest of 13 may be out by 40 %.
+    # 24 runs determine each standard deviation to 15 %; the greatest of 13 may be off by 40 %.
     assert (scatter / exact).max() < 1.45
     assert (scatter / published).max() > 1.5
 

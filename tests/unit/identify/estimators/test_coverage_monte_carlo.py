@@ -1,4 +1,4 @@
-"""The 2-sigma intervals of IDIM-PIV cover the truth as often as they say; 200 runs: ``tests.statistics.coverage``."""
+"""Coverage of the 2-sigma intervals of IDIM-PIV; 200 runs: ``tests.statistics.coverage``."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from tests.statistics.coverage import (
 )
 
 LEVEL = 0.01
-"""Probability of failing where the intervals are right, of each of the two tests on simulated recordings."""
+"""Probability of a false alarm of each of the two tests on simulated recordings."""
 
 
 def drawn(understated: float, runs: int = 200, bias: float = 0.0) -> Runs:
@@ -44,7 +44,7 @@ def test_right_intervals_are_called_right_and_the_truth_is_as_far_as_chance_puts
     runs = drawn(1.0)
     rows = coverage(runs)
     assert [row.name for row in rows] == list(ESSENTIAL)
-    # 92 % of 200 is 2.4 standard deviations of the count below what is promised.
+    # 92 % of 200 is 2.4 standard deviations of the count below the nominal coverage.
     assert sum(row.verdict == "ok" for row in rows) >= 25
     assert not any(row.verdict in ("low", "high") for row in rows)
     assert np.mean([row.share for row in rows]) == pytest.approx(NOMINAL, abs=0.01)

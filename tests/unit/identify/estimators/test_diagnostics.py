@@ -1,4 +1,4 @@
-"""Diagnostics reject 5 % of what is true and nearly all of what is false; seeds are fixed, sizes known to 1.5 %."""
+"""Size and power of the diagnostic tests; seeds are fixed, sizes are determined to 1.5 %."""
 
 import json
 from dataclasses import replace
@@ -38,7 +38,7 @@ JOINTS = ("joint_1", "joint_2")
 THETA = np.array([1.0, -2.0, 0.5])
 DRAWS = 400
 SIZE = stats.binom.interval(0.999, DRAWS, 0.05)
-"""Rejections out of DRAWS that a test of size 5 % stays within, 999 times in 1000."""
+"""Range of rejections out of DRAWS for a test of size 5 %, with probability 0.999."""
 AR1 = ArModel(np.array([-0.8]), 1.0, 0.0)
 
 
@@ -51,7 +51,7 @@ def coloured(rng: np.random.Generator, samples: int, ar: ArModel, columns: int =
 def drawn(
     rng: np.random.Generator, ar: ArModel, *, errors_in_variables: bool, samples: int = 300
 ) -> tuple[ExperimentEquations, Array]:
-    """Two joints, three parameters: a smooth motion, a regressor with noise, instruments with other noise."""
+    """Two joints, three parameters: a smooth motion, a noisy regressor, instruments with independent noise."""
     slow, fast = signal.butter(2, 0.1), 0.5
     motion = 3 * signal.lfilter(*slow, rng.standard_normal((samples, 2, 3)), axis=0)
     x = motion + fast * rng.standard_normal(motion.shape)
@@ -140,7 +140,7 @@ def test_first_stage_f_of_white_errors_is_the_textbook_one() -> None:
     block = ExperimentEquations(x[:, :, 0], x, np.ones((4000, 1), np.bool_), np.arange(4000.0))
     (found,) = instrument_relevance(["zz1"], [block], [z], [WHITE])
     r2 = np.corrcoef(z[:, 0, 0], x[:, 0, 0])[0, 1] ** 2
-    # The robust variance is known to about 2 sqrt(lags / M) = 20 %.
+    # The robust variance is accurate to about 2 sqrt(lags / M) = 20 %.
     assert found.first_stage_f == pytest.approx(r2 / (1 - r2) * 3998, rel=0.4)
     assert found.partial_r2 == pytest.approx(r2, rel=0.02)
 
@@ -279,7 +279,7 @@ def test_all_of_it_for_least_squares_has_no_instruments_and_goes_into_json() -> 
     assert found.condition_instruments is None
     assert [j.against for j in found.joints] == [("speed", "torque"), ("torque",)]
     assert found.essential is not None
-    # zz1 = 1 and fc1 = 0.5 stand far off zero.
+    # zz1 = 1 and fc1 = 0.5 are far from zero.
     assert not found.essential.sufficient
     document = json.loads(json.dumps(found.document(), allow_nan=False))
     assert document["joints"][1]["joint"] == "joint_2"

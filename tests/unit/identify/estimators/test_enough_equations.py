@@ -1,4 +1,4 @@
-"""A decimation never leaves fewer equations than the parameters need, whatever the bandwidth asks for."""
+"""A decimation leaves at least ten equations per parameter, whatever the bandwidth."""
 
 import math
 

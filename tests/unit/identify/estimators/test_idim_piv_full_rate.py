@@ -86,7 +86,7 @@ def test_every_sample_gives_what_the_rough_decimation_gives() -> None:
     assert loop(1, BAND_HZ)[0][0].y.shape[0] == recorded()[0].q.shape[0]
     assert full.converged
     assert not full.warnings
-    # Both hold all the information below the band; they differ in the noise models alone.
+    # Both contain all information below the band; only the noise models differ.
     assert np.max(np.abs(full.theta - rough.theta) / rough.std) < 1.0
     assert np.sqrt(np.mean(((full.theta - truth()) / full.std) ** 2)) < 1.5
     assert 0.8 < np.median(full.std / rough.std) < 1.25
@@ -124,7 +124,7 @@ def test_the_decimation_that_idim_piv_chooses_leaves_the_instruments_alone() -> 
 
 @pytest.mark.parametrize("cutoff_hz", [13.0, 50.0, 77.0, 240.0, 999.0, 2400.0])
 def test_no_chosen_decimation_is_wider_than_twice_the_band(cutoff_hz: float) -> None:
-    """A factor is a whole number: what rounding it down leaves is never an octave."""
+    """The factor is an integer; rounding it down widens the band by less than an octave."""
     factor = design(0.0002, cutoff_hz).factor
 
     assert 0.5 / (0.0002 * factor) < 2.0 * cutoff_hz

@@ -1,4 +1,4 @@
-"""Instruments from the smoothed motion itself, where nothing can be simulated."""
+"""Instruments from the smoothed motion, for recordings whose arm cannot be simulated."""
 
 import numpy as np
 import pytest

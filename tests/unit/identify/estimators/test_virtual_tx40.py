@@ -1,4 +1,4 @@
-"""The estimators on recordings of the virtual TX40, whose drives' law is known: claims of the thesis's chapter 4."""
+"""Results of chapter 4 of the thesis on recordings of the virtual TX40, whose control law is known."""
 
 import math
 from collections.abc import Callable
@@ -66,13 +66,13 @@ def truth() -> Floats:
 
 
 def cad() -> Floats:
-    """The start of the thesis: zero but for rotor inertias."""
+    """Initial parameters of the thesis: zero except rotor inertias."""
     return initial_parameters(model())
 
 
 @cache
 def recorded(noise: float, steps: int = 1) -> Recorded:
-    """One recording, its encoders ``steps`` times as coarse as the TX40's."""
+    """One recording with encoders ``steps`` times as coarse as those of the TX40."""
     robot = load_robot("tx40")
     joints = tuple(
         joint.model_copy(
@@ -156,7 +156,7 @@ def test_encoders_a_hundred_times_as_coarse_still_give_the_parameters(method: It
     found = method(data.blocks, data.loop, data.ls)
     assert np.isfinite(found.theta).all()
     assert np.isfinite(found.covariance).all()
-    # The parameters that table B.4 knows to 3 % or better are still known.
+    # The parameters with 3 % or better in table B.4 are still accurate.
     sure = [model().base.names.index(name) for name in ("zz1r", "fv1", "fc1", "zz2r", "fv2", "fc2", "fv3", "fc3")]
     assert (np.abs(found.theta - truth())[sure] < 5 * found.std[sure]).all()
     assert found.converged or found.stop_reason.startswith(("stopped after", "the equations of", "no step"))

@@ -1,4 +1,4 @@
-"""The heart: parameters of the virtual TX40, computed by another library, come back from its recordings."""
+"""Parameters of the virtual TX40, simulated by another library, identified from its recordings."""
 
 from dataclasses import replace
 from functools import cache
@@ -115,6 +115,6 @@ def test_essential_parameters_are_recovered_within_their_own_standard_deviations
     z = np.abs(np.array(deviations))
     assert np.mean(z < 3) >= 0.98
     assert z.max() < 5
-    # White residuals have 5 % of their lags outside; the mean over 20 seeds and 20 lags is known to 1 %.
+    # White residuals have 5 % of their lags outside; the mean over 20 seeds and 20 lags is accurate to 1 %.
     known = 0.01 * np.sqrt(20 / seeds)
     assert (np.mean(outside, axis=0) < 0.05 + 3 * known).all()

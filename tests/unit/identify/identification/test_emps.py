@@ -1,4 +1,4 @@
-"""EMPS, a measured axis with recorded reference and known controller: the published fit to its printed digits."""
+"""EMPS, a measured axis with recorded reference and known controller: reproduction of the published fit."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""EMPS, everything published about it: both fits, the cross-test and both closed-loop simulations, and IDIM-PIV.
+"""EMPS: reproduction of both published fits, the cross-test and both closed-loop simulations, and IDIM-PIV.
 
 Published are the fits and errors of Janot, Gautier, Brunot 2019. Their simulations hold the control signal one sample
 late, take the velocity over two samples, start from zero, have a friction that switches at standstill, run on the time
@@ -44,7 +44,7 @@ KP, KV = 160.18, 243.45
 PUBLISHED = np.array([95.1089, 203.5034, 20.3935, -3.1648])
 """M kg, Fv N s/m, Fc N, offset N of the symmetric fit."""
 SWITCHING = 1e7
-"""Sign smoothing, s/m, that is a switch: standstill is passed within 0.1 um/s."""
+"""Sign smoothing, s/m, steep enough for a switch: the sign changes within 0.1 um/s."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def test_closed_loop_simulation_has_the_published_errors(
     m, fv, fc, off = PUBLISHED
     just_after = (force - fv * run.qd - fc * np.sign(run.qd) - off) / m
     found = errors(axis, run, force, just_after)
-    # Another integrator than theirs (variable step, ten steps per sample): at or below, to the digits they print.
+    # Another integrator than theirs (variable step, ten steps per sample): at or below their printed digits.
     rounding = np.array([5e-5, 5e-4, 5e-2, 5e-3])
     assert (np.array(found) <= np.array(published) + rounding).all()
     np.testing.assert_allclose(found, published, rtol=0.015)
@@ -236,7 +236,7 @@ def test_idim_piv_with_the_identified_controller_agrees_with_the_published_fit_w
 
 
 def test_idim_piv_on_both_recordings_together_stays_with_the_published_fit(plain: Axis, pulsed: Axis) -> None:
-    # The recorded force has the pulses in it, which no controller explains: its fit suffers, the model does not.
+    # The recorded force contains the pulses: they degrade the fit of the controller, not the model.
     found = identify_experiment([plain.experiment, pulsed.experiment], load_robot("emps"))
     assert found.converged
     assert found.controller["kind"] == "crc"

@@ -1,4 +1,4 @@
-"""From a recording to experiments: conversions, the reference, gaps, and what is refused."""
+"""Experiments from a recording: conversions, the reference, gaps, and errors."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -71,7 +71,7 @@ def test_positions_come_out_on_the_joint_side_within_a_count(tx40: RobotConfig) 
     (experiment,), _ = experiments_from_recording(recording, tx40)
     t = np.arange(1000, 9001) / RATE
     expected = 0.5 * np.sin(2 * np.pi * t[:, None] * (1 + np.arange(6)))
-    # Half a count of the motor, seen through the smallest gear ratio, twice on joint 6 through the coupling.
+    # Half a count of the motor over the smallest gear ratio, twice on joint 6 through the coupling.
     assert np.abs(experiment.q - expected).max() <= 2 * 0.5 / COUNTS / 32
 
 

@@ -1,13 +1,13 @@
 """Two measured arms with torque sensors behind their gears, KUKA LWR4+ and Panda, imported and identified.
 
-The recordings of the KUKA hold nothing above 4 Hz. In the first two it makes the same motion twice, in the third
-another one, twice as fast, which the first two alone do not determine. It repeats its torques to 1.6 %: that is as well
-as one recording can be predicted from another.
+The recordings of the KUKA have no content above 4 Hz. The first two contain the same motion, the third another one,
+twice as fast, which the first two alone do not determine. The arm repeats its torques to 1.6 %. This is the limit of
+the prediction of one recording from another.
 
-Three things keep a rigid upright arm from that, and stand as effects in its configuration: the base is one degree
-askew, joint 6 has a ripple of four periods per turn, joint 7 one of one period. A diagnosis of the second and third
-recording names that of joint 7 (`cogging_torque`); each training part by itself shows that of joint 6. All their values
-are estimated on training data.
+A rigid upright arm does not reach this limit, for three reasons that are effects in the configuration. The base is
+tilted by one degree, joint 6 has a ripple of four periods per turn, joint 7 one of one period. A diagnosis of the
+second and third recording finds that of joint 7 (`cogging_torque`). Each training part by itself shows that of
+joint 6. All values are estimated on training data.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ RUN_IN = 500
 """Samples at the start of each KUKA recording that its publisher's own identification leaves out (FloBaRoID,
 ``startOffset``): the arm starts with a jerk."""
 RIGID = KUKA.model_copy(update={"effects": ()})
-"""The KUKA upright, with nothing but links and friction."""
+"""The KUKA upright, with links and friction only."""
 
 
 def need(folder: Path, *names: str) -> list[Path]:
@@ -60,7 +60,7 @@ def need(folder: Path, *names: str) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def kuka(shared_data: Path) -> list[Experiment]:
-    """The three recordings; their targets are in the wrong unit and left out."""
+    """The three recordings, without their targets, which are in a wrong unit."""
     experiments = []
     for file in need(shared_data / "kuka_lwr4", *(f"measurements_{k}.npz" for k in (1, 2, 3))):
         recording = import_recording(file, KUKA, rate_hz=200.0, names={"demand": "-"})
@@ -76,7 +76,7 @@ def panda_files(shared_data: Path) -> tuple[Path, Path]:
 
 @pytest.fixture(scope="module")
 def panda(panda_files: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Experiment:
-    """As it comes out of a recording file."""
+    """The recordings of the Panda after import into a file."""
     position, torque = panda_files
     recording = import_recording(position, PANDA, effort=torque, rate_hz=1000.0, polled=True)
     file = tmp_path_factory.mktemp("panda") / "panda.mcap"
@@ -101,7 +101,7 @@ def least_squares(experiments: Sequence[Experiment], robot: RobotConfig) -> Iden
 def prepared(
     robot: RobotConfig, experiments: Sequence[Experiment], theta: np.ndarray | None = None
 ) -> tuple[list[ExperimentEquations], list[Derivatives], Decimation]:
-    """What `identify_experiment` makes of experiments by default; effects predict torques by ``theta``."""
+    """Equations of experiments as in `identify_experiment` by default; effects predict torques by ``theta``."""
     assert robot.bandwidth_hz is not None
     dt = experiments[0].dt
     decimation = design(dt, LS_CUTOFF * robot.bandwidth_hz)
@@ -112,13 +112,13 @@ def prepared(
 
 
 def prediction_error(theta: np.ndarray, robot: RobotConfig, experiments: Sequence[Experiment]) -> float:
-    """Relative torque error in percent on recordings that theta has not seen."""
+    """Relative torque error in percent on held-out recordings."""
     blocks, _, _ = prepared(robot, experiments, theta)
     return relative_errors(blocks, theta)[0]
 
 
 def held_out_error(robot: RobotConfig, training: Sequence[Experiment], unseen: Sequence[Experiment]) -> float:
-    """The same with everything estimated on training data."""
+    """Relative torque error in percent on held-out recordings, with all values estimated on training data."""
     return prediction_error(least_squares(training, robot).theta, robot, unseen)
 
 
@@ -132,7 +132,7 @@ def test_each_recording_of_the_kuka_is_explained_up_to_1_7_percent(kuka: list[Ex
 def test_too_low_a_bandwidth_leaves_the_kuka_ten_equations_per_parameter_all_the_same(kuka: list[Experiment]) -> None:
     model, dt, slow = arm_model(RIGID), kuka[0].dt, kuka[:2]
     lengths, rows = [len(e.q) for e in slow], least_rows(model)
-    # What five times the 0.12 Hz below which 95 % of their velocity's power lies would ask for.
+    # Five times 0.12 Hz, the frequency below which 95 % of the power of their velocity lies.
     assert decimated_rows(decimation_of("idim-ls", dt, 0.6, None), lengths) < rows
     enough = decimation_of("idim-ls", dt, 0.6, None, samples=lengths, rows=rows)
     blocks = equations(model, slow, [differentiate(e.q, dt) for e in slow], enough)
@@ -175,7 +175,7 @@ def test_the_last_thirds_of_all_recordings_of_the_kuka_are_predicted_up_to_1_7_p
     assert 0.9 < np.degrees(np.linalg.norm(tilt)) < 1.3
     assert np.linalg.norm(tilt) > 10 * std.max()
     errors = [held_out_error(robot, first, last) for robot in (RIGID, with_stanzas("gravity_direction"), KUKA)]
-    # Each effect earns its place on data it has not seen.
+    # Each effect improves the prediction of held-out data.
     assert errors[0] - errors[1] > 0.1
     assert errors[1] - errors[2] > 0.1
     assert errors[2] < 1.7

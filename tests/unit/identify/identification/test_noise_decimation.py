@@ -1,4 +1,4 @@
-"""Decimation from the memory of the noise (thesis section 6.2.3)."""
+"""Decimation by the correlation time of the noise (thesis section 6.2.3)."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_factor_is_the_order_of_the_longest_memory() -> None:
 
 
 def test_what_is_kept_is_nearly_white_where_the_noise_was_not() -> None:
-    # Noise through a low-pass of 25 taps, as a torque filter in a drive leaves it.
+    # Noise after a low-pass of 25 taps, like the torque filter of a drive.
     window = np.hanning(27)[1:-1]
     noise = np.convolve(np.random.default_rng(1).standard_normal(60000), window, mode="valid")
     found = decimation_from_noise([noise[:, None]])

@@ -1,4 +1,4 @@
-"""Every method by name, from a recording of the virtual arm to the finished document and page."""
+"""Every method by name, from a recording of the virtual arm to the result document and report."""
 
 import json
 from functools import cache
@@ -32,7 +32,7 @@ def identified(options: Options) -> IdentificationOutcome:
 
 
 def options(method: Method) -> Options:
-    """Output errors take the simulation for the truth: they get the controller's law, not its impulse response."""
+    """Options; output-error methods need an exact controller: its law instead of an impulse response."""
     return Options(method=method, controller="crc" if method in MEASURED else "parametric")
 
 
@@ -95,7 +95,7 @@ def test_the_grey_box_agrees_with_the_black_box() -> None:
 
 
 def test_decimation_from_the_noise_gives_the_same_arm() -> None:
-    """The thesis kept one sample of 125 by hand (section 6.2.3)."""
+    """The thesis chose a factor of 125 by hand (section 6.2.3)."""
     usual = identified(options("idim-iv")).result
     chosen = identified(Options(method="idim-iv", decimation="noise")).result
     rate = chosen.noise_model["rate_hz"]

@@ -1,4 +1,4 @@
-"""The delay between torque and position on a simulated axis, where it is known."""
+"""Delay between torque and position on a simulated axis with known delay."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def run(axis: ArmModel, disturbance: NDArray[np.float64] | None = None) -> tuple
 
 
 def recorded(simulated: Simulation, reference: NDArray[np.float64], tau: NDArray[np.float64], shift: int) -> Experiment:
-    """What is recorded where torques arrive ``shift`` samples early."""
+    """Recording whose torques lead by ``shift`` samples."""
     q = np.round(simulated.q / QUANTUM) * QUANTUM
     rows = slice(10, -10)
     return Experiment(q=q[rows], tau=np.roll(tau, -shift, axis=0)[rows], q_ref=reference[rows], dt=DT)
@@ -68,7 +68,7 @@ def test_standard_deviation_is_that_of_the_estimates_over_20_noises(axis: ArmMod
         noisy = simulated.tau + 2.0 * rng.standard_normal(simulated.tau.shape)
         found = estimated(axis, recorded(simulated, reference, noisy, 0))
         z.append((found.samples[0] - HELD) / found.std[0])
-    # The standard deviation of 20 is known to 16 %, three of that.
+    # The standard deviation of 20 values is accurate to 16 %; three times that.
     assert 0.5 < np.std(z) < 1.5
     assert abs(np.mean(z)) < 1.0
 

@@ -1,4 +1,4 @@
-"""The measured TX40 (no reference, no controller recorded) against two published estimates of the same kind of arm."""
+"""The measured TX40 (no reference or controller recorded) against two published estimates of this type of arm."""
 
 from pathlib import Path
 
@@ -87,7 +87,7 @@ def test_without_a_reference_it_says_so_and_uses_the_smoothed_motion(results: di
 
 def test_residuals_are_white_once_their_noise_model_is_known(results: dict[str, Identification]) -> None:
     outside = [w.fraction_outside_2sigma for w in results["idim-piv"].whiteness]
-    # Of 20 lags one in 20 is expected outside; three of 120 joints and lags more is chance.
+    # One of 20 lags is expected outside the band; three more of 120 joints and lags are chance.
     assert np.mean(outside) <= 0.075
 
 

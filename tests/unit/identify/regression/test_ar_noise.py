@@ -1,4 +1,4 @@
-"""AR models: found, applied, and tested for what they leave."""
+"""AR models: estimation, whitening, and tests of the whitened residuals."""
 
 import numpy as np
 import pytest
@@ -75,7 +75,7 @@ def test_widening_is_two_of_akaikes_factors_and_leaves_filter_and_white_noise_al
 
 
 def test_errors_of_parameters_are_as_large_as_said_although_the_noise_model_is_an_estimate() -> None:
-    # Noise of long memory and parameters of the low frequencies, as a robot has them after rough decimation.
+    # Noise with a long correlation time and parameters at low frequencies, as for a robot after rough decimation.
     coefficients = np.array([-0.80, 0.28, -0.24, 0.14, -0.16, 0.18, -0.10, 0.08, -0.18])
     samples, parameters, runs = 700, 10, 300
     rng = np.random.default_rng(0)
@@ -101,7 +101,7 @@ def test_errors_of_parameters_are_as_large_as_said_although_the_noise_model_is_a
 
 
 def test_stretches_of_a_long_series_say_what_the_parameters_absorbed() -> None:
-    # A motion that changes as it goes, as an excitation trajectory does, at the recorded rate.
+    # A motion that changes over time, like an excitation trajectory, at the recorded rate.
     samples, lags = 40_000, 60
     t = np.arange(samples) / 5000.0
     rng = np.random.default_rng(5)
@@ -122,7 +122,7 @@ def weighted(
 
 
 def squared_distance(theta: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
-    """Of an estimate from its truth 0, as a share of what its covariance makes expect."""
+    """Squared distance of an estimate from the truth 0, over its expectation by the covariance."""
     return float(theta @ np.linalg.solve(covariance, theta)) / theta.size
 
 
@@ -142,7 +142,7 @@ def test_an_ar_spectrum_gives_its_own_model() -> None:
 
 
 def test_model_of_any_spectrum_is_stable_in_both_directions_of_use() -> None:
-    # A gain whose inverse, as it stands, would not be stable: a zero outside the unit circle.
+    # A gain without a stable inverse: a zero outside the unit circle.
     z = np.exp(-1j * np.pi * np.linspace(0, 1, 4097))
     model = fit_spectrum(1 / np.abs(1 - 1.25 * z) ** 2, 5)
     roots = np.roots(np.append(1.0, model.coefficients))

@@ -1,4 +1,4 @@
-"""Solving the stacked regression: least squares, instruments, covariances, excitation."""
+"""Solution of the stacked regression: least squares, instruments, covariances, excitation."""
 
 import numpy as np
 import pytest
@@ -64,7 +64,7 @@ def test_serial_covariance_predicts_the_scatter_under_coloured_noise() -> None:
     keep = np.ones((samples, 1), dtype=np.bool_)
     white = ArModel(np.empty(0), 1.0, 0.0)
     predicted = serial_covariance([x[:, None, :]], [x[:, None, :]], [keep], [white], [noise])
-    # 600 runs know a standard deviation to 3 %; the filter starts at rest at one end, worth a few percent more.
+    # 600 runs determine a standard deviation to 3 %; the filter starts at rest at one end: a few percent more.
     np.testing.assert_allclose(np.std(found, axis=0), np.sqrt(np.diag(predicted)), rtol=0.12)
 
 
@@ -96,7 +96,7 @@ def test_ordinary_least_squares_knows_its_scatter_where_joints_differ() -> None:
         np.testing.assert_allclose(estimate.theta, np.linalg.lstsq(x.reshape(-1, 2), y.ravel(), rcond=None)[0])
         found.append(estimate.theta)
         promised = estimate.std
-    # 300 runs know a standard deviation to 4 %, one run's own residuals to 5 %.
+    # 300 runs determine a standard deviation to 4 %, the residuals of one run to 5 %.
     np.testing.assert_allclose(np.std(found, axis=0), promised, rtol=0.25)
 
 

@@ -1,4 +1,4 @@
-"""Sums of whitened rows give the estimate and the covariance that orthogonal triangularisation gives."""
+"""Estimate and covariance from sums of whitened rows, against those from orthogonal triangularisation."""
 
 import numpy as np
 import pytest
@@ -69,7 +69,7 @@ def test_regressors_alike_to_six_digits_cost_the_sums_no_more_digits_than_the_tr
     z = weighted_rows(instruments, [b.keep for b in blocks], NOISE)
     by_factors = instrumental_variable(z, *stacked(silent, NOISE))
     scale = np.abs(truth)
-    # Products of the instruments as they come would square the condition number: 1e12, four digits left.
+    # Products of the unchanged instruments would square the condition number: 1e12, four digits left.
     assert np.max(np.abs(found - truth) / scale) < 10 * np.max(np.abs(by_factors - truth) / scale) + 1e-12
     assert np.max(np.abs(found - truth) / scale) < 1e-7
 

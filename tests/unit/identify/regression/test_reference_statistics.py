@@ -73,7 +73,7 @@ def test_ar_model_is_the_yule_walker_estimate_of_lowest_aic(seed: int) -> None:
 
 
 def test_whitening_is_that_of_generalised_least_squares() -> None:
-    """The filter is that of statsmodels' GLSAR, and so are the parameters that follow from it."""
+    """Filter and parameters are those of statsmodels' GLSAR."""
     rng = np.random.default_rng(5)
     x = rng.standard_normal((800, 3))
     y = x @ np.array([1.0, -2.0, 0.5]) + ar_process(800, 6)

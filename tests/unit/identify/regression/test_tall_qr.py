@@ -1,4 +1,4 @@
-"""Triangularisation: an orthogonal factorisation, the same to the last bit every time."""
+"""Triangularisation: an orthogonal factorisation with reproducible bits."""
 
 import numpy as np
 
