@@ -258,7 +258,7 @@ class _Found:
 
     @property
     def misfit(self) -> float:
-        """Sum over the joints of the logarithm of the share of the held-out torque's power that the model leaves."""
+        """Sum over the joints of the logarithm of the residual share of the held-out torque's power."""
         _, each = relative_errors(self.outcome.state.fit, held=True)
         return float(np.sum(np.log(each**2)))
 

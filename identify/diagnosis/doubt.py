@@ -88,7 +88,7 @@ def _confidence(finding: Finding) -> float:
 
 
 def _left_open(finding: Finding) -> float:
-    """Part of its joint's held-out error without it that a finding leaves."""
+    """Held-out error of the joint of a finding with it, over the error without it."""
     return finding.gap_after / max(finding.gap_before, 1e-300)
 
 

@@ -43,7 +43,7 @@ def detection_limits(state: State, settings: Settings) -> list[DetectionLimit]:
 
 
 def _smallest(state: State, candidate: Candidate, shapes: Shapes, settings: Settings) -> Array | None:
-    """Smallest size (k,) of each linear parameter that would be found; infinite where none would."""
+    """Smallest detectable size (k,) of each linear parameter; infinite where it is not detectable."""
     fit = state.fit
     # Columns at the simulated motion: they are in the cache, and the limit is that of a probability.
     z, held_z = (

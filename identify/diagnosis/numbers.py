@@ -138,9 +138,9 @@ def _closes(comparison: Comparison, before: Sequence[Change], after: Sequence[Ch
 
 
 def _held_out(comparison: Comparison, before: Array, after: Array) -> float:
-    """Projection of the held-out residual on the change of prediction in its standard deviations.
+    """Projection of the held-out residual on the change of prediction, in standard deviations.
 
-    Its spread comes from the noise, from what serial correlation is left (Newey-West), and from the baseline.
+    Its variance comes from the noise, from the remaining serial correlation (Newey-West), and from the baseline.
     """
     held = comparison.fit.held
     change = held.z @ (after - before)

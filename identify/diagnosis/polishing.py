@@ -34,7 +34,7 @@ RANK = 1e-9
 
 @dataclass(frozen=True)
 class _Free:
-    """A nonlinear parameter that may be moved: of which term, and between which values."""
+    """A free nonlinear parameter: number of its term, its name and its range."""
 
     term: int
     name: str
@@ -43,18 +43,18 @@ class _Free:
 
 
 def polished(study: Study, robot: RobotConfig, before: Fit) -> RobotConfig:
-    """The robot with the nonlinear parameters of its new effects where the training data have them.
+    """Robot with the nonlinear parameters of its new effects estimated from the training data (Gauss-Newton).
 
-    Gauss-Newton steps with the model's own parameters beside: columns are derivatives of the torques at measured
-    signals, instruments the same at simulated ones, where noise makes a wrong value no better. The loop is simulated
-    anew where it has gone far. Steps are kept as long as they make the errors of the training data smaller.
+    The model's own parameters are estimated at the same time. Columns are derivatives of the torques at measured
+    signals. Instruments are the same at simulated signals, which are free of noise. The loop is simulated again after
+    large steps. Steps are kept as long as they reduce the errors of the training data.
 
     Parameters
     ----------
     study
-        The data, with the model that the search began with: its effects stay as they are.
+        Data, with the model at the start of the search, whose effects stay as they are.
     robot
-        With effects found.
+        Configuration with effects found.
     before
         A fit without the last of them.
     """
@@ -84,7 +84,7 @@ def polished(study: Study, robot: RobotConfig, before: Fit) -> RobotConfig:
 
 
 def _fitted(study: Study, robot: RobotConfig, before: Fit, *, simulate: bool) -> Fit:
-    """A fit of other nonlinear parameters, with the simulated motion that there is or with its own.
+    """Fit with other nonlinear parameters, at the present simulated motion or at its own.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def _fitted(study: Study, robot: RobotConfig, before: Fit, *, simulate: bool) ->
 
 
 def training_errors(fit: Fit) -> float:
-    """Sum over the joints of the logarithms of their training errors' powers."""
+    """Sum over the joints of the logarithm of the power of their training errors."""
     errors = np.concatenate(fit.errors(fit.theta, held=False))
     return float(np.sum(np.log(np.maximum(np.sum(errors**2, axis=0), 1e-300))))
 
@@ -119,7 +119,7 @@ def _step(fit: Fit, own: int) -> list[tuple[_Free, float]] | None:
 
 
 def _free(bench: Workshop, own: int) -> list[_Free]:
-    """Parameters that may be moved."""
+    """Free parameters with their ranges."""
     study, found = bench.study, []
     for k, term in enumerate(effect_terms(study.model)):
         if stanza_number(study.robot, k) < own:
@@ -140,7 +140,7 @@ def _values(shape: Shape, bench: Workshop, term: Term) -> list[float]:
 def _slopes(bench: Workshop, fit: Fit, one: _Free) -> tuple[Array, Array]:
     """Derivative (R,) of a term's whitened torque over the logarithm of a parameter, at measured and simulated signals.
 
-    Leaps are their own instruments: no simulation meets them to the sample.
+    Effects with jumps are their own instruments: a simulation does not reproduce the instants of jumps.
     """
     term = effect_terms(fit.study.model)[one.term]
     own = [fit.study.model.base.names.index(name) for name in term.names]

@@ -1,8 +1,8 @@
 """Test of candidates in the closed loop that contains them.
 
-Candidates are tested at simulated signals of a loop without them. Where a missing effect changes the motion of the arm
-visibly (elasticity, a torque delay), that loop differs from the arm, and the candidate may fail in spite of a high
-score. A second simulation with the candidate in the model gives instruments that are still independent of the noise.
+Candidates are tested at simulated signals of a loop without them. A missing effect may change the motion of the arm
+visibly (elasticity, a torque delay). Then that loop differs from the arm, and the candidate may fail in spite of its
+high score. A second simulation with the candidate in the model gives instruments still independent of the noise.
 """
 
 from collections.abc import Iterable, Sequence

@@ -1,4 +1,4 @@
-"""One step after the other: add the effect that predicts unseen data best, take out what is no longer needed."""
+"""Stepwise selection: add the effect with the best prediction of held-out data, remove effects no longer needed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

@@ -338,7 +338,7 @@ def _calmed(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop, 
 
 
 def _beside_model(fit: Fit, candidate: Candidate, shapes: Shapes, workshop: Workshop) -> tuple[Array, Array] | None:
-    """Linear parameters of a candidate beside the model, and the change of the model's own that goes with them."""
+    """Linear parameters of a candidate fitted together with the model, and the decrease of the model's own."""
     columns = workshop.columns(candidate.effect, candidate.place, shapes, fit.noise)
     solution = _values(fit, columns)
     if solution is None:

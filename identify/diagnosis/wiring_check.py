@@ -1,8 +1,8 @@
-"""Mistakes of wiring, found before anything else: signals with the wrong sign, or of the wrong drive.
+"""Test for wiring errors before any other test: signals with the wrong sign, or of the wrong drive.
 
 Every hypothesis (as recorded; one signal negated; two drives exchanged) is a least-squares fit to the same torques of
-the motors. Physics takes part: no joint may have negative friction or a negative moment of inertia. With a sign wrong
-a model free of that would fit nearly as well, of a single axis exactly as well.
+the motors. Friction and moments of inertia of all joints are constrained to be non-negative. Without these constraints
+a model with a wrong sign would fit nearly as well; for a single axis, exactly as well.
 """
 
 import math
@@ -120,7 +120,7 @@ class _Rows:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Unexplained share of each recorded torque's power (n,), and what the residuals are made of."""
+    """Residual share of each recorded torque's power (n,), and the equations and parameters of the residuals."""
 
     shares: Array
     x: Array
@@ -130,7 +130,7 @@ class _Fit:
 
     @property
     def residual(self) -> Array:
-        """In the order of the recorded torques, (M, n)."""
+        """Residuals in the order of the recorded torques, (M, n)."""
         residual: Array = (self.y - self.x @ self.theta)[:, np.argsort(self.taken)]
         return residual
 
@@ -151,7 +151,7 @@ class _Fit:
 
 @dataclass
 class _Bench:
-    """Signals of the experiments, and equations already made, by the assignment of positions."""
+    """Signals of the experiments, and a cache of the equations by the assignment of positions."""
 
     model: ArmModel
     signals: list[Derivatives]
@@ -218,9 +218,9 @@ class _Bench:
 def find_wiring(experiments: Sequence[Experiment], robot: RobotConfig) -> WiringFinding | None:
     """Wrong signs and exchanged drives, or ``None``.
 
-    Mistakes that the robot's effects name are undone first; what is found comes on top of them. A single mistake that
-    the recordings prefer throughout, though not by much, is returned as not ``certain``: two like joints exchanged as a
-    whole, or an effect that is missing from the model.
+    Wiring errors among the robot's effects are corrected first; the result is in addition to them. A single error that
+    the recordings favour throughout, but by a small margin, is returned as not ``certain``. Two similar joints
+    exchanged as a whole, or a missing effect, look like this.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ def _bench(experiments: Sequence[Experiment], robot: RobotConfig) -> _Bench:
 
 
 def _singles(robot: RobotConfig) -> Iterator[_Hypothesis]:
-    """All single mistakes: of a position, a torque or both, of one motor or between two."""
+    """All single wiring errors: of a position, a torque or both, of one motor or between two."""
     names = [joint.name for joint in robot.joints]
     places: list[tuple[str, str, str | None]] = [("sign_error", name, None) for name in names]
     places += [("joint_order", one, two) for one, two in combinations(names, 2)]
@@ -318,7 +318,7 @@ def _physical_least_squares(gram: Array, right: Array, physical: Array) -> Array
 
 
 def _preferred(first: _Fit, second: _Fit) -> float:
-    """Chance that stretches of time prefer the second fit so consistently, were both equally good (Vuong 1989)."""
+    """Probability that time intervals favour the second fit so consistently if both are equally good (Vuong 1989)."""
     gains = np.zeros(first.residual.shape[0])
     for e, f in zip(first.residual.T, second.residual.T, strict=True):
         before, after = float(np.mean(e**2)), float(np.mean(f**2))

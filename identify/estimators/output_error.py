@@ -99,7 +99,7 @@ def _approach(
     start: Array,
     iterations: int,
 ) -> "_LevenbergMarquardt":
-    """The better of the start and of what pseudo-linear regression makes of it."""
+    """Start of the minimisation: the given parameters, or those of pseudo-linear regression (4.22) if better."""
     given = _LevenbergMarquardt(signal, measured, blocks, auxiliary, *auxiliary.reachable(start))
     near, _ = solve_didim(blocks, auxiliary, given.theta, iterations)
     found = _LevenbergMarquardt(signal, measured, blocks, auxiliary, *auxiliary.reachable(near.theta))

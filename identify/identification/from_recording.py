@@ -31,7 +31,7 @@ def experiments_from_recording(recording: Recording, robot: RobotConfig) -> tupl
     Parameters
     ----------
     recording
-        The recording; a torn one is used as far as it goes.
+        The recording; of a torn one the readable part is used.
     robot
         The robot to identify: the recorded one, possibly with other numbers.
 

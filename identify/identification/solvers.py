@@ -49,19 +49,19 @@ def decimation_of(
     Parameters
     ----------
     method
-        Methods with a noise model decimate only roughly.
+        Name of the method; those with a noise model decimate only roughly.
     dt
         Sampling period, s.
     bandwidth_hz
-        Closed-loop bandwidth.
+        Closed-loop bandwidth, Hz.
     factor
-        Factor chosen by the user, kept however few equations it leaves; ``None``: from the bandwidth.
+        Factor chosen by the user, kept even if too few equations are left; ``None``: from the bandwidth.
     samples
         Length of every experiment.
     rows
         Fewest instants to leave of all experiments together, see `least_rows`.
     warnings
-        Gets a line if the cut-off was raised to leave as many, or if there are fewer.
+        List to which a line is added if the cut-off was raised, or if too few equations are left.
     """
     share = PIV_CUTOFF if method in PREFILTERED else LS_CUTOFF
     cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)

@@ -97,7 +97,8 @@ def torque_delay(
     """Delay between torque and position of every joint, in fractions of samples.
 
     The torque is taken as recorded. All base parameters are estimated along with the delays, so a delay explains only
-    what they cannot. Each joint has its own delay; coupled motors of a wrist give the mixture that acts on the joint.
+    the part that they cannot. Each joint has its own delay; coupled motors of a wrist give the mixture that acts on
+    the joint.
 
     Parameters
     ----------

@@ -159,7 +159,7 @@ def filtered_regressor(
         total, piece = np.zeros((last - first, model.n * rigid)), np.zeros((PIECE, model.n, rigid))
         for begin in range(first * decimation.factor, end, PIECE):
             stop = min(begin + PIECE, end)
-            # The kernel writes the same places every time: what it leaves out stays zero.
+            # The kernel writes the same elements every time: all others stay zero.
             span, phi = slice(begin, stop), piece[: stop - begin]
             fill_regressor(model.chain, model.base_columns, smoothing, q[span], qd[span], qdd[span], phi)
             touched = decimation.rows_of(begin, stop)
