@@ -207,7 +207,7 @@ def heal(
 ) -> None:
     """Former name of `armident recover`.
 
-    Example: armident recover recordings/*.mcap
+    Example: armident heal recordings/*.mcap
     """
     logging.getLogger(__name__).warning("heal is now recover; the next release removes the old name")
     recover(recordings, as_json)

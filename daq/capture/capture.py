@@ -33,9 +33,8 @@ from armident.daq.logs import log_to
 from armident.daq.recording import Mark, QueuedSeries
 from armident.daq.streaming import Keys
 from armident.drivers.can.frames import FrameSource
-from armident.drivers.can.packet_ring import open_source
 from armident.drivers.can.receiver import Receiver
-from armident.drivers.can.udp import UDP_WARNING
+from armident.drivers.can.udp import UDP_WARNING, open_bus
 from armident.drivers.canopen.emcy_listener import EmcyListener
 
 __all__ = ["CapturePlan", "CaptureResult", "capture", "load_plan", "run_capture"]
@@ -174,7 +173,7 @@ def _connect(recorder: Recorder, reloader: Reloader, requested: threading.Event,
 
 def _opener(bus: Bus, number: int, plan: CapturePlan) -> Callable[[], FrameSource]:
     """Return a function that opens a bus for the frames of the capture and the error frames of its controller."""
-    return lambda: open_source(bus, filters=plan.filters(number), errors=True, hardware=True)
+    return lambda: open_bus(bus, filters=plan.filters(number), errors=True, hardware=True)
 
 
 def run_capture(

@@ -177,6 +177,13 @@ class Effect:
         """Return True if linear parameters (k,) with standard deviations (k,) are physically possible.
 
         Signs and bounds may be violated by `SIGN_TOLERANCE` standard deviations: single parameters may be zero.
+
+        Parameters
+        ----------
+        values, std
+            Linear parameters and their standard deviations, (k,) each.
+        shapes
+            Nonlinear parameters by name.
         """
         if self.physical is not None and not self.physical(values, shapes):
             return False
@@ -195,17 +202,45 @@ class Effect:
         return replace(self, linear=tuple(self.linear[k] for k in kept), columns=partial(_some, self.columns, kept))
 
     def refinable(self, robot: RobotConfig, place: "Place") -> tuple[bool, ...]:
-        """Return, for each nonlinear parameter, True if it may lie between the values of its grid at a place."""
+        """Return, for each nonlinear parameter, True if it may lie between the values of its grid at a place.
+
+        Parameters
+        ----------
+        robot
+            Configuration of the robot.
+        place
+            Location of the effect.
+        """
         prismatic = robot.joints[place.joint].type == "prismatic"
         return tuple(shape.continuous[prismatic] for shape in self.shapes)
 
     def movable(self, robot: RobotConfig, place: "Place", shapes: Mapping[str, float]) -> list[str]:
-        """Return the names of the nonlinear parameters to refine; those at zero stay, as refinement is by factors."""
+        """Return the names of the nonlinear parameters to refine; those at zero stay, as refinement is by factors.
+
+        Parameters
+        ----------
+        robot
+            Configuration of the robot.
+        place
+            Location of the effect.
+        shapes
+            Nonlinear parameters by name.
+        """
         between = zip(self.shapes, self.refinable(robot, place), strict=True)
         return [s.name for s, may in between if (may or s.movable) and shapes[s.name] != 0.0]
 
     def torque(self, motion: Motion, place: "Place", shapes: Mapping[str, float]) -> Array:
-        """Return the columns of all joints, shape (N, n, k)."""
+        """Return the columns of all joints, shape (N, n, k).
+
+        Parameters
+        ----------
+        motion
+            The motion, N samples.
+        place
+            Location of the effect.
+        shapes
+            Nonlinear parameters by name.
+        """
         columns = self.columns(motion, place, **shapes)
         if columns.ndim == 3:
             return columns

@@ -134,7 +134,7 @@ def watched(plan: armident.daq.capture.capture.CapturePlan, bus: GeneratedBus, c
                 stop.set()
 
     # Only the source of the frames is simulated; it sends no EMCY.
-    setattr(armident.daq.capture.capture, "open_source", open_bus)  # noqa: B010
+    setattr(armident.daq.capture.capture, "open_bus", open_bus)  # noqa: B010
     setattr(armident.drivers.can.filtered_socket, "open_bus", lambda config, **_: GeneratedBus(0, 1.0))  # noqa: B010
     watcher = threading.Thread(target=watch)
     watcher.start()

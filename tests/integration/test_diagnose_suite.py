@@ -77,9 +77,9 @@ def test_ctrl_c_ends_a_run_and_the_next_one_continues(small: Path, tmp_path: Pat
     out = tmp_path / "out"
     words = ["diagnose-suite", "--suite", str(small), "--out", str(out), "--jobs", "2"]
     with CommandProcess(words, start=partial(start_command, own_session=True)) as suite:
-        log = out / "logs" / "diagnosis.0.log"
+        log = out / "logs" / "plant.0.log"
         until = time.monotonic() + 120
-        while not log.exists() and time.monotonic() < until:
+        while not log.exists() and suite.process.poll() is None and time.monotonic() < until:
             time.sleep(0.1)
         children = descendants(getattr(suite.process, "pid", 0))
         suite.send_signal(signal.SIGINT)
