@@ -100,9 +100,7 @@ def test_a_recording_without_reference_still_gives_the_parameters() -> None:
     assert (np.abs(result.theta - truth())[chosen] < 5 * identified(0, 1.0, Options()).std[chosen]).all()
 
 
-@pytest.mark.parametrize(
-    "seeds", [3, pytest.param(20, marks=[pytest.mark.proof, pytest.mark.timeout(1800)])], ids=lambda n: f"{n} seeds"
-)
+@pytest.mark.parametrize("seeds", [pytest.param(20, marks=pytest.mark.timeout(1800))], ids=lambda n: f"{n} seeds")
 def test_essential_parameters_are_recovered_within_their_own_standard_deviations(seeds: int) -> None:
     deviations, outside = [], []
     for seed in range(1, seeds + 1):
