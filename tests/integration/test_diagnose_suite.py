@@ -94,7 +94,9 @@ def test_ctrl_c_ends_a_run_and_the_next_one_continues(small: Path, tmp_path: Pat
     while (left := [child for child in children if Path(f"/proc/{child}").exists()]) and time.monotonic() < until:
         time.sleep(0.05)
     assert left == []
-    assert not (out / RESULTS).exists()
+    # A case may have ended before the signal; both have not, or the exit code would be 0.
+    done = (out / RESULTS).read_text().splitlines() if (out / RESULTS).exists() else []
+    assert len(done) < 2
     assert diagnose_suite(*words[1:]).returncode == 0
 
 
