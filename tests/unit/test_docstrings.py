@@ -14,9 +14,9 @@ from armident.identify.api import identify
 
 PACKAGES = ("configs", "drivers", "daq", "identify", "virtual_robot", "src/armident")
 ROOT = Path(__file__).resolve().parents[2]
-WITHOUT_PARAMETERS_SECTION = 420
+WITHOUT_PARAMETERS_SECTION = 141
 """Public functions and methods with two or more parameters whose docstring has no Parameters section; lower it only."""
-RIDDLES = 230
+RIDDLES = 16
 """Docstrings that begin with What, Whether, Which, How, Where, Who or That; lower it only."""
 RIDDLE = re.compile(r"(What|Whether|Which|How|Where|Who|That)\b")
 
