@@ -30,8 +30,8 @@ from armident.configs import load_robot, load_session
 from armident.configs.schema.session import Bus
 from armident.daq.matching.streams import captured_streams
 from armident.daq.recording import read_recording
-from armident.drivers.can.packet_ring import open_source
 from armident.drivers.can.receiver import Receiver
+from armident.drivers.can.udp import open_bus
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.benchmarks.harness import Row, ratio_of_medians
 from tests.faults.bus import session_file
@@ -222,7 +222,7 @@ def rows(found: dict[str, Competitor], recorded: str) -> list[Row]:
 
 def receive(channels: list[str]) -> None:
     """Read all buses as a capture does, and count."""
-    openers = [partial(open_source, Bus(channel=name)) for name in channels]
+    openers = [partial(open_bus, Bus(channel=name)) for name in channels]
     with Receiver(openers) as receiver:
         print("ready", flush=True)
         count = 0
