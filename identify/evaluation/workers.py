@@ -74,8 +74,8 @@ class CaseRunner:
         for case in cases:
             queue.put(case)
         with ThreadPoolExecutor(self._jobs) as pool:
-            threads = [pool.submit(self._work, k, queue, on_result, until) for k in range(self._jobs)]
             try:
+                threads = [pool.submit(self._work, k, queue, on_result, until) for k in range(self._jobs)]
                 for thread in threads:
                     thread.result()
             except BaseException:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -73,6 +74,15 @@ def test_a_spring_is_found_and_a_run_goes_on_where_it_was(small: Path, tmp_path:
     assert (out / RESULTS).read_text(encoding="utf-8") == lines
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Child processes react to SIGINT, also where the tests were started in the background, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_ends_a_run_and_the_next_one_continues(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = ["diagnose-suite", "--suite", str(small), "--out", str(out), "--jobs", "2"]
