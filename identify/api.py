@@ -1,21 +1,20 @@
 """Identification, diagnosis, comparison and trajectory design, as ``import armident`` offers them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import yaml
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from armident.configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot, load_trajectory
+from armident.configs import ConfigError, DataError, RobotConfig, Trajectory, load_robot
 from armident.daq.recording import Recording, read_recording
 from armident.identify.document import (
     DiagnosisDocument,
     IdentificationDocument,
-    Parameter,
     load_document,
     reference,
     to_json,
@@ -23,7 +22,6 @@ from armident.identify.document import (
 )
 from armident.identify.effects.effect import Effect as Effect
 from armident.identify.effects.registry import catalogue
-from armident.identify.effects.terms import arm_model
 from armident.identify.experiment import Experiment
 from armident.identify.identification.api import experiments_of, identify_recording
 from armident.identify.identification.options import (
@@ -38,115 +36,17 @@ from armident.identify.monitoring.change_test import ParameterChangeTest
 from armident.identify.monitoring.change_test import compare as test_parameter_change
 from armident.identify.regression.equations import MAX_AR_ORDER
 from armident.identify.report.files import robot_yaml
-from armident.identify.robot.controller import DiscreteController
 from armident.identify.signals.differentiate import NvrRule
+from armident.identify.tables import EffectTable, ParameterTable, Table
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from armident.identify.diagnosis.diagnose import Diagnosis as DiagnosisResult
     from armident.identify.excitation.design import Design as DesignResult
-    from armident.identify.robot.simulation import Simulation
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 Robot = RobotConfig | str | Path
 Recorded = Recording | str | Path
-
-
-class Table(Sequence[Mapping[str, Any]]):
-    """Rows with named columns that print, show themselves in a notebook and convert to pandas.
-
-    Parameters
-    ----------
-    columns
-        Names of the columns.
-    rows
-        One tuple of values per row, as long as ``columns``.
-    title
-        Heading, may be empty.
-    """
-
-    def __init__(self, columns: Sequence[str], rows: Sequence[Sequence[Any]], title: str = "") -> None:
-        self.columns = tuple(columns)
-        self.rows = [tuple(row) for row in rows]
-        self.title = title
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def __getitem__(self, key: Any) -> Any:
-        """Return row ``key`` as a mapping if it is a number, else the column of that name as a list."""
-        if isinstance(key, str):
-            column = self.columns.index(key)
-            return [row[column] for row in self.rows]
-        if isinstance(key, slice):
-            return [dict(zip(self.columns, row, strict=True)) for row in self.rows[key]]
-        return dict(zip(self.columns, self.rows[key], strict=True))
-
-    def to_pandas(self) -> "pd.DataFrame":
-        """Return the table as a pandas DataFrame, indexed by its first column.
-
-        Raises
-        ------
-        ConfigError
-            If pandas is not installed.
-        """
-        try:
-            import pandas
-        except ImportError as error:
-            raise ConfigError("a table as DataFrame needs the package pandas (pip install pandas)") from error
-        return pandas.DataFrame(self.rows, columns=list(self.columns)).set_index(self.columns[0])
-
-    def __str__(self) -> str:
-        cells = [self.columns, *(tuple(_text(value) for value in row) for row in self.rows)]
-        widths = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
-        numbers = [any(isinstance(row[k], float) for row in self.rows) for k in range(len(self.columns))]
-        lines = [
-            "  ".join(
-                text.rjust(width) if number else text.ljust(width)
-                for text, width, number in zip(row, widths, numbers, strict=True)
-            ).rstrip()
-            for row in cells
-        ]
-        return "\n".join([self.title, *lines] if self.title else lines)
-
-    def __repr__(self) -> str:
-        return str(self)
-
-    def _repr_html_(self) -> str:
-        head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
-        body = "".join(
-            "<tr>" + "".join(f"<td>{escape(_text(value))}</td>" for value in row) + "</tr>" for row in self.rows
-        )
-        caption = f"<caption>{escape(self.title)}</caption>" if self.title else ""
-        return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-class ParameterTable(Table):
-    """Estimated base parameters: a table that is also indexed by the name of a parameter.
-
-    Parameters
-    ----------
-    parameters
-        The parameters, in the order of ``theta``.
-    title
-        Heading.
-    """
-
-    def __init__(self, parameters: Sequence[Parameter], title: str = "") -> None:
-        columns = ("name", "value", "std", "relative_std_pct", "unit", "essential", "formula")
-        super().__init__(columns, [[getattr(p, column) for column in columns] for p in parameters], title)
-        self._by_name = {p.name: p for p in parameters}
-
-    def __getitem__(self, key: Any) -> Any:
-        """Return the parameter of that name, else a column or a row as `Table` does."""
-        if isinstance(key, str) and key in self._by_name:
-            return self._by_name[key]
-        if isinstance(key, str) and key not in self.columns:
-            known = ", ".join(self._by_name)
-            raise KeyError(f"{key!r} is no base parameter and no column; parameters: {known}")
-        return super().__getitem__(key)
 
 
 @dataclass(frozen=True, repr=False)
@@ -741,220 +641,6 @@ def design_trajectory(
     return Design(config, found)
 
 
-class RobotModel:
-    """The dynamic model of a robot configuration: regressor, inverse and forward dynamics, closed loop.
-
-    All quantities are in SI units on the joint side. Parameters ``theta`` are base parameters (b,) in the order of
-    ``names``, or standard parameters (p,) in that of ``standard_names`` (thesis equations 2.3 to 2.9).
-
-    Parameters
-    ----------
-    robot
-        Configuration, or the path or shipped name of one; its effects are terms of the model.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such configuration, or it is wrong.
-
-    Examples
-    --------
-    >>> import armident, numpy as np
-    >>> model = armident.RobotModel("tx40")
-    >>> q = np.zeros((1, model.n))
-    >>> model.regressor(q, q, q).shape
-    (1, 6, 61)
-    """
-
-    def __init__(self, robot: Robot) -> None:
-        self.robot = _robot(robot, ())
-        self._arm = arm_model(self.robot)
-
-    @property
-    def n(self) -> int:
-        """Number of joints."""
-        return self._arm.n
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the base parameters, (b,)."""
-        return self._arm.base.names
-
-    @property
-    def standard_names(self) -> tuple[str, ...]:
-        """Names of the standard parameters, (p,)."""
-        return self._arm.names
-
-    def regressor(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, dt: float | None = None) -> Array:
-        """Return the regressor of the base parameters (thesis equation 2.8), (N, n, b).
-
-        Parameters
-        ----------
-        q, qd, qdd
-            Positions, velocities and accelerations, (N, n) each; rad or m and their derivatives.
-        dt
-            Sampling period, s; needed where the configuration has effects.
-
-        Raises
-        ------
-        ValueError
-            If shapes do not fit, or ``dt`` is missing.
-        """
-        return self._arm.base_regressor(q, qd, qdd, dt=dt)
-
-    def inverse_dynamics(
-        self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, dt: float | None = None
-    ) -> Array:
-        """Return the joint torques along a motion, (N, n), N m or N.
-
-        Parameters
-        ----------
-        theta
-            Base parameters (b,) or standard parameters (p,).
-        q, qd, qdd
-            Positions, velocities and accelerations, (N, n) each; rad or m and their derivatives.
-        dt
-            Sampling period, s; needed where the configuration has effects.
-
-        Raises
-        ------
-        ValueError
-            If shapes do not fit, or ``dt`` is missing.
-        """
-        torque = self._arm.inverse_dynamics(theta, q, qd, qdd)
-        if self._arm.e == 0:
-            return torque
-        if dt is None:
-            raise ValueError("the effects of the configuration need the sampling period dt")
-        values = np.asarray(theta, dtype=np.float64)
-        known = self._arm.anchored(values)
-        further: Array = known.term_regressor(known.motion(q, qd, qdd, dt)) @ values[values.size - self._arm.e :]
-        return torque + further
-
-    def mass_matrix(self, theta: ArrayLike, q: ArrayLike) -> Array:
-        """Return the mass matrices, rotors and couplings included, (N, n, n).
-
-        Parameters
-        ----------
-        theta
-            Base parameters (b,) or standard parameters (p,).
-        q
-            Positions (N, n), rad or m.
-
-        Raises
-        ------
-        ValueError
-            If shapes do not fit.
-        """
-        return self._arm.mass_matrix(theta, q)
-
-    def forward_dynamics(self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, tau: ArrayLike) -> Array:
-        """Return the joint accelerations under given torques (thesis equation 2.9), (N, n).
-
-        Parameters
-        ----------
-        theta
-            Base parameters (b,) or standard parameters (p,).
-        q, qd
-            Positions and velocities, (N, n) each.
-        tau
-            Joint torques (N, n), N m or N.
-
-        Raises
-        ------
-        ConfigError
-            If the configuration has effects: they need a whole motion, see `simulate`.
-        ArmidentError
-            If a mass matrix is not positive definite: these parameters are not physical.
-        """
-        if self._arm.e:
-            raise ConfigError(f"{self.robot.name}: forward dynamics leave effects out; use simulate for a whole motion")
-        return self._arm.forward_dynamics(theta, q, qd, tau)
-
-    def simulate(
-        self,
-        theta: ArrayLike,
-        trajectory: Trajectory | str | Path | ArrayLike,
-        *,
-        dt: float,
-        controller: DiscreteController | None = None,
-    ) -> "Simulation":
-        """Simulate the closed loop along a reference (thesis section B.3).
-
-        Parameters
-        ----------
-        theta
-            Base parameters (b,) or standard parameters (p,).
-        trajectory
-            Reference: a trajectory, the path or shipped name of one, or positions (N, n), rad or m.
-        dt
-            Sampling period of loop and controller, s.
-        controller
-            By default that of the configuration, or else a stiff PD controller for its bandwidth.
-
-        Returns
-        -------
-        Simulation
-            ``q``, ``qd``, ``qdd``, ``tau``, (N, n) each, and ``diverged_at``.
-
-        Raises
-        ------
-        ConfigError
-            If the configuration has neither a controller nor a bandwidth.
-        """
-        from armident.identify.controller.nominal import known_controller, nominal_controller
-        from armident.identify.robot.relaxation import simulate_with_terms
-
-        if isinstance(trajectory, str | Path):
-            trajectory = load_trajectory(trajectory)
-        positions = trajectory.sample(dt) if isinstance(trajectory, Trajectory) else np.asarray(trajectory, np.float64)
-        values = np.asarray(theta, dtype=np.float64)
-        if controller is None:
-            if self.robot.controller is not None:
-                controller = known_controller(self.robot, dt)
-            elif self.robot.bandwidth_hz is not None:
-                controller = nominal_controller(self._arm, values, positions, dt, self.robot.bandwidth_hz)
-            else:
-                raise ConfigError(f"{self.robot.name}: simulate needs a controller; the configuration has none")
-        return simulate_with_terms(self._arm, values, controller, positions, dt)
-
-    def __repr__(self) -> str:
-        effects_ = f", {self._arm.e} of effects" if self._arm.e else ""
-        return f"RobotModel({self.robot.name}: {self.n} joints, {len(self.names)} base parameters{effects_})"
-
-
-class EffectTable(Table):
-    """The effects of the catalogue: a table that is also indexed by the name of an effect."""
-
-    def __init__(self, found: Mapping[str, Effect]) -> None:
-        columns = ("name", "title", "scope", "parameters", "required_motion", "reference")
-        rows = [
-            (
-                effect.name,
-                effect.title,
-                effect.scope,
-                ", ".join([p.name for p in effect.linear] + [s.name for s in effect.shapes]),
-                effect.needs,
-                effect.reference,
-            )
-            for effect in found.values()
-        ]
-        super().__init__(columns, rows)
-        self._by_name = dict(found)
-
-    def __getitem__(self, key: Any) -> Any:
-        """Return the effect of that name, else a column or a row as `Table` does."""
-        if isinstance(key, str) and key in self._by_name:
-            return self._by_name[key]
-        if isinstance(key, str) and key not in self.columns:
-            raise KeyError(f"{key!r} is no effect and no column; effects: {', '.join(self._by_name)}")
-        return super().__getitem__(key)
-
-    def effects(self) -> Iterator[Effect]:
-        """Iterate over the effects, in the order of the table."""
-        return iter(self._by_name.values())
-
-
 def effects() -> EffectTable:
     """Return the effects that a model can have and a diagnosis looks for.
 
@@ -994,9 +680,3 @@ def _document(given: Identification | IdentificationDocument | str | Path) -> Id
         return given
     path = Path(given)
     return load_document(path / "identification.json" if path.is_dir() else path, IdentificationDocument)
-
-
-def _text(value: Any) -> str:
-    if value is None:
-        return ""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -249,7 +249,7 @@ class RecordingScan:
         if not self.finished:
             since = "from the start" if last_sync is None else f"after SYNC {last_sync}"
             words.append(
-                f"the file was not finished: whatever came {since} and the counters are missing"
+                f"the file was not finished: rows {since} and the counters are missing"
                 f" ({len(self._data) - self.end} bytes of a torn record left out)"
             )
         return words

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from armident.identify.api import Diagnosis as Diagnosis
     from armident.identify.api import Effect as Effect
     from armident.identify.api import Identification as Identification
-    from armident.identify.api import RobotModel as RobotModel
     from armident.identify.api import compare as compare
     from armident.identify.api import design_trajectory as design_trajectory
     from armident.identify.api import diagnose as diagnose
     from armident.identify.api import effects as effects
     from armident.identify.api import identify as identify
+    from armident.identify.robot_model import RobotModel as RobotModel
     from armident.virtual_robot.api import simulate_recording as simulate_recording
 
 _HOMES = {
@@ -39,9 +39,10 @@ _HOMES = {
     "armident.daq.api": ("capture", "import_recording"),
     "armident.daq.recording": ("Recording", "read_recording"),
     "armident.identify.api": (
-        "ChangeTest", "Design", "Diagnosis", "Effect", "Identification", "RobotModel", "compare", "design_trajectory",
-        "diagnose", "effects",
+        "ChangeTest", "Design", "Diagnosis", "Effect", "Identification", "compare", "design_trajectory", "diagnose",
+        "effects",
     ),
+    "armident.identify.robot_model": ("RobotModel",),
     "armident.virtual_robot.api": ("simulate_recording",),
 }  # fmt: skip
 """Names of the public API by the module that defines them; a name is imported when it is first used."""

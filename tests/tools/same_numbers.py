@@ -272,12 +272,12 @@ def renamed(value: Any) -> Any:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a number; true and false are none."""
+    """Return True for a number; true and false are not numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def is_array(value: Any) -> bool:
-    """Whether a value is a list of numbers, or of such lists; null stands for a number that is not finite."""
+    """Return True for a list of numbers or of such lists; null stands for a number that is not finite."""
     return isinstance(value, list) and all(item is None or is_number(item) or is_array(item) for item in value)
 
 

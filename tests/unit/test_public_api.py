@@ -175,7 +175,14 @@ def test_a_mistake_is_one_clear_line(call: object, expected: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "module", ["armident", "armident.identify.api", "armident.virtual_robot.api", "armident.identify.robot.arm"]
+    "module",
+    [
+        "armident",
+        "armident.identify.api",
+        "armident.identify.robot_model",
+        "armident.virtual_robot.api",
+        "armident.identify.robot.arm",
+    ],
 )
 def test_the_examples_of_the_docstrings_run(module: str) -> None:
     __import__(module)

@@ -139,7 +139,7 @@ def test_the_command_says_what_is_missing(tmp_path: Path) -> None:
     shown = CliRunner().invoke(app, ["recover", str(tmp_path / "r.mcap")])
     assert shown.exit_code == 0
     last = read_recording(tmp_path / "r.mcap").samples.sync[-1]
-    assert f"r.mcap: recovered: the file was not finished: whatever came after SYNC {last}" in shown.output
+    assert f"r.mcap: recovered: the file was not finished: rows after SYNC {last}" in shown.output
     again = CliRunner().invoke(app, ["recover", "--json", str(tmp_path / "r.mcap")])
     assert json.loads(again.output)[0]["missing"] is None
     assert len(data) > 0
