@@ -31,17 +31,35 @@ from armident.identify.robot.motion import Motion
 from armident.identify.robot.terms import ModelTerm
 
 PIECE = 4096
-"""Samples of a long regressor that one processor fills at a time."""
+"""Samples (rows) of a long regressor that one thread fills per call."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
     """Inverse dynamic model ``tau = phi(q, qd, qdd) theta`` of a serial arm (thesis equations 2.3, 2.8).
 
-    Everything is joint side and SI. Friction is ``fv qd + fc sign(qd) + off``; where ``sharp_sign`` is
-    false the sign is ``(2/pi) atan(g qd)`` with the ``sign_smoothing`` g of the robot configuration.
-    Additional terms may be given: their linear parameters stand after all others in ``names`` and in
-    ``base.names``. Rigid dynamics (mass matrix, recursion, simulation step) leave them out.
+    All quantities are joint side and SI. Friction is ``fv qd + fc sign(qd) + off`` (2.7). Unless ``sharp_sign`` is
+    true, the sign is ``(2/pi) atan(g qd)`` with the ``sign_smoothing`` g of the robot configuration (section B.2).
+
+    Terms add torques that are linear in e further parameters: the last ones of ``names`` and of ``base.names``.
+    The mass matrix, the Newton-Euler recursion and the simulation step omit these terms.
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot, n joints.
+    names
+        Names of the standard parameters (p,), those of the terms last.
+    chain
+        Geometry of the chain; m, rad, and gravity in m/s^2.
+    columns, base_columns
+        Regressor columns of the standard and of the base parameters.
+    base
+        The b base parameters and their formulas.
+    terms
+        Additional torque terms.
+    anchor
+        Standard (p,) or base (b,) parameters, SI, that predict the torques for terms that depend on them.
 
     Examples
     --------
@@ -61,7 +79,6 @@ class ArmModel:
     base: BaseParameters
     terms: tuple[ModelTerm, ...] = ()
     anchor: Floats | None = None
-    """Parameters by which terms that depend on the model's own torques predict them, (p,) or (b,)."""
 
     @classmethod
     def from_config(cls, robot: RobotConfig, terms: tuple[ModelTerm, ...] = ()) -> Self:
@@ -94,45 +111,57 @@ class ArmModel:
 
     @property
     def e(self) -> int:
-        """Number of linear parameters of the effects: the last ones of ``names`` and of ``base.names``."""
+        """Number of linear parameters of the terms: the last ones of ``names`` and of ``base.names``."""
         return sum(len(term.names) for term in self.terms)
 
     @property
     def of_links(self) -> NDArray[np.bool_]:
-        """Which standard parameters belong to links: not friction, offset, rotor or effect, (p,)."""
+        """Mask (p,) of the standard parameters of links: no friction, offset, rotor inertia or term."""
         rigid = self.names[: len(self.names) - self.e]
         links = [name.rstrip("0123456789") in INERTIAL for name in rigid]
         return np.array(links + [False] * self.e, dtype=np.bool_)
 
     def anchored(self, theta: ArrayLike) -> Self:
-        """The same model, its terms predicting torques by ``theta``, (p,) or (b,)."""
+        """Return the model whose terms predict torques with ``theta``, standard (p,) or base (b,); SI."""
         return replace(self, anchor=np.asarray(theta, dtype=np.float64))
 
     def without_terms(self) -> Self:
-        """The rigid model alone."""
+        """Return the model without its additional terms."""
         if not self.terms:
             return self
         rigid = len(self.names) - self.e
         return replace(self, names=self.names[:rigid], base=self.base.without(self.e), terms=(), anchor=None)
 
     def with_gravity(self, gravity: ArrayLike) -> Self:
-        """The same model under another gravity (3,), m/s^2."""
+        """Return the model under another gravity vector (3,) in the base frame, m/s^2."""
         return replace(self, chain=self.chain._replace(gravity=np.asarray(gravity, dtype=np.float64)))
 
     def smooth_sign(self, qd: Floats) -> Floats:
-        """``(2/pi) atan(g qd)`` (thesis appendix B.2)."""
+        """``(2/pi) atan(g qd)`` of joint velocities in rad/s or m/s, any shape (thesis appendix B.2)."""
         smooth: Floats = 2 / np.pi * np.arctan(self.smoothing * qd)
         return smooth
 
     def motion(
         self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, dt: float, start: float = 0.0, *, sharp_sign: bool = False
     ) -> Motion:
-        """A motion as the terms see it; every array (N, n), ``dt`` and ``start`` in s."""
+        """Return the motion from which the terms compute their columns.
+
+        Parameters
+        ----------
+        q, qd, qdd
+            Positions, velocities, accelerations, each (N, n); rad or m, s.
+        dt
+            Sampling period, s.
+        start
+            Time of the first sample since the beginning of the first recording, s.
+        sharp_sign
+            ``sign(qd)`` instead of its smoothed form.
+        """
         q, qd, qdd = self._motion(q, qd, qdd)
         return Motion(self, q, qd, qdd, dt, start, self.anchor, sharp=sharp_sign)
 
     def term_regressor(self, motion: Motion) -> Floats:
-        """Columns of the terms, shape (N, n, e): torque per unit of their linear parameters."""
+        """Regressor of the terms, shape (N, n, e): joint torque (N m or N) per unit of each linear parameter."""
         columns = [term.columns(motion) for term in self.terms]
         return np.concatenate(columns, axis=2) if columns else np.zeros((motion.samples, self.n, 0))
 
@@ -154,7 +183,7 @@ class ArmModel:
         sharp_sign
             ``sign(qd)`` instead of its smoothed form.
         out
-            Where to write: zeros, or an earlier regressor of this model and length, which saves a large one its memory.
+            Array to write into: zeros, or an earlier regressor of this model and length, which is then reused.
 
         Returns
         -------
@@ -175,10 +204,18 @@ class ArmModel:
     ) -> Floats:
         """Regressor of the base parameters, shape (N, n, b); see `regressor`.
 
+        A model with terms needs ``dt``, ``start`` and the whole motion: terms may depend on earlier samples.
+
         Parameters
         ----------
-        dt, start
-            Sampling period and time of the first sample, s; a model with terms needs the whole motion and these.
+        q, qd, qdd
+            Positions, velocities, accelerations, each (N, n); rad or m, s.
+        sharp_sign
+            ``sign(qd)`` instead of its smoothed form.
+        dt
+            Sampling period, s.
+        start
+            Time of the first sample since the beginning of the first recording, s.
 
         Raises
         ------
@@ -194,7 +231,15 @@ class ArmModel:
         return np.concatenate([rigid, further], axis=2)
 
     def rigid_regressor(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, sharp_sign: bool = False) -> Floats:
-        """Regressor of the base parameters without those of the terms, shape (N, n, b - e)."""
+        """Regressor of the base parameters without those of the terms, shape (N, n, b - e).
+
+        Parameters
+        ----------
+        q, qd, qdd
+            Positions, velocities, accelerations, each (N, n); rad or m, s.
+        sharp_sign
+            ``sign(qd)`` instead of its smoothed form.
+        """
         return self._regressor(self.base_columns, self.base.b - self.e, q, qd, qdd, sharp_sign)
 
     def inverse_dynamics(
@@ -205,9 +250,11 @@ class ArmModel:
         Parameters
         ----------
         theta
-            Standard parameters (p,) or base parameters (b,).
+            Standard parameters (p,) or base parameters (b,), SI.
         q, qd, qdd
-            Each (N, n).
+            Positions, velocities, accelerations, each (N, n); rad or m, s.
+        sharp_sign
+            ``sign(qd)`` instead of its smoothed form.
         """
         q, qd, qdd = self._motion(q, qd, qdd)
         out = np.empty_like(q)
@@ -216,19 +263,36 @@ class ArmModel:
         return out
 
     def mass_matrix(self, theta: ArrayLike, q: ArrayLike) -> Floats:
-        """Mass matrices (N, n, n), rotors and couplings included, at postures ``q`` (N, n)."""
+        """Mass matrices (N, n, n) with rotors and couplings, kg m^2, kg m or kg.
+
+        Parameters
+        ----------
+        theta
+            Standard parameters (p,) or base parameters (b,), SI.
+        q
+            Postures (N, n), rad or m.
+        """
         (q,) = self._motion(q)
         out = np.empty((q.shape[0], self.n, self.n))
         fill_mass_matrices(self.chain, self.values(theta), q, out)
         return out
 
     def forward_dynamics(self, theta: ArrayLike, q: ArrayLike, qd: ArrayLike, tau: ArrayLike) -> Floats:
-        """Joint accelerations (N, n) under torques ``tau`` (N, n), smoothed friction (2.9).
+        """Joint accelerations (N, n) of the direct dynamic model with smoothed friction (2.9), without the terms.
+
+        Parameters
+        ----------
+        theta
+            Standard parameters (p,) or base parameters (b,), SI.
+        q, qd
+            Positions and velocities, each (N, n); rad or m, s.
+        tau
+            Joint torques or forces (N, n), N m or N.
 
         Raises
         ------
         ArmidentError
-            If the mass matrix is not positive definite somewhere; names the sample.
+            If the mass matrix of a sample is not positive definite; the message names the sample.
         """
         q, qd, tau = self._motion(q, qd, tau)
         out = np.empty_like(q)
@@ -238,18 +302,18 @@ class ArmModel:
         return out
 
     def standard_from_base(self, theta_base: ArrayLike) -> Floats:
-        """Fill standard parameters (p,) with the base ones, the others zero: the dynamics are the same."""
+        """Standard parameters (p,) with the base values (b,) and zeros elsewhere: the dynamics are the same."""
         theta = np.zeros(len(self.names))
         theta[self.base.independent] = theta_base
         return theta
 
     def values(self, theta: ArrayLike) -> Values:
-        """Parameters taken apart for the kernels; ``theta`` is (p,) standard or (b,) base.
+        """Parameter arrays for the kernels, from standard (p,) or base (b,) parameters in SI units.
 
         Raises
         ------
         ValueError
-            If it has neither length.
+            If ``theta`` has neither shape.
         """
         vector = np.asarray(theta, dtype=np.float64)
         if vector.shape == (len(self.names),):
@@ -291,7 +355,7 @@ class ArmModel:
         if q.shape[0] <= PIECE:
             fill(0)
             return out
-        # On all processors: the kernel holds no interpreter lock, and most of the time is the memory's.
+        # Threads on all processors: the kernel releases the interpreter lock. Memory bandwidth limits most of the time.
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
             for _ in pool.map(fill, range(0, q.shape[0], PIECE)):
                 pass

@@ -1,7 +1,7 @@
 """Base parameters: the minimum set that the inverse dynamic model needs (thesis section A.3).
 
-Found twice: in symbols by Khalil's rules, and numerically by the QR decomposition of a random
-regressor. The numbers decide; the rules give the formulas.
+Two methods find them: Khalil's rules in symbols, and the QR decomposition of a random regressor in numbers.
+Where they differ, the numerical result is used; the rules give the formulas.
 """
 
 from dataclasses import dataclass, replace
@@ -15,15 +15,18 @@ from armident.identify.robot.kernels import fill_regressor
 from armident.identify.robot.khalil import Form, evaluate, khalil_rules, lengths_of, text_of
 
 KEEP_FIRST = ("xx", "xy", "xz", "yz", "zz", "mx", "my", "m*", "fv", "fc", "off", "ia", "yy", "mz", "m")
-"""Within a link, the order in which columns may stay: that of tables B.2 and B.3. ``m*``: prismatic joints."""
+"""Priority of columns within a link, first kept first (tables B.2 and B.3); ``m*`` is the mass at a prismatic joint."""
 
 RANK_TOLERANCE = 1e-9
-"""A column is dependent if less than this share of it is new: far above rounding, far below any real effect."""
+"""Relative norm of the part orthogonal to the columns kept before; a column below it is dependent.
+
+Rounding errors are far smaller and physical effects far larger.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """What can be identified of the standard parameters, ``theta_base = regroup @ theta_standard``.
+    """Identifiable combinations of the standard parameters, ``theta_base = regroup @ theta_standard``.
 
     Parameters
     ----------
@@ -32,11 +35,11 @@ class BaseParameters:
     independent
         Standard column of each base parameter, shape (b,), increasing.
     regroup
-        Shape (b, p).
+        Coefficients of the combinations, shape (b, p).
     formulas
-        Each base parameter as text in the standard ones, the lengths as symbols ``d3, r4``.
+        Text of each base parameter in terms of the standard ones, with lengths as symbols ``d3, r4``.
     eliminated, regrouped
-        Standard parameters without any effect, and those that only act through base parameters.
+        Names of standard parameters without effect, and of those that act only through other base parameters.
     """
 
     names: tuple[str, ...]
@@ -52,7 +55,7 @@ class BaseParameters:
         return len(self.names)
 
     def without(self, last: int) -> "BaseParameters":
-        """The same without the last parameters, which terms of the model have added."""
+        """Return the base parameters without the ``last`` ones, which terms of the model have added."""
         b, p = self.b - last, self.regroup.shape[1] - last
         return replace(
             self,
@@ -64,7 +67,20 @@ class BaseParameters:
 
 
 def with_terms(base: BaseParameters, names: tuple[str, ...]) -> BaseParameters:
-    """Base parameters with those of further terms at the end, which nothing is regrouped with."""
+    """Append the parameters of model terms, which are never regrouped with others.
+
+    Parameters
+    ----------
+    base
+        Base parameters (b,) of the rigid model.
+    names
+        Names of the terms' linear parameters (e,).
+
+    Returns
+    -------
+    BaseParameters
+        With b + e base and p + e standard parameters.
+    """
     if not names:
         return base
     b, p = base.regroup.shape
@@ -82,7 +98,24 @@ def with_terms(base: BaseParameters, names: tuple[str, ...]) -> BaseParameters:
 
 
 def base_parameters(robot: RobotConfig, chain: Chain, columns: Columns, names: tuple[str, ...]) -> BaseParameters:
-    """Find base parameters: Khalil's rules, completed where a random regressor shows more dependences."""
+    """Find the base parameters by Khalil's rules and the dependences of a random regressor (thesis section A.3).
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot.
+    chain
+        Its geometry.
+    columns
+        Regressor columns of the standard parameters.
+    names
+        Names of the standard parameters (p,).
+
+    Returns
+    -------
+    BaseParameters
+        Combinations by the rules, further regrouped where the regressor shows dependences that the rules miss.
+    """
     forms = khalil_rules(robot, chain, names)
     lengths = lengths_of(chain)
     where = {name: k for k, name in enumerate(names)}
@@ -118,20 +151,32 @@ def independent_columns(
     candidates: Ints | None = None,
     seed: int = 0,
 ) -> tuple[Ints, Floats]:
-    """Independent columns of the regressor and how the others depend on them (A.30 to A.35).
+    """Independent columns of a random regressor, and the dependence of the others on them (A.30 to A.35).
 
-    The QR decomposition runs over the columns in the order `KEEP_FIRST`, base to tip, so that of several
-    possible sets the one of the tables is found.
+    The QR decomposition takes the columns from base to tip, within a link in the order `KEEP_FIRST`. Of several
+    possible sets it therefore finds that of tables B.2 and B.3.
 
     Parameters
     ----------
+    robot
+        Configuration of the robot.
+    chain
+        Its geometry.
+    columns
+        Regressor columns of the standard parameters.
+    names
+        Names of the standard parameters (p,).
     candidates
-        Columns to look at; all of them if ``None``.
+        Indices of the standard columns to examine; ``None``: all of them.
+    seed
+        Seed of the random motion.
 
     Returns
     -------
-    kept, mixing
-        Standard columns (b,), and (b, len(candidates)) with ``theta_base = mixing @ theta[candidates]``.
+    kept : ndarray
+        Indices of the independent standard columns, shape (b,), increasing.
+    mixing : ndarray
+        Shape (b, len(candidates)), with ``theta_base = mixing @ theta[candidates]``.
     """
     if candidates is None:
         candidates = np.arange(len(names), dtype=np.int64)
@@ -146,12 +191,12 @@ def independent_columns(
     alive = scale > RANK_TOLERANCE * scale.max()
     order = [k for k in _preference(robot, names, candidates) if alive[k]]
     scaled = x[:, order] / scale[order]
-    # A dependent column must not enter the factor, or its rounding errors become directions.
+    # A dependent column must not enter the factor: normalised, its rounding errors would become a basis vector.
     chosen: list[int] = []
     q1 = np.zeros((x.shape[0], len(order)))
     for position, column in enumerate(order):
         basis, rest = q1[:, : len(chosen)], scaled[:, position]
-        # Twice is enough (Kahan and Parlett) for orthogonality to rounding.
+        # Two passes of Gram-Schmidt give orthogonality to rounding (Kahan and Parlett).
         for _ in range(2):
             rest = rest - basis @ (basis.T @ rest)
         norm = np.linalg.norm(rest)
@@ -168,7 +213,7 @@ def independent_columns(
 
 
 def _preference(robot: RobotConfig, names: tuple[str, ...], candidates: Ints) -> list[int]:
-    """Positions in ``candidates``, those that may stay first at the front; couplings come last."""
+    """Positions in ``candidates`` in the order of the decomposition: base to tip, `KEEP_FIRST`, couplings last."""
     rank = {kind: k for k, kind in enumerate(KEEP_FIRST)}
     place: dict[str, tuple[int, int]] = {}
     for link, joint in enumerate(robot.joints, start=1):
@@ -180,7 +225,7 @@ def _preference(robot: RobotConfig, names: tuple[str, ...], candidates: Ints) ->
 
 
 def _mixed(forms: dict[str, Form], row: Floats, candidates: Ints, names: tuple[str, ...]) -> Form:
-    """Sum of the forms of the candidates, weighted by ``row``."""
+    """Sum of the linear forms of the candidates, weighted by ``row``, shape (len(candidates),)."""
     mixed: Form = {}
     for weight, k in zip(row, candidates, strict=True):
         if weight:
