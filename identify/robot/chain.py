@@ -1,4 +1,4 @@
-"""The constant arrays a kernel needs: geometry of the chain, columns of the regressor, values of the parameters."""
+"""Constant arrays of the kernels: geometry of the chain, columns of the regressor, values of the parameters."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,21 @@ INERTIAL = ("xx", "xy", "xz", "yy", "yz", "zz", "mx", "my", "mz", "m")
 
 
 class Chain(NamedTuple):
-    """Geometry of a serial chain: modified Denavit-Hartenberg (thesis section 2.1.1), one entry per joint."""
+    """Geometry of a serial chain in modified Denavit-Hartenberg notation (thesis section 2.1.1).
+
+    Parameters
+    ----------
+    cos_alpha, sin_alpha
+        Cosine and sine of the twist angles alpha_j, (n,).
+    d, r
+        Distances d_j along x and r_j along z, m, (n,).
+    theta
+        Joint angles at position zero, rad, (n,).
+    prismatic
+        True for prismatic joints, (n,).
+    gravity
+        Gravity in the base frame, m/s^2, (3,).
+    """
 
     cos_alpha: Floats
     sin_alpha: Floats
@@ -27,7 +41,19 @@ class Chain(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Which column of the regressor a parameter has; -1 where it has none."""
+    """Regressor column of each parameter; -1 for a parameter without one.
+
+    Parameters
+    ----------
+    inertial
+        Columns of the inertial parameters in the order `INERTIAL`, (n, 10).
+    ia, fv, fc, off
+        Columns of rotor inertia, viscous friction, Coulomb friction and offset, (n,) each.
+    coupling_joints
+        Indices of the two joints of each coupling, (c, 2).
+    coupling
+        Columns of inertia, viscous and Coulomb friction of each coupling (thesis equation B.1), (c, 3).
+    """
 
     inertial: Ints
     ia: Ints
@@ -39,7 +65,21 @@ class Columns(NamedTuple):
 
 
 class Values(NamedTuple):
-    """Parameter values by meaning: ``inertial`` (n, 10), joint terms (n,), ``coupling`` (c, 3)."""
+    """Parameter values in SI units, one array per kind of parameter.
+
+    Parameters
+    ----------
+    inertial
+        Inertial parameters in the order `INERTIAL`, (n, 10).
+    ia, fv, fc, off
+        Rotor inertia, viscous friction, Coulomb friction and offset, (n,) each.
+    coupling_joints
+        Indices of the two joints of each coupling, (c, 2).
+    coupling
+        Inertia, viscous and Coulomb friction of each coupling, (c, 3).
+    smoothing
+        ``g`` of the smoothed sign, s/rad or s/m.
+    """
 
     inertial: Floats
     ia: Floats
@@ -52,13 +92,13 @@ class Values(NamedTuple):
 
 
 def cos_sin(angle: float) -> tuple[float, float]:
-    """Cosine and sine with exact zeros and ones at multiples of a right angle."""
+    """Cosine and sine of an angle in rad, with exact zeros and ones at multiples of a right angle."""
     c, s = float(np.cos(angle)), float(np.sin(angle))
     return (round(c), float(round(s))) if min(abs(c), abs(s)) < 1e-12 else (c, s)
 
 
 def chain_of(robot: RobotConfig) -> Chain:
-    """Geometry of a robot configuration."""
+    """Geometry arrays of the chain of a robot configuration."""
     angles = np.array([cos_sin(j.mdh.alpha) for j in robot.joints], dtype=np.float64)
     return Chain(
         cos_alpha=angles[:, 0].copy(),
@@ -83,7 +123,20 @@ def standard_names(robot: RobotConfig) -> tuple[str, ...]:
 
 
 def columns_of(robot: RobotConfig, names: tuple[str, ...]) -> Columns:
-    """Column numbers of the standard parameters listed in ``names``."""
+    """Column numbers of the standard parameters listed in ``names``.
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot.
+    names
+        Standard parameter of each column.
+
+    Returns
+    -------
+    Columns
+        With -1 for parameters that ``names`` does not list.
+    """
     where = {name: k for k, name in enumerate(names)}
     joints = range(1, robot.n + 1)
     index = {joint.name: k for k, joint in enumerate(robot.joints)}
@@ -108,7 +161,17 @@ def columns_of(robot: RobotConfig, names: tuple[str, ...]) -> Columns:
 
 
 def values_of(columns: Columns, theta: Floats, smoothing: float) -> Values:
-    """Parameter vector ``theta`` taken apart by meaning; parameters without a column are zero."""
+    """Parameter values by kind, from a parameter vector; parameters without a column are zero.
+
+    Parameters
+    ----------
+    columns
+        Elements of ``theta`` by kind of parameter.
+    theta
+        Parameters in SI units; further elements, for instance those of terms, are not used.
+    smoothing
+        ``g`` of the smoothed sign, s/rad or s/m.
+    """
     padded = np.append(np.asarray(theta, dtype=np.float64), 0.0)
     return Values(
         inertial=padded[columns.inertial],

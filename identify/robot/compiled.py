@@ -1,4 +1,4 @@
-"""How the numeric kernels are compiled: cached on disk, no interpreter lock, ordinary IEEE arithmetic."""
+"""Compilation of the numeric kernels: cached on disk, without the interpreter lock, ordinary IEEE arithmetic."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -8,7 +8,7 @@ import numba
 F = TypeVar("F", bound=Callable[..., object])
 
 _ARITHMETIC: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
-# Without reference counts: the caller holds the arrays, and an atomic increment each costs as much as the arithmetic.
+# No reference counts: the caller keeps the arrays alive, and an atomic increment costs as much as the arithmetic.
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}
 
 
@@ -20,6 +20,6 @@ def compiled(function: F) -> F:
 def inlined(function: F) -> F:
     """Compile a helper that allocates nothing into every kernel that calls it.
 
-    There the compiler knows which arrays are distinct and which loops are short, which a call would hide from it.
+    In the caller the compiler sees which arrays are distinct and which loops are short; a call would hide both.
     """
     return cast(F, numba.njit(forceinline=True, **_ARITHMETIC, **_UNCOUNTED)(function))

@@ -1,4 +1,4 @@
-"""Discrete joint controllers at the sample rate, as the simulation runs them."""
+"""Discrete joint controllers that the simulation runs once per sample."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -14,22 +14,26 @@ class DiscreteController:
     """One linear controller per motor, with saturation.
 
     ``nu(k) = sum_i error_taps[:, i] eps(k-i) + sum_i position_taps[:, i] q_motor(k-i)
-    + sum_i output_taps[:, i] nu(k-1-i)``, ``eps = R (q_ref - q)``, then limited to ``saturation``; the
-    limited value is what later samples see.
+    + sum_i output_taps[:, i] nu(k-1-i)``.
+
+    Here ``eps = R (q_ref - q)`` and ``q_motor = R q``, with the transmission matrix R. The output ``nu`` is limited
+    to ``saturation``; later samples use the limited value.
 
     Parameters
     ----------
-    error_taps, position_taps, output_taps
-        Shapes (n, m), (n, m2), (n, m3); motor torque (N m or N) per rad or m, and per unit of itself.
+    error_taps, position_taps
+        Coefficients of the tracking error (n, m) and of the motor position (n, m2), N m/rad or N/m.
+    output_taps
+        Coefficients of earlier outputs, shape (n, m3), without unit.
     saturation
-        Largest absolute motor torque, shape (n,); ``inf`` where there is no limit.
+        Largest absolute motor torque, shape (n,), N m or N; ``inf``: no limit.
     dt
         Sampling period, s.
 
     Raises
     ------
     ValueError
-        If the shapes do not fit together or a number is not finite.
+        If the shapes differ in n, a coefficient is not finite, or ``saturation`` or ``dt`` is not positive.
     """
 
     error_taps: Floats
@@ -39,7 +43,7 @@ class DiscreteController:
     dt: float
 
     def __post_init__(self) -> None:
-        """Check the shapes."""
+        """Check shapes and values."""
         n = self.saturation.shape[0]
         for name in ("error_taps", "position_taps", "output_taps"):
             taps = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
@@ -56,7 +60,7 @@ class DiscreteController:
 
     @property
     def memory(self) -> int:
-        """How many samples back the controller looks, the present one included."""
+        """Number of samples that the controller uses, the present one included."""
         widths = (self.error_taps.shape[1], self.position_taps.shape[1], self.output_taps.shape[1] + 1)
         return max(int(width) for width in widths)
 
@@ -77,13 +81,17 @@ class DiscreteController:
         Parameters
         ----------
         kp
-            (n,), 1/s.
+            Position gains (n,), 1/s.
         kv
-            (n,), units of the drive's signal per rad/s or m/s of the motor.
+            Velocity gains (n,), units of the drive's signal per rad/s or m/s of the motor.
         gain
-            (n,), motor torque or force per unit of the drive's signal.
+            Drive gains (n,), motor torque (N m) or force (N) per unit of the drive's signal.
+        dt
+            Sampling period, s.
+        saturation
+            Largest absolute motor torque, scalar or (n,), N m or N; ``None``: no limit.
         velocity_samples
-            At least 1; 2 is the mean of the last two backward differences.
+            Number of periods, at least 1; 2 is the mean of the last two backward differences.
 
         Raises
         ------
@@ -109,7 +117,17 @@ class DiscreteController:
 
     @classmethod
     def fir(cls, taps: ArrayLike, dt: float, saturation: ArrayLike | None = None) -> Self:
-        """Finite impulse responses from the tracking error to the motor torque, ``taps`` (n, m) (5.2, CRC)."""
+        """Controller of finite impulse responses from the tracking error to the motor torque (CRC, thesis section 5.2).
+
+        Parameters
+        ----------
+        taps
+            Impulse responses (n, m), N m/rad or N/m.
+        dt
+            Sampling period, s.
+        saturation
+            Largest absolute motor torque, scalar or (n,), N m or N; ``None``: no limit.
+        """
         taps = np.atleast_2d(np.asarray(taps, dtype=np.float64))
         empty = np.zeros((taps.shape[0], 0))
         return cls(taps, empty, empty, _limits(saturation, taps.shape[0]), dt)

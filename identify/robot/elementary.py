@@ -1,8 +1,8 @@
-"""Sine, cosine and arctangent of short arrays, written so that the compiler turns them into vector instructions.
+"""Sine, cosine and arctangent of short arrays, in a form that the compiler turns into vector instructions.
 
-A simulated sample needs about a dozen of each, which one call per number of the C library makes the dearest part of it.
-Polynomials and reductions are those of Moshier's Cephes library (double precision); no branches, errors of a few
-units in the last place for arguments up to 1e5.
+A simulated sample needs about a dozen of each. With one call of the C library per number they would take most of the
+computing time of a sample. The polynomials and range reductions are those of Moshier's Cephes library (double
+precision). The code has no branches; errors are a few units in the last place for arguments up to 1e5.
 """
 
 import numpy as np
@@ -11,10 +11,10 @@ from armident.identify.robot.chain import Floats
 from armident.identify.robot.compiled import inlined
 
 LANES = 4
-"""Arrays are as long as the next multiple of this, so that no element is left to a scalar loop."""
+"""Array lengths are rounded up to a multiple of this number, so that no element needs a scalar loop."""
 
 _TWO_OVER_PI = 2.0 / np.pi
-# pi / 2 in three parts, the first two with trailing zeros: their products with small integers are exact.
+# pi / 2 in three parts. The first two end in zero bits: their products with small integers are exact.
 _HALF_PI_1, _HALF_PI_2, _HALF_PI_3 = 1.57079625129699707031, 7.54978941586159635336e-8, 5.39030252995776476554e-15
 _TAN_3_PI_8 = 2.41421356237309504880
 _MORE_BITS = 6.123233995736765886130e-17
@@ -22,13 +22,21 @@ _MORE_BITS = 6.123233995736765886130e-17
 
 @inlined
 def padded(n: int) -> int:
-    """The next multiple of `LANES`."""
+    """Smallest multiple of `LANES` that is not below ``n``."""
     return -(-n // LANES) * LANES
 
 
 @inlined
 def sines_cosines(angle: Floats, sine: Floats, cosine: Floats) -> None:
-    """Fill ``sine`` and ``cosine`` of ``angle``, all of one length."""
+    """Compute sines and cosines of an array.
+
+    Parameters
+    ----------
+    angle
+        Angles, rad, (m,).
+    sine, cosine
+        Output arrays, (m,) each.
+    """
     for i in range(angle.size):
         x = angle[i]
         k = np.rint(x * _TWO_OVER_PI)
@@ -46,7 +54,7 @@ def sines_cosines(angle: Floats, sine: Floats, cosine: Floats) -> None:
         c = c * z - 1.38888888888730564116e-3
         c = c * z + 4.16666666666665929218e-2
         c = 1.0 - 0.5 * z + z * z * c
-        # The quadrant, 0 to 3, and what it swaps and negates.
+        # Quadrant, 0 to 3: an odd one gives (c, -s) instead of (s, c); quadrants 2 and 3 change both signs.
         quadrant = k - 4.0 * np.floor(0.25 * k)
         odd = quadrant - 2.0 * np.floor(0.5 * quadrant)
         upper = np.floor(0.5 * quadrant)
@@ -57,7 +65,15 @@ def sines_cosines(angle: Floats, sine: Floats, cosine: Floats) -> None:
 
 @inlined
 def arctangents(x: Floats, out: Floats, slope: Floats) -> None:
-    """Fill ``out`` with the arctangents of ``x`` and ``slope`` with their derivatives, all of one length."""
+    """Compute arctangents of an array and their derivatives ``1 / (1 + x^2)``.
+
+    Parameters
+    ----------
+    x
+        Arguments, (m,).
+    out, slope
+        Output arrays of the arctangents (rad) and of the derivatives, (m,) each.
+    """
     for i in range(x.size):
         t = abs(x[i])
         large = t > _TAN_3_PI_8

@@ -1,4 +1,4 @@
-"""The model with some of its base parameters only: those that are essential for the data at hand (thesis B.2)."""
+"""Arm model reduced to its essential base parameters, those that the data determine (thesis section B.2)."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -9,20 +9,22 @@ from armident.identify.robot.chain import columns_of
 
 
 def restricted_to(model: ArmModel, names: Collection[str]) -> ArmModel:
-    """The same arm with the base parameters ``names`` only, the others being zero.
+    """Return the model with the base parameters ``names`` only; the others are zero.
 
-    Regressor, dynamics and simulation then speak of these parameters alone, in the order of the full model; terms of
-    the model are left out.
+    Regressor, dynamics and simulation of the result use these parameters alone, in the order of the full model. The
+    result has no additional terms.
 
     Parameters
     ----------
+    model
+        The full model.
     names
-        Base parameters to keep.
+        Names of the base parameters to keep.
 
     Raises
     ------
     ConfigError
-        If the model has no base parameter of such a name.
+        If ``names`` contains a name that is not a base parameter of the model.
     """
     model = model.without_terms()
     base = model.base

@@ -1,4 +1,4 @@
-"""Additional torque terms of an arm model, beside its rigid dynamics and friction."""
+"""Protocol of the torque terms that an arm model can have besides its rigid dynamics and friction."""
 
 from typing import Protocol
 
@@ -9,7 +9,7 @@ from armident.identify.robot.motion import Motion
 
 
 class ModelTerm(Protocol):
-    """A torque that is linear in ``k`` parameters; `armident.identify.effects.terms.Term` is one."""
+    """Torque that is linear in ``k`` parameters; `armident.identify.effects.terms.Term` implements it."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -17,19 +17,19 @@ class ModelTerm(Protocol):
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the linear parameters, (k,)."""
+        """Units of the linear parameters as text, (k,)."""
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Values of the linear parameters in the configuration, (k,)."""
+        """Values of the linear parameters in the configuration, (k,), each in its unit."""
 
     @property
     def depends_on_torque(self) -> bool:
-        """True if the columns need torques that the model predicts."""
+        """True if the columns depend on torques that the model predicts."""
 
     @property
     def scales_torque(self) -> bool:
-        """True if the term is a share of the torque that the model predicts."""
+        """True if the term is a fraction of the torque that the model predicts."""
 
     def columns(self, motion: Motion) -> NDArray[np.float64]:
-        """Return the torques of all joints per unit of the linear parameters, (N, n, k)."""
+        """Return the torques (N m or N) of all n joints per unit of each linear parameter, (N, n, k)."""
