@@ -1,9 +1,9 @@
-"""The physically consistent arm nearest to a base estimate: full standard parameters by semidefinite programming.
+"""Physically consistent standard parameters nearest to a base estimate, by semidefinite programming.
 
 A link is physical if its pseudo-inertia matrix is positive semidefinite (Wensing, Kim and Slotine 2018; Sousa and
-Cortesao 2014); rotors and friction must not be negative. Base parameters say only what the torques show, ``theta_base =
-K theta`` (thesis section A.3), so that many standard vectors belong to one base vector and, for some, none that is
-physical.
+Cortesao 2014). Rotor inertias and friction coefficients must not be negative. Torques determine only the base
+parameters ``theta_base = K theta`` (thesis section A.3). Many standard vectors therefore have the same base vector;
+for some base vectors none of them is physical.
 """
 
 from collections.abc import Sequence
@@ -24,63 +24,69 @@ clarabel: Any = untyped_clarabel
 Identifiability = Literal["alone", "group", "no"]
 
 REGULARISATION = 1e-8
-"""Price of a kilogram while the distance is sought, in the mean square of the estimate's t values: so little that it
-decides only what data and physics leave open."""
+"""Weight of a kilogram in the objective that minimises the distance, in units of the mean square t value.
+
+It is so small that it affects only parameters that data and constraints leave undetermined.
+"""
 
 INDIFFERENCE = 0.1
-"""Squared standard deviations that the lightest arm may be farther away than the nearest: no data tell such two apart.
-The very nearest arm often is a limit, of bodies that shrink to points of any mass."""
+"""Increase of the squared distance, in standard deviations squared, allowed for a lighter arm.
+
+No data distinguish two arms that differ by so little. The nearest arm itself is often a limit case, in which bodies
+shrink to points of arbitrary mass.
+"""
 
 PRICE_STEP = 3.0
-"""Factor by which the price is raised on the way from the nearest arm to a light one."""
+"""Factor between successive mass weights in the search for a lighter arm."""
 
 SIGNIFICANCE = 0.05
-"""Probability of calling an estimate of a physical arm incompatible with physics."""
+"""Significance level of the test: probability that the estimate of a physical arm is rejected."""
 
 NOTHING = 1e-3
-"""Distance (standard deviations) that counts as none: what the solver's tolerance leaves."""
+"""Distance (standard deviations) that counts as zero: the error that the solver's tolerance allows."""
 
 PROBE = 0.1
-"""Step (standard deviations) of the derivative of the projection."""
+"""Step (standard deviations) of the finite differences of the projection."""
 
 TOLERANCE = 1e-9
-"""Of the solver, relative and absolute."""
+"""Relative and absolute tolerance of the solver."""
 
 NULL = 1e-9
-"""Share of a unit vector outside the row space of K under which it is inside."""
+"""Distance of a unit vector from the row space of K below which it counts as inside."""
 
 
 @dataclass(frozen=True, eq=False)
 class ConsistentParameters:
-    """A physically consistent arm, and how far the estimate is from it; SI, joint side.
+    """Physically consistent parameters and their distance from the estimate; SI, joint side.
 
     Parameters
     ----------
     names, theta
-        Standard parameters (p,).
+        Names and values of the standard parameters (p,).
     base_names, theta_base
-        Base parameters (b,) of ``theta``.
+        Names and values of the base parameters (b,) that belong to ``theta``.
     identifiable
-        Per standard parameter (p,): ``alone``, the torques determine it by itself; ``group``, only together with
-        others; ``no``, it does not act on the torques. What is not ``alone`` has a value that the regularisation
-        chose among many.
+        Identifiability of each standard parameter (p,). ``alone``: the torques determine it by itself; ``group``: only
+        together with others; ``no``: it does not affect the torques. The regularisation selects the values of
+        parameters that are not ``alone``.
     groups
-        Base parameters that each standard one acts through (p,).
+        Names of the base parameters that contain each standard parameter (p,).
     std
-        Standard deviations (p,) of those determined alone, NaN for the others; those of the estimate before physics
-        was imposed.
+        Standard deviations (p,) of the parameters determined ``alone``, NaN for the others. They are those of the
+        estimate before the physical constraints.
     shifts
-        How far each base parameter moved, in its own standard deviations (b,).
+        Change of each base parameter by the constraints, in its standard deviations (b,).
     distance_std
         Mahalanobis distance between the estimate and the nearest consistent base parameters, in standard deviations.
     degrees
-        Dimensions of the base space that physics takes away there; 0 if the estimate is consistent.
+        Degrees of freedom of the test: dimensions of the base space removed by the constraints that are active at the
+        nearest point; 0 if the estimate is consistent.
     p_value
-        Probability of such a distance or more for the estimate of a physical arm.
+        Probability of this distance or a larger one for the estimate of a physical arm.
     compatible, verdict
-        Whether the estimate can be that of a physical arm, and in words.
+        True if the p value reaches the significance level; the result as a sentence.
     smallest_eigenvalues
-        Smallest eigenvalue of every link's pseudo-inertia (n,).
+        Smallest eigenvalue of the pseudo-inertia of each link (n,), kg or kg m^2.
     """
 
     names: tuple[str, ...]
@@ -99,7 +105,7 @@ class ConsistentParameters:
     smallest_eigenvalues: Floats
 
     def document(self) -> dict[str, Any]:
-        """Plain numbers, strings, lists and dictionaries."""
+        """Return the result as plain numbers, strings, lists and dictionaries, for a JSON document."""
         rows = zip(self.names, self.theta, self.identifiable, self.groups, self.std, strict=True)
         return {
             "parameters": [
@@ -127,16 +133,22 @@ class ConsistentParameters:
 def nearest_consistent(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> ConsistentParameters:
     """Find the physically consistent parameters nearest to a base estimate.
 
-    Minimises ``(K theta - theta_base)' P^-1 (K theta - theta_base)`` over standard parameters whose pseudo-inertias are
-    positive semidefinite and whose rotor inertias, friction and coupling coefficients are not negative. Where that
-    leaves a choice, the lightest arm is taken: the smallest sum of the traces of the pseudo-inertias, second moments
-    divided by the square of the arm's mean length. A consistent estimate keeps its base parameters; for another
-    one all arms that are as near as ``INDIFFERENCE`` allows are a choice.
+    Minimises ``(K theta - theta_base)' P^-1 (K theta - theta_base)`` over the standard parameters ``theta``. Their
+    pseudo-inertias must be positive semidefinite; rotor inertias, friction and coupling coefficients must not be
+    negative.
+
+    Of several solutions the lightest arm is returned. It has the smallest sum of the traces of the pseudo-inertias,
+    with second moments divided by the square of the arm's mean length. A consistent estimate keeps its base
+    parameters. For an inconsistent estimate the squared distance may exceed its minimum by ``INDIFFERENCE``.
 
     Parameters
     ----------
-    theta_base, covariance
-        Estimate (b,) and its covariance P (b, b), positive definite.
+    model
+        Arm with p standard and b base parameters.
+    theta_base
+        Estimate of the base parameters (b,), SI.
+    covariance
+        Covariance P of the estimate (b, b), positive definite.
 
     Returns
     -------
@@ -151,10 +163,11 @@ def nearest_consistent(model: ArmModel, theta_base: ArrayLike, covariance: Array
 
     Notes
     -----
-    The verdict: an estimate ``N(truth, P)`` of a physical arm is projected onto the convex set of base parameters of
-    physical arms. Given the face it lands on, its squared distance is at most chi-square with as many degrees of
-    freedom as the face lacks (Wollan and Dykstra 1986); these are the trace of ``I`` minus the derivative of the
-    projection, which also counts curved faces.
+    Test of consistency: an estimate ``N(truth, P)`` of a physical arm is projected onto the convex set of base
+    parameters of physical arms. Given the face of the set that contains the projection, the squared distance is
+    stochastically at most chi-square. Its degrees of freedom are the codimension of the face (Wollan and Dykstra
+    1986). They are computed as the trace of ``I`` minus the derivative of the projection, which also holds for curved
+    faces.
     """
     theta, p = _checked(model, theta_base, covariance)
     std = np.sqrt(np.diag(p))
@@ -193,10 +206,11 @@ def nearest_consistent(model: ArmModel, theta_base: ArrayLike, covariance: Array
 
 
 def identifiability(model: ArmModel) -> tuple[Identifiability, ...]:
-    """Which standard parameters the torques determine: alone, in a group, or not at all.
+    """Identifiability of each standard parameter (p,) from torques: ``alone``, in a ``group``, or ``no``.
 
-    Parameter k is determined alone if its unit vector lies in the row space of the grouping K, that is if no
-    direction that leaves the base parameters unchanged moves it; values and data play no part.
+    Parameter k is determined alone if its unit vector lies in the row space of the regrouping matrix K. Then it is
+    the same for all standard parameters with equal base parameters. The result depends on the model only, not on
+    parameter values or data.
     """
     grouping = model.base.regroup
     outside = np.eye(grouping.shape[1]) - np.linalg.pinv(grouping) @ grouping
@@ -210,7 +224,20 @@ def identifiability(model: ArmModel) -> tuple[Identifiability, ...]:
 
 
 def pseudo_inertias(model: ArmModel, theta: ArrayLike) -> Floats:
-    """Pseudo-inertia matrices (n, 4, 4) of standard parameters (p,): second moments, first moments and mass."""
+    """Pseudo-inertia matrices of the links: second moments (kg m^2), first moments (kg m) and mass (kg).
+
+    Parameters
+    ----------
+    model
+        Arm with n joints.
+    theta
+        Standard parameters (p,), SI.
+
+    Returns
+    -------
+    ndarray
+        Shape (n, 4, 4).
+    """
     xx, xy, xz, yy, yz, zz, mx, my, mz, m = model.values(theta).inertial.T
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
     out = np.empty((model.n, 4, 4))
@@ -221,17 +248,27 @@ def pseudo_inertias(model: ArmModel, theta: ArrayLike) -> Floats:
 
 
 def non_negative(model: ArmModel) -> Ints:
-    """Columns of the standard parameters that cannot be negative besides masses: rotors, friction, couplings."""
+    """Indices of the non-negative standard parameters apart from masses: rotor inertias, friction, couplings."""
     c = model.columns
     columns = np.concatenate([c.ia, c.fv, c.fc, c.coupling.ravel()])
     return np.sort(columns[columns >= 0])
 
 
 class _Projection:
-    """The semidefinite programme for whitened base parameters, set up once and solved for many.
+    """Semidefinite programme for whitened base parameters, set up once and solved for several right sides.
 
     Variables are the standard parameters and the whitened residual ``r = L^-1 (K theta - theta_base)``, in units of
-    ``scale`` standard deviations: t values of a thousand beside masses of one would spoil the solver's arithmetic.
+    ``scale`` standard deviations. Without this scale, t values of a thousand beside masses of one make the problem
+    badly conditioned.
+
+    Parameters
+    ----------
+    model
+        Arm with p standard and b base parameters.
+    factor
+        Lower Cholesky factor L (b, b) of the covariance of the base estimate.
+    scale
+        Unit of the residual, standard deviations.
     """
 
     def __init__(self, model: ArmModel, factor: Floats, scale: float) -> None:
@@ -253,22 +290,49 @@ class _Projection:
         self._weight = np.zeros(p + b)
         for kind, share in (("xx", 0.5 / length**2), ("yy", 0.5 / length**2), ("zz", 0.5 / length**2), ("m", 1.0)):
             self._weight[model.columns.inertial[:, INERTIAL.index(kind)]] = share
-        # Rotors weigh too, or the choice between rotor and link in one group would be nobody's.
+        # Rotor inertias have a weight, too: otherwise their share in a group with link parameters is not unique.
         rotors = model.columns.ia[model.columns.ia >= 0]
         self._weight[rotors] = 1 / length**2
         self._p, self._b, self._scale = p, b, scale
 
     def nearest(self, whitened: Floats, price: float = REGULARISATION) -> tuple[Floats, Floats]:
-        """Standard parameters (p,) of the nearest consistent arm and the whitened residual (b,)."""
+        """Solve the programme for one whitened base estimate.
+
+        Parameters
+        ----------
+        whitened
+            Whitened base parameters ``L^-1 theta_base``, (b,), standard deviations.
+        price
+            Weight of a kilogram in the objective.
+
+        Returns
+        -------
+        theta, residual : ndarray
+            Standard parameters (p,) of the nearest consistent arm, SI, and the whitened residual (b,).
+        """
         right = np.zeros(self._rows.shape[0])
         right[: self._b] = whitened / self._scale
         x = _solve(self._quadratic, price * self._weight, self._rows, right, self._cones)
         return x[: self._p], self._scale * x[self._p :]
 
     def lightest(self, whitened: Floats, nearest: Floats, distance: float) -> Floats:
-        """Standard parameters (p,) of an arm as light as ``INDIFFERENCE`` allows.
+        """Find the lightest arm whose squared distance exceeds the minimum by at most ``INDIFFERENCE``.
 
-        The price of a kilogram is raised step by step until the squared distance has grown by that much.
+        The weight of a kilogram is increased in steps until the squared distance exceeds this limit.
+
+        Parameters
+        ----------
+        whitened
+            Whitened base parameters (b,), standard deviations.
+        nearest
+            Standard parameters (p,) of the nearest consistent arm, SI.
+        distance
+            Distance of that arm, standard deviations.
+
+        Returns
+        -------
+        ndarray
+            Standard parameters (p,), SI.
         """
         best, price = nearest, REGULARISATION
         while price < 1.0:
@@ -280,7 +344,7 @@ class _Projection:
         return best
 
     def lost_dimensions(self, whitened: Floats) -> float:
-        """Trace of ``I`` minus the derivative of the projection, at least 1."""
+        """Trace of ``I`` minus the derivative of the projection at ``whitened`` (b,), at least 1."""
         _, here = self.nearest(whitened)
         lost = 0.0
         for k in range(self._b):
@@ -291,7 +355,7 @@ class _Projection:
 
 
 def _solve(quadratic: Floats, linear: Floats, rows: Floats, right: Floats, cones: Sequence[Any]) -> Floats:
-    """Minimise ``x'Qx/2 + c'x`` with ``right - rows x`` in the cones.
+    """Minimise ``x'Qx/2 + c'x`` subject to ``right - rows x`` in the cones.
 
     Raises
     ------
@@ -326,7 +390,7 @@ def _checked(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> t
 
 
 def _inside(model: ArmModel, theta: Floats) -> Floats:
-    """``theta`` moved into the cones by what the solver's tolerance left outside."""
+    """Standard parameters (p,) moved into the cones: the solver may violate them by its tolerance."""
     inside = theta.copy()
     signed = non_negative(model)
     inside[signed] = np.maximum(inside[signed], 0.0)
@@ -339,9 +403,10 @@ def _inside(model: ArmModel, theta: Floats) -> Floats:
 
 
 def _triangles(length: float) -> Floats:
-    """Upper triangles (10, 10) of the pseudo-inertia of each unit inertial parameter, lengths in units of ``length``.
+    """Upper triangles of the pseudo-inertia of each unit inertial parameter, shape (10, 10).
 
-    Column by column, off-diagonals times sqrt(2): an isometry, as the solver expects.
+    Lengths are in units of ``length`` (m). Triangles are stored column by column with off-diagonals times sqrt(2), an
+    isometry, in the format of the solver.
     """
     scale = np.array([1 / length, 1 / length, 1 / length, 1.0])
     out = np.empty((10, 10))
@@ -358,13 +423,16 @@ def _triangles(length: float) -> Floats:
 
 
 def _length(model: ArmModel) -> float:
-    """Mean of the lengths of the arm that are not zero, m; 1 if all are."""
+    """Mean of the nonzero lengths ``d`` and ``r`` of the arm, m; 1 if all are zero."""
     lengths = np.abs(np.concatenate([model.chain.d, model.chain.r]))
     return float(lengths[lengths > 0].mean()) if lengths.any() else 1.0
 
 
 def _standard_deviations(model: ArmModel, p: Floats, identifiable: Sequence[Identifiability]) -> Floats:
-    """Standard deviations (p,) of the parameters determined alone, ``e_k = K' a`` and ``a' P a``; NaN elsewhere."""
+    """Standard deviations (p,) of the parameters determined alone, NaN elsewhere.
+
+    The unit vector of such a parameter is ``e_k = K' a``; its variance is ``a' P a``.
+    """
     combinations = np.linalg.pinv(model.base.regroup)
     std = np.sqrt(np.einsum("ki,ij,kj->k", combinations, p, combinations))
     return np.where(np.array(identifiable) == "alone", std, np.nan)

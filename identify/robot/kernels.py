@@ -1,7 +1,8 @@
 """Compiled recursions over the chain: regressor, inverse dynamics, mass matrix and bias forces.
 
-Newton-Euler in modified Denavit-Hartenberg frames, thesis equations A.22 to A.26. Gravity enters as
-acceleration ``-g`` of the base. Vectors of link j are written in frame j, scalars by component.
+Newton-Euler recursion in modified Denavit-Hartenberg frames (thesis equations A.22 to A.26). Gravity enters as the
+acceleration ``-g`` of the base. Vectors of link j are expressed in frame j; each component is a scalar variable.
+Sizes: N samples, n joints.
 """
 
 import numpy as np
@@ -15,27 +16,77 @@ TWO_OVER_PI = 2.0 / np.pi
 
 @inlined
 def smooth_sign(x: float, smoothing: float) -> float:
-    """``sign(x)``, or ``(2/pi) atan(smoothing x)`` where ``smoothing`` is positive (thesis section B.2)."""
+    """``sign(x)``, or ``(2/pi) atan(smoothing x)`` if ``smoothing`` is positive (thesis section B.2).
+
+    Parameters
+    ----------
+    x
+        Velocity, rad/s or m/s.
+    smoothing
+        ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
+    """
     return TWO_OVER_PI * np.arctan(smoothing * x) if smoothing > 0.0 else float(np.sign(x))
 
 
 @inlined
 def into_child(ca: float, sa: float, c: float, s: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Write a vector of frame j-1 in frame j."""
+    """Transform the components of a vector from frame j-1 to frame j (rotation only).
+
+    Parameters
+    ----------
+    ca, sa
+        Cosine and sine of the twist angle alpha_j.
+    c, s
+        Cosine and sine of the joint angle theta_j.
+    x, y, z
+        Components of the vector in frame j-1.
+
+    Returns
+    -------
+    tuple of float
+        Components in frame j.
+    """
     t = ca * y + sa * z
     return c * x + s * t, c * t - s * x, ca * z - sa * y
 
 
 @inlined
 def into_parent(ca: float, sa: float, c: float, s: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Write a vector of frame j in frame j-1."""
+    """Transform the components of a vector from frame j to frame j-1 (rotation only).
+
+    Parameters
+    ----------
+    ca, sa
+        Cosine and sine of the twist angle alpha_j.
+    c, s
+        Cosine and sine of the joint angle theta_j.
+    x, y, z
+        Components of the vector in frame j.
+
+    Returns
+    -------
+    tuple of float
+        Components in frame j-1.
+    """
     t = s * x + c * y
     return c * x - s * y, ca * t - sa * z, sa * t + ca * z
 
 
 @inlined
 def turn(n: int, chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: Floats) -> None:
-    """Joint angles at ``q`` (n,) with their sines and cosines, each in an array of `padded` length."""
+    """Compute the joint angles of one sample, with their sines and cosines.
+
+    Parameters
+    ----------
+    n
+        Number of joints.
+    chain
+        Geometry of the chain.
+    q
+        Joint positions (n,), rad or m.
+    angle, sine, cosine
+        Output arrays of `padded` length: angles in rad, their sines and cosines.
+    """
     for j in range(n):
         angle[j] = chain.theta[j] + (0.0 if chain.prismatic[j] else q[j])
     sines_cosines(angle, sine, cosine)
@@ -45,7 +96,22 @@ def turn(n: int, chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: F
 def fill_regressor(
     chain: Chain, columns: Columns, smoothing: float, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
-    """Write the columns of the inverse dynamic model into ``out`` (N, n, columns), which holds zeros."""
+    """Compute the regressor of the inverse dynamic model (thesis equation 2.8).
+
+    Parameters
+    ----------
+    chain
+        Geometry of the chain.
+    columns
+        Regressor column of each parameter; -1: the parameter is left out.
+    smoothing
+        ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
+    q, qd, qdd
+        Positions, velocities, accelerations, each (N, n); rad or m, s.
+    out
+        Output array (N, n, columns), N m or N per unit of the parameter. It holds zeros, or an earlier result of the
+        same ``columns``.
+    """
     n = chain.d.size
     lin = np.empty((n, 3))
     ang = np.empty((n, 3))
@@ -143,7 +209,19 @@ def fill_regressor(
 
 @inlined
 def add_friction(values: Values, smoothing: float, qd: Floats, tau: Floats) -> None:
-    """Add friction, offsets and coupled friction at velocity ``qd`` (n,) to ``tau`` (n,) (2.7, B.1)."""
+    """Add friction, offsets and coupled friction of one sample to its torques (thesis equations 2.7, B.1).
+
+    Parameters
+    ----------
+    values
+        Parameter values by kind, SI.
+    smoothing
+        ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
+    qd
+        Joint velocities (n,), rad/s or m/s.
+    tau
+        Joint torques (n,), N m or N, changed in place.
+    """
     for j in range(qd.size):
         tau[j] += values.fv[j] * qd[j] + values.off[j]
         if values.fc[j] != 0.0:
@@ -168,9 +246,24 @@ def rigid_torque(
     work: Floats,
     tau: Floats,
 ) -> None:
-    """Torques of the rigid chain of n joints, without friction and rotors, for one sample; ``work`` is (n, 6).
+    """Compute the torques of the rigid chain, without friction and rotors, for one sample (A.22 to A.26).
 
-    ``sine`` and ``cosine`` are of the joint angles, as `turn` leaves them.
+    Parameters
+    ----------
+    n
+        Number of joints.
+    chain
+        Geometry of the chain.
+    values
+        Parameter values by kind, SI.
+    q, qd, qdd
+        Positions, velocities, accelerations, each (n,); rad or m, s.
+    sine, cosine
+        Sines and cosines of the joint angles, of `padded` length, from `turn`.
+    work
+        Scratch array (n, 6): force and moment of each link.
+    tau
+        Output array of the joint torques (n,), N m or N.
     """
     wx = wy = wz = bx = by = bz = 0.0
     ax, ay, az = -chain.gravity[0], -chain.gravity[1], -chain.gravity[2]
@@ -180,7 +273,7 @@ def rigid_torque(
         moves = chain.prismatic[j]
         r = chain.r[j] + (q[j] if moves else 0.0)
         c, s = cosine[j], sine[j]
-        # In shoulders and wrists origins coincide: nothing to shift.
+        # If the origins of both frames coincide, as in shoulders and wrists, the shift is zero.
         if d != 0.0 or r != 0.0:
             px, py, pz = d, -r * sa, r * ca
             ux, uy, uz = wy * pz - wz * py, wz * px - wx * pz, wx * py - wy * px
@@ -236,9 +329,22 @@ def rigid_torque(
 def fill_mass_matrix(
     n: int, chain: Chain, values: Values, q: Floats, sine: Floats, cosine: Floats, mass: Floats
 ) -> None:
-    """Mass matrix (n, n) with rotors and couplings, by composite rigid bodies.
+    """Compute the mass matrix of one posture, with rotors and couplings, by the composite rigid body method.
 
-    ``sine`` and ``cosine`` are of the joint angles, as `turn` leaves them.
+    Parameters
+    ----------
+    n
+        Number of joints.
+    chain
+        Geometry of the chain.
+    values
+        Parameter values by kind, SI.
+    q
+        Joint positions (n,), rad or m.
+    sine, cosine
+        Sines and cosines of the joint angles, of `padded` length, from `turn`.
+    mass
+        Output array (n, n), kg m^2, kg m or kg.
     """
     xx = xy = xz = yy = yz = zz = hx = hy = hz = m = 0.0
     for j in range(n - 1, -1, -1):
@@ -253,7 +359,7 @@ def fill_mass_matrix(
         hy += p[7]
         hz += p[8]
         m += p[9]
-        # Wrench at O_j that gives joint j a unit acceleration, handed down the chain.
+        # Wrench at O_j for a unit acceleration of joint j, then transmitted towards the base.
         if chain.prismatic[j]:
             fx, fy, fz, tx, ty, tz = 0.0, 0.0, m, hy, -hx, 0.0
             mass[j, j] = m + values.ia[j]
@@ -277,7 +383,7 @@ def fill_mass_matrix(
         ca, sa, c, s = chain.cos_alpha[j], chain.sin_alpha[j], cosine[j], sine[j]
         r = chain.r[j] + (q[j] if chain.prismatic[j] else 0.0)
         hx, hy, hz = into_parent(ca, sa, c, s, hx, hy, hz)
-        # Rot(z) then Rot(x) of the inertia, then its shift from O_j to O_j-1.
+        # Rotate the inertia about z, then about x; then shift it from O_j to O_j-1.
         cc, ss, cs = c * c, s * s, c * s
         jxx, jyy, jxy = (
             cc * xx - 2 * cs * xy + ss * yy,
@@ -316,7 +422,21 @@ def fill_mass_matrix(
 def fill_inverse_dynamics(
     chain: Chain, values: Values, smoothing: float, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
-    """Joint torques ``out`` (N, n) of the whole model along a motion."""
+    """Compute the joint torques along a motion, with friction, rotors and couplings.
+
+    Parameters
+    ----------
+    chain
+        Geometry of the chain.
+    values
+        Parameter values by kind, SI.
+    smoothing
+        ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
+    q, qd, qdd
+        Positions, velocities, accelerations, each (N, n); rad or m, s.
+    out
+        Output array of the joint torques (N, n), N m or N.
+    """
     n = chain.d.size
     work = np.empty((n, 6))
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
@@ -334,7 +454,19 @@ def fill_inverse_dynamics(
 
 @compiled
 def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> None:
-    """Mass matrices ``out`` (N, n, n) at postures ``q`` (N, n)."""
+    """Compute the mass matrices of several postures; see `fill_mass_matrix`.
+
+    Parameters
+    ----------
+    chain
+        Geometry of the chain.
+    values
+        Parameter values by kind, SI.
+    q
+        Postures (N, n), rad or m.
+    out
+        Output array (N, n, n), kg m^2, kg m or kg.
+    """
     n = chain.d.size
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
     for k in range(q.shape[0]):
@@ -344,9 +476,21 @@ def fill_mass_matrices(chain: Chain, values: Values, q: Floats, out: Floats) -> 
 
 @inlined
 def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
-    """Factor the lower triangle of ``matrix`` as ``L D L'``; ``False`` if it is not positive definite.
+    """Factor a symmetric matrix as ``L D L'``.
 
-    The lower triangle of ``factor`` gets L, its diagonal the inverse of D, its upper triangle ``D L'``.
+    Parameters
+    ----------
+    matrix
+        Symmetric matrix (n, n); only its lower triangle is read.
+    factor
+        Output array (n, n): L below the diagonal, the inverse of D on it, ``D L'`` above it.
+    n
+        Size of the matrix.
+
+    Returns
+    -------
+    bool
+        ``False`` if the matrix is not positive definite; ``factor`` is then incomplete.
     """
     for j in range(n):
         pivot = matrix[j, j]
@@ -368,7 +512,17 @@ def cholesky(matrix: Floats, factor: Floats, n: int) -> bool:
 
 @inlined
 def solve_factored(factor: Floats, n: int, x: Floats) -> None:
-    """Solve in place with the factors left by `cholesky`."""
+    """Solve ``L D L' x = b`` in place with the factors of `cholesky`.
+
+    Parameters
+    ----------
+    factor
+        Factors (n, n) from `cholesky`.
+    n
+        Size of the system.
+    x
+        Right side b (n,) at entry, solution at return.
+    """
     for i in range(n):
         value = x[i]
         for k in range(i):
@@ -385,7 +539,28 @@ def solve_factored(factor: Floats, n: int, x: Floats) -> None:
 def fill_forward_dynamics(
     chain: Chain, values: Values, smoothing: float, q: Floats, qd: Floats, tau: Floats, out: Floats
 ) -> int:
-    """Joint accelerations ``out`` (N, n); returns the first sample whose mass matrix is singular, or -1."""
+    """Compute the joint accelerations of the direct dynamic model (thesis equation 2.9).
+
+    Parameters
+    ----------
+    chain
+        Geometry of the chain.
+    values
+        Parameter values by kind, SI.
+    smoothing
+        ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
+    q, qd
+        Positions and velocities, each (N, n); rad or m, s.
+    tau
+        Joint torques (N, n), N m or N.
+    out
+        Output array of the accelerations (N, n), rad/s^2 or m/s^2.
+
+    Returns
+    -------
+    int
+        First sample whose mass matrix is not positive definite, or -1.
+    """
     n = chain.d.size
     work = np.empty((n, 6))
     angle, sine, cosine = np.zeros(padded(n)), np.empty(padded(n)), np.empty(padded(n))
