@@ -1,11 +1,13 @@
 """Khalil's rules: which standard parameters are eliminated or regrouped, in symbols (thesis section A.3).
 
-Every parameter of link j is a linear form in the standard parameters, its coefficients polynomials in
-the lengths ``d_j`` and ``r_j``. The rules hand what link j cannot show on its own to link j-1, from the
-tip to the base. Rule 3 is printed with ``zz`` of link j, which rule 2 hands to link j-1: here it goes there
-at once. Rule 7, on rotor inertias of prismatic joints, is used in its general form: it holds
-whenever the earlier revolute joints are parallel to the prismatic one and the earlier prismatic ones
-orthogonal, and gravity then moves a constant into ``off``.
+Every parameter of link j is a linear form in the standard parameters; its coefficients are polynomials in the lengths
+``d_j`` and ``r_j``. From tip to base, the rules regroup parameters of link j with those of link j-1 if they have no
+separate effect on the torques.
+
+Rule 3 is printed with ``zz`` of link j, which rule 2 regroups with link j-1. Here rule 3 adds to link j-1 directly.
+Rule 7, on rotor inertias of prismatic joints, is used in its general form. Its conditions: the earlier revolute joints
+are parallel to the prismatic joint and the earlier prismatic joints orthogonal. Gravity then adds a constant to
+``off``.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,16 +22,26 @@ Polynomial = dict[Monomial, float]
 Form = dict[str, Polynomial]
 
 PARALLEL = 1e-9
-"""Sine or cosine under which two axes count as parallel or orthogonal."""
+"""Sine (cosine) of the angle between two axes below which they count as parallel (orthogonal)."""
 
 
 def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> dict[str, Form]:
-    """Derive base parameters as forms in the standard ones (thesis section A.3).
+    """Derive the base parameters as linear forms in the standard ones by Khalil's rules (thesis section A.3).
+
+    Parameters
+    ----------
+    robot
+        Configuration of the robot.
+    chain
+        Its geometry.
+    names
+        Names of the standard parameters (p,).
 
     Returns
     -------
     dict
-        For each parameter that stays, in standard order: standard parameter -> polynomial in the lengths.
+        Linear form of each remaining parameter, in the order of ``names``. A form maps standard parameters to
+        polynomials in the lengths.
     """
     forms: dict[str, Form] = {name: {name: {(): 1.0}} for name in names}
     axes, origins = _axes(chain)
@@ -60,7 +72,7 @@ def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> di
             if f"ia{link}" in forms and (j == r1 or (j == r2 and _orthogonal(axes[j], axes[r1]))):
                 _add(forms[own["zz"]], forms.pop(f"ia{link}"), {(): 1.0})
             _add(forms[own["xx"]], forms[own["yy"]], {(): -1.0})
-            # The rotation about z_j mixes xx and yy: only their sum, constant, goes to the parent.
+            # The rotation about z_j mixes xx and yy; their sum is constant and is regrouped with the parent.
             for kind in ("yy", "mz", "m"):
                 _regroup(forms, own[kind], j, parent[kind])
             if turning:
@@ -74,7 +86,22 @@ def khalil_rules(robot: RobotConfig, chain: Chain, names: tuple[str, ...]) -> di
 
 
 def evaluate(form: Form, lengths: Mapping[str, float], names: tuple[str, ...]) -> Floats:
-    """Coefficients of a form over ``names``, with numbers for the lengths."""
+    """Evaluate the coefficients of a linear form at given lengths.
+
+    Parameters
+    ----------
+    form
+        Linear form in the standard parameters.
+    lengths
+        Values of the symbols, m, from `lengths_of`.
+    names
+        Names of the standard parameters (p,).
+
+    Returns
+    -------
+    ndarray
+        Coefficients, shape (p,).
+    """
     row = np.zeros(len(names))
     for k, name in enumerate(names):
         for monomial, coefficient in form.get(name, {}).items():
@@ -83,12 +110,22 @@ def evaluate(form: Form, lengths: Mapping[str, float], names: tuple[str, ...]) -
 
 
 def lengths_of(chain: Chain) -> dict[str, float]:
-    """Values of the symbols ``d1, r1, d2, ...`` of a chain."""
+    """Values of the symbols ``d1, r1, d2, ...`` of a chain, m."""
     return {f"{kind}{j + 1}": float(value) for kind in ("d", "r") for j, value in enumerate(getattr(chain, kind))}
 
 
 def text_of(name: str, form: Form, names: tuple[str, ...]) -> str:
-    """Write a form as in table B.3: ``name`` first, then by ``names``, equal coefficients bracketed."""
+    """Text of a linear form as in thesis table B.3; parameters with equal coefficients share a bracket.
+
+    Parameters
+    ----------
+    name
+        Parameter that stands first.
+    form
+        Linear form in the standard parameters, with ``name`` among them.
+    names
+        Names of the standard parameters, the order of the other terms.
+    """
     groups: dict[str, list[str]] = {}
     polynomials: dict[str, Polynomial] = {}
     for parameter in (name, *(other for other in names if other in form and other != name)):
@@ -140,9 +177,9 @@ def _add(target: Form, source: Form, factor: Polynomial) -> None:
 
 
 def _regroup(forms: dict[str, Form], name: str, j: int, rows: Mapping[str, Polynomial], still: bool = False) -> None:
-    """Hand parameter ``name`` of link j+1 to its parent; dropped where the parent is the base.
+    """Regroup parameter ``name`` of link j+1 with those of its parent link; drop it if the parent is the base.
 
-    With ``still`` terms in the joint's own ``r`` are left out: displacements along the only axis of rotation.
+    With ``still``, terms in the length ``r`` of joint j+1 are omitted: displacements along the only axis of rotation.
     """
     form = forms.pop(name)
     own_length = f"r{j + 1}"
@@ -155,10 +192,10 @@ def _regroup(forms: dict[str, Form], name: str, j: int, rows: Mapping[str, Polyn
 
 
 def _transfer(chain: Chain, j: int) -> dict[str, dict[str, Polynomial]]:
-    """Contribution of each parameter of link j+1 to the parameters of its parent.
+    """Contribution of each parameter of link j+1 to the parameters of its parent link.
 
-    For a revolute joint ``yy`` stands for the sum ``xx + yy`` and ``mz``, ``m`` are as they are: the
-    combinations that do not depend on the joint angle. Lengths that are zero do not appear.
+    For a revolute joint the combinations that do not depend on the joint angle are ``xx + yy``, ``mz`` and ``m``;
+    the entry ``yy`` is that of the sum. Lengths of zero do not appear.
     """
     ca, sa = float(chain.cos_alpha[j]), float(chain.sin_alpha[j])
     c, s = cos_sin(float(chain.theta[j])) if chain.prismatic[j] else (1.0, 0.0)
@@ -176,7 +213,7 @@ def _transfer(chain: Chain, j: int) -> dict[str, dict[str, Polynomial]]:
             p = unit[0] + unit[3]
         inertia = np.array([[p[0], p[1], p[2]], [p[1], p[3], p[4]], [p[2], p[4], p[5]]])
         if kind == "yy" and not chain.prismatic[j]:
-            # Only the invariant part: xx and yy both become yy, half the trace in the plane.
+            # Part that does not depend on the joint angle: xx and yy are both yy, half the trace in the plane.
             inertia = np.diag([1.0, 1.0, 0.0])
         first, mass = rotation @ p[6:9], p[9]
         terms: dict[Monomial, Floats] = {(): _pack(rotation @ inertia @ rotation.T, first, mass)}
@@ -192,7 +229,7 @@ def _transfer(chain: Chain, j: int) -> dict[str, dict[str, Polynomial]]:
 
 
 def _shift(u: Floats, v: Floats) -> Floats:
-    """``2 (u.v) I - u v' - v u'``: change of inertia when a first moment ``v`` moves by ``u``."""
+    """``2 (u.v) I - u v' - v u'``: change of the inertia matrix when a first moment ``v`` is displaced by ``u``."""
     result: Floats = 2.0 * float(u @ v) * np.eye(3) - np.outer(u, v) - np.outer(v, u)
     return result
 
@@ -202,7 +239,7 @@ def _pack(inertia: Floats, first: Floats, mass: float) -> Floats:
 
 
 def _axes(chain: Chain) -> tuple[list[Floats], list[Floats]]:
-    """Joint axes and a point on each, in the base frame, at the zero posture."""
+    """Unit vectors of the joint axes and a point on each axis, in the base frame at the zero posture."""
     rotation, position = np.eye(3), np.zeros(3)
     axes, origins = [], []
     for j in range(chain.d.size):
@@ -216,7 +253,7 @@ def _axes(chain: Chain) -> tuple[list[Floats], list[Floats]]:
 
 
 def _in_link_frame(chain: Chain, j: int, direction: Floats, axes: list[Floats]) -> Floats:
-    """Write a direction of the base frame, at the zero posture, in the frame of link j."""
+    """Transform a direction (3,) from the base frame to the frame of link j+1, at the zero posture."""
     rotation = np.eye(3)
     for k in range(j + 1):
         ca, sa = chain.cos_alpha[k], chain.sin_alpha[k]
@@ -227,7 +264,7 @@ def _in_link_frame(chain: Chain, j: int, direction: Floats, axes: list[Floats]) 
 
 
 def _direction_unseen(forms: dict[str, Form], own: Mapping[str, str], axis: Floats) -> None:
-    """Regroup the first moment along the only axis of rotation, which has no effect (rule 4)."""
+    """Regroup the first moment along the only axis of rotation, which has no effect on the torques (rule 4)."""
     x, y, z = (float(v) for v in axis)
     if abs(z) > PARALLEL:
         gone = forms.pop(own["mz"])
@@ -244,14 +281,14 @@ def _direction_unseen(forms: dict[str, Form], own: Mapping[str, str], axis: Floa
 
 
 def _alone_along_axis(prismatic: list[bool], axes: list[Floats], j: int) -> bool:
-    """Whether only joint j itself ever moves its link along its axis."""
+    """Return True if no joint before joint j moves its link along the axis of joint j."""
     return all(_orthogonal(axes[i], axes[j]) if prismatic[i] else _parallel(axes[i], axes[j]) for i in range(j))
 
 
 def _rotor_into_mass(
     forms: dict[str, Form], robot: RobotConfig, chain: Chain, j: int, axis: Floats, rows: Mapping[str, Polynomial]
 ) -> None:
-    """Regroup ``ia`` of a prismatic joint with the mass it moves alone (rule 7)."""
+    """Regroup the rotor inertia ``ia`` of a prismatic joint with the mass that it moves (rule 7)."""
     gone = forms.pop(f"ia{j + 1}")
     _add(forms[f"m{j + 1}"], gone, {(): 1.0})
     weight = float(np.asarray(robot.gravity) @ axis)
@@ -266,7 +303,7 @@ def _rotor_into_mass(
 
 
 def _still_axis(chain: Chain, axes: list[Floats], origins: list[Floats], r1: int, j: int) -> bool:
-    """Whether joint j turns about the axis of ``r1``, parallel to gravity and to every axis before it."""
+    """Return True if joint j rotates about the axis of joint ``r1``, parallel to gravity and to all earlier axes."""
     along = _parallel(axes[j], axes[r1]) and np.linalg.norm(np.cross(origins[j] - origins[r1], axes[r1])) < PARALLEL
     up = np.linalg.norm(np.cross(chain.gravity, axes[r1])) < PARALLEL
     return bool(along and up and all(_parallel(axes[i], axes[r1]) for i in range(j)))

@@ -1,4 +1,4 @@
-"""A motion as the effects of the catalogue see it."""
+"""Motion of an arm with the derived signals that effects use: times, signs, predicted torques and their slopes."""
 
 from dataclasses import dataclass, field
 from functools import cache, cached_property
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 STEP = 1e-6
-"""Of the finite differences, rad and rad/s, or in metres."""
+"""Step of the finite differences, rad and rad/s or m and m/s."""
 
 
 POSTURES = 64
-"""Over which a mean is taken."""
+"""Number P of postures for mean values over the workspace."""
 
 
 @cache
 def _spread(limits: tuple[tuple[float, float], ...]) -> Array:
-    """Points (P, n) of the Halton sequence between limits."""
+    """Points (P, n) of the Halton sequence between the limits of each joint, rad or m."""
     points = qmc.Halton(len(limits), scramble=False).random(POSTURES)
     low, high = np.array(limits).T
     return np.ascontiguousarray(low + points * (high - low))
@@ -33,25 +33,27 @@ def _spread(limits: tuple[tuple[float, float], ...]) -> Array:
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions, their derivatives, and what the model makes of them; SI, joint side.
+    """Positions, their derivatives, and signals that the model computes from them; SI, joint side.
 
     Parameters
     ----------
     model
-        The arm; of it effects use geometry, transmission, limits and the smoothing of the sign.
+        Arm model; effects use its geometry, transmission, limits and smoothing of the sign.
     q, qd, qdd
-        Shape (N, n) each.
+        Positions, velocities, accelerations, (N, n) each; rad or m, s.
     dt
         Sampling period, s.
     start
         Time of the first sample since the beginning of the first recording, s.
     theta
-        Standard or base parameters by which torques are predicted, (p,) or (b,); ``None`` while there are none.
+        Standard (p,) or base (b,) parameters that predict the torques, SI; ``None`` if they are not known.
     duration
-        Of all recordings together, s: what a slow change is measured in.
+        Duration of all recordings together, s: the time unit of slow changes.
+    sharp
+        ``sign(qd)`` instead of its smoothed form.
     lead
-        Samples at the front that are there for what has a memory (a gap, a bristle, a swinging link) only: of columns
-        made of the motion they are cut off.
+        Samples at the front that only set the state of effects with memory (backlash, bristles, elastic links).
+        Columns computed from the motion omit them.
     """
 
     model: "ArmModel"
@@ -71,7 +73,7 @@ class Motion:
 
     @property
     def samples(self) -> int:
-        """N."""
+        """Number N of samples."""
         return int(self.q.shape[0])
 
     @property
@@ -81,7 +83,7 @@ class Motion:
 
     @cached_property
     def sign(self) -> Array:
-        """Sign of the velocity, smoothed as the model smooths it (thesis appendix B.2), (N, n)."""
+        """Sign of the velocity, smoothed with the ``g`` of the model unless ``sharp`` (thesis appendix B.2), (N, n)."""
         if self.sharp:
             return np.sign(self.qd)
         smooth: Array = self.model.smooth_sign(self.qd)
@@ -95,90 +97,131 @@ class Motion:
 
     @cached_property
     def motor(self) -> Array:
-        """Angles of the motors, rad (m where the axis is prismatic and direct), (N, n)."""
+        """Motor positions, rad (m at prismatic joints with direct drive), (N, n)."""
         angles: Array = self.q @ self.model.robot.transmission_matrix.T
         return angles
 
     @cached_property
     def top_speed(self) -> Array:
-        """Speed that each joint exceeds for one sample in a hundred, (n,)."""
+        """99 % quantile of the absolute velocity of each joint, rad/s or m/s, (n,)."""
         top: Array = np.maximum(np.quantile(np.abs(self.qd), 0.99, axis=0), 1e-9)
         return top
 
     @property
     def postures(self) -> Array:
-        """Postures of the arm, spread evenly over the ranges of its joints whatever the motion, (P, n)."""
+        """Postures spread evenly over the ranges of the joints, independent of the motion, rad or m, (P, n)."""
         return _spread(tuple(joint.limits.position for joint in self.model.robot.joints))
 
     @cached_property
     def span(self) -> Array:
-        """Distance between the outermost positions of each joint, (n,)."""
+        """Difference between the largest and the smallest position of each joint, rad or m, (n,)."""
         span: Array = np.maximum(np.ptp(self.q, axis=0), 1e-9)
         return span
 
     @cached_property
     def torque(self) -> Array:
-        """Joint torques that the model predicts, friction included, (N, n).
+        """Joint torques that the model predicts, with friction, N m or N, (N, n).
 
         Raises
         ------
         ValueError
-            If there are no parameters to predict with.
+            If ``theta`` is missing.
         """
         return self._predicted(self._theta)
 
     @cached_property
     def transmitted(self) -> Array:
-        """Torques that the gears hand on to the links: without friction, offsets and rotors, (N, n)."""
+        """Torques that the gears transmit to the links: without friction, offsets and rotors, N m or N, (N, n)."""
         return self._predicted(self.links)
 
     def handed_on(self, joint: int, rotor: float) -> Array:
-        """Torque (N,) that a gear hands on if ``rotor`` (kg m^2 or kg) of the link's inertia is the motor's."""
+        """Torque that the gear of a joint transmits if part of the link's inertia belongs to the motor.
+
+        Parameters
+        ----------
+        joint
+            Index of the joint, from 0.
+        rotor
+            Part of the link's inertia that belongs to the motor, kg m^2 or kg.
+
+        Returns
+        -------
+        ndarray
+            Torque, N m or N, shape (N,).
+        """
         load: Array = self.transmitted[:, joint] - rotor * self.qdd[:, joint]
         return load
 
     @cached_property
     def standard(self) -> Array:
-        """Standard parameters that predict the same torques as ``theta``, (p,)."""
+        """Standard parameters with the same torques as ``theta``, SI, (p,)."""
         theta = self._theta
         return theta if theta.size == len(self.model.names) else self.model.standard_from_base(theta)
 
     @cached_property
     def links(self) -> Array:
-        """Standard parameters of the links alone: no friction, offsets and rotors, (p,)."""
+        """Standard parameters of the links, SI, (p,); friction, offsets and rotor inertias are zero."""
         alone: Array = np.where(self.model.of_links, self.standard, 0.0)
         return alone
 
     @cached_property
     def motor_torque(self) -> Array:
-        """Torques at the shafts of the motors that the model predicts, (N, n)."""
+        """Torques that the model predicts at the motor shafts, N m or N, (N, n)."""
         at_shafts: Array = self.torque @ np.linalg.inv(self.model.robot.transmission_matrix)
         return at_shafts
 
     def of_motor(self, motor: int, torque: Array) -> Array:
-        """What a torque (N,) at the shaft of a motor is at the joints, (N, n, 1)."""
+        """Joint torques caused by a torque at the shaft of one motor.
+
+        Parameters
+        ----------
+        motor
+            Index of the motor, from 0.
+        torque
+            Torque at its shaft (N,), N m or N.
+
+        Returns
+        -------
+        ndarray
+            Shape (N, n, 1), N m or N.
+        """
         joints: Array = (torque[:, None] * self.model.robot.transmission_matrix[motor])[:, :, None]
         return joints
 
     def response(
         self, joint: int, shift: Array, rate: Array, acceleration: Array, *, links: bool = False, rotor: float = 0.0
     ) -> Array:
-        """Change (N, n) of the predicted torques when one joint moves otherwise, to first order.
+        """First-order change (N, n) of the predicted torques when the motion of one joint changes.
 
         Parameters
         ----------
+        joint
+            Index of the joint, from 0.
         shift, rate, acceleration
-            Changes of the joint's position, velocity and acceleration, (N,) each.
+            Changes of the joint's position, velocity and acceleration, (N,) each; rad or m, s.
         links
-            Of the links alone, without friction and rotors.
+            Torques of the links alone, without friction and rotors.
         rotor
-            What of the link's inertia is the motor's, kg m^2 or kg.
+            Part of the link's inertia that belongs to the motor, kg m^2 or kg.
         """
         change: Array = _first_order(*self.slopes(joint, links=links), shift, rate, acceleration, joint, rotor)
         return change
 
     def slopes(self, joint: int, *, links: bool = False) -> tuple[Array, Array, Array]:
-        """Slopes of the predicted torques over position, velocity and acceleration of a joint, (N, n) each."""
+        """Derivatives of the predicted torques with respect to position, velocity and acceleration of one joint.
+
+        Parameters
+        ----------
+        joint
+            Index of the joint, from 0.
+        links
+            Torques of the links alone, without friction and rotors.
+
+        Returns
+        -------
+        tuple of ndarray
+            Three arrays (N, n), in N m or N per rad or m, s.
+        """
         key = (joint, links)
         if key not in self._slopes:
             theta = self.links if links else self._theta
@@ -192,9 +235,10 @@ class Motion:
         return self._slopes[key]
 
     def _smooth(self, links: bool) -> tuple[Array, Array]:
-        """Predicted torques (N, n), and their slopes over the accelerations, (n, N, n) with those of each joint first.
+        """Predicted torques (N, n) and their derivatives with respect to the joint accelerations, (n, N, n).
 
-        The sign is smoothed even where the motion has it sharp: a jump has no slope.
+        The first axis of the derivatives is the joint that accelerates. The sign of the friction is always smoothed:
+        a jump has no derivative.
         """
         if links not in self._still:
             theta = self.links if links else self._theta
@@ -204,7 +248,7 @@ class Motion:
         return self._still[links]
 
     def rate(self, values: Array) -> Array:
-        """Time derivative along the first axis, central differences."""
+        """Time derivative along the first axis by central differences, in units of ``values`` per s."""
         slope: Array = np.gradient(values, self.dt, axis=0)
         return slope
 
@@ -229,7 +273,7 @@ def _first_order(
     joint: int,
     rotor: float,
 ) -> Array:
-    """See `Motion.response`; the slopes are (N, n) each."""
+    """Compute the sum of `Motion.response`; ``position``, ``velocity`` and ``inertia`` are the slopes, (N, n) each."""
     change = np.empty(position.shape)
     for k in range(position.shape[0]):
         for i in range(position.shape[1]):
