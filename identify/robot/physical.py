@@ -1,4 +1,4 @@
-"""Damping of iterates whose parameters no real arm can have."""
+"""Step reduction for iterates whose parameters are not physical."""
 
 from dataclasses import dataclass
 
@@ -9,24 +9,24 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.chain import Floats
 
 SMALLEST_EIGENVALUE = 1e-6
-"""Smallest eigenvalue of the mass matrix, over its largest, that counts as positive."""
+"""Ratio of smallest to largest eigenvalue above which a mass matrix counts as positive definite."""
 
 MOST_HALVINGS = 30
-"""Halvings of a step before it is given up."""
+"""Maximum number of halvings of a step; after these the previous iterate is kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class Damped:
-    """A physical iterate.
+    """Physical iterate and the applied fraction of its step.
 
     Parameters
     ----------
     theta
-        Parameters, in the shape of those given.
+        Parameters, base (b,) or standard (p,) as given, SI.
     step
-        Length of the step over that from the previous iterate to the wanted one, 0 to 1.
+        Applied fraction of the step from the previous to the proposed iterate, 0 to 1.
     reason
-        Defect of the wanted iterate and the remedy; empty if it had none.
+        Defects of the proposed iterate and their correction; empty if there were none.
     """
 
     theta: Floats
@@ -35,17 +35,17 @@ class Damped:
 
 
 def damp_to_physical(model: ArmModel, theta: ArrayLike, theta_previous: ArrayLike, q_samples: ArrayLike) -> Damped:
-    """Shorten the step of an iteration until its parameters are physical.
+    """Reduce the step of an iteration until its parameters are physical.
 
-    Negative friction coefficients become zero. Then the step from ``theta_previous`` is halved until the mass
+    Negative friction coefficients are set to zero. Then the step from ``theta_previous`` is halved until the mass
     matrix is positive definite at all postures.
 
     Parameters
     ----------
     model
-        The arm.
+        Arm model with n joints.
     theta, theta_previous
-        Wanted and last physical parameters in SI units: both base (b,) or both standard (p,).
+        Proposed parameters and those of the previous, physical iterate, SI: both base (b,) or both standard (p,).
     q_samples
         Postures, shape (N, n), rad or m.
     """
@@ -81,12 +81,12 @@ def _names(model: ArmModel, theta: Floats) -> tuple[str, ...]:
 
 
 def _friction(names: tuple[str, ...], terms: int) -> list[int]:
-    """Indices of viscous and Coulomb friction; the last parameters are those of the terms."""
+    """Indices of viscous and Coulomb friction; the last ``terms`` parameters belong to the terms and are skipped."""
     return [k for k, name in enumerate(names[: len(names) - terms]) if name.startswith(("fv", "fc"))]
 
 
 def _mass_failures(model: ArmModel, theta: Floats, postures: Floats) -> tuple[int, float]:
-    """Number of postures at which the mass matrix is not positive definite, and its smallest eigenvalue."""
+    """Number of postures without positive definite mass matrix, and the smallest eigenvalue of all postures."""
     eigenvalues = np.linalg.eigvalsh(model.mass_matrix(theta, postures))
     bad = eigenvalues[:, 0] <= SMALLEST_EIGENVALUE * np.abs(eigenvalues).max(axis=1)
     return int(bad.sum()), float(eigenvalues.min())

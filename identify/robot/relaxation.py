@@ -1,11 +1,12 @@
-"""Closed-loop simulation of an arm whose model has further terms, by waveform relaxation.
+"""Closed-loop simulation of an arm whose model has additional terms, by waveform relaxation.
 
-The compiled loop knows the rigid arm with friction. What a term adds is computed along the whole simulated motion,
-taken for a load on the next simulation, and so on until the motion stays (Lelarasmee, Ruehli, Sangiovanni-Vincentelli
-1982). Each load is guessed from how the last ones answered (Anderson 1965, J. ACM 12(4)), so that terms that depend on
-accelerations and torques settle, too; what goes with the acceleration of a joint is inertia that the compiled loop has
-at every instant, however large. Any effect of the catalogue, also one with a memory of its own, so has a place in
-the simulation by its columns alone.
+The compiled simulation contains the rigid arm with friction. The torque of the terms is computed along the whole
+simulated motion and applied as a load in the next simulation. This repeats until the load no longer changes
+(Lelarasmee, Ruehli, Sangiovanni-Vincentelli 1982). Anderson mixing extrapolates each load from earlier loads and their
+results (Anderson 1965, J. ACM 12(4)). The iteration then also converges for terms that depend on accelerations and
+torques. The part of the load that is proportional to a joint's own acceleration acts as inertia. The compiled
+simulation includes it at every instant, whatever its size. To be simulated, an effect needs only its regressor columns,
+even with internal states.
 """
 
 from collections import deque
@@ -22,25 +23,25 @@ from armident.identify.robot.simulation import Simulation, simulate
 from armident.identify.signals.bandpass import butterworth
 
 ROUNDS = 16
-"""Most simulations."""
+"""Maximum number of simulations."""
 
 SETTLED = 1e-3
-"""Torque of the terms beside the load that they were simulated with, over its size, that ends the rounds."""
+"""Relative difference between the torque of the terms and the applied load at which the iteration ends."""
 
 POSTURES = 100
-"""Postures of a motion at which the inertia of its joints is looked at."""
+"""Approximate number of postures of a motion at which the joint inertias are evaluated."""
 
 MEMORY = 6
-"""Rounds from which the next load is guessed."""
+"""Number of earlier simulations from which the next load is extrapolated."""
 
 FELT_INERTIA = 0.1
-"""Inertia that terms add to a joint, over its own, from which on the compiled loop has it."""
+"""Inertia added by terms, relative to the joint's own, above which the compiled simulation includes it."""
 
 LEAST_INERTIA = 0.4
-"""Share of its own that a joint keeps there where terms take inertia away."""
+"""Fraction of its own inertia that a joint keeps at least in the compiled simulation if terms reduce inertia."""
 
 STEP = 0.5
-"""Share of what is still missing from the load that goes into the next one, beyond the guess."""
+"""Mixing factor: fraction of the remaining difference that is added to the extrapolated load."""
 
 
 def simulate_with_terms(
@@ -55,22 +56,34 @@ def simulate_with_terms(
     band_hz: float = np.inf,
     **initial: Any,
 ) -> Simulation:
-    """Simulate like :func:`armident.identify.robot.simulation.simulate`, the terms of the model included.
+    """Simulate the closed loop with the terms of the model; see :func:`armident.identify.robot.simulation.simulate`.
 
     Parameters
     ----------
+    model
+        Arm model with n joints and e parameters of terms.
     theta_base
-        Base (b,) or standard (p,) parameters; the last e are those of the terms.
+        Base (b,) or standard (p,) parameters, SI; the last e are those of the terms.
+    controller
+        Controller with the sampling period ``dt``.
+    q_ref
+        Reference positions (N, n), rad or m.
+    dt
+        Sampling period, s.
     start
-        Time of the first sample since the recordings began, s.
+        Time of the first sample since the beginning of the first recording, s.
+    disturbance
+        Additional motor torques (N, n), N m or N.
     band_hz
-        The arm feels no more of the terms than what is slower than this: differentiated twice or thrice, the steps in
-        which references arrive would keep the rounds from settling.
+        Cut-off frequency of the low-pass for the torque of the terms, Hz. References that arrive in steps, two or
+        three times differentiated, would otherwise prevent convergence.
+    **initial
+        Further arguments of ``simulate``: ``q0``, ``qd0``, ``max_velocity``.
 
     Returns
     -------
     Simulation
-        ``tau`` is what the drives report: the torque that moves the rigid arm, and that of the terms.
+        ``tau`` is the torque that the drives report: that of the rigid arm plus that of the terms.
     """
     theta = np.asarray(theta_base, dtype=np.float64)
     values = theta[theta.size - model.e :]
@@ -117,12 +130,12 @@ def simulate_with_terms(
 
 
 def _slow(values: Floats, dt: float, band_hz: float) -> Floats:
-    """What is slower than a frequency, if sampling lets anything be faster."""
+    """Low-pass ``values`` (N, n) at ``band_hz``; unchanged if it is not below 0.45 of the sampling rate."""
     return butterworth(values, dt, band_hz) if band_hz < 0.45 / dt else values
 
 
 def _inertia(model: ArmModel, theta: Floats, run: Simulation, torque: Floats, qdd: Floats) -> Floats:
-    """What of the terms' torque (N, n) goes with each joint's own acceleration, (n,), where it is worth its while."""
+    """Inertia (n,) of each joint that fits the torque (N, n) of the terms, zero where it is small; kg m^2 or kg."""
     found = np.sum(torque * qdd, axis=0) / np.maximum(np.sum(qdd * qdd, axis=0), 1e-300)
     postures = run.q[:: max(1, run.q.shape[0] // POSTURES)]
     own = np.maximum(np.einsum("kjj->kj", model.mass_matrix(theta, postures)).min(axis=0), 0.0)
@@ -131,14 +144,22 @@ def _inertia(model: ArmModel, theta: Floats, run: Simulation, torque: Floats, qd
 
 
 class _Past:
-    """Loads of the last rounds, and what was missing from them."""
+    """Loads of the last simulations and their differences from the torque of the terms, for Anderson mixing."""
 
     def __init__(self) -> None:
         self._loads: deque[Floats] = deque(maxlen=MEMORY)
         self._missing: deque[Floats] = deque(maxlen=MEMORY)
 
     def next(self, load: Floats, missing: Floats) -> Floats:
-        """The load at which the least would be missing if it answered linearly, and a step from there."""
+        """Return the next load: the one of least difference in a linear model, plus ``STEP`` times that difference.
+
+        Parameters
+        ----------
+        load
+            Load of the last simulation (N, n), N m or N.
+        missing
+            Torque of the terms minus ``load`` (N, n), N m or N.
+        """
         self._loads.append(load)
         self._missing.append(missing)
         if len(self._loads) == 1:

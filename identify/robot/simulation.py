@@ -1,11 +1,10 @@
 """Closed-loop simulation of the auxiliary model: direct dynamics under a discrete controller.
 
-The thesis integrates with a fixed-step explicit method (ode3). The smoothed Coulomb friction of a small
-wrist joint is too stiff for that at the sample rate, so the friction is linearly implicit here: over one
-sample the mass matrix and the bias forces are extrapolated to its middle from the last two samples
-(second order), and ``M qd' = tau - bias - friction(qd)`` is integrated by the two-stage Rosenbrock method
-of order two that damps any stiffness (Shampine and Reichelt 1997, ``ode23s``), in smaller steps while a
-joint passes through standstill.
+The thesis integrates with an explicit fixed-step method (ode3). At the sampling rate, the smoothed Coulomb friction of
+a small wrist joint is too stiff for it. The friction is therefore linearly implicit here. In each sampling period the
+mass matrix and the bias forces are extrapolated to its middle from the last two samples (second order). Then
+``M qd' = tau - bias - friction(qd)`` is integrated by the L-stable two-stage Rosenbrock method of order two (Shampine
+and Reichelt 1997, ``ode23s``). Steps are smaller while a joint passes through standstill.
 """
 
 from dataclasses import dataclass
@@ -24,37 +23,37 @@ GAMMA = 1.0 / (2.0 + np.sqrt(2.0))
 """Rosenbrock parameter that makes the two-stage method of order two L-stable."""
 
 RUNAWAY = 10.0
-"""A joint faster than this many times its configured limit has run away, where nothing else is said."""
+"""Multiple of the configured velocity limit above which a simulation counts as diverged by default."""
 
 
 NEAR_STANDSTILL = 4.0
-"""``g |qd|`` under which the smoothed sign bends so much that its slope changes within a sample."""
+"""``g |qd|`` below which the slope of the smoothed sign changes noticeably within a sample."""
 
 STEPS_PER_UNIT = 4.0
-"""Steps per unit of ``g qd`` passed within one sample near standstill."""
+"""Integration steps per unit change of ``g qd`` within one sample near standstill."""
 
 MOST_STEPS = 16
-"""Most steps within one sample."""
+"""Maximum number of integration steps within one sample."""
 
 HISTORY = 1024
-"""Samples the controller's memory takes before it is moved to the front of its arrays again."""
+"""Number of samples after which the past of the controller is copied to the front of its arrays."""
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A simulated motion; all arrays (N, n), joint side, NaN from ``diverged_at`` on.
+    """Simulated motion; all arrays (N, n), SI, joint side, NaN from ``diverged_at`` on.
 
     Parameters
     ----------
     q, qd
-        Positions and velocities at the samples.
+        Positions and velocities at the samples, rad or m, s.
     qdd
-        Accelerations at the samples: the mean of those just before and just after the torque changes.
+        Accelerations at the samples: mean of the values immediately before and after the torque changes.
     tau
-        Torque held over ``[k, k + 1)``.
+        Joint torque during ``[k, k + 1)``, N m or N.
     diverged_at
-        Sample at which the simulation stopped: not finite, too fast, or a mass matrix that is not
-        positive definite; ``None`` if it reached the end.
+        Sample at which the simulation stopped; ``None`` if it reached the end. Reasons: a state that is not finite, a
+        velocity above its limit, or a mass matrix that is not positive definite.
     """
 
     q: Floats
@@ -81,30 +80,31 @@ def simulate(
 
     Parameters
     ----------
+    model
+        Arm model with n joints; its terms are not simulated.
     theta_base
-        Base parameters (b,) or standard parameters (p,); friction is smoothed.
+        Base parameters (b,) or standard parameters (p,), SI; friction is smoothed.
     controller
-        Runs once per sample on the position at that sample; its torque is held over the sample.
+        Controller that acts once per sample on the position at that sample; its torque is held for one period.
     q_ref
         Reference positions (N, n), rad or m.
     dt
-        Sampling period, s; that of the controller.
+        Sampling period, s; equal to that of the controller.
     q0, qd0
-        State at the first sample, (n,); by default on the reference, with its velocity. Before the first
-        sample the tracking error was constant and the velocity ``qd0``.
+        State at the first sample, (n,), rad or m, s; by default that of the reference. Before the first sample the
+        tracking error was constant and the velocity ``qd0``.
     max_velocity
-        Joint velocities, scalar or (n,), beyond which the simulation counts as diverged; by default ten
+        Joint velocities, scalar or (n,), rad/s or m/s, above which the simulation counts as diverged; by default ten
         times the limits of the configuration.
     disturbance
-        Motor torques (N, n), N m or N, that something else adds to those of the controller, after their saturation;
-        ``tau`` contains them.
+        Motor torques (N, n), N m or N, added to those of the controller after their saturation; ``tau`` contains them.
     inertia
-        Of the joints (n,), kg m^2 or kg, beside that of the parameters.
+        Additional inertia of the joints (n,), kg m^2 or kg.
 
     Raises
     ------
     ValueError
-        If shapes or sampling periods do not fit.
+        If numbers of joints, shapes or sampling periods differ.
     """
     reference = np.ascontiguousarray(q_ref, dtype=np.float64)
     samples, n = reference.shape
@@ -167,9 +167,24 @@ def friction(
     slope: Floats,
     pair_slope: Floats,
 ) -> None:
-    """Friction ``force`` (n,) at velocities ``v``, its diagonal ``slope`` (n,) and that of each coupling.
+    """Compute friction torques and their derivatives with respect to velocity (thesis equations 2.7, B.1).
 
-    ``x``, ``bend`` and ``steep`` are scratch of the `padded` number of joints and couplings.
+    Parameters
+    ----------
+    n, pairs
+        Numbers of joints and of couplings.
+    values
+        Parameter values by kind, SI.
+    v
+        Joint velocities (n,), rad/s or m/s.
+    x, bend, steep
+        Scratch arrays of length ``padded(n + pairs)``: arguments of the arctangent, its values and its derivatives.
+    force
+        Output array of the friction torques with offsets (n,), N m or N.
+    slope
+        Output array of the diagonal of the derivative (n,), N m s/rad or N s/m.
+    pair_slope
+        Output array of the off-diagonal derivative of each coupling (pairs,).
     """
     g = values.smoothing
     for j in range(n):
@@ -195,7 +210,19 @@ def friction(
 
 @inlined
 def divisions(n: int, pairs: int, values: Values, v: Floats, a: Floats, dt: float) -> int:
-    """How many steps one sample needs: more while a joint with Coulomb friction passes standstill."""
+    """Number of integration steps in one sample: more while a joint with Coulomb friction passes standstill.
+
+    Parameters
+    ----------
+    n, pairs
+        Numbers of joints and of couplings.
+    values
+        Parameter values by kind, SI.
+    v, a
+        Joint velocities and accelerations (n,), rad or m, s.
+    dt
+        Sampling period, s.
+    """
     most = 1
     for j in range(n):
         x, dx = values.smoothing * v[j], values.smoothing * a[j] * dt
@@ -213,7 +240,23 @@ def divisions(n: int, pairs: int, values: Values, v: Floats, a: Floats, dt: floa
 def stiffen(
     n: int, pairs: int, mass: Floats, step: float, coupled: Ints, slope: Floats, pair_slope: Floats, stiff: Floats
 ) -> None:
-    """Lower triangle of the matrix of the implicit stages over ``step``, ``mass`` and friction slopes."""
+    """Compute the matrix of the implicit stages, ``mass + GAMMA step F`` with the friction derivative F.
+
+    Parameters
+    ----------
+    n, pairs
+        Numbers of joints and of couplings.
+    mass
+        Mass matrix (n, n); only its lower triangle is read.
+    step
+        Integration step, s.
+    coupled
+        Indices of the two joints of each coupling (pairs, 2).
+    slope, pair_slope
+        Derivatives of the friction from `friction`, (n,) and (pairs,).
+    stiff
+        Output array (n, n); only its lower triangle is written.
+    """
     for i in range(n):
         for j in range(i):
             stiff[i, j] = mass[i, j]
@@ -245,10 +288,40 @@ def run(
     joints: tuple[int, ...],
     couplings: tuple[int, ...],
 ) -> int:
-    """Fill ``q, qd, qdd, tau`` (N, n) from their first sample on; returns where it stopped, or -1.
+    """Simulate the closed loop; fill ``q, qd, qdd, tau`` from the state in the first row of ``q`` and ``qd``.
 
-    ``reference`` (N, n) is that of the motors. ``joints`` and ``couplings`` have one entry each per joint and coupling:
-    the length of a tuple is known when the kernel is compiled, and its short loops become straight code.
+    The length of a tuple is known when the kernel is compiled: with ``joints`` and ``couplings`` the compiler unrolls
+    the short loops.
+
+    Parameters
+    ----------
+    chain
+        Geometry of the chain.
+    values
+        Parameter values by kind, SI.
+    transmission, inverse_transmission
+        Matrix (n, n) from joint to motor positions, and its inverse.
+    error_taps, position_taps, output_taps, saturation
+        Coefficients and limits of the controller; see `DiscreteController`.
+    memory
+        Number of samples that the controller uses.
+    reference
+        Reference positions of the motors (N, n), rad or m.
+    disturbance
+        Additional motor torques (N, n), N m or N; shape (0, n): none.
+    dt
+        Sampling period, s.
+    max_velocity
+        Joint velocities (n,), rad/s or m/s, above which the simulation stops.
+    q, qd, qdd, tau
+        Output arrays (N, n), joint side, SI.
+    joints, couplings
+        Tuples with one entry per joint and per coupling; only their lengths are used.
+
+    Returns
+    -------
+    int
+        Sample at which the simulation stopped, or -1 if it reached the end.
     """
     samples, n = reference.shape[0], len(joints)
     coupled = values.coupling_joints
@@ -260,12 +333,12 @@ def run(
     x, bend, steep = np.zeros(terms), np.empty(terms), np.empty(terms)
     bias, bias_before, still = np.empty(n), np.empty(n), np.zeros(n)
     load, k1, k2, middle, rate = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    # State and torque live in arrays of their own: a view of a row costs more than the row.
+    # State and torque have their own arrays: creating a view of a row takes longer than copying the row.
     p, v, held, drive = q[0].copy(), qd[0].copy(), np.empty(n), np.empty(n)
     disturbed = disturbance.shape[0] > 0
     force, slope, pair_slope = np.empty(n), np.empty(n), np.empty(pairs)
     force_middle, slope_middle, pair_slope_middle = np.empty(n), np.empty(n), np.empty(pairs)
-    # The newest sample stands in row ``now``; when the rows are used up, the last ones move to the front.
+    # The newest sample is in row ``now``; after the last row, the most recent ones are copied to the front.
     rows = memory + HISTORY
     error, position, output = np.empty((rows, n)), np.empty((rows, n)), np.empty((rows, n))
     now = memory - 2
@@ -327,7 +400,7 @@ def run(
             for j in range(i + 1):
                 middle_mass[i, j] = 1.5 * mass[i, j] - 0.5 * mass_before[i, j]
                 mass_before[i, j] = mass[i, j]
-        # One step over the whole sample is the rule: its factors are on their way while those at the sample are.
+        # Usually one step covers the sample: factor its matrix here, so that both factorisations overlap in the CPU.
         stiffen(n, pairs, middle_mass, dt, coupled, slope, pair_slope, stiff)
         if not cholesky(mass, factor, n):
             return k
@@ -355,7 +428,7 @@ def run(
             for i in range(n):
                 middle[i] = v[i] + 0.5 * h * k1[i]
             friction(n, pairs, values, middle, x, bend, steep, force_middle, slope_middle, pair_slope_middle)
-            # M k1 = load - force - gamma h F k1 spares the product with the mass matrix.
+            # M k1 = load - force - gamma h F k1 makes the product with the mass matrix unnecessary.
             for i in range(n):
                 k2[i] = force[i] - force_middle[i] + GAMMA * h * slope[i] * k1[i]
             for m in range(pairs):
