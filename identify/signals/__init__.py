@@ -1,1 +1,1 @@
-"""Signals: smoothing, differentiation and decimation of what was measured."""
+"""Signal processing: smoothing, differentiation and decimation of measured signals."""

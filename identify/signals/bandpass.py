@@ -1,4 +1,4 @@
-"""The thesis's bandpass: zero-phase Butterworth and central differences (section 2.3.1)."""
+"""Bandpass filtering of the thesis: zero-phase Butterworth filter and central differences (section 2.3.1)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,20 +15,20 @@ def butterworth(
     Parameters
     ----------
     x
-        Shape (N,) or (N, n).
+        Signal, shape (N,) or (N, n).
     dt
         Sampling period, s.
     cutoff_hz
-        Cut-off of one pass, Hz; the forward and reverse passes together have -6 dB there.
+        Cut-off frequency of one pass, Hz; forward and reverse pass together have -6 dB there.
     order
-        Order of one pass.
+        Filter order of one pass.
     padlen
-        Samples of odd extension at each end; ``None``: ``3 * order``.
+        Number of samples of odd extension at each end; ``None``: ``3 * order``.
 
     Raises
     ------
     DataError
-        If the cut-off is not below the Nyquist frequency or the series is shorter than the padding.
+        If the cut-off is not below the Nyquist frequency or the signal is not longer than the padding.
     """
     if cutoff_hz * dt >= 0.5:
         raise DataError(f"cut-off {cutoff_hz:g} Hz is not below half the sampling rate ({0.5 / dt:g} Hz)")
@@ -41,5 +41,18 @@ def butterworth(
 
 
 def central_difference(x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-    """``(x(k+1) - x(k-1)) / (2 dt)`` along the first axis, one-sided at the two ends."""
+    """Derivative ``(x(k+1) - x(k-1)) / (2 dt)`` along the first axis, one-sided at both ends.
+
+    Parameters
+    ----------
+    x
+        Signal, shape (N,) or (N, n).
+    dt
+        Sampling period, s.
+
+    Returns
+    -------
+    ndarray
+        Shape of ``x``, in its unit per s.
+    """
     return np.gradient(x, dt, axis=0)

@@ -1,4 +1,4 @@
-"""How fast the recorded motion is, where nobody said it."""
+"""Bandwidth of a recorded motion, for the choice of filters if none is configured."""
 
 from collections.abc import Sequence
 
@@ -9,36 +9,35 @@ from scipy import signal
 from armident.configs import DataError
 
 POWER_SHARE = 0.95
-"""Share of the power of the velocity that lies below the bandwidth of the motion."""
+"""Fraction of the power of the velocity that lies below the bandwidth of the motion."""
 
 MARGIN = 5.0
-"""From the bandwidth of the motion to the closed-loop bandwidth that the filters are chosen for."""
+"""Ratio of the closed-loop bandwidth assumed for the filters to the bandwidth of the motion."""
 
 SIGNIFICANT = 10.0
-"""Power of a frequency in noise floors from which on it counts as motion; white noise exceeds it once in 20000."""
+"""Power relative to the noise floor above which a frequency counts as motion; white noise exceeds it once in 20000."""
 
 PERIODS = 50.0
-"""Fewest periods of the bandwidth in the shortest experiment: 200 samples after the decimation of IDIM-LS."""
+"""Minimum bandwidth in periods per shortest experiment: 200 samples after the decimation of IDIM-LS."""
 
 
 def motion_bandwidth(q: Sequence[NDArray[np.float64]], dt: float) -> float:
-    """Bandwidth (Hz) to choose filters by: a margin above where nearly all power of every joint's velocity lies.
+    """Bandwidth (Hz) for the choice of filters: ``MARGIN`` times that of the fastest joint's velocity.
 
-    Noise of the encoder is told from motion by the floor of the position's spectrum in the upper half of the
-    frequencies. Motion so slow that its filters would leave too few equations is given the bandwidth that leaves
-    enough.
+    The noise floor of the encoder is estimated from the upper half of the position's spectrum. For slow motion the
+    bandwidth is increased to ``PERIODS`` per shortest experiment: decimation would otherwise leave too few equations.
 
     Parameters
     ----------
     q
-        Measured positions (N, n) of every experiment.
+        Measured positions of each experiment, (N, n), rad or m.
     dt
         Sampling period, s.
 
     Raises
     ------
     DataError
-        If nothing moves.
+        If no joint moves.
     """
     highest = max((_velocity_bandwidth(positions, dt) for positions in q), default=0.0)
     if highest == 0:
@@ -48,12 +47,12 @@ def motion_bandwidth(q: Sequence[NDArray[np.float64]], dt: float) -> float:
 
 
 def _highest(dt: float) -> float:
-    """Highest frequency (Hz) at which motion is looked for."""
+    """Highest frequency (Hz) that can count as motion."""
     return 0.04 / dt
 
 
 def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
-    """Frequency (Hz) below which ``POWER_SHARE`` of the velocity's power lies, of the fastest joint; 0: none moves."""
+    """Frequency (Hz) below which ``POWER_SHARE`` of the fastest joint's velocity power lies; 0 if no joint moves."""
     frequency, power = signal.periodogram(np.diff(q, axis=0) / dt, 1 / dt, window="hann", axis=0)
     frequency, power = frequency[1:], power[1:]
     position = power / (2 - 2 * np.cos(2 * np.pi * frequency * dt))[:, None]

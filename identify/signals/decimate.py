@@ -1,4 +1,4 @@
-"""The parallel ("decimate") filter: one zero-phase low-pass for torque and regressor alike (section 2.3.1)."""
+"""Parallel ("decimate") filter: the same zero-phase low-pass for torque and regressor (thesis section 2.3.1)."""
 
 from dataclasses import dataclass
 
@@ -10,21 +10,28 @@ from scipy import signal
 from armident.configs import DataError
 
 STOPBAND_DB = 70.0
-"""Attenuation beyond the Nyquist frequency of the decimated signal."""
+"""Attenuation above the Nyquist frequency of the decimated signal, dB."""
 
 TRANSITION = 0.5
-"""Width of the transition band as a share of the decimated Nyquist frequency."""
+"""Width of the transition band as a fraction of the decimated Nyquist frequency."""
 
 _ROWS = 8
-"""Rows per product: fewer waste calls, more waste the zeros off the band."""
+"""Output rows per matrix product: fewer rows mean more calls, more rows more products with zeros off the band."""
 
 
 @dataclass(frozen=True, eq=False)
 class Decimation:
-    """A linear-phase low-pass of finite length and the factor by which it thins out the samples.
+    """Linear-phase low-pass of finite length followed by decimation.
 
-    Being symmetric it has zero phase, being finite it needs no initial state: samples whose window
-    leaves the record are dropped.
+    The filter is symmetric and centred, so that it has zero phase. It is finite and needs no initial state. Samples
+    whose window extends beyond the record are dropped.
+
+    Parameters
+    ----------
+    factor
+        Decimation factor: one sample of ``factor`` is kept.
+    taps
+        Symmetric impulse response, odd length, shape (m,).
     """
 
     factor: int
@@ -47,29 +54,54 @@ class Decimation:
 
     @property
     def passes_all(self) -> bool:
-        """Whether nothing is filtered and every sample kept."""
+        """True if the filter is the identity and every sample is kept."""
         return self.factor == 1 and self.taps.size == 1 and self.taps[0] == 1.0
 
     def count(self, samples: int) -> int:
-        """How many samples are left of ``samples``."""
+        """Number M of output samples for a record of ``samples``."""
         return max(0, (samples - self.taps.size) // self.factor + 1)
 
     def instants(self, samples: int) -> NDArray[np.int64]:
-        """Index of the sample at the centre of each window, shape (M,)."""
+        """Index of the input sample at the centre of each window, shape (M,), for a record of ``samples``."""
         return self.margin + self.factor * np.arange(self.count(samples), dtype=np.int64)
 
     def rows_of(self, begin: int, end: int) -> slice:
-        """Rows of the result that a sample of ``begin .. end - 1`` counts for, of an endless record."""
+        """Output rows that depend on the input samples ``begin .. end - 1``, for a record without end.
+
+        Parameters
+        ----------
+        begin, end
+            First input sample, and the one after the last.
+        """
         return slice(max(0, -(-(begin - self.taps.size + 1) // self.factor)), (end - 1) // self.factor + 1)
 
     def weights(self, rows: slice, begin: int, end: int) -> NDArray[np.float64]:
-        """What the samples ``begin .. end - 1`` weigh in some rows of the result, shape (rows, samples)."""
+        """Filter coefficients of the input samples ``begin .. end - 1`` in output rows.
+
+        Parameters
+        ----------
+        rows
+            Output rows, with ``start`` and ``stop``.
+        begin, end
+            First input sample, and the one after the last.
+
+        Returns
+        -------
+        ndarray
+            Shape (rows, samples).
+        """
         tap = np.arange(begin, end) - self.factor * np.arange(rows.start, rows.stop)[:, None]
         inside = (tap >= 0) & (tap < self.taps.size)
         return np.where(inside, self.taps[np.where(inside, tap, 0)], 0.0)
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Filter and thin out along the first axis: (N, ...) to (M, ...)."""
+        """Filter and decimate along the first axis: (N, ...) to (M, ...).
+
+        Raises
+        ------
+        DataError
+            If the record is shorter than the filter.
+        """
         count = self.count(x.shape[0])
         if count == 0:
             raise DataError(
@@ -81,7 +113,7 @@ class Decimation:
 
 
 def design(dt: float, cutoff_hz: float, factor: int | None = None) -> Decimation:
-    """Low-pass that keeps everything up to about ``cutoff_hz`` and decimates accordingly.
+    """Design a low-pass with cut-off ``cutoff_hz`` and the decimation factor that it allows.
 
     Parameters
     ----------
@@ -90,8 +122,8 @@ def design(dt: float, cutoff_hz: float, factor: int | None = None) -> Decimation
     cutoff_hz
         Half-amplitude frequency, Hz (thesis: ``w_Fp >= 2 w_dyn``).
     factor
-        Keep one sample of ``factor``; ``None``: as many as the Nyquist rate of ``cutoff_hz`` allows, which is
-        the thesis's ``n_d = w_nyq / w_Fp``.
+        Decimation factor; 1 gives the identity. ``None``: the largest factor whose Nyquist frequency is not below
+        ``cutoff_hz``, which is the thesis's ``n_d = w_nyq / w_Fp``.
     """
     if factor is None:
         factor = max(1, int(0.5 / (dt * cutoff_hz) + 1e-9))
@@ -104,7 +136,7 @@ def design(dt: float, cutoff_hz: float, factor: int | None = None) -> Decimation
 
 
 def _filtered(x: NDArray[np.float64], taps: NDArray[np.float64], factor: int, count: int) -> NDArray[np.float64]:
-    """``sum_i taps[i] x[factor m + i]`` for m under ``count``, in blocks of rows as products with a banded matrix."""
+    """Compute ``sum_i taps[i] x[factor m + i]`` for m < ``count``, as products of blocks with a banded matrix."""
     span = (_ROWS - 1) * factor + taps.size
     band = np.zeros((_ROWS, span))
     for i in range(_ROWS):
