@@ -16,21 +16,29 @@ from armident.identify.signals.irwsm import automatic_nvr, cross_validated_nvr, 
 Method = Literal["irwsm", "irwsm2", "bandpass"]
 
 NvrRule = Literal["automatic", "cross-validation", "likelihood", "tracking-error"]
-"""How the noise-variance ratio is found where no number is given."""
+"""Rule that determines the noise-variance ratio if no number is given."""
 
 NVR_RULES: tuple[NvrRule, ...] = ("automatic", "cross-validation", "likelihood", "tracking-error")
 
 NVR_BY_HAND = 1e-5
-"""The thesis's manual choice (section 5.3.1)."""
+"""Noise-variance ratio chosen manually in the thesis (section 5.3.1)."""
 
 
 @dataclass(frozen=True)
 class Derivatives:
-    """Positions and their derivatives at the sampling instants, shape (N, n) each.
+    """Positions and their derivatives at the sampling instants.
 
-    ``nvr`` has shape (n, 2) for ``irwsm`` (first and second pass), (n, 1) for ``irwsm2``, ``None`` for ``bandpass``.
-    ``dt`` is the sampling period and ``start`` the time of the first sample since the recordings began, s: what terms
-    of a model may depend on.
+    Parameters
+    ----------
+    q, qd, qdd
+        Positions, velocities, accelerations, shape (N, n) each; rad or m, s.
+    nvr
+        Noise-variance ratios: shape (n, 2) for ``irwsm`` (first and second pass), (n, 1) for ``irwsm2``, ``None`` for
+        ``bandpass``.
+    dt
+        Sampling period, s; model terms may depend on it.
+    start
+        Time of the first sample since the beginning of the first recording, s; model terms may depend on it.
     """
 
     q: NDArray[np.float64]
@@ -63,31 +71,32 @@ def differentiate(
         ``irwsm``: IRWSM 1, the level-slope smoother applied twice; ``irwsm2``: IRWSM 2, three states at once;
         ``bandpass``: zero-phase Butterworth of order 4 at five times ``bandwidth_hz``, then central differences.
     nvr
-        Noise-variance ratio, one for all joints or one per joint, or the rule to find it: ``automatic`` (the same as
-        ``None``, see :func:`armident.identify.signals.irwsm.automatic_nvr`), ``cross-validation``, ``likelihood``
-        (thesis 5.21) or ``tracking-error`` (5.26, 5.27).
+        Noise-variance ratio, scalar or (n,), or the rule that determines it: ``automatic`` (the same as ``None``, see
+        :func:`armident.identify.signals.irwsm.automatic_nvr`), ``cross-validation``, ``likelihood`` (thesis 5.21) or
+        ``tracking-error`` (5.26, 5.27).
     bandwidth_hz
         Closed-loop bandwidth, Hz; needed by ``bandpass``.
     q_ref
-        Reference positions, shape (N, n); needed by ``tracking-error``.
+        Reference positions, shape (N, n), rad or m; needed by ``tracking-error``.
     resolution
-        Encoder resolution on the joint side, one for all joints or one per joint, rad or m; needed by
-        ``tracking-error``, see :func:`encoder_resolution`.
+        Encoder resolution on the joint side, scalar or (n,), rad or m; needed by ``tracking-error``, see
+        :func:`encoder_resolution`.
 
     Notes
     -----
-    The slope state is the forward difference of the level and belongs half a sample later. IRWSM 1 therefore
-    yields velocity midway between samples, whose smoothed difference is an acceleration at the sample; the
-    velocity at the sample is the mean of its two neighbours.
+    The slope state is the forward difference of the level: it belongs to the instant half a sample later. IRWSM 1
+    therefore yields velocities midway between samples. Their smoothed difference is the acceleration at the sample;
+    the mean of two neighbours is the velocity at the sample.
 
-    The second pass of IRWSM 1 takes the ratio of the first, except with ``likelihood``, which estimates one for each
-    pass as the thesis does: what the first pass leaves is no white noise any more, so nothing can be learned from it.
+    The second pass of IRWSM 1 uses the ratio of the first pass: the noise after the first pass is not white, so that
+    its ratio cannot be estimated. Only ``likelihood`` estimates a ratio for each pass, as the thesis does.
 
     Raises
     ------
     DataError
-        If a series is too short or not finite, ``bandpass`` lacks the bandwidth, ``tracking-error`` lacks the
-        reference or the resolution or has no error, or ``nvr`` is neither positive nor a rule.
+        If a series is too short or not finite, or ``nvr`` is neither positive nor a rule. ``bandpass``: if the
+        bandwidth is missing. ``tracking-error``: if the reference or the resolution is missing, or a joint has no
+        tracking error.
     """
     if derivatives == "bandpass":
         if bandwidth_hz is None:
@@ -103,7 +112,7 @@ def differentiate(
         level[:, j], qd[:, j], qdd[:, j], used = smoother(q[:, j], dt, rule, given[j])
         return used
 
-    # On all processors: the kernels hold no interpreter lock.
+    # Threads on all processors: the kernels release the interpreter lock.
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         ratios = list(pool.map(derive, range(q.shape[1])))
     return Derivatives(q=level, qd=qd, qdd=qdd, nvr=np.array(ratios), dt=dt)
@@ -117,11 +126,11 @@ def tracking_error_nvr(
     Parameters
     ----------
     error
-        ``q_ref - q``, shape (N, n), rad or m.
+        Tracking error ``q_ref - q``, shape (N, n), rad or m.
     order
         2: variance of its difference (5.26, IRWSM 1); 3: of its second difference (5.27, IRWSM 2).
     resolution
-        Encoder resolution, one for all joints or one per joint, rad or m: what one count is worth.
+        Encoder resolution: joint displacement per count, scalar or (n,), rad or m.
 
     Raises
     ------
@@ -140,9 +149,9 @@ def tracking_error_nvr(
 
 
 def encoder_resolution(robot: RobotConfig) -> NDArray[np.float64]:
-    """What one count of the motor encoders is worth on the joint side, shape (n,), rad or m.
+    """Joint displacement per count of the motor encoders, shape (n,), rad or m.
 
-    Where several motors move a joint, their steps add as independent errors do.
+    If several motors move a joint, their resolutions add as the square root of the sum of squares.
 
     Raises
     ------
@@ -168,7 +177,7 @@ def _ratios(
     q_ref: NDArray[np.float64] | None,
     resolution: float | Sequence[float] | NDArray[np.float64] | None,
 ) -> tuple[NvrRule, list[float | None]]:
-    """The rule, and for every joint the ratio that is already known."""
+    """Return the rule, and the ratio of each joint if it is already known, otherwise ``None``."""
     n = q.shape[1]
     if nvr is None:
         return "automatic", [None] * n
@@ -214,11 +223,11 @@ def _found(y: NDArray[np.float64], order: int, rule: NvrRule) -> float:
 
 
 def _to_samples(slope: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values midway between samples (N - 1,) to values at the samples (N,)."""
+    """Interpolate values midway between samples (N - 1,) to the samples (N,)."""
     inner = (slope[1:] + slope[:-1]) / 2
     return np.concatenate([slope[:1], inner, slope[-1:]])
 
 
 def _extended(inner: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values at the samples 1..N-2 to all N: the two ends repeat their neighbour."""
+    """Extend values at the samples 1..N-2 to all N samples; each end repeats its neighbour."""
     return np.concatenate([inner[:1], inner, inner[-1:]])

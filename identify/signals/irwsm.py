@@ -1,15 +1,19 @@
 """Integrated-random-walk smoother (IRWSM) in its exact banded form (thesis section 5.1.2).
 
 The fixed-interval smoother of an integrated random walk of order ``d`` minimises
-``sum (y - x)^2 + (1/NVR) sum (D x)^2`` with ``D`` the d-th difference, so ``x = y - D' V^-1 D y`` with the banded
-``V = NVR I + D D'``, and the concentrated likelihood (5.16, 5.21) needs only the factors of ``V``: O(N) throughout.
+``sum (y - x)^2 + (1/NVR) sum (D x)^2``. ``D`` is the d-th difference. The solution is ``x = y - D' V^-1 D y`` with the
+banded ``V = NVR I + D D'``. The concentrated likelihood (5.16, 5.21) needs only the factors of ``V``. All computations
+are O(N).
 
-The likelihood assumes a random walk, that is accelerations with white increments. The accelerations of a robot are
-smoother: their spectrum falls faster. At a signal-to-noise ratio of 100 dB the ratio of maximum likelihood then follows
-the noise far beyond the frequency where the motion vanishes in it (so does thesis section 5.3.1). Cross-validation
-selects the smoother that predicts a left-out sample best. It needs white noise, but no model of the motion (Craven and
-Wahba 1979; Wahba 1985 compares the two criteria where the prior is wrong). :func:`automatic_nvr` takes the smaller of
-the ratios from cross-validation and from the likelihood of the third order; each errs towards too little smoothing.
+The likelihood assumes a random walk: accelerations with white increments. The accelerations of a robot are smoother:
+their spectrum falls faster. At a signal-to-noise ratio of 100 dB the ratio of maximum likelihood is therefore too
+large. The smoother then passes noise far above the frequency at which the noise exceeds the motion (as in thesis
+section 5.3.1).
+
+Cross-validation selects the smoother that predicts a left-out sample best. It needs white noise, but no model of the
+motion (Craven and Wahba 1979; Wahba 1985 compares the two criteria with a wrong prior). :func:`automatic_nvr` takes the
+smaller of the ratios from cross-validation and from the likelihood of the third order. The error of each of them is
+too little smoothing.
 """
 
 from collections.abc import Callable
@@ -22,7 +26,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError
 
 LOG10_NVR_RANGE = {2: (-12.0, 4.0), 3: (-14.0, 4.0)}
-"""Range of the search for the ratio; below it, third-order factors lose definiteness (about 1e-16)."""
+"""Search range of log10(NVR) for each order; third-order factors lose definiteness at about 1e-16."""
 
 SETTLED = 40.0
 """Time constants, ``NVR^(-1 / (2 order))`` samples, after which the factors of the band are constant to rounding."""
@@ -32,17 +36,17 @@ _STENCIL = {2: np.array([1.0, -2.0, 1.0]), 3: np.array([-1.0, 3.0, -3.0, 1.0])}
 
 @dataclass(frozen=True)
 class Smoothed:
-    """A smoothed series and its differences, in units per sample.
+    """Smoothed series and its first difference.
 
     Parameters
     ----------
     level
-        Smoothed series, shape (N,).
+        Smoothed series, shape (N,), in the unit of the series.
     slope
-        First difference of ``level``, shape (N - 1,). Element k is the state "slope" of sample k: the forward
-        difference, which belongs to the instant k + 1/2.
+        First difference of ``level``, shape (N - 1,), per sample. Element k is the slope state of sample k: the
+        forward difference, which belongs to the instant k + 1/2.
     nvr
-        Noise-variance ratio that was used.
+        Noise-variance ratio used.
     """
 
     level: NDArray[np.float64]
@@ -106,12 +110,12 @@ def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> 
     order
         2 or 3, see :func:`irwsm`.
     tolerance
-        Width of the final bracket in decades; the likelihood is flat to a few hundredths there.
+        Width of the final bracket, decades; near its optimum the likelihood is flat over a few hundredths.
 
     Returns
     -------
     float
-        The ratio; 1.0 for a series whose differences are all zero, which determines none.
+        The ratio; 1.0 for a series whose differences are all zero: it determines no ratio.
     """
     w = _scaled_differences(y, order)
     if w is None:
@@ -122,9 +126,18 @@ def optimal_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> 
 def cross_validation(w: NDArray[np.float64], order: int, nvr: float) -> float:
     """Logarithm of the generalised cross-validation score of a noise-variance ratio, up to a constant.
 
-    ``log(|y - x|^2 / N) - 2 log(tr(I - A) / N)`` with the smoother ``x = A y``. Where the noise is white this is, but
-    for a constant, the mean square error of predicting each sample from all others. The trace is that of a long series.
-    Parameters are those of :func:`negative_log_likelihood`. Source: Craven and Wahba 1979.
+    ``log(|y - x|^2 / N) - 2 log(tr(I - A) / N)`` with the smoother ``x = A y``. For white noise the score is, up to a
+    constant, the mean square error of predicting each sample from all others. The trace is that of a long series.
+    Source: Craven and Wahba 1979.
+
+    Parameters
+    ----------
+    w
+        Differences of the series, ``numpy.diff(y, n=order)``, shape (N - order,).
+    order
+        2 or 3, see :func:`irwsm`.
+    nvr
+        Noise-variance ratio, positive.
     """
     squares = float(_residual_sum(w, _band(order, nvr), _STENCIL[order], _transient(order, nvr)))
     return float(np.log(squares) - 2 * np.log(1 - kept_share(order, nvr)))
@@ -133,8 +146,22 @@ def cross_validation(w: NDArray[np.float64], order: int, nvr: float) -> float:
 def cross_validated_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
     """Noise-variance ratio of least generalised cross-validation score, by a bounded search on ``log10(NVR)``.
 
-    It assumes white measurement noise, as quantisation is while a sample passes several counts, and nothing about the
-    motion. Parameters and result are those of :func:`optimal_nvr`.
+    The criterion assumes white measurement noise and nothing about the motion. Quantisation noise is white if the
+    position changes by several counts per sample.
+
+    Parameters
+    ----------
+    y
+        Series, shape (N,).
+    order
+        2 or 3, see :func:`irwsm`.
+    tolerance
+        Width of the final bracket, decades.
+
+    Returns
+    -------
+    float
+        The ratio; 1.0 for a series whose differences are all zero: it determines no ratio.
     """
     w = _scaled_differences(y, order)
     if w is None:
@@ -143,12 +170,25 @@ def cross_validated_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0
 
 
 def automatic_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -> float:
-    """Noise-variance ratio for positions with unknown noise: the smaller of two choices.
+    """Noise-variance ratio for positions with unknown noise: the smaller of those of two criteria.
 
-    Cross-validation is right where the measurement noise is white, and follows the noise where it is coloured. The
-    likelihood of the third-order walk depends less on the colour, and follows white noise a little too far. For
+    Cross-validation is optimal for white measurement noise; for coloured noise its ratio is too large. The likelihood
+    of the third-order random walk depends less on the colour; for white noise its ratio is slightly too large. For
     order 2 the ratio of the third order is converted to the same half-power frequency, ``NVR^(1 / (2 order))``.
-    Parameters and result are those of :func:`optimal_nvr`.
+
+    Parameters
+    ----------
+    y
+        Series, shape (N,).
+    order
+        2 or 3, see :func:`irwsm`.
+    tolerance
+        Width of the final bracket, decades.
+
+    Returns
+    -------
+    float
+        The ratio; 1.0 for a series whose differences are all zero: it determines no ratio.
     """
     validated = cross_validated_nvr(y, order, tolerance)
     likeliest = optimal_nvr(y, 3, tolerance)
@@ -156,23 +196,29 @@ def automatic_nvr(y: NDArray[np.float64], order: int, tolerance: float = 0.02) -
 
 
 def kept_share(order: int, nvr: float) -> float:
-    """Degrees of freedom per sample that the smoother ``x = A y`` of a long series keeps, ``tr(A) / N``.
+    """Degrees of freedom per sample of the smoother ``x = A y`` for a long series, ``tr(A) / N``.
 
-    The mean over frequency of ``NVR / (NVR + (2 - 2 cos w)^order)``, by partial fractions. Parameters are those of
-    :func:`irwsm`.
+    This is the mean over frequency of ``NVR / (NVR + (2 - 2 cos w)^order)``, computed by partial fractions.
+
+    Parameters
+    ----------
+    order
+        2 or 3, see :func:`irwsm`.
+    nvr
+        Noise-variance ratio, positive.
     """
     poles = nvr ** (1 / order) * np.exp(1j * np.pi * (2 * np.arange(order) + 1) / order)
     return float(np.sum(-poles / (np.sqrt(-poles) * np.sqrt(4 - poles))).real / order)
 
 
 def _scaled_differences(y: NDArray[np.float64], order: int) -> NDArray[np.float64] | None:
-    """Differences of a series scaled to a maximum of 1, or ``None`` at standstill."""
+    """Differences of a series (N - order,) scaled to a maximum of 1; ``None`` if all are zero."""
     w = np.diff(_checked(y, order), n=order)
     return w / np.abs(w).max() if np.any(w) else None
 
 
 def _search(criterion: Callable[[float], float], order: int, tolerance: float) -> float:
-    """Minimise a criterion of the ratio: a grid of two decades, then a golden section between its neighbours."""
+    """Minimise a criterion of the ratio on a grid of two decades, then by golden section around the best point."""
     low, high = LOG10_NVR_RANGE[order]
     grid = np.arange(low, high + 1e-9, 2.0)
     best = int(np.argmin([criterion(10.0**g) for g in grid]))
@@ -218,7 +264,10 @@ def _transient(order: int, nvr: float) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
-    """Row i of ``V = L diag(d) L'``: fills ``low[i % p]`` (distance 1..p) and returns d_i; rings of length p."""
+    """Row i of ``V = L diag(d) L'``: fill ``low[i % (p + 1)]`` (distances 1..p) and return d_i.
+
+    ``low`` and ``d`` are ring buffers of length p + 1.
+    """
     for j in range(min(p, i), 0, -1):
         value = band[j]
         for k in range(j + 1, min(p, i) + 1):
@@ -232,7 +281,7 @@ def _row(band, d, low, i, p):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _profile(w, band, transient):  # type: ignore[no-untyped-def]
-    """``m log(w' V^-1 w) + log|V|`` in one forward sweep; the factors of a Toeplitz band become constant."""
+    """``m log(w' V^-1 w) + log|V|`` in one forward sweep; after ``transient`` rows the factors are constant."""
     m, p = w.size, band.size - 1
     d, low, z = np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.zeros(p + 1)
     quadratic, logdet, pivot, i = 0.0, 0.0, 1.0, 0
@@ -264,7 +313,7 @@ def _profile(w, band, transient):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _forward(w, band, transient):  # type: ignore[no-untyped-def]
-    """``L^-1 w`` with ``V = L diag(d) L'``, and rows of L and d up to those that stand for all that follow."""
+    """``L^-1 w`` with ``V = L diag(d) L'``, and the first rows of L and d; all later rows equal the last one."""
     m, p = w.size, band.size - 1
     d, low, z = np.zeros(p + 1), np.zeros((p + 1, p + 1)), np.empty(m)
     last = min(m, transient) - 1
@@ -291,12 +340,12 @@ def _forward(w, band, transient):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _correction(w, band, stencil, transient):  # type: ignore[no-untyped-def]
-    """``D' V^-1 w``, shape (m + order,); the factors of a Toeplitz band become constant."""
+    """``D' V^-1 w``, shape (m + order,); after ``transient`` rows the factors are constant."""
     m, p = w.size, band.size - 1
     z, rows, pivots = _forward(w, band, transient)
     last = pivots.size - 1
     out = np.zeros(m + p)
-    # Solved backwards: u1, u2, u3 are the solution one, two and three places later, zero beyond the end.
+    # Backward substitution: u1, u2, u3 are the next three elements of the solution, zero beyond the end.
     u1 = u2 = u3 = 0.0
     for i in range(m - 1, -1, -1):
         value = z[i] / pivots[min(i, last)] - rows[min(i + 1, last), 1] * u1 - rows[min(i + 2, last), 2] * u2
@@ -310,14 +359,14 @@ def _correction(w, band, stencil, transient):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _residual_sum(w, band, stencil, transient):  # type: ignore[no-untyped-def]
-    """``|D' V^-1 w|^2``; as in :func:`_profile` the factors of a Toeplitz band become constant."""
+    """``|D' V^-1 w|^2``; after ``transient`` rows the factors are constant."""
     m, p = w.size, band.size - 1
     z, rows, pivots = _forward(w, band, transient)
     last = pivots.size - 1
     l1, l2 = rows[last, 1], rows[last, 2]
     l3 = rows[last, 3] if p == 3 else 0.0
     total = 0.0
-    # Solved backwards: u1, u2, u3 are the solution one, two and three places later, zero beyond the end.
+    # Backward substitution: u1, u2, u3 are the next three elements of the solution, zero beyond the end.
     u1 = u2 = u3 = 0.0
     s0, s1, s2 = stencil[0], stencil[1], stencil[2]
     s3 = stencil[3] if p == 3 else 0.0

@@ -1,9 +1,10 @@
-"""Velocities while the arm moves: a causal Kalman filter on the positions as they arrive.
+"""Online estimation of velocities and accelerations: a causal Kalman filter on measured positions.
 
-The model is that of the smoother (thesis section 5.1.2) in its kinematic form: the highest derivative is driven by
-white noise, the state holds position and derivatives at the sampling instant itself, so nothing has to be moved by
-half a sample. With the unit of time one sample and that of variance the measurement's, only the noise-variance ratio
-is left, and its meaning is that of :mod:`armident.identify.signals.irwsm`: the same spectrum, ``NVR / w^(2 order)``.
+The model is the kinematic form of that of the smoother (thesis section 5.1.2). White noise drives the highest
+derivative. The state holds position and derivatives at the sampling instant, so that no shift by half a sample is
+needed. The unit of time is one sample, the unit of variance that of the measurement noise. The only parameter left is
+the noise-variance ratio. It has the same meaning as in :mod:`armident.identify.signals.irwsm`: the spectrum is
+``NVR / w^(2 order)`` in both.
 """
 
 from dataclasses import dataclass
@@ -15,14 +16,20 @@ from numpy.typing import ArrayLike, NDArray
 from armident.configs import DataError
 
 PRIOR = 1e10
-"""Variance of the unknown derivatives at the first sample, in units of the measurement's variance."""
+"""Prior variance of the derivatives at the first sample, in units of the variance of the measurement noise."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class LiveDerivatives:
-    """Filtered positions and derivatives of a batch, shape (M, n) each; NaN until a joint's first measurement."""
+    """Filtered positions and derivatives of a batch; NaN before the first measurement of a joint.
+
+    Parameters
+    ----------
+    q, qd, qdd
+        Positions, velocities, accelerations, shape (M, n) each; rad or m, s. ``qdd`` is NaN for order 2.
+    """
 
     q: Array
     qd: Array
@@ -31,17 +38,17 @@ class LiveDerivatives:
 
 @dataclass(frozen=True)
 class LiveState:
-    """Where the filter stands after the last sample; all of shape (n,).
+    """State of the filter after the last sample; all arrays of shape (n,).
 
     Parameters
     ----------
     q, qd, qdd
-        Position, velocity and acceleration at the last sample, SI; ``qdd`` is NaN for a filter of order 2, all are
-        NaN before the first measurement.
+        Position, velocity and acceleration at the last sample, rad or m, s. ``qdd`` is NaN for a filter of order 2;
+        all are NaN before the first measurement.
     q_std, qd_std, qdd_std
-        Their standard deviations, from the innovations seen so far (5.16); NaN before there are enough.
+        Their standard deviations, from the innovations so far (5.16); NaN up to ``order`` measurements.
     measured
-        Number of measurements that entered.
+        Number of measurements processed.
     """
 
     q: Array
@@ -54,7 +61,7 @@ class LiveState:
 
 
 class VelocityFilter:
-    """Causal velocities and accelerations of n joints, sample by sample or batch by batch.
+    """Causal filter for velocities and accelerations of n joints, sample by sample or batch by batch.
 
     Parameters
     ----------
@@ -63,14 +70,14 @@ class VelocityFilter:
     dt
         Sampling period, s.
     nvr
-        Noise-variance ratio, one for all joints or one per joint: the same number as for the smoother of this
-        order, for instance ``automatic_nvr(q[:, j], order)`` of an earlier recording.
+        Noise-variance ratio, scalar or (n,): the same number as for the smoother of this order, for instance
+        ``automatic_nvr(q[:, j], order)`` of an earlier recording.
     order
         2: position and velocity; 3: acceleration as well, and no lag while it is constant.
 
     Notes
     -----
-    ``F``, ``H``, ``Q`` and ``R`` are the matrices of the model in filterpy's notation, in samples.
+    ``F``, ``H``, ``Q`` and ``R`` are the matrices of the model in filterpy's notation; the unit of time is one sample.
 
     Raises
     ------
@@ -92,44 +99,44 @@ class VelocityFilter:
 
     @property
     def F(self) -> Array:  # noqa: N802
-        """Transition over one sample, (order, order)."""
+        """State transition matrix over one sample, (order, order)."""
         return np.array([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])[: self.order, : self.order]
 
     @property
     def H(self) -> Array:  # noqa: N802
-        """Measurement, (1, order)."""
+        """Measurement matrix, (1, order)."""
         return np.eye(self.order)[:1]
 
     @property
     def Q(self) -> Array:  # noqa: N802
-        """Covariance that one sample of white noise adds, (n, order, order), relative to the measurement's."""
+        """Covariance of the process noise over one sample, relative to that of the measurement, (n, order, order)."""
         return self.nvr[:, None, None] * _driven(self.order)
 
     @property
     def R(self) -> Array:  # noqa: N802
-        """Covariance of the measurement, (1, 1): the unit."""
+        """Covariance of the measurement noise, (1, 1): one, by the choice of units."""
         return np.eye(1)
 
     def reset(self) -> None:
-        """Forget everything: the next measurement is the first."""
+        """Reset the state: the next measurement is treated as the first."""
         self._x = np.full((self.n, self.order), np.nan)
         self._p = np.zeros((self.n, self.order, self.order))
         self._squares = np.zeros(self.n)
         self._measured = np.zeros(self.n, dtype=np.int64)
 
     def handle(self, samples: ArrayLike) -> LiveDerivatives:
-        """Take positions in and give their filtered values and derivatives.
+        """Process measured positions and return their filtered values and derivatives.
 
         Parameters
         ----------
         samples
-            One sample (n,) or a batch (M, n), rad or m, in the order of time; NaN where a joint's measurement is
-            missing, which then is predicted.
+            One sample (n,) or a batch (M, n), rad or m, in the order of time. NaN: the measurement is missing and its
+            value is predicted.
 
         Raises
         ------
         DataError
-            If the shape does not fit the joints, or a position is infinite.
+            If the shape does not fit the number of joints, or a position is infinite.
         """
         y = np.atleast_2d(np.asarray(samples, dtype=np.float64))
         if y.ndim != 2 or y.shape[1] != self.n:
@@ -146,7 +153,7 @@ class VelocityFilter:
         return LiveDerivatives(out[0], out[1] / self.dt, out[2] / self.dt**2)
 
     def result(self) -> LiveState:
-        """State after the last sample, with standard deviations."""
+        """Return the state after the last sample, with standard deviations."""
         known = self._measured > self.order
         variance = np.full(self.n, np.nan)
         variance[known] = self._squares[known] / (self._measured[known] - self.order)
@@ -158,7 +165,7 @@ class VelocityFilter:
 
 
 def _driven(order: int) -> Array:
-    """Covariance that unit white noise on the highest derivative adds over one sample, (order, order)."""
+    """Covariance from unit white noise on the highest derivative over one sample, (order, order)."""
     if order == 2:
         return np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
     return np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])
@@ -176,7 +183,7 @@ def _filter(y, nvr, driven, x, p, squares, measured, out):  # type: ignore[no-un
             if measured[j] == 0:
                 if np.isnan(value):
                     continue
-                # The first measurement: what it says of the position, and nothing of the rest.
+                # The first measurement determines the position; the derivatives have the prior variance.
                 x[j] = 0.0
                 x[j, 0] = value
                 for a in range(order):

@@ -1,4 +1,4 @@
-"""Power spectra of short records."""
+"""Power spectra of short records: Hann window and periodogram."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,12 +7,12 @@ Array = NDArray[np.float64]
 
 
 def hann_window(samples: int) -> Array:
-    """Symmetric Hann window divided by its norm, so that windowed white noise keeps its power; shape (N,).
+    """Symmetric Hann window of unit norm, so that windowed white noise keeps its power; shape (N,).
 
     Parameters
     ----------
     samples
-        Length N.
+        Length N of the window.
     """
     window = np.hanning(samples)
     return np.asarray(window / np.sqrt(window @ window))
@@ -21,19 +21,20 @@ def hann_window(samples: int) -> Array:
 def periodogram(windowed: Array, padding: int = 1) -> Array:
     """``|DFT|^2`` of a windowed record at the frequencies ``k / (padding N dt)`` from zero to the Nyquist frequency.
 
-    White noise of variance v has the level v at every frequency; times ``2 dt`` it is the one-sided power density.
+    White noise of variance v has the expected level v at every frequency. Multiplied by ``2 dt`` the result is the
+    one-sided power density.
     scipy.signal.periodogram is not used: its one-sided density has half of this at the Nyquist frequency.
 
     Parameters
     ----------
     windowed
-        Record times :func:`hann_window`, shape (N,).
+        Record multiplied by :func:`hann_window`, shape (N,).
     padding
-        Frequencies over independent ones.
+        Zero-padding factor: the length of the DFT is ``padding N``.
 
     Returns
     -------
     ndarray
-        Shape (padding N // 2 + 1,).
+        Shape (padding N // 2 + 1,), in the squared unit of the record.
     """
     return np.asarray(np.abs(np.fft.rfft(windowed, padding * windowed.size)) ** 2)

@@ -1,4 +1,4 @@
-"""The preprocessing that EMPS and many other data sets were published with: IIR filters as MATLAB applies them."""
+"""Preprocessing used for the published EMPS data and many other data sets: IIR filters as applied by MATLAB."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,22 +10,33 @@ from armident.configs import DataError
 def chebyshev_decimate(
     x: NDArray[np.float64], factor: int, order: int, ripple_db: float, padlen: int
 ) -> NDArray[np.float64]:
-    """Zero-phase Chebyshev low-pass at 0.8 of the new Nyquist frequency, then one sample of ``factor``.
+    """Decimate with a zero-phase Chebyshev low-pass at 0.8 of the new Nyquist frequency.
 
-    In second-order sections: as one transfer function the filter is numerically broken beyond ``factor`` of
-    about 30. The samples kept are those of MATLAB's ``decimate``: the last one is among them.
+    The filter is in second-order sections: as one transfer function it fails numerically for a ``factor`` above about
+    30. The samples kept are those of MATLAB's ``decimate``, with the last one among them.
 
     Parameters
     ----------
     x
-        Shape (N, ...).
+        Signal, shape (N, ...).
+    factor
+        Decimation factor: one sample of ``factor`` is kept.
+    order
+        Order of the Chebyshev filter (type I) of one pass.
+    ripple_db
+        Passband ripple of one pass, dB.
     padlen
-        Samples of odd extension at each end.
+        Number of samples of odd extension at each end.
+
+    Returns
+    -------
+    ndarray
+        Shape (M, ...), one row per index of :func:`kept_samples`.
 
     Raises
     ------
     DataError
-        If there are not more than ``padlen`` samples.
+        If the signal does not have more than ``padlen`` samples.
     """
     if x.shape[0] <= padlen:
         raise DataError(f"decimating needs more than {padlen} samples, got {x.shape[0]}")
@@ -35,6 +46,14 @@ def chebyshev_decimate(
 
 
 def kept_samples(samples: int, factor: int) -> NDArray[np.int64]:
-    """Indices that MATLAB's ``decimate`` keeps of ``samples``."""
+    """Indices of the samples that MATLAB's ``decimate`` keeps, shape (M,).
+
+    Parameters
+    ----------
+    samples
+        Number N of samples before decimation.
+    factor
+        Decimation factor.
+    """
     first = factor - (factor * (-(-samples // factor)) - samples) - 1
     return np.arange(first, samples, factor, dtype=np.int64)
