@@ -355,7 +355,7 @@ class ArmModel:
         if q.shape[0] <= PIECE:
             fill(0)
             return out
-        # Threads on all processors: the kernel releases the interpreter lock. Memory bandwidth limits most of the time.
+        # Threads on all processors: the kernel releases the interpreter lock. Memory access takes most of the time.
         with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
             for _ in pool.map(fill, range(0, q.shape[0], PIECE)):
                 pass

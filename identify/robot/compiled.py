@@ -18,7 +18,7 @@ def compiled(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """Compile a helper that allocates nothing into every kernel that calls it.
+    """Compile a helper that allocates no memory, inlined into every kernel that calls it.
 
     In the caller the compiler sees which arrays are distinct and which loops are short; a call would hide both.
     """

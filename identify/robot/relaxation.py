@@ -111,7 +111,7 @@ def simulate_with_terms(
         torque = known.term_regressor(known.motion(run.q, run.qd, run.qdd, dt, start)) @ values
         if k == 0:
             inertia = _inertia(model, theta, run, _slow(torque, dt, band_hz), _slow(run.qdd, dt, band_hz))
-        # A torque held over a period acts like its mean between two samples.
+        # The load is held during each period: take the mean of the torques at its two ends.
         held = torque - run.qdd * inertia
         held[:-1] = 0.5 * (held[1:] + held[:-1])
         held = _slow(held, dt, band_hz)

@@ -56,7 +56,7 @@ def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
     frequency, power = signal.periodogram(np.diff(q, axis=0) / dt, 1 / dt, window="hann", axis=0)
     frequency, power = frequency[1:], power[1:]
     position = power / (2 - 2 * np.cos(2 * np.pi * frequency * dt))[:, None]
-    # The power of white noise at one frequency is exponentially distributed: its median is log 2 of its mean.
+    # The power of white noise at one frequency is exponentially distributed: its median is log(2) times its mean.
     floor = np.median(position[frequency >= 0.25 / dt], axis=0) / np.log(2)
     moving = (position > SIGNIFICANT * floor) & (frequency <= _highest(dt))[:, None]
     cumulative = np.cumsum(np.where(moving, power, 0.0), axis=0)
