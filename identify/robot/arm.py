@@ -226,7 +226,7 @@ class ArmModel:
         if not self.terms:
             return rigid
         if dt is None:
-            raise ValueError("the terms of a model need the sampling period")
+            raise ValueError("dt is missing: the model has torque terms, which need the sampling period")
         further = self.term_regressor(self.motion(q, qd, qdd, dt, start, sharp_sign=sharp_sign))
         return np.concatenate([rigid, further], axis=2)
 
@@ -298,7 +298,9 @@ class ArmModel:
         out = np.empty_like(q)
         failed = fill_forward_dynamics(self.chain, self.values(theta), self.smoothing, q, qd, tau, out)
         if failed >= 0:
-            raise ArmidentError(f"the mass matrix is not positive definite at sample {failed}: parameters not physical")
+            raise ArmidentError(
+                f"the mass matrix is not positive definite at sample {failed}: the parameters are not physical"
+            )
         return out
 
     def standard_from_base(self, theta_base: ArrayLike) -> Floats:

@@ -369,7 +369,7 @@ def _solve(quadratic: Floats, linear: Floats, rows: Floats, right: Floats, cones
         sparse.csc_matrix(np.triu(quadratic)), linear, sparse.csc_matrix(rows), right, list(cones), settings
     ).solve()
     if str(solution.status) not in ("Solved", "AlmostSolved"):
-        raise ArmidentError(f"no consistent parameters found: the solver says {solution.status}")
+        raise ArmidentError(f"no physically consistent parameters found: solver status {solution.status}")
     return np.asarray(solution.x, dtype=np.float64)
 
 
@@ -443,9 +443,10 @@ def _verdict(model: ArmModel, distance: float, degrees: float, p_value: float, s
         return "the estimate is physically consistent as it is"
     worst = int(np.argmax(np.abs(shifts)))
     far = (
-        f"the nearest consistent arm is {distance:.2g} standard deviations away in {degrees:.1f} dimensions "
-        f"(p = {p_value:.2g}), most in {model.base.names[worst]} ({shifts[worst]:+.2g})"
+        f"the nearest consistent parameters are {distance:.2g} standard deviations away "
+        f"({degrees:.1f} degrees of freedom, p = {p_value:.2g}); "
+        f"{model.base.names[worst]} changes most, by {shifts[worst]:+.2g} standard deviations"
     )
     if p_value >= SIGNIFICANCE:
         return f"compatible with physics: {far}"
-    return f"not compatible with physics: {far}; the model lacks something or the standard deviations are too small"
+    return f"not compatible with physics: {far}; the model misses an effect or the standard deviations are too small"

@@ -51,7 +51,9 @@ class DiscreteController:
                 raise ValueError(f"{name}: expected finite numbers of shape ({n}, m), found {taps.shape}")
             object.__setattr__(self, name, taps)
         if self.saturation.shape != (n,) or not (self.saturation > 0.0).all() or not self.dt > 0.0:
-            raise ValueError("saturation (n,) and dt must be positive")
+            raise ValueError(
+                f"expected positive saturation of shape (n,) and positive dt, found {self.saturation} and {self.dt}"
+            )
 
     @property
     def n(self) -> int:

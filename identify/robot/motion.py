@@ -258,7 +258,7 @@ class Motion:
     @property
     def _theta(self) -> Array:
         if self.theta is None:
-            raise ValueError("a motion without parameters predicts no torque")
+            raise ValueError("theta is missing: predicted torques need parameters")
         return self.theta
 
 

@@ -72,7 +72,7 @@ def damp_to_physical(model: ArmModel, theta: ArrayLike, theta_previous: ArrayLik
                 break
         else:
             step, candidate = 0.0, previous.copy()
-        reasons.append(f"{first}: went {100.0 * step:.3g} % of the way")
+        reasons.append(f"{first}: step reduced to {100.0 * step:.3g} %")
     return Damped(candidate, step, "; ".join(reasons))
 
 

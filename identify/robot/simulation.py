@@ -109,12 +109,15 @@ def simulate(
     reference = np.ascontiguousarray(q_ref, dtype=np.float64)
     samples, n = reference.shape
     if n != model.n or controller.n != n or samples < 1:
-        raise ValueError(f"reference (N, {n}) and controller of {controller.n} for an arm of {model.n} joints")
+        raise ValueError(
+            f"expected {model.n} joints and at least one sample: the reference has shape {reference.shape}, "
+            f"the controller {controller.n} motors"
+        )
     if abs(controller.dt - dt) > 1e-9 * dt:
         raise ValueError(f"the controller runs every {controller.dt} s, the simulation every {dt} s")
     pushed = np.zeros((0, n)) if disturbance is None else np.ascontiguousarray(disturbance, dtype=np.float64)
     if disturbance is not None and pushed.shape != reference.shape:
-        raise ValueError(f"disturbance {pushed.shape} for a reference of shape {reference.shape}")
+        raise ValueError(f"the disturbance has shape {pushed.shape}, the reference {reference.shape}")
     if max_velocity is None:
         max_velocity = [RUNAWAY * joint.limits.velocity for joint in model.robot.joints]
     start = reference[0] if q0 is None else np.asarray(q0, dtype=np.float64)

@@ -104,9 +104,7 @@ class Decimation:
         """
         count = self.count(x.shape[0])
         if count == 0:
-            raise DataError(
-                f"{x.shape[0]} samples are fewer than the {self.taps.size} that a decimation by {self.factor} needs"
-            )
+            raise DataError(f"decimation by {self.factor} needs at least {self.taps.size} samples, got {x.shape[0]}")
         flat = np.ascontiguousarray(x, dtype=np.float64).reshape(x.shape[0], -1)
         out: NDArray[np.float64] = _filtered(flat, self.taps, self.factor, count)
         return out.reshape((count, *x.shape[1:]))

@@ -144,7 +144,9 @@ def tracking_error_nvr(
         )
     ratios: NDArray[np.float64] = (np.std(np.diff(error, n=order - 1, axis=0), axis=0) / step) ** 2
     if not (ratios > 0).all():
-        raise DataError(f"nvr by tracking error: joint {int(np.argmin(ratios > 0)) + 1} has none that varies")
+        raise DataError(
+            f"nvr by tracking error: the tracking error of joint {int(np.argmin(ratios > 0)) + 1} does not vary"
+        )
     return ratios
 
 

@@ -120,7 +120,7 @@ def test_negative_friction_alone_becomes_zero_at_the_distance_of_its_own_t_value
     assert found.p_value == pytest.approx(stats.chi2.sf(9, 1), rel=0.05)
     assert not found.compatible
     assert "not compatible with physics" in found.verdict
-    assert "most in fv2 (+3" in found.verdict
+    assert "fv2 changes most, by +3 standard" in found.verdict
     # A lighter arm may be farther by 0.1 squared standard deviations: 0.02 here.
     assert 0 <= found.theta[model.names.index("fv2")] <= 0.02 * std[k]
 

@@ -180,7 +180,7 @@ def test_damping_ends_at_physical_parameters_on_the_way(tx40: ArmModel, theta: F
     assert damped.step == 0.25
     assert damped.theta[inertia] == pytest.approx(0.75 * 0.01 + 0.25 * -0.02)
     assert "fc6" in damped.reason
-    assert "25 % of the way" in damped.reason
+    assert "step reduced to 25 %" in damped.reason
     unchanged = damp_to_physical(tx40, theta, theta, postures)
     assert unchanged.step == 1.0
     assert unchanged.reason == ""

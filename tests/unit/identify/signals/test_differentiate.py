@@ -150,7 +150,7 @@ def test_encoder_resolution_is_that_of_the_joint_side() -> None:
         ({"nvr": "tracking-error", "q_ref": np.zeros((500, 1))}, "encoder resolution is unknown"),
         ({"nvr": "tracking-error", "q_ref": np.zeros((50, 1)), "resolution": 1.0}, "shape"),
         ({"nvr": "tracking-error", "q_ref": np.ones((500, 1)), "resolution": 0.0}, "not positive"),
-        ({"nvr": "tracking-error", "q_ref": np.zeros((500, 1)), "resolution": 1.0}, "none that varies"),
+        ({"nvr": "tracking-error", "q_ref": np.zeros((500, 1)), "resolution": 1.0}, "does not vary"),
         ({"nvr": "guess"}, "neither a number nor one of"),
         ({"nvr": [1.0, 2.0]}, "one positive number or 1"),
         ({"nvr": 0.0}, "one positive number"),
