@@ -18,10 +18,10 @@ PREWHITENING_ORDER = 10
 """AR order of the prewhitening, the thesis's usual choice (table 5.12)."""
 
 HELD_OUT = 0.3
-"""Share of the data that only judges."""
+"""Share of the data that is held out of the fit and used to compare the candidates."""
 
 GAIN_WORTH_A_TAP = 0.002
-"""Relative gain in held-out error below which the shorter response is taken."""
+"""Relative decrease of the held-out error below which the shorter response is taken."""
 
 PIECE = 16384
 """Samples of a signal whose products at all lags are formed while they are in the cache."""
@@ -38,8 +38,8 @@ class JointResponse:
     error_taps
         From the tracking error (rad or m at the motor) to motor torque, one per sampling period.
     position_taps
-        From the measured motor position to motor torque; their sum is zero (a velocity loop feels changes
-        only). Empty where the tracking error alone explains the torque.
+        From the measured motor position to motor torque. Their sum is zero, as a velocity loop responds only to changes
+        of the position. Empty where the tracking error alone explains the torque.
     prewhitening_order
         Order of the AR filter applied to both sides; 0 for none.
     fit_pct
@@ -54,7 +54,15 @@ class JointResponse:
 
 @dataclass(frozen=True)
 class IdentifiedController:
-    """The controllers of all motors and how well each explains its torque."""
+    """Identified controller of all motors.
+
+    Parameters
+    ----------
+    controller
+        Discrete controller of all motors.
+    responses
+        Impulse response and held-out fit of each motor, n of them.
+    """
 
     controller: DiscreteController
     responses: tuple[JointResponse, ...]
@@ -72,23 +80,31 @@ def identify_crc(
 ) -> IdentifiedController:
     """Impulse response of each motor's controller from tracking error to torque.
 
-    Correlation analysis solves ``R_nu,eps(tau) = sum_k h(k) R_eps,eps(tau - k)`` (5.31, 5.32), once as it stands and
-    once with both signals prewhitened by an AR model of the error; what predicts the held-out torque best is kept.
-    A cascade also feeds back the measured velocity, which the tracking error does not contain; so a second
-    response, from position changes, is tried, and kept where the held-out data want it.
+    Correlation analysis solves ``R_nu,eps(tau) = sum_k h(k) R_eps,eps(tau - k)`` (5.31, 5.32). It is done with the
+    signals as recorded, and with both signals prewhitened by an AR model of the error. The response that predicts the
+    held-out torque best is returned. A cascade also feeds back the measured velocity, which the tracking error does not
+    contain. A second response, from position changes, is therefore tried; it is kept where it reduces the held-out
+    error.
 
     Parameters
     ----------
     q_motor, reference_motor, torque_motor
-        Measured position, reference and torque at the motor shafts, one (N, n) array per experiment.
+        Measured position (rad or m), reference (rad or m) and torque (N m or N) at the motor shafts, one (N, n) array
+        per experiment.
     dt
         Sampling period, s.
     length
-        Taps for all motors or for each; ``None``: chosen by the data.
+        Number of taps, for all motors or for each; ``None``: the one of `LENGTHS` with the least held-out error.
     velocity_loop
-        Whether to allow the response from position changes; ``None``: chosen by the data.
+        True: include the response from position changes. False: leave it out. ``None``: compare both on the held-out
+        data.
     saturation
-        Largest motor torque (n,); ``None``: none.
+        Largest motor torque (n,), N m or N; ``None``: no limit.
+
+    Returns
+    -------
+    IdentifiedController
+        Controller, and impulse response and held-out fit of each motor.
 
     Raises
     ------
@@ -147,7 +163,7 @@ def _identify_joint(
 
 @dataclass(frozen=True)
 class _Correlations:
-    """``R_eps,eps`` (m, m) and ``R_nu,eps`` (m,) of 5.31 and 5.32, and the power of the output, all as sums."""
+    """``R_eps,eps`` (m, m) and ``R_nu,eps`` (m,) of 5.31 and 5.32, and the power of the output; all are sums."""
 
     auto: NDArray[np.float64]
     cross: NDArray[np.float64]
@@ -157,13 +173,21 @@ class _Correlations:
         return _Correlations(self.auto + other.auto, self.cross + other.cross, self.power + other.power)
 
     def miss(self, taps: NDArray[np.float64], chosen: NDArray[np.int64]) -> float:
-        """Sum of the squared errors of a response."""
+        """Sum of the squared errors of a response, in the square of the torque's unit.
+
+        Parameters
+        ----------
+        taps
+            Impulse response, shape (k,).
+        chosen
+            Indices of its taps in the correlation matrix, shape (k,).
+        """
         explained = 2 * taps @ self.cross[chosen] - taps @ self.auto[np.ix_(chosen, chosen)] @ taps
         return max(self.power - float(explained), 0.0)
 
 
 def _held_out(output: Sequence[NDArray[np.float64]], length: int) -> list[NDArray[np.float64]]:
-    """The last part of every experiment, which only judges."""
+    """Return the last part of every experiment, which is not used in the fit."""
     return [b[length - 1 + _cut(b.size - length + 1) :] for b in output]
 
 
@@ -188,7 +212,7 @@ def _correlations(
 def _sums(
     inputs: Sequence[NDArray[np.float64]], b: NDArray[np.float64], length: int, first: int, last: int
 ) -> _Correlations:
-    """Correlations over the samples ``first .. last - 1``; no matrix of lagged inputs is ever formed."""
+    """Correlations over the samples ``first .. last - 1``, without a matrix of lagged inputs."""
     auto = np.block([[_lag_products(u, v, length, first, last) for v in inputs] for u in inputs])
     cross = np.concatenate([_products(b, u, length, first, last) for u in inputs])
     return _Correlations(auto, cross, float(b[first:last] @ b[first:last]))
@@ -197,7 +221,10 @@ def _sums(
 def _lag_products(
     u: NDArray[np.float64], v: NDArray[np.float64], length: int, first: int, last: int
 ) -> NDArray[np.float64]:
-    """``sum_k u(k - i) v(k - j)`` for lags i, j, shape (length, length): one edge, and steps along the diagonals."""
+    """``sum_k u(k - i) v(k - j)`` for lags i, j, shape (length, length).
+
+    First row and column are summed; the rest follows by recursion along the diagonals.
+    """
     out = np.empty((length, length))
     out[0], out[:, 0] = _products(u, v, length, first, last), _products(v, u, length, first, last)
     for i in range(1, length):
@@ -210,7 +237,7 @@ def _lag_products(
 def _products(
     u: NDArray[np.float64], v: NDArray[np.float64], length: int, first: int, last: int
 ) -> NDArray[np.float64]:
-    """``sum_k u(k) v(k - lag)`` for every lag, shape (length,), all lags of a piece while it is in the cache."""
+    """``sum_k u(k) v(k - lag)`` for every lag, shape (length,); summed piece by piece for the cache."""
     out = np.zeros(length)
     for begin in range(first, last, PIECE):
         end = min(begin + PIECE, last)
@@ -219,7 +246,7 @@ def _products(
 
 
 def _solve(correlations: _Correlations, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Solve the correlation equations; directions that the input does not contain get no response."""
+    """Solve the correlation equations; the response is zero along directions that the input does not excite."""
     gram, right = correlations.auto[np.ix_(chosen, chosen)], correlations.cross[chosen]
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = linalg.eigh(gram / np.outer(scale, scale))

@@ -1,4 +1,4 @@
-"""The control law of a drive: what it can contain, as columns of a regression, as taps, and as gains people know.
+"""Control law of a drive: structure, regression columns, taps of the discrete controller, and gains.
 
 Motor side, at the drive's sample rate, with ``e = q_r - q``::
 
@@ -20,26 +20,27 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Structure:
-    """What the law of one drive contains.
+    """Structure of the control law of one drive.
 
     Parameters
     ----------
     velocity
-        Acted on by the velocity gain: ``position``, the measured velocity (a cascade); ``error``, the derivative of
-        the tracking error (a PD, or a cascade with full velocity feed-forward); ``both``, the measured velocity and a
-        feed-forward of the reference's with a gain of its own.
+        Input of the velocity gain. ``position``: the measured velocity (a cascade). ``error``: the derivative of the
+        tracking error (a PD, or a cascade with full velocity feed-forward). ``both``: the measured velocity, and the
+        velocity of the reference with a gain of its own.
     velocity_taps
-        Backward differences in the velocity, each with its own weight.
+        Number of backward differences in the velocity, each with its own weight.
     filtered
         First-order low-pass on the ``velocity``, on the whole ``command``, or none.
     integral
-        Integral action of the velocity loop.
+        True if the velocity loop has integral action.
     acceleration
-        Feed-forward of the reference's acceleration.
+        True if the acceleration of the reference is fed forward.
     delay
-        Whole samples between the inputs and the output.
+        Delay between inputs and output, whole samples.
     added
-        The recorded torque also contains, to a share to be estimated, a known torque that is not the controller's.
+        True if the recorded torque contains a known torque that does not come from the controller. Its share in the
+        record is then estimated.
     """
 
     velocity: Literal["position", "error", "both"] = "position"
@@ -52,7 +53,7 @@ class Structure:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameters that enter linearly, in order: those that no velocity filter touches come first."""
+        """Names of the linear parameters in their order: those whose inputs are not filtered come first."""
         lags = range(self.velocity_taps)
         return (
             *(("added",) if self.added else ()),
@@ -65,7 +66,7 @@ class Structure:
 
     @property
     def unfiltered(self) -> int:
-        """How many of the linear parameters act past the filter."""
+        """Number of linear parameters whose inputs are not filtered."""
         if self.filtered is None:
             return len(self.names)
         if self.filtered == "command":
@@ -79,15 +80,15 @@ class Structure:
 
     @property
     def lead(self) -> int:
-        """Samples at the start of a stretch that only serve as past."""
+        """Number of samples at the start of a stretch that serve only as past values."""
         return self.delay + self.velocity_taps + 1
 
     def pole(self, theta: Array) -> float:
-        """Pole of the filter; 0 without one."""
+        """Return the pole of the filter; 0 without one."""
         return float(theta[-1]) if self.filtered else 0.0
 
     def __str__(self) -> str:
-        """One line for people."""
+        """Return a description of the structure in one line."""
         form = {"position": "cascade", "error": "PD on the error", "both": "cascade with velocity feed-forward"}
         parts = [form[self.velocity]]
         if self.integral:
@@ -105,7 +106,17 @@ class Structure:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Uninterrupted motor position, reference, torque and known added torque, each (N,)."""
+    """Uninterrupted samples of one motor.
+
+    Parameters
+    ----------
+    q, r
+        Measured position and reference, rad or m, shape (N,).
+    nu
+        Recorded torque, N m or N, shape (N,).
+    added
+        Known torque in the record that does not come from the controller, N m or N, shape (N,).
+    """
 
     q: Array
     r: Array
@@ -113,7 +124,7 @@ class Stretch:
     added: Array
 
     def part(self, span: slice) -> "Stretch":
-        """Some of its samples."""
+        """Return the samples of a slice."""
         return Stretch(self.q[span], self.r[span], self.nu[span], self.added[span])
 
 
@@ -122,6 +133,8 @@ def loop_ratios(structure: Structure, theta: Array) -> tuple[float, float]:
 
     Parameters
     ----------
+    structure
+        Structure of the law.
     theta
         Parameters (size,).
     """
@@ -135,7 +148,21 @@ def loop_ratios(structure: Structure, theta: Array) -> tuple[float, float]:
 
 
 def columns(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> Array:
-    """Inputs of the law (N - lead, m) in the order of its names, that of the integral with the ratios of ``theta``."""
+    """Inputs of the law (N - lead, m) in the order of its names.
+
+    The input of the integral contains the gain ratios of ``theta``, see `loop_ratios`.
+
+    Parameters
+    ----------
+    stretch
+        Motor position, reference and torque, N samples.
+    structure
+        Structure of the law, with m linear parameters.
+    theta
+        Parameters (size,).
+    dt
+        Sampling period, s.
+    """
     e = stretch.r - stretch.q
     v, speed = (np.diff(x, prepend=x[0]) / dt for x in (stretch.q, stretch.r))
     velocity = speed - v if structure.velocity == "error" else -v
@@ -150,9 +177,21 @@ def columns(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> 
 
 
 def integral_slopes(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> Array:
-    """What the columns lack to be the slopes of the torque (N - lead, m): the integral's input has gains in it.
+    """Derivatives of the torque by the gains inside the integral's input (N - lead, m).
 
-    The product of these with ``theta`` is zero, so a regression on columns and slopes together is a Gauss-Newton step.
+    The columns of `columns` plus these are the Jacobian of the torque. Their product with ``theta`` is zero, so a
+    regression on the sum is a Gauss-Newton step.
+
+    Parameters
+    ----------
+    stretch
+        Motor position, reference and torque, N samples.
+    structure
+        Structure of the law, with integral action and m linear parameters.
+    theta
+        Parameters (size,).
+    dt
+        Sampling period, s.
     """
     names, past = structure.names, 1.0 / (1.0 - structure.pole(theta))
     level = {name: 1.0 if i < structure.unfiltered else past for i, name in enumerate(names)}
@@ -173,9 +212,20 @@ def integral_slopes(stretch: Stretch, structure: Structure, theta: Array, dt: fl
 
 
 def simulate_law(stretch: Stretch, structure: Structure, theta: Array, dt: float) -> Array:
-    """Torque of the law (N - lead,) along measured position and reference.
+    """Torque of the law (N - lead,), N m or N, along measured position and reference.
 
-    An integral has no known start: its constant is the one that fits the stretch best.
+    The initial value of an integral is unknown; the value that fits the stretch best is used.
+
+    Parameters
+    ----------
+    stretch
+        Motor position, reference and torque, N samples.
+    structure
+        Structure of the law.
+    theta
+        Parameters (size,).
+    dt
+        Sampling period, s.
     """
     m, split = len(structure.names), structure.unfiltered
     u = columns(stretch, structure, theta, dt)
@@ -186,7 +236,15 @@ def simulate_law(stretch: Stretch, structure: Structure, theta: Array, dt: float
 
 
 def low_pass(x: Array, pole: float) -> Array:
-    """``x / (1 - pole z^-1)`` along the first axis, from the steady state of its first sample."""
+    """``x / (1 - pole z^-1)`` along the first axis, from the steady state of its first sample.
+
+    Parameters
+    ----------
+    x
+        Series, shape (N,) or (N, k).
+    pole
+        Pole of the filter; 0 returns ``x``.
+    """
     if pole == 0.0 or x.size == 0:
         return x
     filtered: Array = signal.lfilter([1.0], [1.0, -pole], x, axis=0, zi=x[:1] * pole / (1 - pole))[0]
@@ -194,7 +252,24 @@ def low_pass(x: Array, pole: float) -> Array:
 
 
 def taps(structure: Structure, theta: Array, dt: float) -> tuple[Array, Array, Array]:
-    """Taps of the discrete controller on error, position and own output; a reference is error plus position."""
+    """Taps of the discrete controller on tracking error, position and own output; the reference is error plus position.
+
+    Parameters
+    ----------
+    structure
+        Structure of the law.
+    theta
+        Parameters (size,).
+    dt
+        Sampling period, s.
+
+    Returns
+    -------
+    error, position
+        Taps on tracking error and motor position, N m/rad or N/m.
+    output
+        Taps on the past outputs, from one sampling period ago.
+    """
     pole = structure.pole(theta)
     kp, forward = loop_ratios(structure, theta)
     integrate = np.array([1.0, -1.0]) if structure.integral else np.ones(1)
@@ -236,14 +311,16 @@ UNITS = {
     "corner": "Hz",
     "added": "1",
 }
-"""Of the gains; motor positions, speeds and accelerations are in rad or m and s."""
+"""Units of the gains; motor positions, speeds and accelerations are in rad or m and s."""
 
 
 def gains(structure: Structure, theta: Array, dt: float, unit: float) -> dict[str, float]:
-    """The gains that a drive's data sheet would name.
+    """Gains of the law by the names of a drive's data sheet, in the units of `UNITS`.
 
     Parameters
     ----------
+    structure
+        Structure of the law.
     theta
         Parameters (size,).
     dt
@@ -254,10 +331,9 @@ def gains(structure: Structure, theta: Array, dt: float, unit: float) -> dict[st
     Returns
     -------
     dict
-        ``kp``, ``kv``, ``stiffness`` (their product), ``error_delay`` and ``velocity_delay`` (mean age of what the
-        torque answers to; a backward difference is half a sample old), and, where the structure has them, ``ti`` (reset
-        time), ``corner`` of the filter, ``velocity_feedforward`` (share), ``acceleration_feedforward`` and ``added``
-        (share).
+        ``kp``, ``kv`` and ``stiffness`` (their product). ``error_delay`` and ``velocity_delay``: mean age of the
+        inputs; a backward difference is half a sample old. Where the structure has them: ``ti`` (reset time),
+        ``corner`` of the filter, ``velocity_feedforward`` (share), ``acceleration_feedforward``, ``added`` (share).
     """
     value, pole = _levels(structure, theta), structure.pole(theta)
     lags = range(structure.velocity_taps)

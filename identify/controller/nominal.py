@@ -1,4 +1,4 @@
-"""Controllers that are not identified: the known one, and a stiff stand-in that follows any motion."""
+"""Controllers that are not identified: that of the configuration, and a stiff nominal PD that follows any motion."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,21 +8,28 @@ from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 
 STIFFNESS = 8.0
-"""Natural frequency of the stand-in, in closed-loop bandwidths of the robot."""
+"""Natural frequency of the nominal controller, over the closed-loop bandwidth of the robot."""
 
 HIGHEST = 0.3
-"""Largest natural frequency times sampling period (rad): beyond, the sampled loop is poorly damped."""
+"""Largest natural frequency times sampling period (rad); above it the sampled loop is poorly damped."""
 
 
 def saturation(robot: RobotConfig) -> NDArray[np.float64]:
-    """Largest motor torque of each drive (N m or N), infinite where the configuration gives none."""
+    """Largest motor torque of each drive (n,), N m or N; infinite where the configuration gives none."""
     return np.array(
         [np.inf if j.drive.saturation is None else abs(j.drive.gain) * j.drive.saturation for j in robot.joints]
     )
 
 
 def known_controller(robot: RobotConfig, dt: float) -> DiscreteController:
-    """The cascade of the configuration.
+    """Cascade controller with the gains of the configuration.
+
+    Parameters
+    ----------
+    robot
+        Configuration with ``controller`` (``kp``, ``kv``).
+    dt
+        Sampling period, s.
 
     Raises
     ------
@@ -46,16 +53,20 @@ def known_controller(robot: RobotConfig, dt: float) -> DiscreteController:
 def nominal_controller(
     model: ArmModel, theta: NDArray[np.float64], q: NDArray[np.float64], dt: float, bandwidth_hz: float
 ) -> DiscreteController:
-    """Critically damped PD on the tracking error for the mean inertia that each motor feels.
+    """Critically damped PD on the tracking error for the mean inertia at each motor.
 
     Its derivative acts on the error, not on the velocity, so that it follows a moving reference without lag.
 
     Parameters
     ----------
+    model
+        Model of the arm, with n joints.
     theta
-        Base parameters (b,).
+        Base parameters (b,), SI units.
     q
-        Postures over which the inertia is averaged, shape (N, n).
+        Postures over which the inertia is averaged, rad or m, shape (N, n).
+    dt
+        Sampling period, s.
     bandwidth_hz
         Closed-loop bandwidth of the robot, Hz.
 

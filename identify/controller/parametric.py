@@ -14,39 +14,42 @@ from armident.identify.controller.riv import LawFit, fit_law, refined_iv
 from armident.identify.robot.controller import DiscreteController
 
 WORTH = 1e-5
-"""Share of the torque's variance that an addition to the law has to explain on held-out data (0.3 % in amplitude),"""
+"""Least decrease of the held-out error by a term of the law, over the torque's variance (0.3 % in amplitude).
+
+A relative decrease by `WORTH_OF_REST` suffices, too.
+"""
 
 WORTH_OF_REST = 0.5
-"""or share of what the law did not explain before,"""
+"""Relative decrease of the held-out error that always suffices for a term of the law."""
 
 EXACT = 1e-9
-"""but never less than this share of the torque's variance, where numbers end."""
+"""Lower bound of both limits, over the torque's variance, where rounding errors begin."""
 
 SIGNIFICANT = 3.0
-"""Standard errors by which the held-out error has to fall for a change of the law to be believed."""
+"""Least decrease of the held-out error by a change of the law, in its standard errors."""
 
 BLOCKS = 30
-"""Stretches of held-out data over which that standard error is taken."""
+"""Number of parts of the held-out data over which this standard error is computed."""
 
 MOST_TAPS = 3
-"""Most backward differences that the velocity of a drive is averaged over."""
+"""Largest number of backward differences in the velocity."""
 
 MOST_DELAY = 2
-"""Most whole samples tried between position and controller output."""
+"""Largest delay tried between position and controller output, samples."""
 
 COARSE = 15
-"""Refined IV iterations at most while structures are compared."""
+"""Largest number of refined-IV iterations while structures are compared."""
 
 SATURATED = 0.999
-"""Share of the saturation from which a sample is left out."""
+"""Torque over the saturation from which a sample is left out."""
 
 SHORTEST = 200
-"""Samples between two saturated stretches that can still be used."""
+"""Least number of samples of a stretch between saturated samples."""
 
 
 @dataclass(frozen=True)
 class Gain:
-    """A physical gain, its standard deviation, and their unit."""
+    """Gain of a control law: value, standard deviation and their unit."""
 
     value: float
     std: float
@@ -55,20 +58,20 @@ class Gain:
 
 @dataclass(frozen=True)
 class ControlLaw(JointResponse):
-    """The identified law of one drive; ``prewhitening_order`` is the order of its AR noise model.
+    """Identified control law of one drive; ``prewhitening_order`` is the order of its AR noise model.
 
     Parameters
     ----------
     output_taps
         From past torque to torque, (m,).
     structure
-        What the law contains.
+        Structure of the law.
     gains
-        Those of :func:`armident.identify.controller.law.gains`.
+        Gains by name, see :func:`armident.identify.controller.law.gains`.
     saturated
-        Samples that were left out.
+        Number of saturated samples, which were left out.
     iterations, converged
-        Of the refined instrumental variables.
+        Number of refined-IV iterations; True if they converged.
     """
 
     output_taps: Array
@@ -92,24 +95,26 @@ def identify_parametric(
 ) -> IdentifiedController:
     """Identify the control law of every drive by refined instrumental variables (thesis 3.2, 5.2.2).
 
-    Where the structure is not given it grows: from a cascade or a PD on the error by whichever change explains the
-    held-out torque best, as long as that is worth the trouble and not chance.
+    Without a given structure, a stepwise search starts from a cascade or a PD on the error. Each step takes the change
+    of the structure that reduces the held-out error most. The search ends when no change reduces it by a relevant and
+    significant amount (`WORTH`, `WORTH_OF_REST`, `SIGNIFICANT`).
 
     Parameters
     ----------
     q_motor, reference_motor, torque_motor
-        Measured position, reference and torque at the motor shafts, one (N, n) array per experiment.
+        Measured position (rad or m), reference (rad or m) and torque (N m or N) at the motor shafts, one (N, n) array
+        per experiment.
     dt
         Sampling period, s.
     structure
-        For all drives or for each; ``None``: chosen by the data.
+        Structure for all drives or for each; ``None``: by stepwise search.
     saturation
-        Largest motor torque (n,); samples that reach it are left out. ``None``: none.
+        Largest motor torque (n,), N m or N; samples that reach it are left out. ``None``: no limit.
     gain
         Motor torque per unit of the drive's signal (n,), for the units of the gains; ``None``: one.
     added_motor
-        Known torques inside ``torque_motor`` that are not the controller's, such as test pulses; their share in the
-        record is estimated, too. ``None``: none.
+        Known torques in ``torque_motor`` that do not come from the controller, such as test pulses, one (N, n) array
+        per experiment. Their share in the record is estimated, too. ``None``: none.
 
     Returns
     -------
@@ -172,7 +177,7 @@ def _saturated(experiment: Stretch, limit: float) -> NDArray[np.bool_]:
 
 
 def _unsaturated(experiments: Sequence[Stretch], limit: float) -> list[Stretch]:
-    """Cut the experiments at saturated samples, which the law does not explain."""
+    """Return the parts of the experiments between saturated samples, which the law does not explain."""
     stretches = []
     for experiment in experiments:
         free = np.concatenate([[False], ~_saturated(experiment, limit), [False]])
@@ -190,7 +195,7 @@ def _unsaturated(experiments: Sequence[Stretch], limit: float) -> list[Stretch]:
 
 
 def _choose(stretches: Sequence[Stretch], dt: float) -> Structure:
-    """Grow the structure on held-out data, then take away again what has become superfluous."""
+    """Select the structure on held-out data: add terms, then remove those that have become superfluous."""
     first, last = _split(stretches)
     power = float(np.mean(np.concatenate([s.nu for s in last]) ** 2))
     added = any(np.ptp(s.added) > 0 for s in stretches)
@@ -210,7 +215,7 @@ def _choose(stretches: Sequence[Stretch], dt: float) -> Structure:
 
 
 def _additions(s: Structure) -> Iterator[Structure]:
-    """Structures with one thing more, or with one thing moved, than this one."""
+    """Structures with one term more than this one, or with one term changed."""
     if s.velocity != "both":
         # With the reference's velocity fed forward, a filtered command is a filtered velocity.
         filtered: Literal["velocity"] | None = "velocity" if s.filtered else None
@@ -230,7 +235,7 @@ def _additions(s: Structure) -> Iterator[Structure]:
 
 
 def _reductions(s: Structure) -> Iterator[Structure]:
-    """Structures with one thing less than this one."""
+    """Structures with one term less than this one."""
     if s.velocity == "both":
         yield replace(s, velocity="position")
         yield replace(s, velocity="error")
@@ -245,7 +250,7 @@ def _reductions(s: Structure) -> Iterator[Structure]:
 
 
 def _worth_it(before: Array, after: Array, power: float, larger: bool) -> bool:
-    """Whether the held-out error falls by more than it scatters and, for a larger law, by enough."""
+    """Return True if the held-out error falls significantly and, for a larger law, by a relevant amount."""
     if not np.isfinite(after).all():
         return False
     if not np.isfinite(before).all():
@@ -257,7 +262,7 @@ def _worth_it(before: Array, after: Array, power: float, larger: bool) -> bool:
 
 
 def _split(stretches: Sequence[Stretch]) -> tuple[list[Stretch], list[Stretch]]:
-    """The first part of every stretch and its held-out rest."""
+    """Split every stretch into its first part and the held-out rest."""
     cuts = [int(s.nu.size * (1 - HELD_OUT)) for s in stretches]
     first = [s.part(slice(0, cut)) for s, cut in zip(stretches, cuts, strict=True)]
     last = [s.part(slice(cut, None)) for s, cut in zip(stretches, cuts, strict=True)]
@@ -273,7 +278,7 @@ def _held_out_errors(first: Sequence[Stretch], last: Sequence[Stretch], structur
         fit = refined_iv(first, structure, dt, noise_model=False, iterations=COARSE)
     except DataError:
         return np.full(BLOCKS, np.inf)
-    # Every structure is judged on the same samples.
+    # The errors of all structures are taken over the same samples.
     begin = max(structure.lead, Structure(velocity_taps=MOST_TAPS, delay=MOST_DELAY).lead)
     errors = [s.nu[begin:] - simulate_law(s, structure, fit.theta, dt)[begin - structure.lead :] for s in last]
     return np.array([block.mean() for block in np.array_split(np.concatenate(errors) ** 2, BLOCKS)])
@@ -288,7 +293,7 @@ def _held_out_fit(stretches: Sequence[Stretch], structure: Structure, dt: float)
 
 
 def _gains_with_deviations(structure: Structure, fit: LawFit, dt: float, unit: float) -> dict[str, Gain]:
-    """Standard deviations to first order from the covariance of the fit."""
+    """Gains with their standard deviations, to first order from the covariance of the fit."""
     if loop_ratios(structure, fit.theta) == (0.0, 0.0):
         raise DataError(f"its torque does not answer to the velocity ({structure})")
     nominal = gains(structure, fit.theta, dt, unit)

@@ -1,8 +1,8 @@
 """Refined instrumental variables for the control law of a drive (thesis section 3.2).
 
-The thesis notes (5.2.2) that a controller's inputs are what it is given, without noise of their own, and that all
-noise of its recorded output is measured on top. So the inputs are their own instruments, and only the past output,
-which a filter in the law brings in, needs one: the output of the law itself, simulated with the last estimate (3.10).
+The recorded inputs of a controller are exactly those that it uses, without noise of their own (thesis 5.2.2). All noise
+is added to its recorded output. The inputs are therefore their own instruments. A filter in the law adds the past
+output to the regressor. Its instrument is the output of the law, simulated with the last estimate (3.10).
 """
 
 from collections.abc import Sequence
@@ -16,30 +16,40 @@ from armident.identify.controller.law import Array, Stretch, Structure, columns,
 from armident.identify.regression.ar_noise import WHITE, ArModel, fit_ar
 
 ITERATIONS = 40
-"""Iterations at most."""
+"""Largest number of iterations."""
 
 TOLERANCE = 1e-3
-"""Change of every parameter in its standard deviations, or a thousandth of this relatively, that ends them."""
+"""Change of every parameter that ends the iterations, in its standard deviations; or a thousandth of it, relatively."""
 
 NOISE_ORDER = 20
 """Highest order of the AR noise model."""
 
 FASTEST, SLOWEST = -0.9, 0.995
-"""Poles of the filter that are allowed; an estimate outside is moved back (the thesis reflects it)."""
+"""Range of the filter's pole; an estimate outside is moved to the bound (the thesis reflects it)."""
 
 SETTLED = 1e-6
-"""Share of a filter's initial error that may be left where its rows begin to count."""
+"""Share of a filter's initial error that may be left at the first row that is used."""
 
 LARGEST_CONDITION = 1e13
-"""Condition number of the scaled equations from which the data do not determine the law."""
+"""Condition number of the scaled equations above which the data do not determine the law."""
 
 MISFIT = 1.5
-"""Growth of the squared simulation error by which a noise model gives away that it models what the law lacks."""
+"""Ratio of squared simulation errors with and without noise model; above it the noise model contains model error."""
 
 
 @dataclass(frozen=True)
 class LawFit:
-    """Parameters (size,) of a structure, covariance (size, size), noise model, and how the iterations ended."""
+    """Fitted control law.
+
+    Parameters
+    ----------
+    theta, covariance
+        Parameters (size,) of the structure and their covariance (size, size).
+    noise
+        Noise model.
+    iterations, converged
+        Number of iterations; True if they converged.
+    """
 
     theta: Array
     covariance: Array
@@ -50,7 +60,7 @@ class LawFit:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Regressor, instruments (N, k) and target (N,) of a stretch, and what the last estimate leaves (N,)."""
+    """Regressor and instruments (N, k), target (N,), and residual of the last estimate (N,), of one stretch."""
 
     x: Array
     z: Array
@@ -59,7 +69,16 @@ class _Rows:
 
 
 def fit_law(stretches: Sequence[Stretch], structure: Structure, dt: float) -> LawFit:
-    """Refined IV, unless its noise model hides what the law lacks: then the simplified method, which simulates best.
+    """Fit the law by refined IV, or by simplified refined IV if the noise model contains model error (`MISFIT`).
+
+    Parameters
+    ----------
+    stretches
+        Samples of one motor without saturation.
+    structure
+        Structure of the law.
+    dt
+        Sampling period, s.
 
     Raises
     ------
@@ -80,17 +99,25 @@ def refined_iv(
     noise_model: bool = True,
     iterations: int = ITERATIONS,
 ) -> LawFit:
-    """Iterate over parameters and noise model (3.2.2, steps 1 to 5).
+    """Fit the law by iteration over parameters and noise model (3.2.2, steps 1 to 5).
 
-    With the filter's pole ``a'`` of the last iteration and ``w`` the part of the torque that is filtered,
-    ``nu + a' w_f(k-1) = U0 k + U1_f b + a w_f(k-1)``, index f for ``1 / (1 - a' z^-1)``: linear in ``k``, ``b`` and
-    ``a``, with measured ``w`` in the regressor and simulated ``w`` among the instruments.
+    Let ``a'`` be the pole of the last iteration and ``w`` the filtered part of the torque. Index f denotes the filter
+    ``1 / (1 - a' z^-1)``. Then ``nu + a' w_f(k-1) = U0 k + U1_f b + a w_f(k-1)`` is linear in ``k``, ``b`` and ``a``.
+    The regressor contains the measured ``w``, the instruments the simulated ``w``.
 
     Parameters
     ----------
+    stretches
+        Samples of one motor without saturation.
+    structure
+        Structure of the law.
+    dt
+        Sampling period, s.
     noise_model
-        Whether an AR model of the noise filters everything; without, this is the simplified method (SRIV), and the
-        covariance is the sandwich of the autocorrelation that its errors have.
+        True: an AR model of the noise filters regressor, instruments and target. False: the simplified method (SRIV),
+        with a sandwich covariance for the autocorrelation of its errors.
+    iterations
+        Largest number of iterations.
 
     Raises
     ------
@@ -119,9 +146,9 @@ def refined_iv(
 
 
 def _integral_start(stretches: Sequence[Stretch], structure: Structure, dt: float) -> Array:
-    """Parameters (size,) by least squares with the integrals of error and velocity free of each other, no filter.
+    """Start values (size,) by least squares, with independent integrals of error and velocity and no filter.
 
-    The law is not linear in its gains where it integrates, and has other minima.
+    A law with integral action is not linear in its gains, and its error has several minima.
     """
     plain = replace(structure, integral=False, filtered=None)
     rows, targets = [], []
@@ -142,7 +169,7 @@ def _integral_start(stretches: Sequence[Stretch], structure: Structure, dt: floa
         integral = -rest[1]
         theta[e] -= integral
     else:
-        # kv kp + ki is seen at the error and ki kp at its integral.
+        # The gain at the error is kv kp + ki, that at its integral ki kp.
         kp = (theta[e] + np.sqrt(max(theta[e] ** 2 - 4 * kv * rest[0], 0.0))) / (2 * kv)
         integral = rest[0] / kp
         theta[e] = kv * kp
@@ -196,7 +223,7 @@ def _instrumental(rows: Sequence[_Rows], noise: ArModel, structure: Structure) -
 
 
 def _sandwich(rows: Sequence[_Rows]) -> Array:
-    """``(Z' X)^-1 Z' S Z (X' Z)^-1``, S the autocovariance of the errors as an AR process."""
+    """Covariance ``(Z' X)^-1 Z' S Z (X' Z)^-1`` with S the autocovariance of the errors as an AR process."""
     noise = fit_ar([r.error for r in rows], NOISE_ORDER)
     poles = np.concatenate([[1.0], noise.coefficients])
     k = rows[0].x.shape[1]
@@ -218,7 +245,7 @@ def _past(x: Array) -> Array:
 
 
 def _settling(pole: float, samples: int) -> int:
-    """Rows until the initial state of the filter is forgotten, at most a quarter of them."""
+    """Number of rows until the initial state of the filter has decayed to `SETTLED`, at most a quarter of them."""
     if abs(pole) < 1e-3:
         return 1
     return min(1 + int(np.log(SETTLED) / np.log(abs(pole))), samples // 4)
