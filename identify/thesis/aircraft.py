@@ -39,7 +39,15 @@ rate the largest singular value of CLOE is that of the thesis."""
 
 @dataclass(frozen=True)
 class AircraftSensitivity:
-    """Singular values (6,) in descending order: of the elevator angle (CLIE), and of w and q together (CLOE)."""
+    """Singular values (6,) in descending order.
+
+    Parameters
+    ----------
+    clie
+        Of the elevator angle.
+    cloe
+        Of w and q together.
+    """
 
     clie: Array
     cloe: Array

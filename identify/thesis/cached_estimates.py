@@ -1,4 +1,4 @@
-"""Cached estimates shared by the tables, by the protocol of the thesis."""
+"""Cached estimates shared by the tables, obtained by the protocol of the thesis."""
 
 import time
 from collections.abc import Callable, Hashable, Sequence
@@ -121,12 +121,12 @@ class CountingModel(AuxiliaryModel):
     midway: bool = False
 
     def instruments(self, theta: Array) -> list[Array]:
-        """Return the instruments, midway between the samples if ``midway``."""
+        """Return the instruments (N, n, b) per experiment, midway between the samples if ``midway``."""
         zeta = super().instruments(theta)
         return [between(z) for z in zeta] if self.midway else zeta
 
     def simulate(self, theta: Array) -> list[Simulation] | None:
-        """Simulate the closed loop and count."""
+        """Simulate the closed loop and count the simulation; ``None`` if it diverges."""
         self.asked.append(1)
         return super().simulate(theta)
 
@@ -147,7 +147,15 @@ class Laboratory:
         self._kept: dict[Hashable, Any] = {}
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Return the value of ``make``, computed at the first call with this key."""
+        """Return the value of ``make``, computed at the first call with this key.
+
+        Parameters
+        ----------
+        key
+            Key of the cache.
+        make
+            Function without arguments that computes the value.
+        """
         if key not in self._kept:
             self._kept[key] = make()
         value: T = self._kept[key]
@@ -237,7 +245,15 @@ class Laboratory:
         return loop if case.gear_ratio == 1.0 else loop.with_gear_ratios(case.gear_ratio)
 
     def run(self, method: Method, case: Case) -> Run:
-        """Return the estimate of a method in a case."""
+        """Return the estimate of a method in a case.
+
+        Parameters
+        ----------
+        method
+            Identification method.
+        case
+            Filters and auxiliary simulation.
+        """
         return self.once((method, case), lambda: self._run(method, case))
 
     def _run(self, method: Method, case: Case) -> Run:
@@ -276,7 +292,15 @@ class Laboratory:
                 raise ValueError(f"{method} does not iterate")
 
     def simulated(self, run: Run, case: Case) -> list[ExperimentEquations]:
-        """Return the equations of a case with the regressor simulated with the parameters of a run."""
+        """Return the equations of a case with the regressor simulated with the parameters of a run.
+
+        Parameters
+        ----------
+        run
+            Estimate whose parameters are used.
+        case
+            Filters and auxiliary simulation.
+        """
         return self.auxiliary(case).equations(self.equations(case), run.estimate.theta)
 
     def positions(self, case: Case) -> list[Array]:
@@ -284,14 +308,31 @@ class Laboratory:
         return [self.decimation(case)(self.recording(case).experiment.q)]
 
     def distance(self, theta: Array, std: Array) -> float:
-        """Return the RMS error of parameters (b,) in given standard deviations (b,).
+        """Return the RMS error of parameters in given standard deviations.
 
         An unbiased estimate with these standard deviations has about 1.
+
+        Parameters
+        ----------
+        theta
+            Parameters (b,), SI units.
+        std
+            Standard deviations (b,) in the same units.
         """
         return float(np.sqrt(np.mean(((theta - self.truth) / std) ** 2)))
 
     def column(self, name: str, run: Run, source: Source = "virtual") -> Column:
-        """Return the estimates of a run as a column of a table."""
+        """Return the estimates of a run as a column of a table.
+
+        Parameters
+        ----------
+        name
+            Name of the column.
+        run
+            Estimate.
+        source
+            Origin of the column.
+        """
         return Column(source, name, estimate_cells(self.names, run.estimate))
 
     def own(self) -> Column:
@@ -305,13 +346,29 @@ def between(x: Array) -> Array:
 
 
 def estimate_cells(names: Sequence[str], estimate: Estimate) -> dict[str, Cell]:
-    """Return value and relative standard deviation of every parameter."""
+    """Return value and relative standard deviation (percent) of every parameter.
+
+    Parameters
+    ----------
+    names
+        Names of the parameters, b of them.
+    estimate
+        Estimate of the b parameters.
+    """
     percent = 100 * estimate.std / np.maximum(np.abs(estimate.theta), np.finfo(np.float64).tiny)
     return {n: Cell(float(v), float(p)) for n, v, p in zip(names, estimate.theta, percent, strict=True)}
 
 
 def derive(recording: Recorded, case: Case) -> Derivatives:
-    """Return derivatives of the measured positions by the method of a case."""
+    """Return derivatives of the measured positions by the method of a case.
+
+    Parameters
+    ----------
+    recording
+        Recording with the positions.
+    case
+        Method (``derivatives``) and its settings (``bandpass_hz``, ``nvr``).
+    """
     experiment = recording.experiment
     q, dt = experiment.q, experiment.dt
     if case.derivatives in ("irwsm", "irwsm2"):
@@ -323,7 +380,15 @@ def derive(recording: Recorded, case: Case) -> Derivatives:
 
 
 def identify_controller(recording: Recorded, kind: str) -> IdentifiedController:
-    """Identify the controller from reference, position and torque of each motor (thesis sections 5.2.2, 5.2.3)."""
+    """Identify the controller from reference, position and torque of each motor (thesis sections 5.2.2, 5.2.3).
+
+    Parameters
+    ----------
+    recording
+        Recording with reference.
+    kind
+        ``parametric``, ``crc`` or ``cra``, see `Case`.
+    """
     robot, experiment = recording.robot, recording.experiment
     assert experiment.q_ref is not None
     ratios = robot.transmission_matrix

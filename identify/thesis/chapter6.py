@@ -142,6 +142,10 @@ class Degraded:
 
     Parameters
     ----------
+    case
+        Filters of the estimate.
+    run
+        Estimate of IDIM-LS.
     distance
         RMS difference between our errors and the published ones (against table B.4), in standard deviations of IDIM-LS
         with good encoders.
@@ -201,17 +205,47 @@ def process_variance(ar: ArModel) -> float:
 
 
 def inverse_error(lab: Laboratory, run: Run, case: Case) -> float:
-    """Return the relative error of a run on the equations of another case, percent."""
+    """Return the relative error of a run on the equations of another case, percent.
+
+    Parameters
+    ----------
+    lab
+        Arm with its cached estimates.
+    run
+        Estimate.
+    case
+        Filters of the equations.
+    """
     return relative_errors(lab.equations(case), run.estimate.theta)[0]
 
 
 def simulated_error(lab: Laboratory, run: Run, case: Case) -> float:
-    """Return the relative error of a run with the simulated regressor of a case, percent."""
+    """Return the relative error of a run with the simulated regressor of a case, percent.
+
+    Parameters
+    ----------
+    lab
+        Arm with its cached estimates.
+    run
+        Estimate.
+    case
+        Filters and auxiliary simulation.
+    """
     return relative_errors(lab.simulated(run, case), run.estimate.theta)[0]
 
 
 def simulated_variances(lab: Laboratory, run: Run, case: Case) -> list[float]:
-    """Return the variance of measured minus simulated torque of each joint, (N m)^2."""
+    """Return the variance of measured minus simulated torque of each joint, (N m)^2.
+
+    Parameters
+    ----------
+    lab
+        Arm with its cached estimates.
+    run
+        Estimate.
+    case
+        Filters and auxiliary simulation.
+    """
     (block,) = lab.simulated(run, case)
     return [float(v) for v in np.var(block.y - block.x @ run.estimate.theta, axis=0)]
 

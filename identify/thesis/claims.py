@@ -27,20 +27,22 @@ from armident.identify.thesis.emps_controller import controllers_on_emps
 Array = NDArray[np.float64]
 
 SAME = 1.0
-"""RMS difference in standard deviations below which two estimates agree."""
+"""RMS difference, in standard deviations, below which two estimates agree."""
 FAR = 4.0
 """Error in standard deviations that noise causes in one of 28 parameters with a probability of 1/600."""
 ORDER = 10**0.5
-"""Ratio from which a number is, rounded, an order of magnitude above another."""
+"""Ratio above which a number is an order of magnitude above another, after rounding."""
 INSENSITIVE = 1000.0
 """Least ratio of the smallest singular values of the CLIE and CLOE Jacobians: "thousands of times"."""
 GEAR_ERROR = 0.2
 """Relative error of the simulator's gear ratios, and expected relative error of DIDIM."""
 ABOUT = 0.5
-"""Relative difference below which a number is about another one."""
+"""Relative difference below which two numbers agree approximately."""
 WHITE = 0.1
-"""Fraction of autocorrelations outside their 2-sigma band up to which residuals count as white; 0.05 is expected, and
-the mean over 6 joints and 20 lags has a standard deviation of 0.02."""
+"""Largest fraction of residual autocorrelations outside their 2-sigma band for residuals that count as white.
+
+0.05 is expected; the mean over 6 joints and 20 lags has a standard deviation of 0.02.
+"""
 PROPORTIONAL = ("zz", "xx", "ia", "fv")
 """Parameters that multiply velocities and accelerations, which wrong gear ratios scale."""
 
@@ -303,7 +305,15 @@ def farthest(names: Sequence[str], run: Run, wanted: Array, std: Array) -> Farth
 
 
 def apart(theta: Array, other: Estimate) -> float:
-    """Return the RMS difference of parameters (b,) from another estimate in its standard deviations."""
+    """Return the RMS difference of parameters from another estimate in its standard deviations.
+
+    Parameters
+    ----------
+    theta
+        Parameters (b,), SI units.
+    other
+        The other estimate of the same parameters.
+    """
     return float(np.sqrt(np.mean(((theta - other.theta) / other.std) ** 2)))
 
 
@@ -330,7 +340,19 @@ def _white(name: str, run: Run, plain: Estimate, other: str) -> Finding:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A claim, the tables that it needs, and the function that tests it."""
+    """Test of a claim.
+
+    Parameters
+    ----------
+    number, text
+        Number and wording of the claim.
+    tables
+        Numbers of the tables that the test needs.
+    look
+        Function that tests the claim.
+    remark
+        Explanation, printed if the claim does not hold.
+    """
 
     number: int
     text: str
@@ -389,7 +411,15 @@ JUDGEMENTS = (
 
 
 def judged(bench: Bench, numbers: Sequence[str]) -> list[Claim]:
-    """Return the claims whose tables are all among ``numbers``."""
+    """Test the claims whose tables are all among ``numbers``.
+
+    Parameters
+    ----------
+    bench
+        Arms with their cached estimates.
+    numbers
+        Numbers of the reproduced tables.
+    """
     return [
         Claim(j.number, j.text, tuple(j.look(bench)), j.remark) for j in JUDGEMENTS if set(j.tables) <= set(numbers)
     ]

@@ -21,7 +21,7 @@ from armident.identify.thesis.recordings import Recorded
 MODE_HZ = 20.0
 """Highest mode of the closed loop, Hz (thesis section 5.1.4)."""
 LENGTH = 10
-"""Length of the impulse response, samples: explains as much as 20, with which the virtual loop is unstable."""
+"""Length of the impulse response, samples. It explains as much as 20, with which the virtual loop is unstable."""
 
 
 @dataclass(frozen=True)

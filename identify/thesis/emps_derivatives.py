@@ -1,9 +1,9 @@
 """Table 5.2: errors of derivatives of positions of the simulated EMPS (thesis section 5.1.4).
 
-As stated by the thesis: model 5.28, controller 5.29 with their parameters, a signal-to-noise ratio of 100 dB,
-Butterworth filter of order 4 at 40 Hz, relative errors in percent averaged over 100 simulations. Motion and sampling
-rate are not stated. The motion here is rest to rest along polynomials of degree five over 0.25 m. The sampling rate is
-that of the TX40: the position error of the bandpass, noise below 40 Hz only, implies several kilohertz.
+As stated by the thesis: model 5.28 and controller 5.29 with their parameters, a signal-to-noise ratio of 100 dB, and a
+Butterworth filter of order 4 at 40 Hz. Errors are relative, in percent, and averaged over 100 simulations. Motion and
+sampling rate are not stated. The motion here is rest to rest along polynomials of degree five over 0.25 m. The sampling
+rate is that of the TX40: the position error of the bandpass, noise below 40 Hz only, implies several kilohertz.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ SIGN_SMOOTHING = 150.0
 SNR_DB = 100.0
 CUTOFF_HZ = 40.0
 MODE_HZ = 8.0
-"""Bandwidth for which ``differentiate`` chooses the 40 Hz of the thesis."""
+"""Bandwidth for which ``differentiate`` selects the 40 Hz of the thesis."""
 
 STROKE = 0.25
 """Length of a move, m."""
@@ -75,7 +75,17 @@ class Row:
 
 @dataclass(frozen=True)
 class EmpsRun:
-    """Noise-free simulation of the axis: reference and motion, shape (N,) each, m, m/s, m/s^2."""
+    """Noise-free simulation of the axis.
+
+    Parameters
+    ----------
+    q_ref, q
+        Reference and position, m, shape (N,).
+    qd, qdd
+        Velocity, m/s, and acceleration, m/s^2, shape (N,).
+    dt
+        Sampling period, s.
+    """
 
     q_ref: Array
     q: Array
@@ -85,7 +95,7 @@ class EmpsRun:
 
 
 def table_5_2(simulations: int = 100, sampling_hz: float = 5000.0, seed: int = 0) -> list[Row]:
-    """Return mean relative errors of the estimated signals, first of the three methods of the table.
+    """Return mean relative errors of the estimated signals; the three methods of the table come first.
 
     IRWSM 1 and 2 use the default rule for the noise-variance ratio. Further rows show the other rules of the thesis,
     and the bandpass with forward differences without compensation of their delay.
@@ -131,7 +141,15 @@ def simulate_emps(dt: float) -> EmpsRun:
 
 
 def follow(q_ref_dd: Array, dt: float) -> EmpsRun:
-    """Simulate the closed loop of equations 5.28 and 5.29 from rest; reference by its acceleration (N,), m/s^2."""
+    """Simulate the closed loop of equations 5.28 and 5.29 from rest along a reference.
+
+    Parameters
+    ----------
+    q_ref_dd
+        Acceleration of the reference, constant over each sample, m/s^2, shape (N,).
+    dt
+        Sampling period, s.
+    """
     signals = np.empty((4, q_ref_dd.size))
     parameters = np.array([MASS, VISCOUS, COULOMB, SIGN_SMOOTHING, GAIN * KV, KP])
     _integrate(q_ref_dd, dt, int(np.ceil(dt / STEP - 1e-9)), parameters, signals)
@@ -140,7 +158,17 @@ def follow(q_ref_dd: Array, dt: float) -> EmpsRun:
 
 
 def polynomial_moves(durations: Sequence[float], dt: float) -> Array:
-    """Return accelerations (N,), m/s^2, constant over each sample, of moves there and back of degree five."""
+    """Return the accelerations (N,), m/s^2, of moves of degree five over `STROKE`, there and back.
+
+    They are constant over each sample.
+
+    Parameters
+    ----------
+    durations
+        Duration of each move in one direction, s.
+    dt
+        Sampling period, s.
+    """
     moves = []
     for duration in durations:
         samples = round(duration / dt)
@@ -169,13 +197,31 @@ def _methods(run: EmpsRun, measured: Array, deviation: float) -> dict[str, Deriv
 
 
 def forward(smooth: Array, dt: float) -> Derivatives:
-    """Return forward differences: velocities half a sample late, accelerations one sample late."""
+    """Return forward differences: velocities half a sample late, accelerations one sample late.
+
+    Parameters
+    ----------
+    smooth
+        Smoothed positions, m, shape (N, 1).
+    dt
+        Sampling period, s.
+    """
     qd = np.diff(smooth, axis=0, append=smooth[-1:]) / dt
     return Derivatives(smooth, qd, np.diff(qd, axis=0, append=qd[-1:]) / dt, None)
 
 
 def relative_errors(run: EmpsRun, found: Derivatives, border: int = 0) -> Errors:
-    """Return relative errors without ``border`` samples at either end, percent."""
+    """Return the relative errors of position, velocity and acceleration, percent.
+
+    Parameters
+    ----------
+    run
+        Noise-free motion.
+    found
+        Estimated signals, shape (N, 1) each.
+    border
+        Number of samples omitted at either end.
+    """
     inner = slice(border, run.q.size - border)
 
     def relative(estimate: Array, truth: Array) -> float:

@@ -3,16 +3,17 @@
 Unknown are motion, sampling rate, noise-variance ratio, kind of differences, and use of the two states of IRWSM 1. The
 figures constrain them:
 
-- Were velocity and acceleration of the bandpass exact derivatives of its position, then by Cauchy-Schwarz (summation by
-  parts from rest to rest) ``|q| |qdd| / |qd|^2`` of the motion would exceed 4000, see :func:`least_product`; the
-  motions here have less than ten. So the error lies in the differences. An acceleration twice as wrong as the velocity
-  is what forward differences make of a motion of a single frequency: half a sample late, and a whole one. Section
-  2.3.1 says central ones, which are not late at all.
+- The error of the bandpass is due to its differences. If its velocity and acceleration were exact derivatives of its
+  position, ``|q| |qdd| / |qd|^2`` of the motion would exceed 4000. This follows from Cauchy-Schwarz (summation by parts
+  from rest to rest), see :func:`least_product`. The motions here have less than ten.
+- The differences are forward ones. Their error in the acceleration is twice that in the velocity for a motion of a
+  single frequency: a delay of one sample, and of half a sample. Section 2.3.1 states central differences, which have
+  no delay.
 - An error of 0.55 % by half a sample of delay means that sampling rate over angular frequency is about 90.
-- IRWSM has velocity errors of thousandths of a percent. So its states were compared at their own instants, and the
-  reversals of Coulomb friction, which a smoother rounds off, had no effect: the motion is slow.
-- A signal-to-noise ratio of 100 dB and the position error of the bandpass at such a sampling rate agree if the noise is
-  relative to the motion and errors are relative to positions with a distant origin.
+- IRWSM has velocity errors of thousandths of a percent. So its states were compared at their own instants. The motion
+  is slow, as the reversals of Coulomb friction, which a smoother rounds off, had no effect.
+- A signal-to-noise ratio of 100 dB and the position error of the bandpass agree at such a sampling rate on two
+  conditions. The noise is relative to the motion, and errors are relative to positions with a distant origin.
 - Noise-variance ratios by likelihood or cross-validation give larger velocity errors of IRWSM than one given ratio for
   both models.
 
@@ -50,7 +51,7 @@ Array = NDArray[np.float64]
 SUFFIX = ", inferred"
 """Suffix of the names of methods with the inferred protocol."""
 VARIANT_SIMULATIONS = 1
-"""Noise realisations of a variant: errors scatter by a few percent, small against the factors."""
+"""Noise realisations of a variant. Their errors scatter by a few percent, which is small against the factors."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ def product(run: EmpsRun) -> float:
 
 
 def evidence(rows: list[Row]) -> list[str]:
-    """Return the evidence for the inferred protocol in figures, one line each."""
+    """Return the evidence for the inferred protocol, one line with figures each."""
     factor, which = worst_factor(rows)
     p, moves = INFERRED, VARIANTS["moves of 0.25 m from rest to rest"]
     lines = [

@@ -62,8 +62,8 @@ class Recorded:
     def controller(self) -> DiscreteController:
         """Return the controller of the drives: position and velocity loop (thesis figure B.1).
 
-        ``nu = kv (kp eps + s)`` where ``s`` is, through a first-order low-pass if there is one, the derivative of
-        ``eps``, or of ``-q`` where the drives feed back the velocity.
+        ``nu = kv (kp eps + s)``. Here ``s`` is the derivative of ``eps``, or of ``-q`` where the drives feed back the
+        velocity. A first-order low-pass acts on ``s`` if the drives have one.
         """
         n, dt, samples = self.robot.n, self.experiment.dt, int(self.truth["velocity_samples"])
         kp, kv = (np.array([self.truth[f"{gain}{j + 1}"] for j in range(n)]) for gain in ("kp", "kv"))

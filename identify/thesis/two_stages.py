@@ -43,7 +43,17 @@ class TwoStages:
 
 
 def two_stages(lab: Laboratory, method: Literal["idim-iv", "didim"], case: Case) -> TwoStages | None:
-    """Identify the controller of a case, then the arm; ``None`` if the second stage does not converge."""
+    """Identify the controller of a case, then the arm; ``None`` if the second stage does not converge.
+
+    Parameters
+    ----------
+    lab
+        Arm with its cached estimates.
+    method
+        Method of the second stage.
+    case
+        Filters and auxiliary simulation, with the kind of controller.
+    """
     identified, took = lab.first_stage(case)
     try:
         run = lab.run(method, case)
@@ -84,7 +94,15 @@ def actual_structure(lab: Laboratory) -> Structure:
 
 
 def gain_error(lab: Laboratory, identified: IdentifiedController) -> float | None:
-    """Return the largest relative error of position and velocity gains, percent; ``None`` for impulse responses."""
+    """Return the largest relative error of position and velocity gains, percent; ``None`` for impulse responses.
+
+    Parameters
+    ----------
+    lab
+        Virtual arm, with the true gains.
+    identified
+        Identified controller of all motors.
+    """
     recording = lab.recording(Case())
     errors = []
     for j, law in enumerate(identified.responses):
