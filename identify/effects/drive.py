@@ -79,7 +79,15 @@ def _eccentricity(motion: Motion, place: Place, *, harmonic: float) -> Array:
 
 
 def rounds(motion: Motion, joint: int) -> Sequence[float]:
-    """Return harmonics: one and two per turn of joint and motor; for a prismatic axis wave numbers, rad/m."""
+    """Return harmonics: one and two per turn of joint and motor; for a prismatic axis wave numbers, rad/m.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
     if motion.model.robot.joints[joint].type == "prismatic":
         resolution = np.pi / float(motion.span[joint])
         return [float(resolution * k) for k in (*np.arange(2.0, 16.0, 0.5), *range(16, 81))]

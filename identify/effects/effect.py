@@ -15,8 +15,11 @@ from armident.identify.robot.motion import Motion
 Array = NDArray[np.float64]
 
 Scope = Literal["joint", "motor", "pair", "arm"]
-"""Location of an effect: one joint, one motor (a coupled transmission acts on several joints), a pair of joints, or the
-whole arm (its entry in the configuration then names the first joint, that of a payload the last one)."""
+"""Location of an effect: one joint, one motor, a pair of joints, or the whole arm.
+
+A coupled transmission makes the effect of a motor act on several joints. The entry of an effect of the whole arm names
+the first joint in the configuration, that of a payload the last one.
+"""
 
 SIGN_TOLERANCE = 2.0
 """Standard deviations by which a parameter must violate its sign or bounds to be rejected."""
@@ -85,20 +88,36 @@ class Shape:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Recorded torque of a motor: sampling period, s, and largest torque, N m or N."""
+    """Recorded torque of a motor.
+
+    Parameters
+    ----------
+    dt
+        Sampling period, s.
+    limit
+        Largest torque, N m or N.
+    """
 
     dt: float
     limit: float
 
 
 def motor_limit(robot: RobotConfig, motor: int) -> float:
-    """Return the largest torque of a motor at its shaft, N m or N."""
+    """Return the largest torque of a motor at its shaft, N m or N.
+
+    Parameters
+    ----------
+    robot
+        Configuration with the limits of the joints and the transmission.
+    motor
+        Index of the motor, from 0.
+    """
     return float(robot.joints[motor].limits.torque / np.abs(robot.transmission_matrix[motor]).max())
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect: its torque in the reported joint torques is ``columns(motion, place, **shapes) @ linear``.
+    """Effect of the catalogue; its torque in the reported torques is ``columns(motion, place, **shapes) @ linear``.
 
     Parameters
     ----------
@@ -120,7 +139,7 @@ class Effect:
     scope
         See `Scope`.
     visible
-        ``(motion, place)`` to the reason why the motion cannot show the effect whatever its size, or ``None``. The
+        ``(motion, place)`` to the reason for which the motion cannot show the effect at any size, or ``None``. The
         motion is the simulated one.
     numbers
         Jacobian (b, k) of the base parameters with respect to the linear ones, for an effect that only changes
@@ -139,8 +158,8 @@ class Effect:
         agree.
     undo
         ``(recorded, at, value)`` to the true torque (N,) of a motor, for the one linear parameter. The columns are its
-        first-order expansion, whose noise at measured signals exceeds the effect; the corrected recording has no
-        added noise.
+        first-order expansion, whose noise at measured signals exceeds the effect; the corrected recording has no added
+        noise.
     sudden
         True if the arm's motion has jumps at instants that a simulation does not reproduce to the sample. The columns
         at measured signals are then their own instruments, and a higher threshold accounts for the feedback bias.
@@ -195,7 +214,7 @@ class Effect:
 
     @property
     def essence(self) -> "Effect":
-        """The effect without its optional linear parameters."""
+        """Effect without its optional linear parameters."""
         kept = [k for k, linear in enumerate(self.linear) if linear.through is None]
         if len(kept) == len(self.linear):
             return self
@@ -250,13 +269,21 @@ class Effect:
 
 
 def _some(columns: Callable[..., Array], kept: Sequence[int], motion: Motion, place: "Place", **shapes: float) -> Array:
-    """Return some of the columns of an effect."""
+    """Return those columns of an effect whose indices are ``kept``."""
     return columns(motion, place, **shapes)[..., kept]
 
 
 @dataclass(frozen=True)
 class Place:
-    """Location of an effect in an arm: joint index from 0; ``other`` is the second joint of a pair."""
+    """Location of an effect in an arm.
+
+    Parameters
+    ----------
+    joint
+        Index of the joint, from 0.
+    other
+        Index of the second joint of a pair, or ``None``.
+    """
 
     joint: int
     other: int | None = None

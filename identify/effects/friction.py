@@ -19,7 +19,15 @@ VISCOUS = ("N m s/rad", "N s/m")
 
 
 def speeds(motion: Motion, joint: int) -> Sequence[float]:
-    """Return characteristic speeds from a hundredth of the joint's top speed to a third of it, rad/s or m/s."""
+    """Return characteristic speeds from a hundredth of the joint's top speed to a third of it, rad/s or m/s.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
     top = float(motion.top_speed[joint])
     return [float(v) for v in top * np.geomspace(0.01, 0.35, 8)]
 
@@ -36,7 +44,15 @@ def _asymmetric_coulomb(motion: Motion, place: Place, *, velocity: float = 0.0) 
 
 
 def films(motion: Motion, joint: int) -> Sequence[float]:
-    """Return speeds from that of the model's smoothed sign to a twentieth of the joint's top speed, rad/s or m/s."""
+    """Return speeds from that of the model's smoothed sign to a twentieth of the joint's top speed, rad/s or m/s.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
     least, most = 1 / motion.model.smoothing, 0.05 * float(motion.top_speed[joint])
     return [float(v) for v in np.geomspace(least, most, 5)] if most > least else [least]
 
@@ -50,7 +66,15 @@ def _stribeck(motion: Motion, place: Place, *, velocity: float, displacement: fl
 
 
 def bristles(motion: Motion, joint: int) -> Sequence[float]:
-    """Return displacements from three millionths of the joint's range of motion to a hundred times that, rad or m."""
+    """Return displacements from three millionths of the joint's range of motion to a hundred times that, rad or m.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
     return [float(d) for d in motion.span[joint] * np.geomspace(3e-6, 3e-4, 4)]
 
 
@@ -63,13 +87,21 @@ def _nonlinear_viscous(motion: Motion, place: Place, *, knee: float) -> Array:
 
 
 def knees(motion: Motion, joint: int) -> Sequence[float]:
-    """Return knees from a hundredth of the joint's top speed to a third of it, as shares of its speed limit."""
+    """Return knees from a hundredth of the joint's top speed to a third of it, as shares of its speed limit.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
     limit = motion.model.robot.joints[joint].limits.velocity
     return [speed / limit for speed in speeds(motion, joint)]
 
 
 def _rises_from_rest(values: Array, shapes: Mapping[str, float]) -> bool:
-    """Refuse a negative value with a low knee: that shape is extra friction at low speed (Stribeck)."""
+    """Return False for a negative value with a low knee: that shape is additional friction at low speed (Stribeck)."""
     return bool(shapes["knee"] >= LATE or values[0] >= 0.0)
 
 
@@ -85,9 +117,16 @@ def _presliding(motion: Motion, place: Place, *, displacement: float) -> Array:
 
 @compiled
 def dahl(q: Array, displacement: float) -> Array:
-    """Return Dahl's friction over its level along positions ``q`` (N,), integrated exactly between samples.
+    """Return Dahl's friction over its level, shape (N,), integrated exactly between samples.
 
     ``dz/dq = (1 - z sign(qd)) / displacement``: after a reversal it approaches its level exponentially in the distance.
+
+    Parameters
+    ----------
+    q
+        Positions, rad or m, shape (N,).
+    displacement
+        Constant of the exponential, in the unit of ``q``.
     """
     z = np.empty(q.size)
     state = 0.0
@@ -107,7 +146,17 @@ def _position_dependent(motion: Motion, place: Place, *, period: float) -> Array
 
 
 def turns(motion: Motion, joint: int) -> Sequence[float]:
-    """Return periods in the joint's position: integer fractions of a turn, or of the travel of a prismatic axis."""
+    """Return periods in the joint's position, rad or m: fractions of a turn, or of the travel of a prismatic axis.
+
+    The fractions are 1, 1/2, 1/3 and 1/4.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
     if motion.model.robot.joints[joint].type == "revolute":
         return [2 * np.pi / k for k in (4, 3, 2, 1)]
     low, high = motion.model.robot.joints[joint].limits.position
@@ -122,7 +171,15 @@ def _drift(motion: Motion, place: Place, *, time_constant: float) -> Array:
 
 
 def warming(motion: Motion, joint: int) -> Sequence[float]:
-    """Return time constants from a tenth of the recorded time to three times it, s; longer ones are linear in time."""
+    """Return time constants from a tenth of the recorded time to three times it, s; longer ones are linear in time.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0; not used.
+    """
     whole = max(motion.duration, motion.dt * motion.samples)
     return [whole * share for share in (0.1, 0.3, 1.0, 3.0)]
 

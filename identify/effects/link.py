@@ -63,7 +63,15 @@ def _offset_numbers(motion: Motion, place: Place) -> Array:
 
 
 def by_numbers(motion: Motion, change: Array) -> Array:
-    """Return the columns (N, n, k) of a change (b, k) of the base parameters."""
+    """Return the columns (N, n, k), N m or N per unit of a parameter, of a change of the base parameters.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm, N samples.
+    change
+        Jacobian (b, k) of the base parameters.
+    """
     columns: Array = motion.model.rigid_regressor(motion.q, motion.qd, motion.qdd, sharp_sign=motion.sharp) @ change
     return columns
 

@@ -61,7 +61,7 @@ class Term:
         return self.effect.share
 
     def of_effect(self, values: Array) -> Array:
-        """Return the values (k,) of its linear parameters among all of the effect's, the others zero."""
+        """Return the values of all linear parameters of the effect: those of the term (k,), the others zero."""
         every = np.zeros(len(self.effect.linear))
         every[list(self.kept)] = values
         return every

@@ -13,7 +13,7 @@ from armident.identify.robot.motion import Motion
 Array = NDArray[np.float64]
 
 DAMPINGS = (0.1, 0.7)
-"""Damping ratios of an elastic joint: of its own, and with damping by the controlled motor."""
+"""Damping ratios of an elastic joint: by its own damping, and with damping by the controlled motor."""
 
 LEAST_DAMPING = 0.02
 """Damping ratio of an elastic joint of steel; visible where the motion contains its oscillation."""
@@ -33,7 +33,17 @@ def _cogging(motion: Motion, place: Place, *, harmonic: float) -> Array:
 
 
 def harmonics(motion: Motion, joint: int) -> Sequence[float]:
-    """Return harmonics of a motor turn; for a prismatic axis of unknown pitch wave numbers that its travel resolves."""
+    """Return harmonics of a motor turn, or wave numbers, rad/m, for a prismatic axis.
+
+    The pitch of the axis is unknown; the wave numbers are those that its travel resolves.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
     if motion.model.robot.joints[joint].type == "revolute":
         return (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 18.0, 24.0)
     resolution = np.pi / float(motion.span[joint])
@@ -61,7 +71,20 @@ def _elasticity(
 def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> tuple[Array, Array, Array]:
     """Return position, velocity and acceleration (N,) of ``share x'' + 2 damping w x' + w^2 x = w^2 pull``, from rest.
 
-    Trapezoidal rule (Newmark 1959): stable at any frequency.
+    Trapezoidal rule (Newmark 1959), which is stable at any frequency.
+
+    Parameters
+    ----------
+    pull
+        Equilibrium position, shape (N,).
+    share
+        Inertia over its mean, shape (N,).
+    w
+        Angular frequency of the resonance at mean inertia, rad/s.
+    damping
+        Damping ratio.
+    dt
+        Sampling period, s.
     """
     way, rate, acceleration = np.empty(pull.size), np.zeros(pull.size), np.zeros(pull.size)
     way[0] = pull[0]
@@ -75,7 +98,15 @@ def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> 
 
 
 def frequencies(motion: Motion, joint: int) -> Sequence[float]:
-    """Return resonance frequencies up to a fifth of the sampling rate, Hz."""
+    """Return resonance frequencies up to a fifth of the sampling rate, Hz.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0; not used.
+    """
     return [float(f) for f in np.geomspace(4.0, min(80.0, 0.2 / motion.dt), 7)]
 
 
@@ -87,7 +118,17 @@ def _backlash(motion: Motion, place: Place, *, gap: float, rotor: float = 0.0) -
 
 
 def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
-    """Return the free acceleration (N,) of a link relative to its motor, without contact of the teeth."""
+    """Return the acceleration (N,) of a link relative to its motor without contact of the teeth, rad/s^2 or m/s^2.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm, N samples.
+    joint
+        Index of the joint, from 0.
+    rotor
+        Rotor inertia that the model contains in the link, kg m^2 or kg.
+    """
     inertia = inertias(motion, joint, rotor)
     if inertia.max() <= 0.0:
         return np.zeros(motion.samples)
@@ -96,7 +137,19 @@ def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
 
 
 def inertias(motion: Motion, joint: int, rotor: float) -> Array:
-    """Return the inertia (N,) of the link that a gear drives, with a lower bound; zero where the fit has none."""
+    """Return the inertia (N,) of the link that a gear drives, kg m^2 or kg.
+
+    It has a lower bound, `LEAST_INERTIA`, and is zero where the fit has no inertia.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm, N samples.
+    joint
+        Index of the joint, from 0.
+    rotor
+        Rotor inertia that the model contains in the link, kg m^2 or kg.
+    """
     inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
     believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())
     return believed
@@ -104,10 +157,19 @@ def inertias(motion: Motion, joint: int, rotor: float) -> Array:
 
 @compiled
 def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
-    """Return position, velocity and acceleration (N,) of a link relative to its motor under ``pull`` (N,) in a gap.
+    """Return position, velocity and acceleration (N,) of a link relative to its motor, in the gap of the gear.
 
     Leapfrog integration with plastic impacts at half a gap to either side. Velocity and acceleration are central
     differences of the position, so that they have no delay.
+
+    Parameters
+    ----------
+    pull
+        Free acceleration of the link, rad/s^2 or m/s^2, shape (N,).
+    gap
+        Width of the gap, rad or m.
+    dt
+        Sampling period, s.
     """
     way, rate, acceleration = np.zeros(pull.size), np.zeros(pull.size), np.zeros(pull.size)
     way[0] = 0.5 * gap if pull[0] > 0.0 else -0.5 * gap
@@ -126,7 +188,17 @@ def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
 
 
 def gaps(motion: Motion, joint: int) -> Sequence[float]:
-    """Return gaps that the link crosses in 5 to 100 ms under the usual load; an error of 25 % misses the impacts."""
+    """Return gaps that the link crosses in 5 to 100 ms under the usual load, rad or m.
+
+    An error of 25 % in the gap misses the instants of the impacts.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
     usual = max(float(np.std(falls(motion, joint))), 1e-9)
     return [0.5 * usual * float(time) ** 2 for time in np.geomspace(0.005, 0.1, 25)]
 
