@@ -30,7 +30,7 @@ T = TypeVar("T", bound=BaseModel)
 
 
 class Document(BaseModel):
-    """A part of a result document: no unknown keys, no NaN."""
+    """Part of a result document, without unknown keys and without NaN."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
 
@@ -76,10 +76,10 @@ class Comparison(Document):
 
 
 class IdentificationDocument(Document):
-    """``identification.json``: estimated parameters, their covariance, the data, the method and its diagnostics.
+    """Content of ``identification.json``: estimated parameters, their covariance, the data, method and diagnostics.
 
-    ``torque_delay_samples`` has two numbers per joint: the number of samples by which the torque leads the position
-    (0.5 if the drive reports the torque that it holds until the next sample), and its standard deviation.
+    ``torque_delay_samples`` has two numbers per joint: the number of samples by which the torque leads the position,
+    and its standard deviation. A drive that reports the torque that it holds until the next sample has a lead of 0.5.
     """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
@@ -116,7 +116,7 @@ class Alternative(Document):
 
 
 DERIVATIVE_NOISE = 0.98
-"""Ratio of the gap without derivative noise to the gap, below which both are shown."""
+"""Ratio of the gap without derivative noise to the gap; below it both are shown."""
 
 Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
 
@@ -137,7 +137,7 @@ class Finding(Document):
 
     @property
     def gap_without_derivative_noise(self) -> float | None:
-        """Gap after without derivative noise, percent; ``None`` unless `DERIVATIVE_NOISE` makes a difference."""
+        """Gap after the finding without derivative noise, percent; ``None`` if this noise makes no difference."""
         without = self.evidence.get("gap_without_derivative_noise")
         return None if without is None or without >= DERIVATIVE_NOISE * self.gap_after else float(without)
 
@@ -159,7 +159,7 @@ class Unexplained(Document):
 
 
 class NotVisible(Document):
-    """Effect that these recordings cannot show at a joint, whatever its size; ``required_motion`` would show it."""
+    """Effect that these recordings cannot show at a joint at any size; ``required_motion`` would show it."""
 
     effect: str
     joint: str
@@ -304,10 +304,10 @@ def identification_document(
     ----------
     result
         Estimates of the base parameters with covariance, residual statistics and timing.
-    recording
-        Recording that they come from.
+    recordings
+        Recordings that they come from.
     robot
-        Its configuration.
+        Configuration of the robot.
     notes
         Messages of the conversion; they precede the estimator's warnings.
     """
@@ -489,7 +489,15 @@ def load_document(path: Path, kind: type[T]) -> T:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write a file so that a reader sees all of it or none of it; missing folders are created."""
+    """Write a file so that a reader sees all of it or none of it; missing folders are created.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    text
+        Its content, written as UTF-8.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:

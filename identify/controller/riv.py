@@ -19,7 +19,7 @@ ITERATIONS = 40
 """Largest number of iterations."""
 
 TOLERANCE = 1e-3
-"""Change of every parameter that ends the iterations, in its standard deviations; or a thousandth of it, relatively."""
+"""Change of every parameter that ends the iterations, over its standard deviation (at least 0.1 % of its value)."""
 
 NOISE_ORDER = 20
 """Highest order of the AR noise model."""

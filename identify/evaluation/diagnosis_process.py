@@ -18,7 +18,7 @@ from armident.identify.evaluation.plant_process import MEMORY_LIMIT, ONE_THREAD
 from armident.processes import resident_bytes
 
 TASKS_PER_PROCESS = 200
-"""Tasks after which a worker process is replaced, whatever its memory."""
+"""Number of tasks after which a worker process is replaced at any memory size."""
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -36,9 +36,9 @@ class _Outcome(Generic[R]):
 class DiagnosisProcess:
     """Runs tasks in a process pool of one worker, one at a time.
 
-    The worker is started at the first task. It is replaced after its end, after a task without a result in time, after
-    a task with which its memory exceeds ``memory_limit``, and after `TASKS_PER_PROCESS` tasks. A pool of one worker
-    confines the end of the worker to one case: a shared pool loses all running tasks with it.
+    The worker is started at the first task. It is replaced after its end, after a task without a result in time, and
+    after `TASKS_PER_PROCESS` tasks. It is also replaced after a task with which its memory exceeds ``memory_limit``. A
+    pool of one worker confines the end of the worker to one case: a shared pool loses all running tasks with it.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ SHORTFALLS: tuple[tuple[str, Callable[[Scored], bool]], ...] = (
     (f"closed by less than {CLOSED:.0%}", lambda s: s[1].first is True and _share_closed(s) < CLOSED),
     ("a parameter off by over 3 sigma", lambda s: not all(s[1].within)),
 )  # fmt: skip
-"""Shortcomings of a case, and the condition of each."""
+"""Shortcomings of a case, with the condition of each."""
 
 
 def report(result: Tables, scored: Sequence[Scored], total: int, versions: Mapping[str, int], core_hours: float) -> str:

@@ -22,7 +22,10 @@ NOT_DECIDING = (
     "armident.identify.report",
     *(f"armident.identify.evaluation.{module}" for module in ("markdown", "run", "score", "show", "store", "tables")),
 )
-"""Packages and modules without influence on a result: a suite is part of each case's key, the others come after."""
+"""Packages and modules without influence on a result.
+
+The suite is part of each case's key; the other modules run after the result.
+"""
 NOT_STORED = ("recordings", "versions", "model")
 """Parts of a diagnosis document that depend on the machine or are not needed."""
 EMPTY: dict[str, Any] = {"recordings": [], "versions": {}, "model": None}

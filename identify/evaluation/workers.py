@@ -194,7 +194,15 @@ class _Worker:
         return self.plant.request(request, TIMEOUT_S)
 
     def diagnose(self, case: Case, baseline: Path | None) -> TimedDiagnosis:
-        """Diagnose the recording; the task contains nothing about the hidden effects."""
+        """Diagnose the recording; the task contains nothing about the hidden effects.
+
+        Parameters
+        ----------
+        case
+            Case with robot and reduced model.
+        baseline
+            Identification document of the healthy arm, or ``None``.
+        """
         joints = [joint for part in case.parts for joint in (part.joint, part.other) if joint]
         task = DiagnosisTask(
             self.recording, case.config, case.leave_out, tuple(joints) if case.leave_out else (), baseline
@@ -202,7 +210,15 @@ class _Worker:
         return self.diagnosis.run(diagnose_file, task, TIMEOUT_S)
 
     def identify(self, case: Case, out: Path) -> None:
-        """Identify the recording and write the identification document."""
+        """Identify the recording and write the identification document.
+
+        Parameters
+        ----------
+        case
+            Case with the robot.
+        out
+            File of the identification document.
+        """
         self.diagnosis.run(identify_file, IdentificationTask(self.recording, case.config, out), TIMEOUT_S)
 
     def kill(self) -> None:

@@ -2,8 +2,8 @@
 
 A trajectory is a sequence of point-to-point moves within the limits, or a finite Fourier series per joint. A random
 search improves waypoints and paces, or coefficients. The criterion is D-optimality: the smallest geometric mean of the
-standard deviations of the base parameters, with the torque noise of each joint as weight, and a condition number below
-`armident.identify.excitation.point_to_point.CONDITION`. The condition number alone would prefer slow moves, whose
+standard deviations of the base parameters, with the torque noise of each joint as weight. The condition number must be
+below `armident.identify.excitation.point_to_point.CONDITION`. As sole criterion it would prefer slow moves, whose
 gravity torques are as small as their inertial ones.
 
 With an `EffectObjective` the criterion is that of the linear parameters of one effect, or of two effects to separate;
@@ -46,7 +46,7 @@ ASSUMED_NOISE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A trajectory and its predicted precision.
+    """Trajectory and its predicted precision.
 
     Parameters
     ----------
@@ -55,11 +55,10 @@ class Design:
     condition
         Condition number of the filtered, weighted base regressor along it.
     std
-        Predicted standard deviation of each base parameter, shape (b,), in its unit; ``None`` if the noise is
-        unknown.
+        Predicted standard deviation of each base parameter, shape (b,), in its unit; ``None`` if the noise is unknown.
     slow_share
-        Share of the samples of each joint, shape (n,), slower than
-        `armident.identify.excitation.point_to_point.SLOW` of its velocity limit.
+        Share of the samples of each joint, shape (n,), slower than `armident.identify.excitation.point_to_point.SLOW`
+        of its velocity limit.
     torque
         Predicted torques (N, n) at `PERIOD`, N m or N; ``None`` if the parameters of the robot are unknown.
     wanted

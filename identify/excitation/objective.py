@@ -24,14 +24,26 @@ CONTAINED = 1e-8
 
 @dataclass(frozen=True)
 class EffectLocation:
-    """An effect at a location, with the values of its nonlinear parameters to consider."""
+    """Effect at a location, with the values of its nonlinear parameters to consider."""
 
     effect: Effect
     place: Place
     shapes: tuple[Shapes, ...]
 
     def columns(self, motion: Motion, shapes: Shapes, decimation: Decimation, sigma: Array) -> Array:
-        """Return the filtered columns over the noise of each joint, (M n, k)."""
+        """Return the filtered columns over the noise of each joint, (M n, k), per unit of the linear parameters.
+
+        Parameters
+        ----------
+        motion
+            Motion at the input rate of the decimation.
+        shapes
+            Nonlinear parameters by name.
+        decimation
+            Filter of the regression.
+        sigma
+            Standard deviation of the torque noise of each joint, N m or N, (n,).
+        """
         columns = decimation(self.effect.torque(motion, self.place, dict(shapes))) / sigma[:, None]
         return columns.reshape(-1, columns.shape[2])
 
@@ -65,7 +77,7 @@ class EffectObjective:
         decimation
             Filter of the regression.
         sigma
-            Standard deviation of the torque noise of each joint, (n,).
+            Standard deviation of the torque noise of each joint, N m or N, (n,).
         """
         values = []
         for location, rival in self.pairs:
@@ -76,9 +88,20 @@ class EffectObjective:
         return float(np.mean(values))
 
     def std(self, motion: Motion, x: Array, decimation: Decimation, sigma: Array) -> dict[str, float]:
-        """Return the predicted standard deviations of the linear parameters by name; arguments as in `cost`.
+        """Return the predicted standard deviations of the linear parameters by name, in their units.
 
         Nonlinear parameters are in the middle of their grids. Parameters that are not identifiable are infinite.
+
+        Parameters
+        ----------
+        motion
+            Motion at the input rate of the decimation.
+        x
+            Weighted base regressor at the instants that the decimation keeps, (M n, b).
+        decimation
+            Filter of the regression.
+        sigma
+            Standard deviation of the torque noise of each joint, N m or N, (n,).
         """
         found: dict[str, float] = {}
         for location, rival in self.pairs:
@@ -137,7 +160,15 @@ def effect_objective(
 
 
 def weighted_rows(x: Array, sigma: ArrayLike) -> Array:
-    """Return a regressor (M, n, b) over the noise ``sigma`` (n,) of each joint, as rows (M n, b)."""
+    """Return a regressor over the noise of each joint as rows (M n, b).
+
+    Parameters
+    ----------
+    x
+        Regressor, shape (M, n, b).
+    sigma
+        Standard deviation of the torque noise of each joint, N m or N, (n,).
+    """
     rows: Array = (x / np.asarray(sigma, dtype=np.float64)[:, None]).reshape(-1, x.shape[2])
     return rows
 

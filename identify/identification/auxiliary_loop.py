@@ -72,7 +72,7 @@ def closed_loop(
     bandwidth: float,
     excluded: str | None = None,
 ) -> ClosedLoop:
-    """First closed loop whose simulation runs and moves like the robot (thesis 5.2).
+    """Return the first closed loop whose simulation runs and moves like the robot (thesis 5.2).
 
     Controllers are tried in order of preference: the identified or known one, then a stiff PD controller. Each is
     simulated with the IDIM-LS estimate, then with the initial parameters of the configuration.

@@ -23,11 +23,11 @@ PIV_CUTOFF = 5.0
 """Cut-off of the rough decimation before IDIM-PIV, in closed-loop bandwidths (thesis section 7.2)."""
 
 EQUATIONS_PER_PARAMETER = 10.0
-"""Fewest equations per base parameter, of all joints and experiments together: the rest determines the noise."""
+"""Least number of equations per base parameter, of all joints and experiments: the rest determines the noise."""
 
 
 def least_rows(model: ArmModel) -> int:
-    """Fewest decimated instants of all experiments together: each gives one equation per joint.
+    """Least number of decimated instants of all experiments together: each gives one equation per joint.
 
     ``EQUATIONS_PER_PARAMETER b / n``, rounded up, for b base parameters and n joints.
     """
@@ -48,7 +48,7 @@ def decimated_rows(decimation: Decimation, samples: Sequence[int]) -> int:
 
 
 def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: int) -> Decimation:
-    """The decimation or, where it leaves too few instants, the strongest one that leaves enough.
+    """Return the decimation or, where it leaves too few instants, the strongest one that leaves enough.
 
     Motion slower than the cut-off passes any wider filter. A higher cut-off only admits noise, which the estimator
     averages, while too few equations determine neither parameters nor noise.
@@ -62,7 +62,8 @@ def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: 
     samples
         Length of every experiment.
     rows
-        Fewest instants of all experiments together, see :func:`least_rows`. All samples stay where they are fewer.
+        Least number of instants of all experiments together, see :func:`least_rows`. Without decimation there may be
+        fewer.
     """
     if decimated_rows(decimation, samples) >= rows:
         return decimation

@@ -10,7 +10,7 @@ from armident.daq.recording import Recording, Stream
 from armident.identify.experiment import Experiment
 
 MAX_MISSING_SHARE = 0.05
-"""Share of samples that an experiment may lack; with more, the rest no longer is the designed motion."""
+"""Largest share of missing samples of an experiment; with more, the rest is no longer the designed motion."""
 MIN_PIECE_S = 0.5
 """Shortest piece between two gaps, s: edge effects of the filters cover shorter ones."""
 STILL_SHARE = 1e-3

@@ -15,7 +15,7 @@ MAX_ORDER = 250
 
 @dataclass(frozen=True)
 class NoiseDecimation:
-    """A decimation and the correlation time of each joint's noise.
+    """Decimation and the correlation time of each joint's noise.
 
     Parameters
     ----------

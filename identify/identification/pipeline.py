@@ -45,10 +45,10 @@ TOLERATED_DELAY = 1.0
 """Deviation of the torque delay from the expected one that gives no warning, samples."""
 
 TORQUE_PREDICTIONS = 2
-"""Most predictions of the torques on which terms depend."""
+"""Largest number of predictions of the torques on which terms depend."""
 
 TORQUE_SHARE_PREDICTIONS = 6
-"""Most predictions where terms are shares of these torques."""
+"""Largest number of predictions where terms are shares of these torques."""
 
 PREDICTED = 1e-3
 """Relative change of the predicted torques that ends the predictions."""
@@ -96,7 +96,7 @@ def identify_experiment(
 def _identify(
     experiments: Sequence[Experiment], robot: RobotConfig, options: Options, clock: "_Clock"
 ) -> Identification:
-    """The steps of the thesis in their order."""
+    """Carry out the steps of the thesis in their order."""
     warnings: list[str] = []
 
     clock.enter("model", 0.0)
@@ -316,11 +316,21 @@ class _Clock:
     _begin: float = field(default_factory=time.perf_counter)
 
     def enter(self, stage: str, share: float) -> None:
+        """End the current stage and begin the next one.
+
+        Parameters
+        ----------
+        stage
+            Name of the next stage.
+        share
+            Share of the identification that is done, 0 to 1.
+        """
         self._close()
         self._stage, self._since = stage, time.perf_counter()
         self.report(stage, share)
 
     def done(self) -> None:
+        """End the last stage, and store the total duration."""
         self._close()
         self.spent["total"] = time.perf_counter() - self._begin
         self.report("done", 1.0)

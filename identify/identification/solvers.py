@@ -44,7 +44,7 @@ def decimation_of(
     rows: int = 0,
     warnings: list[str] | None = None,
 ) -> Decimation:
-    """Low-pass and decimation for a method, never so strong that too few equations are left.
+    """Return low-pass and decimation for a method; enough equations are left unless the user chose the factor.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def decimation_of(
     samples
         Length of every experiment.
     rows
-        Fewest instants to leave of all experiments together, see `least_rows`.
+        Least number of instants of all experiments together, see `least_rows`.
     warnings
         List to which a line is added if the cut-off was raised, or if too few equations are left.
     """
@@ -113,12 +113,12 @@ class Problem:
 
     @cached_property
     def plain_problem(self) -> "Problem":
-        """The problem with the decimation of the methods without a noise model."""
+        """Problem with the decimation of the methods without a noise model."""
         return replace(self, auxiliary=replace(self.auxiliary.fresh(), decimation=self.plain))
 
     @cached_property
     def in_band(self) -> "Problem":
-        """The problem decimated to the band of the instruments where the equations have a wider one.
+        """Problem decimated to the band of the instruments where the equations have a wider one.
 
         At the recorded rate nearly all rows lie beyond the band of the instruments and carry no information.
         """
@@ -130,7 +130,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solution:
-    """An estimate with the problem that it solves.
+    """Estimate with the problem that it solves.
 
     Parameters
     ----------

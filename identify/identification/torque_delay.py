@@ -178,7 +178,7 @@ def _rate(model: ArmModel, s: Derivatives, theta: Array, decimation: Decimation)
     for first in range(0, count, rows):
         last = min(first + rows, count)
         begin, end = first * decimation.factor, (last - 1) * decimation.factor + decimation.taps.size
-        # One more sample at each end, where there is one: the change is that between the neighbours.
+        # One more sample at each end, where there is one: the change is taken between both neighbours.
         before, after = max(begin - 1, 0), min(end + 1, samples)
         torque = model.inverse_dynamics(theta, s.q[before:after], s.qd[before:after], s.qdd[before:after])
         filtered[first:last] = decimation(np.gradient(torque, axis=0)[begin - before : end - before])

@@ -23,7 +23,7 @@ RANK_TOLERANCE = 1e-9
 
 
 MUCH_WORSE = 10.0
-"""Median ratio of standard deviations of the two identifications from which the test is inconclusive."""
+"""Median ratio of standard deviations of the two identifications above which the test is inconclusive."""
 
 
 class Inconclusive(DataError):
@@ -69,14 +69,15 @@ class ParameterChangeTest:
     Parameters
     ----------
     parameters
-        The later ones, (k,) of them.
+        Parameters of the later one, (k,).
     before, difference, std
-        Earlier values, later less earlier, and the standard deviation of that, (k,) each.
+        Earlier values, later values less these, and the standard deviations of the differences, (k,) each.
     p_values
-        That an unchanged arm differs so much in this parameter, (k,), for all parameters and groups together (Holm
-        1979).
+        Probability of such a difference in each parameter without a change, (k,), corrected for all parameters and
+        groups (Holm 1979).
     chi_square, degrees, p_joint
-        ``d' C^-1 d`` with the covariance C of the difference, its degrees of freedom, and the chance of one so large.
+        ``d' C^-1 d`` with the covariance C of the difference, its degrees of freedom, and the probability of a larger
+        one without a change.
     false_alarms
         False-alarm rate; one half is for the joint test, the other for single parameters and groups.
     groups

@@ -74,7 +74,7 @@ _comparisons = sa.Table(
 
 @dataclass(frozen=True)
 class Run:
-    """An identification in the history; ``recorded`` is the time of its recording (UTC)."""
+    """Identification in the history; ``recorded`` is the time of its recording (UTC)."""
 
     number: int
     recorded: datetime.datetime
@@ -164,7 +164,7 @@ class History:
 
     @staticmethod
     def facts(recording: Recording) -> dict[str, Any]:
-        """Return the metadata of a recording, for `describe`."""
+        """Return the metadata of a recording, as `describe` stores them."""
         return {
             "sha256": recording.sha256,
             "path": None if recording.path is None else str(recording.path),
@@ -190,7 +190,7 @@ class History:
         return recorded_at(document, file) if started is None else datetime.datetime.fromisoformat(started)
 
     def describe(self, facts: Mapping[str, Any]) -> None:
-        """Add the metadata of a recording unless the history has them."""
+        """Add the metadata of a recording unless the history has them already."""
         self._insert_once(_recordings, facts)
 
     def judge(
@@ -231,7 +231,15 @@ class History:
             raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
 
     def first(self, robot: str, cell: str | None = None) -> Run | None:
-        """Return the oldest converged identification of an arm, or ``None``; arguments as in `runs`."""
+        """Return the oldest converged identification of an arm, or ``None``.
+
+        Parameters
+        ----------
+        robot
+            Name of the robot.
+        cell
+            Cell of the robot; ``None``: all. Runs whose cell the history does not know are included.
+        """
         found = self._read(_of(robot, cell).where(_runs.c.converged).limit(1))
         return found[0] if found else None
 
@@ -291,7 +299,15 @@ def _digest(document: IdentificationDocument) -> str:
 
 
 def recorded_at(document: IdentificationDocument, file: Path) -> datetime.datetime:
-    """Return the time of a recording: from its name, otherwise that of the result's file."""
+    """Return the time of a recording: from its name, otherwise that of the result's file.
+
+    Parameters
+    ----------
+    document
+        Identification, with the name of its recording.
+    file
+        File of the document.
+    """
     found = _STAMP.search(document.recording.path or "")
     if found is not None:
         return datetime.datetime.strptime(found[1] + "+0000", "%Y%m%dT%H%M%S%z")

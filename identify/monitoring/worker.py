@@ -29,9 +29,9 @@ log = logging.getLogger(__name__)
 MAX_WAITING_S = 10.0
 """Longest wait for missing blocks after the end event of an experiment, s."""
 MOST_BYTES = 1 << 30
-"""Most bytes of samples in memory, an hour of six axes at 5 kHz; a longer capture is read from its file."""
+"""Largest size of the samples in memory: an hour of six axes at 5 kHz. A longer capture is read from its file."""
 HISTORY_BLOCKS = 100_000
-"""Blocks that a worker requests from the capture's cache when it starts: all of it."""
+"""Number of blocks that a worker requests from the capture's cache when it starts: all of it."""
 
 
 @dataclass
@@ -45,7 +45,8 @@ class Assembly:
     start, end
         Start and end event, when received.
     most_bytes
-        Most bytes of samples in memory; above it no block is kept (captures of months, or a malicious sender).
+        Largest size of the samples in memory, bytes. No block is kept above it: captures may last months, and a sender
+        may be malicious.
     """
 
     capture: str

@@ -14,17 +14,17 @@ from armident.daq.recording import Recording, join_parts, read_recording
 from armident.processes import CommandProcess, Process, ProcessEnded, Start, start_command
 
 READY_S = 120.0
-"""Longest start of the guard, s: its loop may have to be compiled."""
+"""Time limit of the start of the guard, s: its loop may have to be compiled."""
 CAPTURE_ENDS_S = 180.0
-"""Longest end of a capture after its signal, s: it waits for late drives."""
+"""Time limit of the end of a capture after its signal, s: it waits for late drives."""
 GUARD_ENDS_S = 10.0
-"""Longest end of the guard after its signal, s."""
+"""Time limit of the end of the guard after its signal, s."""
 POLL_S = 0.05
 """Polling period of both processes, s."""
 _ERRORS: dict[int, type[ArmidentError]] = {2: ConfigError, 3: DataError}
 
 Say = Callable[[str], None]
-"""Takes a line of progress."""
+"""Function that receives a line of progress."""
 
 
 def start_process(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Process:

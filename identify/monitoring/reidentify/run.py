@@ -1,4 +1,4 @@
-"""``armident reidentify`` of one arm: check, move, identify, compare, keep, tell."""
+"""Command ``armident reidentify`` of one arm: check, move, identify, compare, store and publish."""
 
 import json
 import subprocess
@@ -41,7 +41,7 @@ DRIFTED = 4
 CHECK_PERIOD = 1e-3
 """Sampling period of predicted torques, s."""
 DIAGNOSIS_S = 3600.0
-"""Longest duration of a diagnosis, s."""
+"""Time limit of a diagnosis, s."""
 
 
 @dataclass(frozen=True)

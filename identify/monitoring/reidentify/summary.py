@@ -10,7 +10,7 @@ from armident.identify.monitoring.change_test import ParameterChangeTest
 
 _NAME = re.compile(r"([a-z]+)(\d+)r?(?:_\d+)?$")
 CLEAR = 2.0
-"""Difference in standard deviations from which a parameter of a changed group is listed."""
+"""Least difference, in standard deviations, of a parameter that is listed for a changed group."""
 
 _SHARED = ("ia", "fv", "fc")
 """Kinds of parameters of a coupling of two joints."""
