@@ -131,6 +131,17 @@ class _Piece:
 
     @classmethod
     def of(cls, residual: Array, speed: Array, t: Array) -> "_Piece":
+        """Return the piece of a residual.
+
+        Parameters
+        ----------
+        residual
+            Residual of one joint, N m or N, shape (N,).
+        speed
+            Speed of the joint, on which the usual power depends, rad/s or m/s, shape (N,).
+        t
+            Instants, s, shape (N,).
+        """
         own = residual - residual.mean()
         basis = hats(speed, np.array(SIDE) * max(float(speed.max()), 1e-12))
         level, _ = optimize.nnls(basis, own**2)

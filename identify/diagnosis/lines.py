@@ -166,6 +166,15 @@ class _Spectrum:
 
     @classmethod
     def of(cls, e: Array, dt: float) -> "_Spectrum":
+        """Return the spectrum of a series with a Hann window.
+
+        Parameters
+        ----------
+        e
+            Series, shape (N,).
+        dt
+            Sampling period, s.
+        """
         window = hann_window(e.size)
         windowed = window * (e - e.mean())
         power = periodogram(windowed, PADDING)

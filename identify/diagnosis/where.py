@@ -299,6 +299,15 @@ class _Found:
         return self.trial.p_value < level and self.trial.p_held < HELD_OUT_LEVEL and self.trial.gain > 0
 
     def disagreement(self, fit: Fit, workshop: Workshop) -> Disagreement:
+        """Return the dependence of the residual on the variables of the map, as a smoothed curve.
+
+        Parameters
+        ----------
+        fit
+            Fit of the model.
+        workshop
+            Columns of the model and of the effects.
+        """
         study, m = fit.study, self.map
         other = None if m.other is None else study.joints[m.other]
         x = np.linspace(m.low, m.high, 121)

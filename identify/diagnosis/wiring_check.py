@@ -198,7 +198,13 @@ class _Bench:
         return out.reshape(3 * n, -1)
 
     def fit(self, position: Array, torque: Array) -> _Fit:
-        """Physical weighted least squares; residuals in the order and with the weights of the recorded torques."""
+        """Physical weighted least squares; residuals in the order and with the weights of the recorded torques.
+
+        Parameters
+        ----------
+        position, torque
+            Corrections of the motors' positions and torques, shape (n, n); see `exchanges`.
+        """
         rows = self.rows(position)
         taken = np.abs(torque).argmax(axis=1)
         sign = torque[np.arange(self.model.n), taken]
