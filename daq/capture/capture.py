@@ -77,11 +77,11 @@ def capture(
     plan
         Session, robot, trajectory and options of the capture.
     stop
-        Set it to end the capture; the file is finished all the same.
+        Event that ends the capture; the file is finished nevertheless.
     save
-        Set it to have the last seconds written, where a trigger decides what is written.
+        Event that requests a file with the last seconds, where a trigger decides when rows are written.
     reload
-        Set it to have the configuration read again, where the plan was read from a file.
+        Event that requests a reload of the configuration, where the plan was read from a file.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def _change_limits(writer: QueuedSeries, retention: RecordingRetention) -> Chang
 
 
 def _connect(recorder: Recorder, reloader: Reloader, requested: threading.Event, notifier: Notifier, cell: str) -> None:
-    """Have a capture reload its configuration on request, by signal or by command."""
+    """Connect signal and command to the reload of the configuration."""
 
     def reload() -> None:
         notifier.reloading()

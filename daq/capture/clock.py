@@ -5,7 +5,7 @@ import os
 from dataclasses import dataclass
 
 _TIME_ERROR = 5
-"""Returned by adjtimex(2) if the clock is not synchronised."""
+"""Return value of adjtimex(2) if the clock is not synchronised."""
 _UNSYNCHRONISED, _NANOSECONDS = 0x0040, 0x2000
 """Bits of ``status``: STA_UNSYNC, and STA_NANO (the offset is in ns instead of us)."""
 
@@ -26,7 +26,7 @@ class _Timex(ctypes.Structure):
 
 @dataclass(frozen=True)
 class ClockState:
-    """The state of the system clock.
+    """State of the system clock.
 
     Parameters
     ----------

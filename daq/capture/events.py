@@ -12,7 +12,7 @@ from armident.drivers.canopen.master import DriveEvent
 COUNTED = ("emcy", "heartbeat_lost", "rebooted", "mapping_changed", "bus_down", "bus_off", "sync_stopped")
 """Kinds of events that have a counter."""
 SYNC_STOPPED_S = 0.2
-"""SYNC of another master has stopped when none came for this time (s) and for `SYNC_STOPPED` periods."""
+"""Least time without SYNC of another master after which SYNC has stopped, s, besides `SYNC_STOPPED` periods."""
 SYNC_STOPPED = 20
 
 log = logging.getLogger(__name__)

@@ -63,7 +63,7 @@ class JournalHandler(StderrHandler):
 
 
 def in_journal() -> bool:
-    """Return whether stderr is a stream of the journal (systemd.exec(5), ``$JOURNAL_STREAM``)."""
+    """Return True if stderr is a stream of the journal (systemd.exec(5), ``$JOURNAL_STREAM``)."""
     device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
     if not (device.isdigit() and inode.isdigit()):
         return False

@@ -1,8 +1,8 @@
 """Discovery of the TPDOs that drives send, by listening alone.
 
 Frames that come on every n-th SYNC, always with the same length, are TPDOs of the drives whose EDS gives them their
-COB-ID. Frames do not tell their contents. The mapping is that of the session if its length and interval agree, else
-the default of the EDS if its length agrees. Anything else is refused.
+COB-ID. Frames contain no information about their mapping. The mapping is that of the session if its length and interval
+agree, else the default of the EDS if its length agrees. Anything else is refused.
 """
 
 import logging
@@ -26,7 +26,7 @@ from armident.drivers.canopen.objects import COB_SYNC, OBJECTS, TpdoLayout
 SYNC_WAIT_S = 10.0
 """Longest wait for the first SYNC of a bus, s."""
 FEWEST_FRAMES = 3
-"""Fewest frames from which an interval is computed."""
+"""Least number of frames from which an interval is computed."""
 IN_STEP = 0.95
 """Share of a TPDO's frames that must come at its interval; a busy machine may delay the others past the next SYNC."""
 PERIOD_TOLERANCE = 0.05

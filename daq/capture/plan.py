@@ -21,7 +21,7 @@ from armident.drivers.canopen.objects import COB_SDO_REQUEST, COB_SYNC
 
 @dataclass(frozen=True)
 class CapturePlan:
-    """Everything that a capture needs to know.
+    """Configuration and options of a capture.
 
     Parameters
     ----------

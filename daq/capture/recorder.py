@@ -36,15 +36,15 @@ HEALTH_S = 1.0
 REST_S = 0.01
 """Interval of reads of the buses at the end of a capture, s."""
 TELL_BEHIND_S = 0.5
-"""Lag of the drives at the end of a capture from which on it is logged, s."""
+"""Lag of the drives at the end of a capture above which it is logged, s."""
 QUICK_STOP_S = 0.3
 """Time for which the drives stay enabled after a quick stop when no position is received, s."""
 STARVED_S = 20.0
-"""Time without any frame after which the end no longer waits for drives that all lag, s; less than the watchdog's."""
+"""Longest wait without any frame at the end for drives that all lag, s; less than the time of the watchdog."""
 BRAKING_S = 5.0
 """Time for which the drives stay enabled after a quick stop while the arm still moves, s."""
 AHEAD = 10
-"""Steps of niceness by which the thread that reads the buses precedes those that write and publish."""
+"""Difference in niceness between the thread that reads the buses and those that write and publish."""
 OUTAGE_S = 5.0
 """Time without a working bus after which a capture ends, s."""
 
@@ -71,7 +71,7 @@ class Outputs:
 
 
 class Recorder:
-    """The main loop of one capture.
+    """Main loop of one capture.
 
     Parameters
     ----------
@@ -84,9 +84,9 @@ class Recorder:
     outputs
         Destinations of rows and messages.
     stop
-        Ends the capture when it is set.
+        Event that ends the capture.
     save
-        Triggers a recording when it is set.
+        Event that triggers a recording.
     """
 
     def __init__(
@@ -225,13 +225,13 @@ class Recorder:
         return wanted
 
     def _is_interrupted(self) -> bool:
-        """Return whether the capture ends before the motion does."""
+        """Return True if the capture ends before the motion does."""
         return self._motion is not None and self._span is not None and self._assembler.last_sync < self._span[1]
 
     def _loop(self) -> None:
         last = self._last_sync_wanted()
         if isinstance(self._producer, SyncProducer) and self._motion is None and math.isfinite(last):
-            # The producer counts the SYNCs itself: this loop may be late, and drives that lag would lag ever more.
+            # The producer counts the SYNCs itself: this loop may be late, and the lag of the drives would grow.
             # Not for a moving arm: to enabled drives and to the guard, a missing SYNC is a failure of the master.
             self._producer.stop_after(round(last) + 1)
         due = reported = time.monotonic()
@@ -383,10 +383,10 @@ class Recorder:
         log.info("the arm was not seen to come to rest; its drives are disabled all the same")
 
     def _await_answers(self) -> None:
-        """Record until no drive owes an answer, or none has come for ``LATE_S``.
+        """Record until all drives have answered, or no answer has come for ``LATE_S``.
 
-        If all owe answers they lag together, on a host that is too busy: the limit is ``STARVED_S`` then, unless a
-        heartbeat is missing or no bus works.
+        If all answers are missing, the drives lag together, on a host that is too busy. The limit is then
+        ``STARVED_S``, unless a heartbeat is missing or no bus works.
         """
         reported = False
         last_s, lost = time.monotonic(), self._events.counts["heartbeat_lost"]

@@ -111,7 +111,13 @@ class Reloader:
 
 
 def differences(one: SessionConfig, other: SessionConfig) -> Iterator[str]:
-    """Yield the keys whose values differ between two sessions, as ``recording.rotate_mb``."""
+    """Yield the keys whose values differ between two sessions, as ``recording.rotate_mb``.
+
+    Parameters
+    ----------
+    one, other
+        The two sessions.
+    """
     yield from _differing(one.model_dump(by_alias=True), other.model_dump(by_alias=True), "")
 
 

@@ -113,7 +113,17 @@ class Sink:
         self._writer.trigger(self.last_ns)
 
     def move_mark(self, kind: MarkKind, sync: int, text: str) -> None:
-        """Place a mark at another SYNC than planned. Parameters as in :meth:`mark`."""
+        """Place a mark at another SYNC than planned.
+
+        Parameters
+        ----------
+        kind
+            Kind of the mark.
+        sync
+            Number of its SYNC.
+        text
+            Text of the mark.
+        """
         self._planned = [planned for planned in self._planned if planned[0] != kind]
         self.mark(kind, sync, text)
 

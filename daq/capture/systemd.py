@@ -8,8 +8,8 @@ import time
 class Notifier:
     """Sends states to the service manager, if there is one (``$NOTIFY_SOCKET``).
 
-    `progress` feeds the watchdog. The main loop calls it when it has read the buses, no timer does: systemd restarts a
-    capture that hangs.
+    `progress` resets the watchdog. The main loop calls it after it has read the buses; no timer does. So systemd
+    restarts a capture that hangs.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class Notifier:
         self._send(f"READY=1\nSTATUS={status}")
 
     def progress(self, status: str) -> None:
-        """Feed the watchdog, and set the status line."""
+        """Reset the watchdog, and set the status line."""
         self._send(f"WATCHDOG=1\nSTATUS={status}")
 
     def reloading(self) -> None:

@@ -50,7 +50,7 @@ ARMED_STATE = int(NmtState.OPERATIONAL)
 
 @dataclass(frozen=True)
 class Alarm:
-    """A reason to stop the drives.
+    """Reason to stop the drives.
 
     Parameters
     ----------
@@ -226,7 +226,35 @@ def check_limits(  # type: ignore[no-untyped-def]
     moved, raw, seen, demanded, per_count, per_mille, positions, efforts, samples, velocity_s,
     low, high, velocity, torque, following, state, value,
 ):  # fmt: skip
-    """Check the joints that motor ``moved`` drives; return the cause of an alarm or ``NO_ALARM``."""
+    """Check the joints that motor ``moved`` drives; return the cause of an alarm or ``NO_ALARM``.
+
+    Parameters
+    ----------
+    moved
+        Number of the motor with a new value.
+    raw
+        Newest position (counts), effort (per mille of rated) and demand (counts) of each motor, int64, shape (3, n).
+    seen, demanded
+        True for motors with a position, and with a demand, shape (n,).
+    per_count
+        Joint positions per count of the motors, rad or m, shape (n, n).
+    per_mille
+        Joint torques per per mille of rated effort of the motors, N m or N, shape (n, n).
+    positions
+        Ring of the last positions, counts, int64, shape (P, n).
+    efforts
+        Ring of the last efforts over which the torque is averaged, per mille of rated, shape (E, n).
+    samples
+        Number of samples of each motor since the motion began, int64, shape (n,).
+    velocity_s
+        Time between the oldest and the newest of ``positions``, s.
+    low, high, velocity, torque, following
+        Limits of the joints, as in `armident.daq.guard.limits.Limits`, shape (n,) each.
+    state
+        State of the monitor, int64, shape (3,); its element ``JOINT`` is set on an alarm.
+    value
+        Output on an alarm: measured value and limit, in the unit of the limit, shape (2,).
+    """
     n, ring = low.size, positions.shape[0]
     for j in range(n):
         if per_count[j, moved] == 0.0 and per_mille[j, moved] == 0.0:
@@ -267,7 +295,41 @@ def check_batch(  # type: ignore[no-untyped-def]
     per_count, per_mille, positions, efforts, samples, velocity_s,
     low, high, velocity, torque, following, state, sync, value,
 ):  # fmt: skip
-    """Check all frames of a batch, then for missing heartbeats and SYNC; return the cause of an alarm."""
+    """Check all frames of a batch, then for missing heartbeats and SYNC; return the cause of an alarm.
+
+    Parameters
+    ----------
+    ids, lengths, data
+        Fields of an array of N frames: identifiers (N,), numbers of data bytes (N,), and data bytes (N, 8) or (N, 64).
+    now
+        Monotonic time before the frames were received, ns.
+    bus
+        Number of the bus.
+    kinds, joints
+        Kind and joint of the frames of each identifier of this bus, int64, shape (IDENTIFIERS,); kind -1: not checked.
+    at
+        First byte of position and effort in the TPDO of the samples, and of the demand in its TPDO, shape (3,); -1:
+        absent.
+    own_demand
+        True if the drives send their demand; else the set points are the demand.
+    every
+        Number of SYNCs between two set points.
+    raw, seen, demanded, positions, efforts, samples
+        Newest values and rings as in `check_limits`; changed in place.
+    beat
+        Monotonic time of the last heartbeat of each drive, ns, int64, shape (n,); changed in place.
+    silence
+        Time without heartbeat or SYNC after which they are lost, ns.
+    per_count, per_mille, velocity_s, low, high, velocity, torque, following
+        Scales and limits as in `check_limits`.
+    state
+        1 while set points are played, joint and frame of an alarm (-1: none), int64, shape (3,); changed in place.
+    sync
+        Monotonic time (ns) of the last SYNC, and number of SYNCs since a set point, by bus, int64, shape (2, B);
+        changed in place.
+    value
+        Output on an alarm: measured value and limit, shape (2,).
+    """
     for k in range(ids.size):
         if ids[k] >= IDENTIFIERS or kinds[ids[k]] < 0:
             continue

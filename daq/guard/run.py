@@ -21,10 +21,10 @@ from armident.drivers.can.udp import open_bus
 from armident.drivers.canopen.objects import COB_SDO_REQUEST, CONTROLWORD, Control, rpdo_cob, stop_rpdo
 
 BATCH = 512
-"""Most frames that are received at once."""
+"""Largest number of frames that are received at once."""
 
 POLL_S = 0.02
-"""Longest wait for a frame before heartbeats and SYNC are checked, s."""
+"""Longest wait for a frame until heartbeats and SYNC are checked, s."""
 
 PAUSE_PERIODS = 0.5
 """Pause between two reads, in SYNC periods: a wake-up for every frame costs several times as much CPU time."""

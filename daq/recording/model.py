@@ -214,7 +214,7 @@ class Recording:
     metadata
         Facts about the capture, such as software versions or the source file.
     missing
-        Description of what a truncated or damaged file lacks; ``None`` if the recording is complete.
+        Description of the missing parts of a truncated or damaged file; ``None`` if the recording is complete.
     """
 
     path: Path | None

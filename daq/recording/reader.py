@@ -29,9 +29,9 @@ from armident.daq.recording.rows import Rows
 from armident.daq.recording.scan import ChunkItem, RecordingScan
 
 _LEAST_ROW, _MOST_RESERVED = 2, 1 << 25
-"""Smallest share of a compressed file that a row takes, bytes, and most rows that memory is reserved for."""
+"""Least share of a compressed file that a row takes, bytes, and largest number of rows for which memory is reserved."""
 _RELEASE_EVERY = 1 << 26
-"""Bytes read between two releases of the mapped file's pages."""
+"""Number of bytes read between two releases of the mapped file's pages."""
 
 
 def read_recording(path: Path | str) -> Recording:

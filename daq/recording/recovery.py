@@ -20,7 +20,7 @@ from armident.daq.recording.summary import Summary
 from armident.daq.recording.writer import checksum_record
 
 _COPY = 1 << 24
-"""Bytes copied at a time."""
+"""Number of bytes copied at a time."""
 
 
 @dataclass(frozen=True)

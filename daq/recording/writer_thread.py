@@ -21,7 +21,7 @@ MOST_WAITING_BYTES = 128 << 20
 """Memory for rows that wait for the disk, bytes: about six minutes of six axes at 5 kHz."""
 
 CATCH_UP = 2.0
-"""Largest write rate of a backlog, relative to the rate at which its rows came: reading the buses has priority."""
+"""Largest write rate of a backlog, over the rate at which its rows came: reading the buses has priority."""
 
 _Do = Callable[[], object]
 _Rows = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
@@ -62,6 +62,17 @@ class _Chunk:
     count: int = 0
 
     def add(self, stream: str, rows: _Rows, size: int) -> None:
+        """Add rows of a stream.
+
+        Parameters
+        ----------
+        stream
+            Name of the stream.
+        rows
+            SYNC numbers, times (ns UTC) and raw values of the rows.
+        size
+            Size of the rows, bytes.
+        """
         if not self.rows:
             self.began_ns = time.monotonic_ns()
         self.rows.setdefault(stream, []).append(rows)
@@ -71,6 +82,7 @@ class _Chunk:
         self.count += len(rows[0])
 
     def write(self, series: RecordingSeries | TriggeredSeries) -> None:
+        """Write the content to a series."""
         if self.since is not None:
             series.turn(self.since)
         # Gaps first: a truncated file then lists the gaps of all rows it has.
