@@ -133,7 +133,17 @@ def copy_frames(slots: Any, first: Any, count: Any, accept: Any, errors: Any, in
 
 @njit(cache=True, nogil=True)
 def release(slots: Any, first: Any, count: Any) -> None:
-    """Return slots to the kernel. Parameters as for `copy_frames`."""
+    """Return slots to the kernel.
+
+    Parameters
+    ----------
+    slots
+        The ring as numbers of 8 bytes, int64, shape (N, 12) or (N, 20); changed in place.
+    first
+        Number of the first slot.
+    count
+        Number of slots.
+    """
     k = first
     for _ in range(count):
         slots[k, 0] = 0
@@ -288,7 +298,7 @@ class PacketRing:
                 return written
 
     def _take(self, batch: Frames, count: int) -> tuple[int, bool]:
-        """Copy filled slots to a batch and release them; return the number of frames, and if some were dropped."""
+        """Copy filled slots to a batch and release them; return the number of frames, and True if some were dropped."""
         # Separate calls, so that no compiler moves reads of a slot before its status or behind its release.
         into = frame_bytes(batch).view(np.int64)
         written, losing = _copy_frames(self._slots, self._next, count, self._accept, self._errors, into)
@@ -297,7 +307,7 @@ class PacketRing:
         return int(written), bool(losing)
 
     def _assign_drops(self, count: int, losing: bool, emptied: bool) -> None:
-        """Add to `dropped` what was lost before the slots that were taken."""
+        """Add the frames that were lost before the taken slots to `dropped`."""
         if losing:
             self._read_drops()
             # Only the sum of several losses is known: one frame for each batch, the rest with the last one.

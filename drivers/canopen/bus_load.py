@@ -1,7 +1,7 @@
 """Load of CAN buses: bits of classic and FD frames, load of a session by bus, and alternatives that fit.
 
-Classic frames: Davis, Burns, Bril and Lukkien (2007). CAN FD: ISO 11898-1:2015, with arbitration at the nominal bit
-rate, the part between bit rate switch and CRC delimiter at the data bit rate, and fixed stuff bits in the CRC field.
+Classic frames: Davis, Burns, Bril and Lukkien (2007). CAN FD: ISO 11898-1:2015. Its arbitration is at the nominal bit
+rate, the part between bit rate switch and CRC delimiter at the data bit rate. Its CRC field has fixed stuff bits.
 """
 
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ FD_ARBITRATION_BITS = 17
 FD_TAIL_BITS = 13
 """CRC delimiter, acknowledgement, end of frame and interframe space, at the nominal bit rate."""
 STUFF_EVERY = 4
-"""Fewest bits per stuff bit in a stuffed field, after its first bit."""
+"""Least number of bits per stuff bit in a stuffed field, after its first bit."""
 STANDARD_PERIODS_US = (100, 125, 200, 250, 400, 500, 800, 1000, 2000, 4000, 5000, 10_000, 20_000, 50_000, 100_000)
 """SYNC periods that drives commonly offer, us."""
 DATA_BITRATES = (2_000_000, 5_000_000, 8_000_000)
