@@ -268,11 +268,26 @@ class _Tree:
     below: Mapping[str, list[ET.Element]]
 
     def known(self, link: str, key: str) -> str:
+        """Return the name of a link that the file contains.
+
+        Parameters
+        ----------
+        link
+            Name of the link.
+        key
+            Key of the configuration that names the link, for messages.
+
+        Raises
+        ------
+        ConfigError
+            If the file has no such link.
+        """
         if link not in self.links:
             raise ConfigError(f"{self.file}: no link {link!r} ({key}); links are {', '.join(sorted(self.links))}")
         return link
 
     def root(self) -> str:
+        """Return the only link that no joint moves."""
         roots = sorted(self.links - self.above.keys())
         if len(roots) != 1:
             found = f"{len(roots)} ({', '.join(roots)})" if roots else "none: the joints form a loop"
@@ -280,7 +295,18 @@ class _Tree:
         return roots[0]
 
     def path_to(self, base: str, tip: str) -> list[ET.Element]:
-        """Joints from base to tip; branches that move are refused on the way."""
+        """Joints from base to tip; branches that move are refused on the way.
+
+        Parameters
+        ----------
+        base, tip
+            First and last link of the chain.
+
+        Raises
+        ------
+        ConfigError
+            If the base does not move the tip, or a second moving joint branches off.
+        """
         path: list[ET.Element] = []
         link = tip
         while link != base:
@@ -325,6 +351,7 @@ class _Tree:
         )
 
     def type_of(self, element: ET.Element) -> str:
+        """Return the URDF type of a joint."""
         return element.get("type", "")
 
     def origin(self, element: ET.Element) -> Floats:
@@ -337,6 +364,20 @@ class _Tree:
         return frame
 
     def moving_joint(self, element: ET.Element, placement: Floats) -> UrdfJoint:
+        """Return a moving joint of the chain.
+
+        Parameters
+        ----------
+        element
+            Element of the joint.
+        placement
+            Frame of the joint in the base link with all variables zero, shape (4, 4).
+
+        Raises
+        ------
+        ConfigError
+            If the joint is of another type, follows another joint, or has no usable axis.
+        """
         where = f"{self.file}: joint {element.get('name')!r}"
         kind = self.type_of(element)
         if kind not in MOVING:
