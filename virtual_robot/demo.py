@@ -39,9 +39,9 @@ MAX_LOST_SHARE = 0.02
 HEARTBEAT_MS = 1000
 """Heartbeat period, ms: long, because drives and master share this machine."""
 READY_S = 120.0
-"""Longest start of a process, s; the first compilation of its loops takes most of it."""
+"""Time limit of the start of a process, s; the first compilation of its loops takes most of it."""
 PART_S = 300.0
-"""Longest duration of a process after its start, s."""
+"""Time limit of a process after its start, s."""
 SHOWN_CHARACTERS = 160
 """Maximum length of a process's output line that is passed on."""
 PATIENT, URGENT = 19, -10
@@ -55,7 +55,15 @@ class _ElapsedTime(logging.LoggerAdapter[logging.Logger]):
     begin = time.monotonic()
 
     def process(self, msg: Any, kwargs: MutableMapping[str, Any]) -> tuple[Any, MutableMapping[str, Any]]:
-        """Add the elapsed time to a message."""
+        """Add the elapsed time to a message.
+
+        Parameters
+        ----------
+        msg
+            The message.
+        kwargs
+            Keyword arguments of the logging call, which are returned unchanged.
+        """
         return f"[{time.monotonic() - self.begin:5.1f} s] {msg}", kwargs
 
 

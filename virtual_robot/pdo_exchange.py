@@ -58,9 +58,10 @@ def _exchange(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Process frames from ``start`` on up to the next SYNC and answer it; return its index, or ``stop``.
 
-    ``sequence`` is the counter of a SYNC that carries none. ``result`` (3,) receives the number of frames to send, bits
-    for set points (1) and controlwords (2) that take effect at this SYNC (in ``targets`` and ``control``), and the
-    number of SYNCs. ``history`` keeps the live values; an entry sends those of ``tx_back`` SYNCs ago.
+    ``sequence`` is the counter of a SYNC that carries none. ``result`` (3,) receives three numbers: frames to send,
+    bits for set points (1) and controlwords (2) that take effect at this SYNC, and SYNCs. These set points and
+    controlwords are in ``targets`` and ``control``. ``history`` keeps the live values; an entry sends those of
+    ``tx_back`` SYNCs ago.
     """
     at = stop
     for k in range(start, stop):

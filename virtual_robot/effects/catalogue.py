@@ -13,7 +13,7 @@ Target = Literal["force", "bristle", "gear", "body", "drive", "report"]
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """ParameterSpec of an effect, joint side.
+    """Parameter of an effect, joint side.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class ParameterSpec:
 
 @dataclass(frozen=True)
 class EffectSpec:
-    """EffectSpec that can be hidden in the virtual arm.
+    """Effect that can be hidden in the virtual arm.
 
     Parameters
     ----------

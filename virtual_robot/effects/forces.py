@@ -78,7 +78,7 @@ def effect_torque(code, p, q, qd, motor, other, load, t, smoothing):  # type: ig
         return p[0] * (q - p[1]), 0.0
     if code == 8:  # constant
         return p[0], 0.0
-    if code == 9:  # more of the same friction
+    if code == 9:  # scaled viscous and Coulomb friction
         return p[0] * qd + p[1] * side, p[0] + p[1] * side_slope
     if code == 10:  # bump at one angle
         return p[0] * math.exp(-0.5 * ((q - p[1]) / p[2]) ** 2), 0.0
