@@ -450,7 +450,7 @@ def from_json(text: str, kind: type[T], where: str) -> T:
     Raises
     ------
     DataError
-        If the text is no such document; the message names ``where``, the key and what was expected.
+        If the text is no such document; the message names ``where``, the key and the expected value.
     """
     try:
         return kind.model_validate(json.loads(text))

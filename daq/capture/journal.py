@@ -46,7 +46,7 @@ class JournalHandler(StderrHandler):
         """Send one record."""
         if self._socket is not None:
             try:
-                # Waiting for a journal whose buffer is full would delay the capture: the line goes to stderr then.
+                # Waiting for a journal whose buffer is full would delay the capture: stderr receives the line then.
                 datagram = entry(record, self.format(record), self.fields)
                 self._socket.sendto(datagram, socket.MSG_DONTWAIT, self._address)
                 return

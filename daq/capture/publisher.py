@@ -29,7 +29,7 @@ class Publisher:
     """Publishes blocks, events, health and status of a capture.
 
     Blocks wait in a queue of ``session.zenoh.queue_blocks``. If it is full they are dropped and counted; the file is
-    complete all the same. Subscribers detect missing blocks by sequence numbers, and can query the last
+    complete nevertheless. Subscribers detect missing blocks by sequence numbers, and can query the last
     ``cache_blocks``. Events are dropped only if thousands wait. Of health and status only the latest waits.
 
     Parameters

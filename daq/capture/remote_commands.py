@@ -1,4 +1,4 @@
-"""Commands to a running capture over Zenoh: save what was just recorded, set a mark, reload, stop."""
+"""Commands to a running capture over Zenoh: save the last seconds, set a mark, reload, stop."""
 
 import queue
 import time

@@ -109,7 +109,7 @@ class Sink:
         self._place_marks(False)
 
     def trigger(self) -> None:
-        """Write the seconds before and after the newest sample, if a trigger decides what is written."""
+        """Write the seconds before and after the newest sample, if the session records only around triggers."""
         self._writer.trigger(self.last_ns)
 
     def move_mark(self, kind: MarkKind, sync: int, text: str) -> None:

@@ -67,7 +67,7 @@ def read_recording(path: Path | str) -> Recording:
 
 
 def recovered_words(metadata: dict[str, dict[str, str]]) -> list[str]:
-    """Describe what a file lacked when it was recovered; empty if it was not.
+    """Describe the parts that a recovered file lacked; empty if it was not recovered.
 
     Parameters
     ----------

@@ -221,7 +221,7 @@ class _Contents:
         self.missing = "; ".join(recovered_words(self.scan.metadata) + missing) if missing else None
 
     def _add_tail(self) -> None:
-        """Rebuild the indexes of a last chunk: it is complete, they need not be."""
+        """Rebuild the indexes of the last chunk, which may be incomplete although the chunk is complete."""
         if self._last is not None:
             self.end = self._last.indexes_start
             self.tail = self._last.rebuild_indexes()
@@ -240,7 +240,7 @@ class _Contents:
     def _damage_start(self, item: DamageItem) -> int:
         """Return the start of the cut for a damaged record.
 
-        Of counters and their checksum, either may be the damaged one: both are left out.
+        Either the counters or their checksum may be damaged: both are left out.
         """
         counters = [index.offset for index in self.summary.metadata if index.name == COUNTERS]
         if item.opcode != Opcode.METADATA or not counters:

@@ -224,7 +224,7 @@ class RecordingScan:
                     for channel, count in item.message_counts().items():
                         self.messages[channel] = self.messages.get(channel, 0) + count
                 elif item is None and chunk is None:
-                    # Of counters and their checksum, either may be the damaged one.
+                    # Either the counters or their checksum may be damaged.
                     self.metadata.pop(COUNTERS, None)
                 yield item or DamageItem(opcode, start, end)
                 if opcode == Opcode.DATA_END:
@@ -232,7 +232,7 @@ class RecordingScan:
         self.finished = self.finished and bytes(self._data[-len(mcap.MAGIC) :]) == mcap.MAGIC
 
     def missing(self, last_sync: int | None) -> list[str]:
-        """Describe what the file lacks, after the iteration; empty for a complete file.
+        """Describe the missing parts of the file, after the iteration; empty for a complete file.
 
         Parameters
         ----------

@@ -150,7 +150,7 @@ def release(slots: Any, first: Any, count: Any) -> None:
         k = k + 1 if k + 1 < slots.shape[0] else 0
 
 
-# Compiled functions are typed by their Python signatures, which hide what numba accepts.
+# mypy types compiled functions by their Python signatures, which do not contain the types that numba accepts.
 _filled: Any = filled
 _copy_frames: Any = copy_frames
 _release: Any = release

@@ -46,8 +46,8 @@ def frame_bits(data_bytes: int) -> tuple[int, int]:
 def fd_frame_bits(data_bytes: int) -> tuple[tuple[int, int], tuple[int, int]]:
     """Minimum and maximum number of bits of a CAN FD frame with an 11-bit identifier (ISO 11898-1:2015).
 
-    Start of frame to the last data bit gets dynamic stuff bits (none to one in four). The stuff count and the CRC, of
-    17 bits up to 16 bytes and 21 above, have 6 and 7 fixed ones.
+    The bits from start of frame to the last data bit have dynamic stuff bits (none to one in four). The stuff count and
+    the CRC, of 17 bits up to 16 bytes and 21 above, have 6 and 7 fixed ones.
 
     Parameters
     ----------

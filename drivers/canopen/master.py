@@ -301,7 +301,7 @@ class DriveMaster:
         ]
 
     def _check_heartbeats(self, monitor: HeartbeatMonitor) -> None:
-        """Report lost and returned heartbeats, judged by their receive times."""
+        """Report lost and returned heartbeats by their receive times."""
         if time.monotonic() - monitor.updated < HEARTBEAT_CHECK_S:
             return
         # Heartbeats that wait in the sockets count.

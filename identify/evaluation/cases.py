@@ -111,7 +111,7 @@ class Case:
 
     @property
     def key(self) -> str:
-        """Hash of everything that determines the result."""
+        """Hash of all data that determine the result."""
         content = {k: v for k, v in asdict(self).items() if k not in ("quick", "kind", "level")}
         content["parts"] = [
             {k: v for k, v in part.items() if k not in ("brings", "rescales")} for part in content["parts"]

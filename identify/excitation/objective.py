@@ -217,9 +217,10 @@ def _information(
     decimation: Decimation,
     sigma: Array,
 ) -> tuple[Array, Array]:
-    """Return the information in an effect's columns alone (k,), and relative to it beside model and rival (k, k).
+    """Return the information on the linear parameters in the effect's columns alone (k,), and a relative one (k, k).
 
-    An effect that only changes parameters is tested against a baseline, so the model does not absorb it.
+    The second one is that beside model and rival effect, over the first. An effect that only changes parameters is
+    tested against a baseline, so the model does not absorb it.
     """
     own = location.columns(motion, shapes, decimation, sigma)
     power = np.einsum("rk,rk->k", own, own)

@@ -134,7 +134,7 @@ def joint_positions(stream: Stream, quantity: Literal["position", "demand"], rob
 def joint_torques(stream: Stream, robot: RobotConfig) -> Array:
     """Joint torques from the signals of the drives, shape (N, n), N m or N.
 
-    Current and voltage belong to the motor, whatever the side of the positions; a torque names its side.
+    Current and voltage belong to the motor, independently of the side of the positions; a torque names its side.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def _rate_notes(recording: Recording) -> list[str]:
     """Notes on a SYNC rate that differs from the nominal one by the receive times.
 
     A SYNC producer that was held up moves its time grid by whole periods and counts them (``sync_skipped_periods``).
-    This delay is no error of a clock. It matters on a physical bus, where the arm goes on moving meanwhile; a virtual
+    This delay is no error of a clock. It matters on a physical bus, where the arm moves in the meantime; a virtual
     arm advances by one period per SYNC.
     """
     samples, nominal = recording.samples, recording.sample_rate_hz
