@@ -248,7 +248,8 @@ def diagnose_suite(
     strength: Annotated[str, typer.Option("--strength", help="detectable, typical, obvious: A,B,...")] = "",
     jobs: Annotated[int | None, typer.Option("--jobs", help="Cases at a time. [default: processors]", min=1)] = None,
     minutes: Annotated[
-        float | None, typer.Option("--minutes", help="No new case after so long; call again to continue.", min=0)
+        float | None,
+        typer.Option("--minutes", help="Start no case after this time, min; call again to continue.", min=0),
     ] = None,
     any_version: Annotated[
         bool, typer.Option("--any-version", help="Use results of other versions of the code.")
