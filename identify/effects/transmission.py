@@ -76,7 +76,8 @@ def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> 
     Parameters
     ----------
     pull
-        Equilibrium position, shape (N,).
+        Position at equilibrium, shape (N,). The results have its unit (per s, per s^2); for a gear it is minus the
+        transmitted torque, N m or N: the position per unit of compliance.
     share
         Inertia over its mean, shape (N,).
     w
