@@ -32,7 +32,7 @@ from armident.daq.capture.systemd import Notifier
 from armident.daq.logs import log_to
 from armident.daq.recording import Mark, QueuedSeries
 from armident.daq.streaming import Keys
-from armident.drivers.can.frames import FrameSource
+from armident.drivers.can.frames import FrameBus
 from armident.drivers.can.receiver import Receiver
 from armident.drivers.can.udp import UDP_WARNING, open_bus
 from armident.drivers.canopen.emcy_listener import EmcyListener
@@ -171,7 +171,7 @@ def _connect(recorder: Recorder, reloader: Reloader, requested: threading.Event,
     recorder.reload, recorder.between = reload, between
 
 
-def _opener(bus: Bus, number: int, plan: CapturePlan) -> Callable[[], FrameSource]:
+def _opener(bus: Bus, number: int, plan: CapturePlan) -> Callable[[], FrameBus]:
     """Return a function that opens a bus for the frames of the capture and the error frames of its controller."""
     return lambda: open_bus(bus, filters=plan.filters(number), errors=True, hardware=True)
 

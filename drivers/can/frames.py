@@ -41,8 +41,8 @@ class BusDown(ArmidentError):
     """The bus went down, or its interface was removed, while it was in use."""
 
 
-class FrameSource(Protocol):
-    """Interface of a bus that receives frames in batches."""
+class FrameBus(Protocol):
+    """Interface of a bus that moves frames in batches."""
 
     channel: str
     dropped: int
@@ -83,6 +83,16 @@ class FrameSource(Protocol):
         """
         ...
 
+    def send(self, frames: Frames) -> int:
+        """Send all frames in order; return their number.
+
+        Parameters
+        ----------
+        frames
+            Array of ``FRAME`` or ``FD_FRAME``, shape (N,).
+        """
+        ...
+
     def drops(self) -> int:
         """Number of frames dropped by the kernel so far, including those after the last received one."""
         ...
@@ -97,20 +107,6 @@ class FrameSource(Protocol):
 
     def __exit__(self, *_: object) -> None:
         """Close the bus."""
-        ...
-
-
-class FrameBus(FrameSource, Protocol):
-    """Interface of a bus that receives and sends frames in batches."""
-
-    def send(self, frames: Frames) -> int:
-        """Send all frames in order; return their number.
-
-        Parameters
-        ----------
-        frames
-            Array of ``FRAME`` or ``FD_FRAME``, shape (N,).
-        """
         ...
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from armident.configs.errors import ArmidentError
 from armident.drivers.can.error_frames import summarise
-from armident.drivers.can.frames import ERROR_FLAG, BusDown, Frames, FrameSource, frames
+from armident.drivers.can.frames import ERROR_FLAG, BusDown, FrameBus, Frames, frames
 
 BATCH = 4096
 """Maximum number of frames per batch."""
@@ -46,7 +46,7 @@ class BusEvent:
 class _BusState:
     """One bus: its socket, its state and the errors that are not reported yet."""
 
-    def __init__(self, open_bus: Callable[[], FrameSource]) -> None:
+    def __init__(self, open_bus: Callable[[], FrameBus]) -> None:
         self.open = open_bus
         self.bus = open_bus()
         self.batch = frames(BATCH, fd=self.bus.fd)
@@ -77,7 +77,7 @@ class Receiver:
         If a bus is down.
     """
 
-    def __init__(self, openers: Sequence[Callable[[], FrameSource]]) -> None:
+    def __init__(self, openers: Sequence[Callable[[], FrameBus]]) -> None:
         self._events: list[BusEvent] = []
         self._buses: list[_BusState] = []
         try:

@@ -17,12 +17,8 @@ from armident.configs import ArmidentError
 from armident.daq.capture.capture import run_capture
 from armident.daq.matching.assembler import Assembler, TpdoStream
 from armident.drivers.can.frames import frames
-from armident.drivers.can.packet_ring import PacketRing
 from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen import sync_loop
-
-FRAME_BYTES = 900
-"""Size of one frame in the receive buffer of a raw socket, bytes."""
 
 
 def warm() -> None:
@@ -149,8 +145,6 @@ def _record(
         # A short stop overruns a small buffer.
         assert RawSocket.__init__.__kwdefaults__ is not None
         RawSocket.__init__.__kwdefaults__["receive_buffer"] = receive_buffer
-        assert PacketRing.__init__.__kwdefaults__ is not None
-        PacketRing.__init__.__kwdefaults__["slots"] = receive_buffer // FRAME_BYTES
     try:
         run_capture(str(session), out, duration, listen_only, True)
     except ArmidentError as error:
