@@ -77,9 +77,9 @@ class EventHandler:
         if event.kind in self.counts:
             self.counts[event.kind] += 1
         if event.kind in ("bus_down", "bus_up"):
-            self._assembler.silence(event.bus, event.kind == "bus_down")
+            self._assembler.set_bus_down(event.bus, event.kind == "bus_down")
         if event.kind == "bus_off":
-            self._assembler.torn(event.bus)
+            self._assembler.mark_incomplete(event.bus)
         self._sink.mark("note", self._sync, event.text)
         channel = self._plan.session.all_buses[event.bus].channel
         log.info("%s", event.text, extra={"event": event.kind, "bus": channel, "sync": self._sync})

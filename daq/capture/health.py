@@ -114,7 +114,7 @@ class Health:
             "kernel_drops": self._receiver.dropped,
             "error_frames": self._receiver.error_frames,
             "buses_down": sum(self._receiver.down),
-            "answers_owed": self._assembler.owed,
+            "answers_owed": self._assembler.outstanding,
             "queue_depth": self._publisher.depth,
             "disk_free_bytes": free_space(self._plan.directory),
             "blocks_dropped": self._publisher.dropped,

@@ -131,7 +131,7 @@ class Recorder:
         self._watchdog_fed = -math.inf
         self._outage_since: float | None = None
         self._unverified: dict[str, tuple[int, int]] = {}
-        self._syncs_unseen = 0
+        self._syncs_unreceived = 0
         self._drain_s = session.recording.drain_ms * 1e-3
 
     def start(self, stack: ExitStack) -> None:
@@ -145,7 +145,7 @@ class Recorder:
         self._master.configure()
         now = time.time_ns()
         for joint in plan.robot.joints:
-            self._assembler.suspect(joint.name, now, now)
+            self._assembler.mark_unverified(joint.name, now, now)
         # Another producer of SYNC also moves the arm, and enables the drives.
         self._master.start(enable=plan.produces_sync)
         self._temperatures = stack.enter_context(TemperaturePoll(self._master.drives))
@@ -161,7 +161,7 @@ class Recorder:
                 self._producer = KernelSync(session.all_buses[0], *timing)
             else:
                 self._producer = SyncProducer(session.all_buses, *timing)
-                self._assembler.when_sent = self._producer.sent_at
+                self._assembler.send_times = self._producer.sent_at
             self._producer.start()
             stack.callback(self._producer.stop)
 
@@ -188,7 +188,7 @@ class Recorder:
         counters = self._assembler.counters | self._events.counts
         counters["kernel_drops"] = self._receiver.dropped
         counters["error_frames"] = self._receiver.error_frames
-        counters["sync_unseen"] = self._syncs_unseen
+        counters["sync_unseen"] = self._syncs_unreceived
         for name, value in worst(self._jitters).items():
             counters[f"sync_jitter_{name.replace('.', '_')}_us"] = round(value)
         if isinstance(self._producer, SyncProducer):
@@ -280,7 +280,7 @@ class Recorder:
         before, self._unverified = self._unverified, self._master.unverified_mapping
         for joint, span in self._unverified.items():
             if before.get(joint) != span:
-                self._assembler.suspect(joint, *span)
+                self._assembler.mark_unverified(joint, *span)
 
     def _supervise(self) -> None:
         """Check buses, SYNC and drives; a failure while the arm moves ends the capture."""
@@ -361,10 +361,10 @@ class Recorder:
         if self._producer is not None:
             return self._producer.sent
         dropped = self._receiver.dropped_behind
-        self._syncs_unseen = self._assembler.unseen(dropped, time.time_ns())
-        if self._syncs_unseen:
-            self._events.on_frames_dropped_at_end(sum(dropped), self._syncs_unseen)
-        return self._assembler.last_sync + 1 + self._syncs_unseen
+        self._syncs_unreceived = self._assembler.most_unreceived(dropped, time.time_ns())
+        if self._syncs_unreceived:
+            self._events.on_frames_dropped_at_end(sum(dropped), self._syncs_unreceived)
+        return self._assembler.last_sync + 1 + self._syncs_unreceived
 
     def _await_standstill(self) -> None:
         """Record until the arm stands still, at most `BRAKING_S`, or `QUICK_STOP_S` without positions."""
@@ -383,26 +383,26 @@ class Recorder:
         log.info("the arm was not seen to come to rest; its drives are disabled all the same")
 
     def _await_answers(self) -> None:
-        """Record until all drives have answered, or no answer has come for ``LATE_S``.
+        """Record until no answer is outstanding, or none has come for ``LATE_S``.
 
-        If all answers are missing, the drives lag together, on a host that is too busy. The limit is then
-        ``STARVED_S``, unless a heartbeat is missing or no bus works.
+        If all drives lag, the host is too busy: the limit is ``STARVED_S`` then, unless a heartbeat is missing or no
+        bus works.
         """
         reported = False
         last_s, lost = time.monotonic(), self._events.counts["heartbeat_lost"]
         while True:
             if self._drain():
                 last_s = time.monotonic()
-            owed, silent = self._assembler.owed, time.monotonic() - last_s
-            if owed <= 0 or silent > STARVED_S:
+            outstanding, silent = self._assembler.outstanding, time.monotonic() - last_s
+            if outstanding <= 0 or silent > STARVED_S:
                 return
             if silent > LATE_S:
                 self._handle_drive_events()
                 alive = self._events.counts["heartbeat_lost"] == lost and not self._receiver.all_down_s
-                if not (alive and self._assembler.owed_by_all):
+                if not (alive and self._assembler.outstanding_by_all):
                     return
-            if not reported and owed * self._period > TELL_BEHIND_S:
-                log.info("the drives are %.1f s behind: waiting for their answers", owed * self._period)
+            if not reported and outstanding * self._period > TELL_BEHIND_S:
+                log.info("the drives are %.1f s behind: waiting for their answers", outstanding * self._period)
                 reported = True
             time.sleep(REST_S)
 

@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError
 from armident.daq.matching.gaps import SYNC_LOST, OpenGaps
-from armident.daq.matching.pdo_matching import EVER, count_sync, finish, match
+from armident.daq.matching.pdo_matching import OPEN_END, count_sync, finish, match
 from armident.daq.matching.state import (
     COUNT_NAMES,
     COUNTER,
+    INCOMPLETE,
     NEVER,
     ORIGIN,
     RECEIVED,
-    SENT_AT,
+    SEND_TIMES,
     SYNC,
     SYNC_MISALIGNED,
     TIME,
     TOP,
-    TORN,
     MatchedSamples,
     StreamShape,
     new_state,
@@ -30,9 +30,9 @@ from armident.daq.matching.state import (
 from armident.daq.recording import Gap
 from armident.drivers.canopen.objects import COB_SDO_REQUEST
 
-UNSENT = "pack not complete"
+INCOMPLETE_PACK = "pack not complete"
 """Reason of the gap after the last packed TPDO: no drive had to send these samples."""
-__all__ = ["LATE_S", "SYNC_LOST", "UNSENT", "Assembler", "Batch", "Rows", "TpdoStream"]
+__all__ = ["INCOMPLETE_PACK", "LATE_S", "SYNC_LOST", "Assembler", "Batch", "Rows", "TpdoStream"]
 
 LATE_S = 4.0
 """Time after which a missing answer counts as lost while other drives have answered, s."""
@@ -40,14 +40,14 @@ IN_STEP_S = 0.02
 """The same if the drive answers every SYNC again beside a drive without missing answers, s; twice that if it is silent.
 
 Rows wait in memory for this time; a killed process loses them."""
-PATIENCE_S = 120.0
-"""The same if all drives are behind and no frame is known to be missing, s: a busy host can delay virtual drives.
+ALL_BEHIND_S = 120.0
+"""The same if all drives lag and no frame is known to be missing, s: a busy host can delay virtual drives.
 
 Only a SYNC without missing answers proves that nothing was lost, so answers since the last such SYNC are kept."""
 _FEWEST_LATE = 8
 _LONGEST_OUTAGE_S = 60.0
 _MISALIGNED = 20
-"""Number of mismatched first SYNCs of a bus from which they come from another master; fewer are late time stamps."""
+"""Number of mismatched first SYNCs of a bus that proves another master; fewer are explained by late time stamps."""
 
 
 @dataclass(frozen=True)
@@ -140,8 +140,8 @@ class Assembler:
     bus_of
         Number of the bus of each joint's drive; empty: all on one bus.
     nodes
-        Node ID of each joint's drive, if SDO requests are watched: a write to TPDO parameters makes the TPDOs suspect
-        until :meth:`suspect` gives the time span.
+        Node ID of each joint's drive, if SDO requests are watched: a write to TPDO parameters makes the TPDOs
+        unverified until :meth:`mark_unverified` gives the time span.
     """
 
     def __init__(
@@ -157,31 +157,31 @@ class Assembler:
     ) -> None:
         self._streams, self._joints = tuple(streams), tuple(joints)
         self._timing = sync_id, period_ns, overflow
-        self._longest = int(_LONGEST_OUTAGE_S * 1e9 / period_ns)
-        where = tuple(bus_of) or (0,) * len(joints)
-        channel_of = np.full((max(where) + 1, 0x800), -1, np.int64)
+        self._longest_gap = int(_LONGEST_OUTAGE_S * 1e9 / period_ns)
+        buses = tuple(bus_of) or (0,) * len(joints)
+        channel_of = np.full((max(buses) + 1, 0x800), -1, np.int64)
         for s, stream in enumerate(streams):
             for j, cob_id in enumerate(stream.cob_ids):
-                channel_of[where[j], cob_id] = s * len(joints) + j
-        writes_to = np.full((max(where) + 1, 0x800), -1, np.int64)
+                channel_of[buses[j], cob_id] = s * len(joints) + j
+        writes_to = np.full((max(buses) + 1, 0x800), -1, np.int64)
         for j, node in enumerate(nodes):
-            writes_to[where[j], COB_SDO_REQUEST + node] = j
+            writes_to[buses[j], COB_SDO_REQUEST + node] = j
         self._shapes = [stream.shape for stream in streams]
-        window, patience, short = (
+        window, long_window, short_window = (
             [max(_FEWEST_LATE, int(seconds * 1e9 / period_ns) // shape.every) for shape in self._shapes]
-            for seconds in (LATE_S, PATIENCE_S, IN_STEP_S)
+            for seconds in (LATE_S, ALL_BEHIND_S, IN_STEP_S)
         )
-        self._books = new_state(self._shapes, window, patience, short, where, channel_of, writes_to)
-        self._slack = int(self._books.slack[0])
+        self._state = new_state(self._shapes, window, long_window, short_window, buses, channel_of, writes_to)
+        self._slack = int(self._state.slack[0])
         if first_counter is not None:
-            self._books.state[:, COUNTER] = (first_counter - 1) % overflow
-            self._books.state[:, ORIGIN] = first_counter
+            self._state.bus_state[:, COUNTER] = (first_counter - 1) % overflow
+            self._state.bus_state[:, ORIGIN] = first_counter
         self._lossy = np.zeros(len(channel_of), bool)
-        self.when_sent: Callable[[int], tuple[int, NDArray[np.int64]]] | None = None
-        """Send times of the own SYNC producer (:meth:`SyncProducer.sent_at`); ``None`` if there is none."""
-        self._asked_from = 0
+        self.send_times: Callable[[int], tuple[int, NDArray[np.int64]]] | None = None
+        """Returns the send times of the own SYNC producer (:meth:`SyncProducer.sent_at`); ``None`` without one."""
+        self._sends_loaded = 0
         self._gaps = OpenGaps(self._joints)
-        self._given = [0] * len(streams)
+        self._emitted = [0] * len(streams)
         self._totals = dict.fromkeys(
             [f"{s.name}.{what}" for s in streams for what in ("expected", "rows", "in_gaps", "discarded")], 0
         )
@@ -189,29 +189,31 @@ class Assembler:
     @property
     def last_sync(self) -> int:
         """Number of the last SYNC known; -1 before the first."""
-        return int(self._books.state[:, SYNC].max())
+        return int(self._state.bus_state[:, SYNC].max())
 
     @property
-    def owed(self) -> int:
-        """Largest number of SYNCs that a drive has not answered yet."""
-        return int(self._debts().max())
+    def outstanding(self) -> int:
+        """Largest number of outstanding answers of a drive, SYNCs."""
+        return int(self._outstanding().max())
 
     @property
-    def owed_by_all(self) -> int:
-        """Number of SYNCs that no drive has answered yet, in any stream: the bus or the host is delayed."""
-        return max(int(self._debts().min()), 0)
+    def outstanding_by_all(self) -> int:
+        """Number of SYNCs that no drive has answered yet, in any stream; above zero the bus or the host is delayed."""
+        return max(int(self._outstanding().min()), 0)
 
-    def _debts(self) -> NDArray[np.int64]:
-        """Return the number of unanswered SYNCs, (streams, drives)."""
-        debts: NDArray[np.int64] = self._books.head[self._books.bus_of].T - self._books.settled - self._books.pending
-        return debts
+    def _outstanding(self) -> NDArray[np.int64]:
+        """Return the number of outstanding answers, (streams, drives)."""
+        outstanding: NDArray[np.int64] = (
+            self._state.head[self._state.bus_of].T - self._state.settled - self._state.pending
+        )
+        return outstanding
 
     @property
     def wrong_lengths(self) -> dict[tuple[str, str], int]:
         """Number of TPDOs whose length differs from the mapping, by stream and joint, where not zero."""
         return {
-            (self._streams[s].name, self._joints[j]): int(self._books.wrong[s, j])
-            for s, j in np.argwhere(self._books.wrong > 0)
+            (self._streams[s].name, self._joints[j]): int(self._state.wrong_length[s, j])
+            for s, j in np.argwhere(self._state.wrong_length > 0)
         }
 
     @property
@@ -221,7 +223,7 @@ class Assembler:
         Per stream, ``expected`` rows are ``rows`` (complete) or ``in_gaps``. ``discarded`` is the number of samples of
         single joints that were received for rows in gaps.
         """
-        counts = dict(zip(COUNT_NAMES, (int(c) for c in self._books.counts), strict=True))
+        counts = dict(zip(COUNT_NAMES, (int(c) for c in self._state.counts), strict=True))
         return counts | self._totals
 
     def push(self, frames: NDArray[Any], sent: int | None = None, dropped: bool = False, bus: int = 0) -> Batch:
@@ -252,59 +254,61 @@ class Assembler:
         self._lossy[bus] |= dropped
         if frames.size:
             # A bus with frames is not silent.
-            self._books.slack[bus] = self._slack
-        last = int(self._books.state[bus, SYNC])
-        longest = self._longest if sent is None else min(self._longest, sent - last)
+            self._state.slack[bus] = self._slack
+        last = int(self._state.bus_state[bus, SYNC])
+        longest = self._longest_gap if sent is None else min(self._longest_gap, sent - last)
         if sent is not None and not self._lossy[bus]:
-            # Own SYNCs are received unless the kernel drops frames: a long time is a delayed producer, no loss.
+            # Own SYNCs are received unless the kernel drops frames: a long interval is a delayed producer, no loss.
             longest = 0
-        self._look_when_sent(self._lossy[bus])
+        self._load_send_times(self._lossy[bus])
         if dropped:
-            self._books.state[bus, TORN] = 2
-        syncs = _count_sync(*arguments, longest, self._books)
+            self._state.bus_state[bus, INCOMPLETE] = 2
+        syncs = _count_sync(*arguments, longest, self._state)
         if dropped:
-            self._books.hole[bus] = self._books.mark[:, TOP] + syncs + 1
-        out = output_buffers(self._books, syncs)
-        _match(*arguments, longest, self._books, out)
+            self._state.gap_end[bus] = self._state.watermark[:, TOP] + syncs + 1
+        out = output_buffers(self._state, syncs)
+        _match(*arguments, longest, self._state, out)
         if dropped:
-            self.torn(bus)
-        if self._books.counts[SYNC_MISALIGNED] >= _MISALIGNED:
+            self.mark_incomplete(bus)
+        if self._state.counts[SYNC_MISALIGNED] >= _MISALIGNED:
             raise DataError(
-                f"bus {bus + 1}: its SYNC counter says another number than that of another bus at the same time; "
-                "buses of one session need SYNC from one master"
+                f"bus {bus + 1}: its SYNC counter differs from that of another bus at the same time; "
+                "connect all buses of the session to one SYNC master"
             )
         return self._batch(out, False)
 
-    def _look_when_sent(self, lossy: bool) -> None:
-        """Get the send times of own SYNCs if frames are lost: a delayed producer keeps no period."""
-        sent = self._books.sent
+    def _load_send_times(self, lossy: bool) -> None:
+        """Load the send times of own SYNCs if frames are lost, since a delayed producer keeps no period."""
+        sent = self._state.sends_known
         sent[0] = -1
-        if lossy and self.when_sent is not None:
-            first, times = self.when_sent(self._asked_from)
-            numbers = first + np.arange(times.size)[-SENT_AT:]
-            self._books.sent_at[numbers % SENT_AT] = times[-SENT_AT:]
-            sent[0] = self._asked_from = first + times.size
+        if lossy and self.send_times is not None:
+            first, times = self.send_times(self._sends_loaded)
+            numbers = first + np.arange(times.size)[-SEND_TIMES:]
+            self._state.send_times[numbers % SEND_TIMES] = times[-SEND_TIMES:]
+            sent[0] = self._sends_loaded = first + times.size
 
-    def silence(self, bus: int, silent: bool) -> None:
-        """Set whether a bus is known to be down: its drives have nothing to answer, and other buses do not wait for it.
+    def set_bus_down(self, bus: int, down: bool) -> None:
+        """Mark a bus as down or up.
+
+        While a bus is down, its drives have nothing to answer, and other buses do not wait for it.
 
         Parameters
         ----------
         bus
             Number of the bus.
-        silent
-            The bus is down.
+        down
+            True if the bus is down.
         """
-        self._books.slack[bus] = 0 if silent else self._slack
-        self._lossy[bus] |= silent
-        self.torn(bus)
+        self._state.slack[bus] = 0 if down else self._slack
+        self._lossy[bus] |= down
+        self.mark_incomplete(bus)
 
-    def torn(self, bus: int) -> None:
+    def mark_incomplete(self, bus: int) -> None:
         """Note that frames of a bus may be missing after the last one, even if its SYNC counter is consecutive."""
-        self._books.state[bus, TORN] = 1
+        self._state.bus_state[bus, INCOMPLETE] = 1
 
-    def suspect(self, joint: str, since_ns: int, until_ns: int) -> None:
-        """Set the time span in which TPDOs of a joint may have another mapping than that of the session.
+    def mark_unverified(self, joint: str, since_ns: int, until_ns: int) -> None:
+        """Set the time span in which TPDOs of a joint may have another mapping than the session.
 
         Parameters
         ----------
@@ -313,12 +317,12 @@ class Assembler:
         since_ns, until_ns
             Begin and end, ns UTC.
         """
-        span = self._books.suspect[self._joints.index(joint)]
-        if span[0] < span[1] and span[1] == EVER:
+        span = self._state.unverified[self._joints.index(joint)]
+        if span[0] < span[1] and span[1] == OPEN_END:
             since_ns = min(since_ns, int(span[0]))
         span[:] = since_ns, until_ns
 
-    def unseen(self, dropped: Sequence[int], now_ns: int) -> int:
+    def most_unreceived(self, dropped: Sequence[int], now_ns: int) -> int:
         """Return the largest number of SYNCs that may have been sent after the last one received.
 
         Parameters
@@ -328,7 +332,7 @@ class Assembler:
         now_ns
             Present time of the kernel's clock, ns UTC.
         """
-        numbers, times = self._books.state[:, SYNC], self._books.state[:, TIME]
+        numbers, times = self._state.bus_state[:, SYNC], self._state.bus_state[:, TIME]
         known = times != NEVER
         periods = np.maximum(0, now_ns - times[known]) // self._timing[1]
         last = numbers[known] + np.minimum(np.asarray(dropped)[known], periods)
@@ -343,18 +347,20 @@ class Assembler:
             Total number of SYNCs sent; ``None`` if unknown.
         """
         total = self.last_sync + 1 if sent is None else max(sent, self.last_sync + 1)
-        out = output_buffers(self._books, total - self.last_sync)
-        _finish(total, self._books, out)
+        out = output_buffers(self._state, total - self.last_sync)
+        _finish(total, self._state, out)
         return self._batch(out, True)
 
     def warm_up(self, frames: NDArray[Any]) -> None:
         """Compile the loops for frames of this dtype, so that no SYNC waits for the compiler."""
-        few = [_FEWEST_LATE] * len(self._shapes)
-        nobody = np.full((self._lossy.size, 1), -1, np.int64)
-        scratch = new_state(self._shapes, few, few, few, self._books.bus_of.tolist(), nobody, nobody)
+        windows = [_FEWEST_LATE] * len(self._shapes)
+        no_channel = np.full((self._lossy.size, 1), -1, np.int64)
+        scratch = new_state(
+            self._shapes, windows, windows, windows, self._state.bus_of.tolist(), no_channel, no_channel
+        )
         arguments = (*_columns(frames), *self._timing, 0)
-        out = output_buffers(scratch, _count_sync(*arguments, self._longest, scratch))
-        _match(*arguments, self._longest, scratch, out)
+        out = output_buffers(scratch, _count_sync(*arguments, self._longest_gap, scratch))
+        _match(*arguments, self._longest_gap, scratch, out)
         _finish(0, scratch, out)
 
     def _batch(self, out: MatchedSamples, final: bool) -> Batch:
@@ -375,20 +381,20 @@ class Assembler:
             else:
                 rows[stream.name] = Rows(sync, t_ns, _bytes(data))
             if sync.size:
-                self._given[s] = int(sync[-1]) + 1
+                self._emitted[s] = int(sync[-1]) + 1
             if final and stream.pack > 1:
-                gaps += self._unsent(s)
-            gaps += self._gaps.over(stream.name, int(sync[-1]) if sync.size else None, final)
+                gaps += self._incomplete_pack(s)
+            gaps += self._gaps.ended(stream.name, int(sync[-1]) if sync.size else None, final)
         return Batch(rows, tuple(sorted(gaps, key=lambda g: (g.first, g.stream, g.joint or ""))))
 
-    def _unsent(self, s: int) -> list[Gap]:
+    def _incomplete_pack(self, s: int) -> list[Gap]:
         """Return the SYNCs since the last packed TPDO as a gap."""
-        stream, first, last = self._streams[s], self._given[s], self.last_sync
+        stream, first, last = self._streams[s], self._emitted[s], self.last_sync
         if first > last:
             return []
         self._totals[f"{stream.name}.expected"] += last - first + 1
         self._totals[f"{stream.name}.in_gaps"] += last - first + 1
-        return [Gap(stream.name, first, last, None, UNSENT)]
+        return [Gap(stream.name, first, last, None, INCOMPLETE_PACK)]
 
 
 # mypy checks numba functions by their Python signatures, which a tuple of columns does not match.
@@ -402,9 +408,9 @@ def _columns(frames: NDArray[Any]) -> tuple[Any, ...]:
     count = frames.size
     if count < 2:
         # Columns of fewer than two frames count as contiguous, which would compile the loops again.
-        room = np.zeros(2, frames.dtype)
-        room[:count] = frames
-        frames = room
+        padded = np.zeros(2, frames.dtype)
+        padded[:count] = frames
+        frames = padded
     return count, frames["can_id"], frames["length"], frames["t_ns"], frames["data"].view("<u8")
 
 

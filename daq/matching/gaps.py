@@ -48,9 +48,9 @@ class OpenGaps:
         found: list[tuple[str | None, str, NDArray[np.int64]]] = []
         for value, reason in REASONS.items():
             hit = code == value
-            everyone = hit.all(axis=1)
-            found.append((None, reason, sync[everyone]))
-            found += [(name, reason, sync[hit[:, j] & ~everyone]) for j, name in enumerate(self._joints)]
+            all_joints = hit.all(axis=1)
+            found.append((None, reason, sync[all_joints]))
+            found += [(name, reason, sync[hit[:, j] & ~all_joints]) for j, name in enumerate(self._joints)]
         gaps = []
         for joint, reason, numbers in found:
             if numbers.size == 0:
@@ -68,7 +68,7 @@ class OpenGaps:
                 self._open[key] = first, last
         return gaps
 
-    def over(self, stream: str, last: int | None, final: bool) -> list[Gap]:
+    def ended(self, stream: str, last: int | None, final: bool) -> list[Gap]:
         """Return the gaps of a stream that have ended.
 
         Parameters

@@ -11,7 +11,7 @@ all SYNCs, the match is certain, however late the answers were. An answer is los
 Then every answer is taken as prompt (the latest SYNC that it can belong to). If answers also came in bursts, the match
 is ambiguous and the samples in question are discarded as ``AMBIGUOUS``, never guessed. While all drives lack answers
 at every SYNC and no frame is known to be missing, the buses are delayed and nothing is lost: then the window is
-``patience`` SYNCs.
+``LONG_WINDOW`` SYNCs.
 
 Answers to discarded rows, of a drive that was silent or a bus that was off, may still arrive. Until such a drive has
 answered each of some consecutive SYNCs, equal numbers of answers and SYNCs prove nothing; the first surplus answers
@@ -29,11 +29,11 @@ from numba import njit
 
 from armident.daq.matching.resolve import settle_all, slot_of
 from armident.daq.matching.state import (
-    BORROWED,
     COUNTER,
     EVERY,
     FRAMES,
     FRAMES_UNKNOWN,
+    INFERRED,
     LENGTH,
     LOST,
     NEVER,
@@ -59,99 +59,99 @@ from armident.daq.matching.state import (
 from armident.daq.matching.sync_unwrap import advance
 from armident.drivers.canopen.objects import PDOS, SDO_DOWNLOAD, TPDO_COMMUNICATION, TPDO_MAPPING
 
-EVER = int(np.iinfo(np.int64).max)
+OPEN_END = int(np.iinfo(np.int64).max)
 """End of a time span that is still open, ns."""
 
 
 @njit(cache=True, nogil=True)
-def _owe(b: MatcherState, bus: int, k: int, s: int) -> None:
+def _add_row(m: MatcherState, bus: int, k: int, s: int) -> None:
     """Add SYNC ``k`` of a bus to the rows to be answered, if the stream sends on it."""
-    if (b.state[bus, ORIGIN] + k) % b.kind[s, EVERY]:
+    if (m.bus_state[bus, ORIGIN] + k) % m.config[s, EVERY]:
         return
-    slot = slot_of(b, s, b.head[bus, s])
-    if b.head[bus, s] == b.mark[s, TOP]:
-        b.mark[s, TOP] += 1
-        b.row_sync[s, slot] = k
+    slot = slot_of(m, s, m.head[bus, s])
+    if m.head[bus, s] == m.watermark[s, TOP]:
+        m.watermark[s, TOP] += 1
+        m.row_sync[s, slot] = k
         # Loops, not slices: this runs once per SYNC.
-        for i in range(b.kind[s, PACK]):
-            for other in range(b.state.shape[0]):
-                b.row_t[s, slot, i, other] = NEVER
-        for j in range(b.settled.shape[1]):
-            b.row_code[s, slot, j] = LOST
-    for i in range(b.kind[s, PACK]):
-        b.row_t[s, slot, i, bus] = b.recent[bus, (k - b.kind[s, PACK] + 1 + i) % b.recent.shape[1]]
-    b.head[bus, s] += 1
+        for i in range(m.config[s, PACK]):
+            for other in range(m.bus_state.shape[0]):
+                m.row_t[s, slot, i, other] = NEVER
+        for j in range(m.settled.shape[1]):
+            m.row_code[s, slot, j] = LOST
+    for i in range(m.config[s, PACK]):
+        m.row_t[s, slot, i, bus] = m.sync_times[bus, (k - m.config[s, PACK] + 1 + i) % m.sync_times.shape[1]]
+    m.head[bus, s] += 1
 
 
 @njit(cache=True, nogil=True)
-def _miss(b: MatcherState, bus: int, first: int, until: int, out: MatchedSamples) -> None:
+def _add_missing_syncs(m: MatcherState, bus: int, first: int, until: int, out: MatchedSamples) -> None:
     """Count SYNCs ``first`` to before ``until`` of a bus as sent, but not received."""
     if until <= first:
         return
-    streams = b.kind.shape[0]
-    before = b.head[bus].copy()
+    streams = m.config.shape[0]
+    before = m.head[bus].copy()
     for s in range(streams):
-        b.hole[bus, s] = max(b.hole[bus, s], b.head[bus, s] + (until - first) // b.kind[s, EVERY] + 1)
-        if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2:
-            settle_all(b, bus, s, False, out)
+        m.gap_end[bus, s] = max(m.gap_end[bus, s], m.head[bus, s] + (until - first) // m.config[s, EVERY] + 1)
+        if (until - first) // m.config[s, EVERY] > m.config[s, WINDOW] // 2:
+            settle_all(m, bus, s, False, out)
     for k in range(first, until):
-        b.recent[bus, k % b.recent.shape[1]] = NEVER
+        m.sync_times[bus, k % m.sync_times.shape[1]] = NEVER
         for s in range(streams):
-            _owe(b, bus, k, s)
-            if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2:
-                settle_all(b, bus, s, False, out)
+            _add_row(m, bus, k, s)
+            if (until - first) // m.config[s, EVERY] > m.config[s, WINDOW] // 2:
+                settle_all(m, bus, s, False, out)
     for s in range(streams):
-        if (until - first) // b.kind[s, EVERY] > b.kind[s, WINDOW] // 2 or b.head[bus, s] == before[s]:
+        if (until - first) // m.config[s, EVERY] > m.config[s, WINDOW] // 2 or m.head[bus, s] == before[s]:
             continue
         # Answers since the last received SYNC may belong to the missed SYNCs too.
-        for j in range(b.settled.shape[1]):
-            if b.bus_of[j] == bus:
-                for i in range(b.pending[s, j] - b.fresh[s, j], b.pending[s, j]):
-                    b.label[s, j, i] = b.head[bus, s] - 1
+        for j in range(m.settled.shape[1]):
+            if m.bus_of[j] == bus:
+                for i in range(m.pending[s, j] - m.since_sync[s, j], m.pending[s, j]):
+                    m.newest_row[s, j, i] = m.head[bus, s] - 1
 
 
 @njit(cache=True, nogil=True)
-def _skip_silent(
-    b: MatcherState, bus: int, k: int, t_ns: int, period_ns: int, overflow: int, out: MatchedSamples
+def _pass_silent_buses(
+    m: MatcherState, bus: int, k: int, t_ns: int, period_ns: int, overflow: int, out: MatchedSamples
 ) -> None:
     """At SYNC ``k`` of a bus, count the SYNCs of buses that are farther behind than their slack as missing."""
-    for other in range(b.state.shape[0]):
-        last = b.state[other, SYNC]
-        until = k + 1 - b.slack[other]
+    for other in range(m.bus_state.shape[0]):
+        last = m.bus_state[other, SYNC]
+        until = k + 1 - m.slack[other]
         if other == bus or until <= last + 1:
             continue
         if last < 0:
-            b.state[other, ORIGIN] = b.state[bus, ORIGIN]
+            m.bus_state[other, ORIGIN] = m.bus_state[bus, ORIGIN]
         # Answers received so far belong to received SYNCs, not to missing ones.
-        for s in range(b.kind.shape[0]):
-            settle_all(b, other, s, True, out)
-        _miss(b, other, last + 1, until, out)
-        b.counts[SYNC_MISSING] += until - last - 1
-        b.state[other, SYNC] = until - 1
-        b.state[other, BORROWED] = 1
-        b.state[other, TIME] = t_ns - (k + 1 - until) * period_ns
-        if b.state[bus, COUNTER] >= 0:
-            b.state[other, COUNTER] = (b.state[other, ORIGIN] + until - 1) % overflow
-        for s in range(b.kind.shape[0]):
-            settle_all(b, other, s, True, out)
+        for s in range(m.config.shape[0]):
+            settle_all(m, other, s, True, out)
+        _add_missing_syncs(m, other, last + 1, until, out)
+        m.counts[SYNC_MISSING] += until - last - 1
+        m.bus_state[other, SYNC] = until - 1
+        m.bus_state[other, INFERRED] = 1
+        m.bus_state[other, TIME] = t_ns - (k + 1 - until) * period_ns
+        if m.bus_state[bus, COUNTER] >= 0:
+            m.bus_state[other, COUNTER] = (m.bus_state[other, ORIGIN] + until - 1) % overflow
+        for s in range(m.config.shape[0]):
+            settle_all(m, other, s, True, out)
             # All rows of the outage are settled; the bus was up for later ones.
-            b.hole[other, s] = min(b.hole[other, s], b.head[other, s])
+            m.gap_end[other, s] = min(m.gap_end[other, s], m.head[other, s])
 
 
 @njit(cache=True, nogil=True)
-def _notice_write(b: MatcherState, j: int, request: Any, t_ns: int) -> None:
-    """Mark a joint's TPDOs as suspect from now on if an SDO request writes their parameters (CiA 301, 1800h-1BFFh)."""
+def _check_sdo_write(m: MatcherState, j: int, request: Any, t_ns: int) -> None:
+    """Mark a joint's TPDOs as unverified if an SDO request writes their parameters (CiA 301, 1800h-1BFFh)."""
     index = np.int64((request >> np.uint64(8)) & np.uint64(0xFFFF))
     writes = np.int64((request >> np.uint64(5)) & np.uint64(7)) == SDO_DOWNLOAD
-    if writes and TPDO_COMMUNICATION <= index < TPDO_MAPPING + PDOS and t_ns > b.suspect[j, 1]:
-        b.suspect[j, 0] = t_ns
-        b.suspect[j, 1] = EVER
+    if writes and TPDO_COMMUNICATION <= index < TPDO_MAPPING + PDOS and t_ns > m.unverified[j, 1]:
+        m.unverified[j, 0] = t_ns
+        m.unverified[j, 1] = OPEN_END
 
 
 @njit(cache=True, nogil=True)
 def count_sync(
     count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
-    bus: int, longest: int, b: MatcherState,
+    bus: int, longest: int, m: MatcherState,
 ) -> int:  # fmt: skip
     """Return the number of SYNC numbers that the frames may cover, without a change of the state.
 
@@ -173,21 +173,21 @@ def count_sync(
         Number of the bus.
     longest
         Largest advance with whole counter turns, SYNCs.
-    b
+    m
         State of the matcher.
     """
-    total, state = 0, b.state.copy()
+    total, bus_state = 0, m.bus_state.copy()
     for i in range(count):
         if can_id[i] == sync_id:
             counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 else -1
-            total += max(0, advance(state, b, bus, counter, t_ns[i], period_ns, overflow, longest))
+            total += max(0, advance(bus_state, m, bus, counter, t_ns[i], period_ns, overflow, longest))
     return int(total)
 
 
 @njit(cache=True, nogil=True)
 def match(
     count: int, can_id: Any, length: Any, t_ns: Any, data: Any, sync_id: int, period_ns: int, overflow: int,
-    bus: int, longest: int, b: MatcherState, out: MatchedSamples,
+    bus: int, longest: int, m: MatcherState, out: MatchedSamples,
 ) -> None:  # fmt: skip
     """Match frames of one bus, in the order of reception, and append the decided samples to ``out``.
 
@@ -209,86 +209,86 @@ def match(
         Number of the bus.
     longest
         Largest advance with whole counter turns, SYNCs.
-    b
+    m
         State of the matcher.
     out
         Output of decided samples.
     """
-    n = b.settled.shape[1]
-    words = min(data.shape[1], b.answer.shape[3])
+    n = m.settled.shape[1]
+    words = min(data.shape[1], m.answer.shape[3])
     for i in range(count):
-        b.counts[FRAMES] += 1
+        m.counts[FRAMES] += 1
         identifier = np.int64(can_id[i])
         if identifier == sync_id:
             counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 else -1
-            last = b.state[bus, SYNC]
-            step = advance(b.state, b, bus, counter, t_ns[i], period_ns, overflow, longest)
+            last = m.bus_state[bus, SYNC]
+            step = advance(m.bus_state, m, bus, counter, t_ns[i], period_ns, overflow, longest)
             if step <= 0:
-                unlike = last < 0 and step < 0
-                b.counts[SYNC_MISALIGNED if unlike else SYNC_REPEATED] += 1
+                misaligned = last < 0 and step < 0
+                m.counts[SYNC_MISALIGNED if misaligned else SYNC_REPEATED] += 1
                 continue
             k = last + step
             if step > 1:
-                _miss(b, bus, last + 1, k, out)
-            b.recent[bus, k % b.recent.shape[1]] = t_ns[i]
-            for s in range(b.kind.shape[0]):
-                settle_all(b, bus, s, False, out)
-                _owe(b, bus, k, s)
-            b.counts[SYNC_SEEN] += 1
-            b.counts[SYNC_MISSING] += step - 1
+                _add_missing_syncs(m, bus, last + 1, k, out)
+            m.sync_times[bus, k % m.sync_times.shape[1]] = t_ns[i]
+            for s in range(m.config.shape[0]):
+                settle_all(m, bus, s, False, out)
+                _add_row(m, bus, k, s)
+            m.counts[SYNC_SEEN] += 1
+            m.counts[SYNC_MISSING] += step - 1
             # Skip the call on a single bus: passing the state costs more than the function itself.
-            if b.state.shape[0] > 1:
-                _skip_silent(b, bus, k, t_ns[i], period_ns, overflow, out)
+            if m.bus_state.shape[0] > 1:
+                _pass_silent_buses(m, bus, k, t_ns[i], period_ns, overflow, out)
             continue
-        channel = b.channel_of[bus, identifier] if identifier < b.channel_of.shape[1] else np.int64(-1)
-        if channel < 0 and identifier < b.channel_of.shape[1] and b.writes_to[bus, identifier] >= 0:
-            _notice_write(b, b.writes_to[bus, identifier], data[i, 0], t_ns[i])
+        channel = m.channel_of[bus, identifier] if identifier < m.channel_of.shape[1] else np.int64(-1)
+        if channel < 0 and identifier < m.channel_of.shape[1] and m.writes_to[bus, identifier] >= 0:
+            _check_sdo_write(m, m.writes_to[bus, identifier], data[i, 0], t_ns[i])
             continue
         if channel < 0:
-            b.counts[FRAMES_UNKNOWN] += 1
+            m.counts[FRAMES_UNKNOWN] += 1
             continue
         s, j = channel // n, channel % n
-        slot = b.pending[s, j]
-        if b.head[bus, s] == 0:
-            b.counts[TPDO_EARLY] += 1
-        elif slot >= b.label.shape[2]:
-            b.counts[TPDO_DUPLICATE] += 1
+        slot = m.pending[s, j]
+        if m.head[bus, s] == 0:
+            m.counts[TPDO_EARLY] += 1
+        elif slot >= m.newest_row.shape[2]:
+            m.counts[TPDO_DUPLICATE] += 1
         else:
-            right = length[i] == b.kind[s, LENGTH]
-            if not right:
-                b.counts[TPDO_WRONG_LENGTH] += 1
-                b.wrong[s, j] += 1
+            length_ok = length[i] == m.config[s, LENGTH]
+            if not length_ok:
+                m.counts[TPDO_WRONG_LENGTH] += 1
+                m.wrong_length[s, j] += 1
             for w in range(words):
-                b.answer[s, j, slot, w] = data[i, w]
-            b.answer_code[s, j, slot] = RECEIVED if right else WRONG_LENGTH
-            if b.suspect[j, 0] <= t_ns[i] < b.suspect[j, 1]:
-                b.answer_code[s, j, slot] = WRONG_MAPPING
-            b.label[s, j, slot] = b.head[bus, s] - 1
-            b.pending[s, j] += 1
-            b.fresh[s, j] += 1
+                m.answer[s, j, slot, w] = data[i, w]
+            m.answer_code[s, j, slot] = RECEIVED if length_ok else WRONG_LENGTH
+            if m.unverified[j, 0] <= t_ns[i] < m.unverified[j, 1]:
+                m.answer_code[s, j, slot] = WRONG_MAPPING
+            m.newest_row[s, j, slot] = m.head[bus, s] - 1
+            m.pending[s, j] += 1
+            m.since_sync[s, j] += 1
 
 
 @njit(cache=True, nogil=True)
-def finish(total: int, b: MatcherState, out: MatchedSamples) -> None:
+def finish(total: int, m: MatcherState, out: MatchedSamples) -> None:
     """Settle all rows after the last frame: unanswered SYNCs are lost.
 
     Parameters
     ----------
     total
         Number of SYNCs that were sent.
-    b
+    m
         State of the matcher.
     out
         Output of decided samples.
     """
-    for bus in range(b.state.shape[0]):
-        last = b.state[bus, SYNC]
-        for other in range(b.state.shape[0] if last < 0 else 0):
-            if b.state[other, COUNTER] >= 0:
-                b.state[bus, ORIGIN] = b.state[other, ORIGIN]
+    for bus in range(m.bus_state.shape[0]):
+        last = m.bus_state[bus, SYNC]
+        for other in range(m.bus_state.shape[0] if last < 0 else 0):
+            if m.bus_state[other, COUNTER] >= 0:
+                m.bus_state[bus, ORIGIN] = m.bus_state[other, ORIGIN]
         if total > last + 1:
-            _miss(b, bus, last + 1, total, out)
-            b.counts[SYNC_MISSING] += total - 1 - last
-            b.state[bus, SYNC] = total - 1
-        for s in range(b.kind.shape[0]):
-            settle_all(b, bus, s, True, out)
+            _add_missing_syncs(m, bus, last + 1, total, out)
+            m.counts[SYNC_MISSING] += total - 1 - last
+            m.bus_state[bus, SYNC] = total - 1
+        for s in range(m.config.shape[0]):
+            settle_all(m, bus, s, True, out)

@@ -7,29 +7,29 @@ from numba import njit
 
 from armident.daq.matching.state import (
     ALIGNED_SYNCS,
+    ALL_BEHIND,
     AMBIGUOUS,
+    BALANCE,
+    BALANCE_AT,
+    BALANCE_RUN,
     BASE,
-    BEHIND,
-    BEST,
-    BEST_AT,
-    CALM,
+    COUNTED_AT,
     EMITTED,
-    HELD,
+    HELD_AT,
+    IN_STEP_RUN,
     LENGTH,
+    LONG_WINDOW,
+    LONGEST_LOSS,
     NEVER,
     NO_SYNC,
-    PACED,
     PACK,
-    PATIENCE,
     RECEIVED,
-    SHORT,
+    SHORT_WINDOW,
     SIZE,
-    STILL,
-    STOOD,
+    STALE,
     TOP,
     TPDO_DUPLICATE,
     TPDO_LATE,
-    UNSURE,
     WINDOW,
     MatchedSamples,
     MatcherState,
@@ -37,294 +37,301 @@ from armident.daq.matching.state import (
 
 
 @njit(cache=True, nogil=True)
-def slot_of(b: MatcherState, s: int, u: int) -> int:
+def slot_of(m: MatcherState, s: int, u: int) -> int:
     """Return the ring slot of a row.
 
     Parameters
     ----------
-    b
+    m
         State of the matcher.
     s
         Number of the stream.
     u
         Ordinal of the row.
     """
-    return int((u - b.mark[s, BASE]) % b.row_sync.shape[1])
+    return int((u - m.watermark[s, BASE]) % m.row_sync.shape[1])
 
 
 @njit(cache=True, nogil=True)
-def _seen(b: MatcherState, s: int, j: int, u: int) -> bool:
-    """Return whether the SYNC of row ``u`` was received on the bus of a joint."""
-    return bool(b.row_t[s, slot_of(b, s, u), b.kind[s, PACK] - 1, b.bus_of[j]] != NEVER)
+def _is_received(m: MatcherState, s: int, j: int, u: int) -> bool:
+    """Return True if the SYNC of row ``u`` was received on the bus of a joint."""
+    return bool(m.row_t[s, slot_of(m, s, u), m.config[s, PACK] - 1, m.bus_of[j]] != NEVER)
 
 
 @njit(cache=True, nogil=True)
-def _place(b: MatcherState, s: int, j: int, u: int, i: int) -> None:
-    slot = slot_of(b, s, u)
-    for w in range(b.answer.shape[3]):
-        b.row_data[s, slot, j, w] = b.answer[s, j, i, w]
-    b.row_code[s, slot, j] = b.answer_code[s, j, i] if u >= b.doubt[s, j] else AMBIGUOUS
-    if b.label[s, j, i] > u and _seen(b, s, j, u):
-        b.counts[TPDO_LATE] += 1
+def _assign(m: MatcherState, s: int, j: int, u: int, i: int) -> None:
+    """Assign answer ``i`` of a drive to row ``u``."""
+    slot = slot_of(m, s, u)
+    for w in range(m.answer.shape[3]):
+        m.row_data[s, slot, j, w] = m.answer[s, j, i, w]
+    m.row_code[s, slot, j] = m.answer_code[s, j, i] if u >= m.ambiguous_before[s, j] else AMBIGUOUS
+    if m.newest_row[s, j, i] > u and _is_received(m, s, j, u):
+        m.counts[TPDO_LATE] += 1
 
 
 @njit(cache=True, nogil=True)
-def _same(b: MatcherState, s: int, j: int, i: int, k: int) -> bool:
-    """Return whether two answers of a drive have the same bytes."""
-    same = b.answer_code[s, j, i] == b.answer_code[s, j, k]
-    for w in range(-(-b.kind[s, LENGTH] // 8)):
+def _are_equal(m: MatcherState, s: int, j: int, i: int, k: int) -> bool:
+    """Return True if two answers of a drive have the same bytes."""
+    same = m.answer_code[s, j, i] == m.answer_code[s, j, k]
+    for w in range(-(-m.config[s, LENGTH] // 8)):
         # Bytes behind the data of a short frame are undefined.
-        unused = np.uint64(8 * max(0, 8 * w + 8 - b.kind[s, LENGTH]))
-        same = same and ((b.answer[s, j, i, w] ^ b.answer[s, j, k, w]) << unused) == 0
+        unused = np.uint64(8 * max(0, 8 * w + 8 - m.config[s, LENGTH]))
+        same = same and ((m.answer[s, j, i, w] ^ m.answer[s, j, k, w]) << unused) == 0
     return bool(same)
 
 
 @njit(cache=True, nogil=True)
-def _without_repeats(b: MatcherState, s: int, j: int, owed: int) -> None:
-    """Drop repeated frames if there are more answers than SYNCs; mark all as uncertain if they cannot be identified."""
-    count = b.pending[s, j]
-    b.counts[TPDO_DUPLICATE] += count - owed
-    unlike = 0
+def _drop_repetitions(m: MatcherState, s: int, j: int, outstanding: int) -> None:
+    """Drop repeated frames if there are more answers than SYNCs; mark all as ambiguous if they cannot be identified."""
+    count = m.pending[s, j]
+    m.counts[TPDO_DUPLICATE] += count - outstanding
+    distinct = 0
     for i in range(count):
-        if i == 0 or not _same(b, s, j, i, i - 1):
-            unlike += 1
-    if unlike != owed and unlike > 1:
-        b.doubt[s, j] = max(b.doubt[s, j], b.settled[s, j] + owed)
-    elif unlike == owed:
+        if i == 0 or not _are_equal(m, s, j, i, i - 1):
+            distinct += 1
+    if distinct != outstanding and distinct > 1:
+        m.ambiguous_before[s, j] = max(m.ambiguous_before[s, j], m.settled[s, j] + outstanding)
+    elif distinct == outstanding:
         kept = 0
         for i in range(count):
-            if i == 0 or not _same(b, s, j, i, i - 1):
-                b.label[s, j, kept] = b.label[s, j, i]
-                b.answer_code[s, j, kept] = b.answer_code[s, j, i]
-                for w in range(b.answer.shape[3]):
-                    b.answer[s, j, kept, w] = b.answer[s, j, i, w]
+            if i == 0 or not _are_equal(m, s, j, i, i - 1):
+                m.newest_row[s, j, kept] = m.newest_row[s, j, i]
+                m.answer_code[s, j, kept] = m.answer_code[s, j, i]
+                for w in range(m.answer.shape[3]):
+                    m.answer[s, j, kept, w] = m.answer[s, j, i, w]
                 kept += 1
-    b.pending[s, j] = owed
+    m.pending[s, j] = outstanding
 
 
 @njit(cache=True, nogil=True)
-def _was_behind(b: MatcherState, s: int, j: int, rows: int) -> None:
+def _record_lag(m: MatcherState, s: int, j: int, rows: int) -> None:
     """Record that a drive had this number of outstanding answers."""
-    if rows >= b.behind[s, j] or b.head[b.bus_of[j], s] - b.behind_at[s, j] > 2 * b.kind[s, WINDOW]:
-        b.behind[s, j] = rows
-        b.behind_at[s, j] = b.head[b.bus_of[j], s]
+    if rows >= m.lag[s, j] or m.head[m.bus_of[j], s] - m.lag_at[s, j] > 2 * m.config[s, WINDOW]:
+        m.lag[s, j] = rows
+        m.lag_at[s, j] = m.head[m.bus_of[j], s]
 
 
 @njit(cache=True, nogil=True)
-def _keep_pace(b: MatcherState, s: int, j: int) -> None:
+def _update_progress(m: MatcherState, s: int, j: int) -> None:
     """Update the progress of a drive: its best balance of answers and rows, and for how many rows it has kept it."""
-    head = b.head[b.bus_of[j], s]
-    balance = b.pending[s, j] - (head - b.settled[s, j])
-    best = b.pace[s, j, BEST]
-    if balance > best or (balance < best and head - b.pace[s, j, BEST_AT] > b.kind[s, SHORT]):
-        b.pace[s, j, BEST], b.pace[s, j, BEST_AT], b.pace[s, j, STOOD] = balance, head, 0
-    if b.pace[s, j, PACED] == head:
+    head = m.head[m.bus_of[j], s]
+    balance = m.pending[s, j] - (head - m.settled[s, j])
+    best = m.progress[s, j, BALANCE]
+    if balance > best or (balance < best and head - m.progress[s, j, BALANCE_AT] > m.config[s, SHORT_WINDOW]):
+        m.progress[s, j, BALANCE], m.progress[s, j, BALANCE_AT], m.progress[s, j, BALANCE_RUN] = balance, head, 0
+    if m.progress[s, j, COUNTED_AT] == head:
         return
-    b.pace[s, j, PACED] = head
-    b.pace[s, j, STOOD] = b.pace[s, j, STOOD] + 1 if balance == b.pace[s, j, BEST] else 0
-    b.pace[s, j, CALM] = b.pace[s, j, CALM] + 1 if balance == 0 and not b.pace[s, j, UNSURE] else 0
+    m.progress[s, j, COUNTED_AT] = head
+    m.progress[s, j, BALANCE_RUN] = m.progress[s, j, BALANCE_RUN] + 1 if balance == m.progress[s, j, BALANCE] else 0
+    m.progress[s, j, IN_STEP_RUN] = (
+        m.progress[s, j, IN_STEP_RUN] + 1 if balance == 0 and not m.progress[s, j, STALE] else 0
+    )
 
 
 @njit(cache=True, nogil=True)
-def _close(b: MatcherState, s: int, j: int, until: int, unsure: bool) -> None:
-    """Settle the rows before ``until``; ``unsure``: answers to discarded rows may still arrive."""
-    b.settled[s, j], b.pending[s, j] = until, 0
-    b.pace[s, j, BEST], b.pace[s, j, STOOD], b.pace[s, j, UNSURE] = NEVER, 0, int(unsure)
+def _close_rows(m: MatcherState, s: int, j: int, until: int, stale: bool) -> None:
+    """Settle the rows before ``until``; ``stale``: answers to discarded rows may still arrive."""
+    m.settled[s, j], m.pending[s, j] = until, 0
+    m.progress[s, j, BALANCE], m.progress[s, j, BALANCE_RUN], m.progress[s, j, STALE] = NEVER, 0, int(stale)
 
 
 @njit(cache=True, nogil=True)
-def _drop_first(b: MatcherState, s: int, j: int, count: int) -> None:
-    """Drop the first answers, which belong to discarded rows; with repeated frames, their number is uncertain."""
-    for i in range(1, b.pending[s, j]):
-        if _same(b, s, j, i, i - 1):
-            b.doubt[s, j] = max(b.doubt[s, j], b.settled[s, j] + b.pending[s, j] - count)
-    b.pending[s, j] -= count
-    b.counts[TPDO_LATE] += count
-    for i in range(b.pending[s, j]):
-        b.label[s, j, i] = b.label[s, j, i + count]
-        b.answer_code[s, j, i] = b.answer_code[s, j, i + count]
-        for w in range(b.answer.shape[3]):
-            b.answer[s, j, i, w] = b.answer[s, j, i + count, w]
+def _drop_stale(m: MatcherState, s: int, j: int, count: int) -> None:
+    """Drop the first answers, which belong to discarded rows; with repeated frames, their number is ambiguous."""
+    for i in range(1, m.pending[s, j]):
+        if _are_equal(m, s, j, i, i - 1):
+            m.ambiguous_before[s, j] = max(m.ambiguous_before[s, j], m.settled[s, j] + m.pending[s, j] - count)
+    m.pending[s, j] -= count
+    m.counts[TPDO_LATE] += count
+    for i in range(m.pending[s, j]):
+        m.newest_row[s, j, i] = m.newest_row[s, j, i + count]
+        m.answer_code[s, j, i] = m.answer_code[s, j, i + count]
+        for w in range(m.answer.shape[3]):
+            m.answer[s, j, i, w] = m.answer[s, j, i + count, w]
 
 
 @njit(cache=True, nogil=True)
-def _may_repeat(b: MatcherState, s: int, j: int) -> bool:
-    """Return whether late answers came together of which one may be a repetition; the next SYNC shows a surplus."""
+def _may_hold_repetition(m: MatcherState, s: int, j: int) -> bool:
+    """Return True if one of the late answers may be a repetition; the next SYNC then shows a surplus."""
     found = False
-    for i in range(1, b.pending[s, j]):
-        found = found or (b.label[s, j, i] == b.label[s, j, i - 1] and _same(b, s, j, i, i - 1))
+    for i in range(1, m.pending[s, j]):
+        found = found or (m.newest_row[s, j, i] == m.newest_row[s, j, i - 1] and _are_equal(m, s, j, i, i - 1))
     return found
 
 
 @njit(cache=True, nogil=True)
-def _not_behind(b: MatcherState, s: int, j: int) -> int:
-    """Return the number of answers certainly sent in time; all if the drive is not known to have been behind."""
-    count, prompt = b.pending[s, j], 0
-    while prompt < count and not b.pace[s, j, UNSURE] and b.label[s, j, prompt] == b.settled[s, j] + prompt:
+def _count_prompt(m: MatcherState, s: int, j: int) -> int:
+    """Return the number of answers certainly sent in time; all if no recent lag of the drive is known."""
+    count, prompt = m.pending[s, j], 0
+    while prompt < count and not m.progress[s, j, STALE] and m.newest_row[s, j, prompt] == m.settled[s, j] + prompt:
         prompt += 1
-    behind = b.behind[s, j] > 0 and b.head[b.bus_of[j], s] - b.behind_at[s, j] <= 2 * b.kind[s, WINDOW]
-    previous = b.settled[s, j] + prompt - 1
+    lags = m.lag[s, j] > 0 and m.head[m.bus_of[j], s] - m.lag_at[s, j] <= 2 * m.config[s, WINDOW]
+    previous = m.settled[s, j] + prompt - 1
     for i in range(prompt, count):
         # Two answers at once, or so many consecutive rows missing that the drive has paused.
-        behind = behind or b.label[s, j, i] == previous or b.label[s, j, i] - previous > STILL
-        previous = b.label[s, j, i]
-    return prompt if behind else count
+        lags = lags or m.newest_row[s, j, i] == previous or m.newest_row[s, j, i] - previous > LONGEST_LOSS
+        previous = m.newest_row[s, j, i]
+    return prompt if lags else count
 
 
 @njit(cache=True, nogil=True)
-def _settle(b: MatcherState, s: int, j: int, final: bool, witness: bool) -> None:
+def _settle(m: MatcherState, s: int, j: int, final: bool, peer_in_step: bool) -> None:
     """Decide the open rows of one TPDO of one drive: match certain answers, discard rows no longer answered."""
-    bus = b.bus_of[j]
-    head, unsure = b.head[bus, s], b.pace[s, j, UNSURE] != 0
-    owed = head - b.settled[s, j]
-    if b.pending[s, j] > owed and not unsure:
-        _without_repeats(b, s, j, owed)
-    b.fresh[s, j] = 0
-    balance, stood = b.pending[s, j] - owed, b.pace[s, j, STOOD]
+    bus = m.bus_of[j]
+    head, stale = m.head[bus, s], m.progress[s, j, STALE] != 0
+    outstanding = head - m.settled[s, j]
+    if m.pending[s, j] > outstanding and not stale:
+        _drop_repetitions(m, s, j, outstanding)
+    m.since_sync[s, j] = 0
+    balance, balance_run = m.pending[s, j] - outstanding, m.progress[s, j, BALANCE_RUN]
     # If answers to discarded rows may arrive, equal numbers prove nothing until the drive is in step.
-    if (balance == 0 and not unsure) or (balance >= 0 and unsure and stood >= ALIGNED_SYNCS):
+    if (balance == 0 and not stale) or (balance >= 0 and stale and balance_run >= ALIGNED_SYNCS):
         if balance > 0:
-            _drop_first(b, s, j, balance)
-        elif not unsure and not final and b.pace[s, j, HELD] != head - 1 and _may_repeat(b, s, j):
-            b.pace[s, j, HELD] = head
+            _drop_stale(m, s, j, balance)
+        elif not stale and not final and m.progress[s, j, HELD_AT] != head - 1 and _may_hold_repetition(m, s, j):
+            m.progress[s, j, HELD_AT] = head
             return
-        for i in range(owed):
-            if b.label[s, j, i] > b.settled[s, j] + i and _seen(b, s, j, b.label[s, j, i]):
-                _was_behind(b, s, j, owed)
-            _place(b, s, j, b.settled[s, j] + i, i)
-        if b.settled[s, j] < b.hole[bus, s]:
-            _give_up_refilled(b, s, j, owed)
-        _close(b, s, j, head, False)
+        for i in range(outstanding):
+            if m.newest_row[s, j, i] > m.settled[s, j] + i and _is_received(m, s, j, m.newest_row[s, j, i]):
+                _record_lag(m, s, j, outstanding)
+            _assign(m, s, j, m.settled[s, j] + i, i)
+        if m.settled[s, j] < m.gap_end[bus, s]:
+            _discard_near_gap(m, s, j, outstanding)
+        _close_rows(m, s, j, head, False)
         return
-    count = b.pending[s, j]
-    last = b.label[s, j, count - 1] + 1 if count else b.settled[s, j]
+    count = m.pending[s, j]
+    last = m.newest_row[s, j, count - 1] + 1 if count else m.settled[s, j]
     # The drive answers every SYNC but does not catch up, while others lack no answer: its missing answers are lost.
-    in_step = balance < 0 and stood >= ALIGNED_SYNCS and head - b.pace[s, j, BEST_AT] >= b.kind[s, SHORT]
-    in_step = in_step and (witness or b.settled[s, j] < b.hole[bus, s])
-    silent = witness and head - last > 2 * b.kind[s, SHORT]
-    late = owed > b.kind[s, WINDOW] and head - b.mark[s, BEHIND] > b.kind[s, WINDOW]
-    if not (late or owed > b.kind[s, PATIENCE] or final or in_step or silent):
+    in_step = (
+        balance < 0
+        and balance_run >= ALIGNED_SYNCS
+        and head - m.progress[s, j, BALANCE_AT] >= m.config[s, SHORT_WINDOW]
+    )
+    in_step = in_step and (peer_in_step or m.settled[s, j] < m.gap_end[bus, s])
+    silent = peer_in_step and head - last > 2 * m.config[s, SHORT_WINDOW]
+    late = outstanding > m.config[s, WINDOW] and head - m.watermark[s, ALL_BEHIND] > m.config[s, WINDOW]
+    if not (late or outstanding > m.config[s, LONG_WINDOW] or final or in_step or silent):
         return
     if balance > 0:
-        _drop_first(b, s, j, balance)
+        _drop_stale(m, s, j, balance)
         count -= balance
-    keep = head if final else head - b.kind[s, WINDOW]
+    keep = head if final else head - m.config[s, WINDOW]
     if silent:
-        keep = max(keep, head - 2 * b.kind[s, SHORT])
-    keep = max(keep, b.settled[s, j])
-    u, twice, answered = head, False, b.settled[s, j]
-    ends = (final or silent) and not in_step
-    caught_up = _not_behind(b, s, j)
+        keep = max(keep, head - 2 * m.config[s, SHORT_WINDOW])
+    keep = max(keep, m.settled[s, j])
+    u, repeated, answered = head, False, m.settled[s, j]
+    ending = (final or silent) and not in_step
+    first_late = _count_prompt(m, s, j)
     for i in range(count - 1, -1, -1):
-        after, u = u, min(b.label[s, j, i], u - 1)
+        after, u = u, min(m.newest_row[s, j, i], u - 1)
         answered = max(answered, u + 1)
-        _place(b, s, j, u, i)
-        # A drive that was behind before it fell silent: its last answers may be late, or earlier ones lost.
+        _assign(m, s, j, u, i)
+        # A drive that lagged before it fell silent: its last answers may be late, or earlier ones lost.
         for v in range(u + 1, after):
-            ends = ends or not _seen(b, s, j, v)
-        if ends and i >= caught_up:
-            b.row_code[s, slot_of(b, s, u), j] = AMBIGUOUS
+            ending = ending or not _is_received(m, s, j, v)
+        if ending and i >= first_late:
+            m.row_code[s, slot_of(m, s, u), j] = AMBIGUOUS
         # A repeated frame looks like two late answers, which shifts the ones before.
-        twice = u < b.label[s, j, i] and (
-            twice or (b.label[s, j, i] == b.label[s, j, i + 1] and _same(b, s, j, i, i + 1))
+        repeated = u < m.newest_row[s, j, i] and (
+            repeated or (m.newest_row[s, j, i] == m.newest_row[s, j, i + 1] and _are_equal(m, s, j, i, i + 1))
         )
-        if twice:
-            b.row_code[s, slot_of(b, s, u), j] = AMBIGUOUS
-    _give_up_doubtful(b, s, j, count)
+        if repeated:
+            m.row_code[s, slot_of(m, s, u), j] = AMBIGUOUS
+    _discard_ambiguous(m, s, j, count)
     # A drive answers in order: no answer to an earlier row can follow.
-    _close(b, s, j, max(keep, answered), keep > answered or (unsure and not in_step))
+    _close_rows(m, s, j, max(keep, answered), keep > answered or (stale and not in_step))
 
 
 @njit(cache=True, nogil=True)
-def _give_up_refilled(b: MatcherState, s: int, j: int, count: int) -> None:
+def _discard_near_gap(m: MatcherState, s: int, j: int, count: int) -> None:
     """Discard answers as ambiguous where frames were missing recently: one may be lost and a later one repeated."""
-    repeated, unlike = -1, False
+    repeated, differ = -1, False
     for i in range(1, count):
-        if b.label[s, j, i] == b.label[s, j, i - 1] and _same(b, s, j, i, i - 1):
+        if m.newest_row[s, j, i] == m.newest_row[s, j, i - 1] and _are_equal(m, s, j, i, i - 1):
             repeated = i
     for i in range(1, repeated + 1):
-        unlike = unlike or not _same(b, s, j, i, i - 1)
-    for i in range(repeated + 1 if unlike else 0):
-        b.row_code[s, slot_of(b, s, b.settled[s, j] + i), j] = AMBIGUOUS
+        differ = differ or not _are_equal(m, s, j, i, i - 1)
+    for i in range(repeated + 1 if differ else 0):
+        m.row_code[s, slot_of(m, s, m.settled[s, j] + i), j] = AMBIGUOUS
 
 
 @njit(cache=True, nogil=True)
-def _give_up_doubtful(b: MatcherState, s: int, j: int, count: int) -> None:
+def _discard_ambiguous(m: MatcherState, s: int, j: int, count: int) -> None:
     """Discard answers that were taken as prompt but may be late, where one was lost."""
     # Answers in a burst after a pause: with one of them lost, their SYNCs are ambiguous.
-    previous = b.settled[s, j] - 1
+    previous = m.settled[s, j] - 1
     for i in range(count):
-        label = b.label[s, j, i]
-        if i + 1 < count and b.label[s, j, i + 1] == label:
-            if _seen(b, s, j, label):
-                _was_behind(b, s, j, label - previous)
-            for v in range(previous + 1, label + 1):
-                b.row_code[s, slot_of(b, s, v), j] = AMBIGUOUS
+        newest = m.newest_row[s, j, i]
+        if i + 1 < count and m.newest_row[s, j, i + 1] == newest:
+            if _is_received(m, s, j, newest):
+                _record_lag(m, s, j, newest - previous)
+            for v in range(previous + 1, newest + 1):
+                m.row_code[s, slot_of(m, s, v), j] = AMBIGUOUS
         else:
-            previous = label
-    # A drive that was behind recently may have been behind when an answer was lost: later answers are then late.
-    if b.head[b.bus_of[j], s] - b.behind_at[s, j] > 2 * b.kind[s, WINDOW]:
-        b.behind[s, j] = 0
-    previous = b.settled[s, j] - 1
+            previous = newest
+    # A drive that lagged recently may have lagged when an answer was lost: later answers are then late.
+    if m.head[m.bus_of[j], s] - m.lag_at[s, j] > 2 * m.config[s, WINDOW]:
+        m.lag[s, j] = 0
+    previous = m.settled[s, j] - 1
     for i in range(count):
-        label = b.label[s, j, i]
-        if i + 1 < count and b.label[s, j, i + 1] == label:
+        newest = m.newest_row[s, j, i]
+        if i + 1 < count and m.newest_row[s, j, i + 1] == newest:
             # After a burst the drive has caught up.
-            b.doubt[s, j] = min(b.doubt[s, j], label + 1)
-        elif b.behind[s, j] > 1 and label > previous + 1:
-            b.doubt[s, j] = max(b.doubt[s, j], label + b.behind[s, j] - 1)
-        for v in range(max(previous + 1, b.settled[s, j]), min(label + 1, b.doubt[s, j])):
-            if b.row_code[s, slot_of(b, s, v), j] == RECEIVED:
-                b.row_code[s, slot_of(b, s, v), j] = AMBIGUOUS
-        previous = label
+            m.ambiguous_before[s, j] = min(m.ambiguous_before[s, j], newest + 1)
+        elif m.lag[s, j] > 1 and newest > previous + 1:
+            m.ambiguous_before[s, j] = max(m.ambiguous_before[s, j], newest + m.lag[s, j] - 1)
+        for v in range(max(previous + 1, m.settled[s, j]), min(newest + 1, m.ambiguous_before[s, j])):
+            if m.row_code[s, slot_of(m, s, v), j] == RECEIVED:
+                m.row_code[s, slot_of(m, s, v), j] = AMBIGUOUS
+        previous = newest
 
 
 @njit(cache=True, nogil=True)
-def _sample(b: MatcherState, s: int, slot: int, j: int, i: int, word: int) -> Any:
+def _sample(m: MatcherState, s: int, slot: int, j: int, i: int, word: int) -> Any:
     """Return eight bytes of sample ``i`` of a packed answer."""
     value = np.uint64(0)
-    for octet in range(8 * word, min(b.kind[s, SIZE], 8 * word + 8)):
-        at = i * b.kind[s, SIZE] + octet
-        taken = (b.row_data[s, slot, j, at >> 3] >> np.uint64(8 * (at & 7))) & np.uint64(0xFF)
+    for octet in range(8 * word, min(m.config[s, SIZE], 8 * word + 8)):
+        at = i * m.config[s, SIZE] + octet
+        taken = (m.row_data[s, slot, j, at >> 3] >> np.uint64(8 * (at & 7))) & np.uint64(0xFF)
         value |= taken << np.uint64(8 * (octet & 7))
     return value
 
 
 @njit(cache=True, nogil=True)
-def _emit(b: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
+def _emit(m: MatcherState, s: int, end: int, out: MatchedSamples) -> None:
     """Output the rows before ``end``; a packed row is several samples."""
-    pack, buses = b.kind[s, PACK], b.state.shape[0]
-    words = -(-b.kind[s, SIZE] // 8)
-    while b.mark[s, EMITTED] < end:
-        slot = slot_of(b, s, b.mark[s, EMITTED])
+    pack, buses = m.config[s, PACK], m.bus_state.shape[0]
+    words = -(-m.config[s, SIZE] // 8)
+    while m.watermark[s, EMITTED] < end:
+        slot = slot_of(m, s, m.watermark[s, EMITTED])
         for i in range(pack):
-            k = b.row_sync[s, slot] - pack + 1 + i
+            k = m.row_sync[s, slot] - pack + 1 + i
             if k < 0:
                 continue
             o = out.rows[s]
             out.sync[s, o] = k
             out.t_ns[s, o] = NEVER
             for bus in range(buses - 1, -1, -1):
-                if b.row_t[s, slot, i, bus] != NEVER:
-                    out.t_ns[s, o] = b.row_t[s, slot, i, bus]
-            for j in range(b.settled.shape[1]):
-                seen = b.row_t[s, slot, i, b.bus_of[j]] != NEVER
-                out.code[s, o, j] = b.row_code[s, slot, j] if seen else NO_SYNC
+                if m.row_t[s, slot, i, bus] != NEVER:
+                    out.t_ns[s, o] = m.row_t[s, slot, i, bus]
+            for j in range(m.settled.shape[1]):
+                seen = m.row_t[s, slot, i, m.bus_of[j]] != NEVER
+                out.code[s, o, j] = m.row_code[s, slot, j] if seen else NO_SYNC
                 for w in range(words):
-                    out.data[s, o, j, w] = b.row_data[s, slot, j, w] if pack == 1 else _sample(b, s, slot, j, i, w)
+                    out.data[s, o, j, w] = m.row_data[s, slot, j, w] if pack == 1 else _sample(m, s, slot, j, i, w)
             out.rows[s] += 1
-        b.mark[s, EMITTED] += 1
-    if b.mark[s, EMITTED] == b.mark[s, TOP]:
-        b.mark[s, BASE] = b.mark[s, TOP]
+        m.watermark[s, EMITTED] += 1
+    if m.watermark[s, EMITTED] == m.watermark[s, TOP]:
+        m.watermark[s, BASE] = m.watermark[s, TOP]
 
 
 @njit(cache=True, nogil=True)
-def settle_all(b: MatcherState, bus: int, s: int, final: bool, out: MatchedSamples) -> None:
+def settle_all(m: MatcherState, bus: int, s: int, final: bool, out: MatchedSamples) -> None:
     """Decide the open rows of the drives on one bus, and output the rows that all drives have settled.
 
     Parameters
     ----------
-    b
+    m
         State of the matcher.
     bus
         Number of the bus.
@@ -335,45 +342,45 @@ def settle_all(b: MatcherState, bus: int, s: int, final: bool, out: MatchedSampl
     out
         Output of decided samples.
     """
-    n = b.settled.shape[1]
-    head = b.head[bus, s]
-    slot = (head - 1 - b.mark[s, BASE]) % b.row_sync.shape[1]
-    all_owe, whole = n > 1, True
-    here = calm_here = calm = 0
+    n = m.settled.shape[1]
+    head = m.head[bus, s]
+    slot = (head - 1 - m.watermark[s, BASE]) % m.row_sync.shape[1]
+    all_behind, complete = n > 1, True
+    here = in_step_here = in_step = 0
     for j in range(n):
-        if b.bus_of[j] == bus:
+        if m.bus_of[j] == bus:
             here += 1
             # Common case, one answer to one SYNC, inline: passing the state to a function costs more than all of it.
             if (
-                b.pending[s, j] == 1
-                and b.settled[s, j] == head - 1
-                and not b.pace[s, j, UNSURE]
-                and head > b.hole[bus, s]
+                m.pending[s, j] == 1
+                and m.settled[s, j] == head - 1
+                and not m.progress[s, j, STALE]
+                and head > m.gap_end[bus, s]
             ):
-                for w in range(b.answer.shape[3]):
-                    b.row_data[s, slot, j, w] = b.answer[s, j, 0, w]
-                b.row_code[s, slot, j] = b.answer_code[s, j, 0] if head > b.doubt[s, j] else AMBIGUOUS
-                b.settled[s, j], b.pending[s, j], b.fresh[s, j] = head, 0, 0
-                b.pace[s, j, BEST], b.pace[s, j, STOOD] = NEVER, 0
-                if b.pace[s, j, PACED] != head:
-                    b.pace[s, j, PACED] = head
-                    b.pace[s, j, CALM] += 1
+                for w in range(m.answer.shape[3]):
+                    m.row_data[s, slot, j, w] = m.answer[s, j, 0, w]
+                m.row_code[s, slot, j] = m.answer_code[s, j, 0] if head > m.ambiguous_before[s, j] else AMBIGUOUS
+                m.settled[s, j], m.pending[s, j], m.since_sync[s, j] = head, 0, 0
+                m.progress[s, j, BALANCE], m.progress[s, j, BALANCE_RUN] = NEVER, 0
+                if m.progress[s, j, COUNTED_AT] != head:
+                    m.progress[s, j, COUNTED_AT] = head
+                    m.progress[s, j, IN_STEP_RUN] += 1
             else:
-                _keep_pace(b, s, j)
-        all_owe = all_owe and b.settled[s, j] + b.pending[s, j] < b.head[b.bus_of[j], s]
-        whole = whole and b.settled[s, j] >= b.hole[b.bus_of[j], s]
+                _update_progress(m, s, j)
+        all_behind = all_behind and m.settled[s, j] + m.pending[s, j] < m.head[m.bus_of[j], s]
+        complete = complete and m.settled[s, j] >= m.gap_end[m.bus_of[j], s]
         # Buses are read one after the other: only the state of another bus at this row counts.
-        begun, ended = b.pace[s, j, PACED] - b.pace[s, j, CALM], b.pace[s, j, PACED]
-        if begun <= head - ALIGNED_SYNCS and ended >= head - 1:
-            calm += 1
-            calm_here += b.bus_of[j] == bus
-    if all_owe and whole:
-        b.mark[s, BEHIND] = head
-    end = b.mark[s, TOP]
+        run_start, run_end = m.progress[s, j, COUNTED_AT] - m.progress[s, j, IN_STEP_RUN], m.progress[s, j, COUNTED_AT]
+        if run_start <= head - ALIGNED_SYNCS and run_end >= head - 1:
+            in_step += 1
+            in_step_here += m.bus_of[j] == bus
+    if all_behind and complete:
+        m.watermark[s, ALL_BEHIND] = head
+    end = m.watermark[s, TOP]
     for j in range(n):
-        if b.bus_of[j] == bus and (b.settled[s, j] < head or b.pending[s, j]):
+        if m.bus_of[j] == bus and (m.settled[s, j] < head or m.pending[s, j]):
             # A drive without outstanding answers shows that neither the host nor the bus is delayed.
-            _settle(b, s, j, final, calm_here > 0 if here > 1 else calm > 0)
-        end = min(end, b.settled[s, j])
-    if end > b.mark[s, EMITTED]:
-        _emit(b, s, end, out)
+            _settle(m, s, j, final, in_step_here > 0 if here > 1 else in_step > 0)
+        end = min(end, m.settled[s, j])
+    if end > m.watermark[s, EMITTED]:
+        _emit(m, s, end, out)

@@ -183,7 +183,7 @@ def test_dropped_frames_end_the_patience() -> None:
     told.push(frames[:half], dropped=True)
     told.push(frames[half:])
     patient.push(frames[half:])
-    assert patient.owed == 1
+    assert patient.outstanding == 1
     assert told.counters["samples.rows"] > 700
     for assembler in (patient, told):
         gaps = assembler.finish(1000).gaps

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.unit.daq.test_matching_doubt import assembled
+from tests.unit.daq.test_matching_ambiguous import assembled
 
 PERIOD_US = 1000
 JOINTS = (0x181, 0x182)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from armident.configs import DataError
-from armident.daq.matching.assembler import SYNC_LOST, UNSENT, Assembler, Batch, TpdoStream
+from armident.daq.matching.assembler import INCOMPLETE_PACK, SYNC_LOST, Assembler, Batch, TpdoStream
 from armident.daq.recording import Gap
 from armident.drivers.can.frames import FD_FRAME
 
@@ -186,7 +186,7 @@ def test_a_bus_that_is_off_is_a_gap_of_its_axes_alone() -> None:
     rows = 0
     for k in range(COUNT):
         if k in (100, 180):
-            assembler.silence(1, k == 100)
+            assembler.set_bus_down(1, k == 100)
         for b, frames in enumerate(per_bus):
             now = assembler.push(frames[(frames["t_ns"] - T0) // PERIOD_NS == k], sent=k + 1, bus=b)
             gaps += now.gaps
@@ -205,7 +205,7 @@ def test_samples_after_the_last_packed_tpdo_are_accounted_for() -> None:
     for b, frames in in_turn([bus_frames(b, (PACKED,), Faults()) for b in range(3)]):
         gaps += assembler.push(frames[(frames["t_ns"] - T0) // PERIOD_NS < 237], bus=b).gaps
     gaps += assembler.finish().gaps
-    assert gaps == [Gap("samples", 230, 236, None, UNSENT)]
+    assert gaps == [Gap("samples", 230, 236, None, INCOMPLETE_PACK)]
     assert assembler.counters["samples.expected"] == 237
 
 
@@ -229,10 +229,10 @@ def test_frames_that_waited_while_their_bus_was_taken_for_down_are_no_turn_of_th
     number = [(frames["t_ns"] - T0) // PERIOD_NS for frames in per_bus]
     for first, last in ((0, 50), (50, 180), (180, COUNT)):
         if first == 50:
-            assembler.silence(1, True)
+            assembler.set_bus_down(1, True)
         for b in (0, 2, 1):
             batches.append(assembler.push(per_bus[b][(number[b] >= first) & (number[b] < last)], sent=last, bus=b))
-        assembler.silence(1, False)
+        assembler.set_bus_down(1, False)
     batches.append(assembler.finish(COUNT))
     gaps = [g for b in batches for g in b.gaps]
     assert gaps == [Gap("samples", 50, 179, "joint_3", SYNC_LOST)]

@@ -133,7 +133,7 @@ def test_after_an_outage_what_is_late_is_matched_and_what_is_stale_is_dropped(st
     bench, queue = Bench(buses=2), list[int]()
     for k in range(1500):
         if k in (300, 500):
-            bench.assembler.silence(1, k == 300)
+            bench.assembler.set_bus_down(1, k == 300)
         if 300 <= k < 500:
             bench._take(bench.assembler.push(frames_of(k, answers(k)), sent=k + 1, bus=0))
             bench._take(bench.assembler.push(frames(0), sent=k + 1, bus=1))
@@ -172,7 +172,7 @@ def test_what_is_missing_on_one_bus_casts_no_doubt_on_another() -> None:
     assembler = Assembler((stream,), bench.joints, PERIOD_NS, bus_of=(0, 0, 1, 1))
     for k in range(600):
         if k in (200, 300):
-            assembler.silence(1, k == 200)
+            assembler.set_bus_down(1, k == 200)
         first = [] if 310 <= k < 330 else [(0x181, 7)] * (21 if k == 330 else 1)
         first += [(0x182, k)]
         assembler.push(frames_of(k, first), sent=k + 1, bus=0)

@@ -76,10 +76,10 @@ def test_whole_turns_are_missing_where_frames_are_known_to_be(why: str) -> None:
     listener = Listener()
     listener.push(answered(list(range(500))))
     if why == "down":
-        listener.assembler.silence(0, True)
-        listener.assembler.silence(0, False)
+        listener.assembler.set_bus_down(0, True)
+        listener.assembler.set_bus_down(0, False)
     elif why == "bus-off":
-        listener.assembler.torn(0)
+        listener.assembler.mark_incomplete(0)
     listener.push(answered(list(range(500 + 2 * OVERFLOW, 1500))), dropped=why == "dropped")
     assert outages(listener.finish()) == [(500, 500 + 2 * OVERFLOW - 1)]
 
@@ -106,7 +106,7 @@ def test_no_more_syncs_are_unseen_than_frames_were_dropped_or_periods_have_passe
     listener = Listener()
     listener.push(answered(list(range(100))))
     now = T0 + (99 + passed) * PERIOD_NS
-    assert listener.assembler.unseen([dropped], now) == at_most
+    assert listener.assembler.most_unreceived([dropped], now) == at_most
     gaps = listener.finish(100 + at_most)
     assert Gap("samples", 100, 99 + at_most, None, SYNC_LOST) in gaps or not at_most
     assert {k for gap in gaps for k in range(gap.first, gap.last + 1)} <= set(range(99, 100 + at_most))
@@ -114,7 +114,7 @@ def test_no_more_syncs_are_unseen_than_frames_were_dropped_or_periods_have_passe
 
 
 def test_nothing_is_unseen_before_the_first_sync() -> None:
-    assert Listener().assembler.unseen([40], T0) == 0
+    assert Listener().assembler.most_unreceived([40], T0) == 0
 
 
 def test_what_one_bus_had_to_drop_another_one_may_have_received() -> None:
@@ -123,8 +123,8 @@ def test_what_one_bus_had_to_drop_another_one_may_have_received() -> None:
         both = answered(list(range(count)))
         assembler.push(both[both["can_id"] != (0x182, 0x181)[bus]], bus=bus)
     now = T0 + 130 * PERIOD_NS
-    assert assembler.unseen([0, 5], now) == 0
-    assert assembler.unseen([0, 30], now) == 20
+    assert assembler.most_unreceived([0, 5], now) == 0
+    assert assembler.most_unreceived([0, 30], now) == 20
 
 
 @pytest.mark.parametrize("held_up", [0.0, 0.3, 0.9, 5.0])
@@ -160,7 +160,7 @@ def test_our_own_syncs_are_told_by_when_we_sent_them_where_frames_are_lost(
     times = sent["t_ns"][::3] - 300_000
     times[499] += min(round(held_up * OVERFLOW) * PERIOD_NS, stall)
     # The last SYNC is being sent.
-    assembler.when_sent = lambda first: (first, times[first:1999])
+    assembler.send_times = lambda first: (first, times[first:1999])
     gaps = list(assembler.push(sent[:900], sent=2000).gaps)
     gaps += assembler.push(sent[3 * (300 + lost) :], sent=1999, dropped=True).gaps
     gaps += assembler.finish(2000).gaps
@@ -175,12 +175,12 @@ def test_what_waited_behind_an_outage_is_older_than_what_another_bus_had_meanwhi
     assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, 1, bus_of=(0, 1))
     sent = answered(list(range(2000)))
     times = sent["t_ns"][::3] + 20_000
-    assembler.when_sent = lambda first: (first, times[first:1999])
+    assembler.send_times = lambda first: (first, times[first:1999])
     one, other = (sent[sent["can_id"] != identifier] for identifier in (0x182, 0x181))
     gaps = list(assembler.push(other[:1000], 500, bus=1).gaps)
-    assembler.silence(1, True)
+    assembler.set_bus_down(1, True)
     gaps += assembler.push(one[:3800], 1999, bus=0).gaps
-    assembler.silence(1, False)
+    assembler.set_bus_down(1, False)
     if known:
         gaps += assembler.push(one[3800:], 1999, bus=0).gaps
     gaps += assembler.push(other[2 * back :], 1999, bus=1).gaps

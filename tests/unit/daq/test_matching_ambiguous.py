@@ -111,7 +111,7 @@ def test_tpdos_are_suspect_from_the_moment_somebody_writes_to_their_mapping() ->
 
 def test_what_was_written_before_it_was_confirmed_is_no_change() -> None:
     assembler = Assembler(STREAMS, ("a", "b"), PERIOD, nodes=(1, 2))
-    assembler.suspect("a", T0 + 5_000_000, T0 + 5_000_000)
+    assembler.mark_unverified("a", T0 + 5_000_000, T0 + 5_000_000)
     batch = frames(1)
     batch["t_ns"], batch["can_id"], batch["length"] = T0, 0x601, 8
     batch["data"][0, :3] = [0x23, 0x00, 0x1A]
