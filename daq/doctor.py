@@ -247,11 +247,11 @@ def _write_times(probe: Path, size: int) -> list[float]:
 
 def _speed(times: list[float], span_s: float) -> Check:
     """Check the times of writing chunks (s) against the time span of a chunk (s)."""
-    usual, worst = statistics.median(times), max(times)
+    median, worst = statistics.median(times), max(times)
     found = (
-        f"{1e3 * span_s:.0f} ms of rows are written and synced in {1e3 * usual:.2g} ms, {1e3 * worst:.2g} ms at worst"
+        f"{1e3 * span_s:.0f} ms of rows are written and synced in {1e3 * median:.2g} ms, {1e3 * worst:.2g} ms at worst"
     )
-    if usual > 0.5 * span_s:
+    if median > 0.5 * span_s:
         return Check("disk", "warning", f"{found}: too slow; try a larger recording.chunk_ms (a crash loses more then)")
     return Check("disk", "ok", found)
 

@@ -89,8 +89,8 @@ def limits(options: RecordingOptions) -> tuple[int | None, int | None]:
 def free_space(directory: Path) -> int | None:
     """Return the free bytes on the disk of a directory that may not exist yet; ``None`` if unknown."""
     try:
-        there = next(path for path in (directory.absolute(), *directory.absolute().parents) if os.path.exists(path))
-        return shutil.disk_usage(there).free
+        existing = next(path for path in (directory.absolute(), *directory.absolute().parents) if os.path.exists(path))
+        return shutil.disk_usage(existing).free
     except (OSError, StopIteration):
         return None
 
@@ -122,8 +122,10 @@ class RecordingRetention:
         options = self.options
         if options.keep_days is None and options.min_free_gb is None:
             return []
-        least = None if options.min_free_gb is None else options.min_free_gb * 1e9
-        return prune(self._directory, self._robot, datetime.datetime.now(datetime.UTC), options.keep_days, least)
+        min_free_bytes = None if options.min_free_gb is None else options.min_free_gb * 1e9
+        return prune(
+            self._directory, self._robot, datetime.datetime.now(datetime.UTC), options.keep_days, min_free_bytes
+        )
 
     def __enter__(self) -> Self:
         """Return the object; its thread runs already."""

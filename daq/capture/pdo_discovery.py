@@ -104,10 +104,10 @@ def bus_statistics(channel: str, frames: Frames) -> BusStatistics:
     identifiers = {}
     for can_id in np.unique(frames["can_id"]):
         if 0x180 <= can_id < 0x580:
-            mine = frames["can_id"] == can_id
-            lengths = tuple(int(n) for n in np.unique(frames["length"][mine]))
-            interval = _interval(number[mine])
-            identifiers[int(can_id)] = IdentifierStatistics(int(can_id), int(mine.sum()), interval, lengths)
+            selected = frames["can_id"] == can_id
+            lengths = tuple(int(n) for n in np.unique(frames["length"][selected]))
+            interval = _interval(number[selected])
+            identifiers[int(can_id)] = IdentifierStatistics(int(can_id), int(selected.sum()), interval, lengths)
     return BusStatistics(channel, period_us, identifiers)
 
 
@@ -163,9 +163,9 @@ def with_sent_streams(session: SessionConfig, buses: list[BusStatistics]) -> Ses
         if name is None:
             name = "samples" if first.every == 1 and "samples" not in streams else f"tpdo{tpdo}"
         streams[name] = first
-        how = "as the session says" if session.streams.get(name) == first else "as the EDS says"
+        source = "as the session says" if session.streams.get(name) == first else "as the EDS says"
         objects, every = ", ".join(first.objects), max(first.every, first.pack)
-        log.info("TPDO%d is %s: %s on every %d. SYNC, %s", tpdo, name, objects, every, how)
+        log.info("TPDO%d is %s: %s on every %d. SYNC, %s", tpdo, name, objects, every, source)
     if "samples" not in streams or streams["samples"].every != 1:
         raise ConfigError("no TPDO comes on every SYNC: there is nothing to record as samples")
     return session.model_copy(update={"streams": streams})
@@ -177,9 +177,9 @@ def _stream(session: SessionConfig, drive: DriveNode, tpdo: int, bus: BusStatist
     sent = bus.identifiers.get(cob_id)
     if sent is None or sent.every is None:
         return None
-    who = f"bus {bus.channel}: node {drive.node_id} ({drive.joint}), TPDO{tpdo} {sent}"
+    sender = f"bus {bus.channel}: node {drive.node_id} ({drive.joint}), TPDO{tpdo} {sent}"
     if len(sent.lengths) > 1:
-        raise ConfigError(f"{who}: its length changes, so its mapping is unknown")
+        raise ConfigError(f"{sender}: its length changes, so its mapping is unknown")
     (length,) = sent.lengths
     fd = session.bus_of(drive).fd
     for stream in session.streams.values():
@@ -188,15 +188,15 @@ def _stream(session: SessionConfig, drive: DriveNode, tpdo: int, bus: BusStatist
         if stream.tpdo == tpdo and same:
             return stream
     if isinstance(objects, str):
-        raise ConfigError(f"{who}: no stream of the session agrees, and {objects}")
+        raise ConfigError(f"{sender}: no stream of the session agrees, and {objects}")
     size = TpdoLayout.of(objects, "EDS", 1, fd).size
     if fd_length(size) != length:
         raise ConfigError(
-            f"{who}: {drive.eds.name} maps {size} bytes by default ({', '.join(objects) or 'nothing'}) and the session "
+            f"{sender}: {drive.eds.name} maps {size} bytes by default ({', '.join(objects) or 'nothing'}) and the session "
             "has no stream of this length and interval; add the objects of the TPDO to streams"
         )
     if session.sync.counter % sent.every:
-        raise ConfigError(f"{who}: its interval does not divide sync.counter {session.sync.counter}")
+        raise ConfigError(f"{sender}: its interval does not divide sync.counter {session.sync.counter}")
     return Stream.model_validate({"tpdo": tpdo, "every": sent.every, "objects": objects})
 
 

@@ -60,8 +60,8 @@ class Publisher:
         self._session = open_session(session, "capture")
         self.commands = Commands(self._session, keys, session.zenoh.commands)
         self._token = self._session.liveliness().declare_token(keys.alive("capture"))
-        self._samples = self._advanced(keys.samples, session.zenoh.cache_blocks, zenoh.CongestionControl.DROP)
-        self._events = self._advanced(keys.events, _EVENTS_KEPT, zenoh.CongestionControl.BLOCK)
+        self._samples = self._declare_publisher(keys.samples, session.zenoh.cache_blocks, zenoh.CongestionControl.DROP)
+        self._events = self._declare_publisher(keys.events, _EVENTS_KEPT, zenoh.CongestionControl.BLOCK)
         self._thread = threading.Thread(target=self._run, name="zenoh", daemon=True)
         self._thread.start()
 
@@ -115,7 +115,9 @@ class Publisher:
         self._token.undeclare()
         self._session.close()
 
-    def _advanced(self, key: str, kept: int, congestion: zenoh.CongestionControl) -> zenoh.ext.AdvancedPublisher:
+    def _declare_publisher(
+        self, key: str, kept: int, congestion: zenoh.CongestionControl
+    ) -> zenoh.ext.AdvancedPublisher:
         return zenoh.ext.declare_advanced_publisher(
             self._session,
             key,

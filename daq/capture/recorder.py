@@ -35,16 +35,16 @@ HEALTH_S = 1.0
 """Interval of health reports, s."""
 REST_S = 0.01
 """Interval of reads of the buses at the end of a capture, s."""
-TELL_BEHIND_S = 0.5
-"""Lag of the drives at the end of a capture above which it is logged, s."""
+LAG_LOGGED_S = 0.5
+"""Lag of the drives at the end of a capture from which on it is logged, s."""
 QUICK_STOP_S = 0.3
 """Time for which the drives stay enabled after a quick stop when no position is received, s."""
 STARVED_S = 20.0
 """Longest wait without any frame at the end for drives that all lag, s; less than the time of the watchdog."""
 BRAKING_S = 5.0
 """Time for which the drives stay enabled after a quick stop while the arm still moves, s."""
-AHEAD = 10
-"""Difference in niceness between the thread that reads the buses and those that write and publish."""
+NICENESS_STEPS = 10
+"""Steps of niceness by which the thread that reads the buses precedes those that write and publish."""
 OUTAGE_S = 5.0
 """Time without a working bus after which a capture ends, s."""
 
@@ -173,7 +173,7 @@ class Recorder:
     def record(self) -> ArmidentError | None:
         """Run the capture to its end; return the error that ended it early, or ``None``."""
         failure: ArmidentError | None = None
-        with raised_priority(AHEAD):
+        with raised_priority(NICENESS_STEPS):
             try:
                 self._start_motion()
                 self._loop()
@@ -401,7 +401,7 @@ class Recorder:
                 alive = self._events.counts["heartbeat_lost"] == lost and not self._receiver.all_down_s
                 if not (alive and self._assembler.outstanding_by_all):
                     return
-            if not reported and outstanding * self._period > TELL_BEHIND_S:
+            if not reported and outstanding * self._period > LAG_LOGGED_S:
                 log.info("the drives are %.1f s behind: waiting for their answers", outstanding * self._period)
                 reported = True
             time.sleep(REST_S)

@@ -22,9 +22,9 @@ REST_STEP_S = 0.01
 """Shortest time between two compared positions, s."""
 SLOW_SHARE = 0.002
 """Share of a joint's velocity limit up to which it stands still."""
-SHAKE_COUNTS = 2.0
+NOISE_COUNTS = 2.0
 """Encoder counts by which two positions of a motor at standstill may differ."""
-_ALREADY_THERE = 1e-4
+_START_TOLERANCE = 1e-4
 """A joint closer to the start than this (rad or m) needs no approach."""
 
 
@@ -52,7 +52,7 @@ class StandstillDetector:
         self._per_count = np.linalg.inv(robot.transmission_matrix) / counts_per_si(robot)
         limits = np.array([joint.limits.velocity for joint in robot.joints])
         self._slow = limits * SLOW_SHARE * session.sync_period
-        self._shake = np.abs(self._per_count).sum(axis=1) * SHAKE_COUNTS
+        self._noise = np.abs(self._per_count).sum(axis=1) * NOISE_COUNTS
         self._last: tuple[int, NDArray[np.float64]] | None = None
         self._since = 0
 
@@ -71,7 +71,7 @@ class StandstillDetector:
             self._last, self._since = (sync, now), sync
         last, before = self._last
         if sync - last >= max(self._step, 1):
-            if (np.abs(now - before) > np.maximum(self._slow * (sync - last), self._shake)).any():
+            if (np.abs(now - before) > np.maximum(self._slow * (sync - last), self._noise)).any():
                 self._since = sync
             self._last = sync, now
         return self._last[0] - self._since >= self._span
@@ -131,7 +131,7 @@ def plan_setpoints(
     start = np.array(trajectory.start)
     rest = np.repeat(start[None, :], int(np.ceil(options.settle_s / period)) + 1, axis=0)
     parts = [rest]
-    if np.abs(actual - start).max() > _ALREADY_THERE:
+    if np.abs(actual - start).max() > _START_TOLERANCE:
         parts.insert(0, approach(actual, start, robot, period))
     first = sum(len(part) for part in parts)
     parts += [trajectory.sample(period)] * options.repeat
@@ -156,14 +156,16 @@ def approach(
     period
         Time between two rows, s.
     """
-    way = np.abs(start - actual)
+    distance = np.abs(start - actual)
     velocity = np.array([joint.limits.velocity for joint in robot.joints]) * APPROACH_SHARE
     acceleration = np.array([joint.limits.acceleration for joint in robot.joints]) * APPROACH_SHARE
     # Peaks of a unit move in unit time with ramps of share a: speed 1 / (1 - a), acceleration pi / 2 speed / a.
     speed = 1.0 / (1.0 - RAMP_SHARE)
     peak = np.pi / 2 * speed / RAMP_SHARE
     duration = max(
-        SHORTEST_APPROACH_S, float((speed * way / velocity).max()), float(np.sqrt(peak * way / acceleration).max())
+        SHORTEST_APPROACH_S,
+        float((speed * distance / velocity).max()),
+        float(np.sqrt(peak * distance / acceleration).max()),
     )
     move = Move(to=tuple(start.tolist()), duration=duration)
     return Trajectory(schema="armident/trajectory/1", start=tuple(actual.tolist()), moves=(move,)).sample(period)

@@ -141,7 +141,7 @@ class Sink:
     def _take(self, batch: Batch) -> None:
         samples = batch.rows["samples"]
         if samples.sync.size:
-            self._writer.turn(int(samples.t_ns[0]))
+            self._writer.rotate(int(samples.t_ns[0]))
             self.last_ns = self.last_ns or int(samples.t_ns[0])
         if batch.gaps:
             # Before the rows behind them: a file that is cut off has all gaps of its rows.
@@ -214,17 +214,17 @@ def pieces(batch: Batch) -> Iterator[Batch]:
         yield batch
         return
     number = (samples.t_ns - samples.t_ns[0]) // PIECE_NS
-    borders = samples.sync[np.flatnonzero(np.diff(number) > 0) + 1]
-    of_gap = np.searchsorted(borders, [gap.first for gap in batch.gaps], side="right")
+    boundaries = samples.sync[np.flatnonzero(np.diff(number) > 0) + 1]
+    piece_of_gap = np.searchsorted(boundaries, [gap.first for gap in batch.gaps], side="right")
     cuts = {
-        name: [0, *np.searchsorted(rows.sync, borders).tolist(), rows.sync.size] for name, rows in batch.rows.items()
+        name: [0, *np.searchsorted(rows.sync, boundaries).tolist(), rows.sync.size] for name, rows in batch.rows.items()
     }
-    for k in range(borders.size + 1):
+    for k in range(boundaries.size + 1):
         part = {}
         for name, rows in batch.rows.items():
-            here = slice(cuts[name][k], cuts[name][k + 1])
-            part[name] = Rows(rows.sync[here], rows.t_ns[here], rows.data[here])
-        yield Batch(part, tuple(gap for gap, at in zip(batch.gaps, of_gap, strict=True) if at == k))
+            rows_of_piece = slice(cuts[name][k], cuts[name][k + 1])
+            part[name] = Rows(rows.sync[rows_of_piece], rows.t_ns[rows_of_piece], rows.data[rows_of_piece])
+        yield Batch(part, tuple(gap for gap, at in zip(batch.gaps, piece_of_gap, strict=True) if at == k))
 
 
 def _mark(entries: list[tuple[str, Any]]) -> dict[str, Any]:

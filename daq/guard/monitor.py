@@ -335,7 +335,7 @@ def check_batch(  # type: ignore[no-untyped-def]
             continue
         kind, j = kinds[ids[k]], joints[ids[k]]
         state[JOINT], state[FRAME] = j, k
-        news = False
+        updated = False
         if kind == NMT:
             state[ARMED] = 0
         elif kind == SYNC:
@@ -365,7 +365,7 @@ def check_batch(  # type: ignore[no-untyped-def]
             if not own_demand:
                 raw[2, j], demanded[j] = _number(data, k, 0, 4), True
         elif kind == DEMAND and lengths[k] >= at[2] + 4:
-            raw[2, j], demanded[j], news = _number(data, k, at[2], 4), True, True
+            raw[2, j], demanded[j], updated = _number(data, k, at[2], 4), True, True
         elif kind == SAMPLE and lengths[k] >= at[0] + 4:
             raw[0, j] = _number(data, k, at[0], 4)
             if at[1] >= 0 and lengths[k] >= at[1] + 2:
@@ -376,8 +376,8 @@ def check_batch(  # type: ignore[no-untyped-def]
             efforts[samples[j] % efforts.shape[0], j] = raw[1, j]
             samples[j] += 1
             positions[samples[j] % positions.shape[0], j] = raw[0, j]
-            news = True
-        if news and state[ARMED]:
+            updated = True
+        if updated and state[ARMED]:
             code = check_limits(
                 j, raw, seen, demanded, per_count, per_mille, positions, efforts, samples, velocity_s,
                 low, high, velocity, torque, following, state, value,

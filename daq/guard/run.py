@@ -57,8 +57,8 @@ def stop_frames(session: SessionConfig, robot: RobotConfig) -> list[Frames]:
     rpdo = stop_rpdo(session.setpoints.rpdo)
     stops = []
     for number, bus in enumerate(session.all_buses):
-        on_it = zip(node_ids(session, robot), bus_numbers(session, robot), strict=True)
-        nodes = [node for node, place in on_it if place == number]
+        drives = zip(node_ids(session, robot), bus_numbers(session, robot), strict=True)
+        nodes = [node for node, place in drives if place == number]
         orders = [(rpdo_cob(rpdo, node), word) for node in nodes]
         orders += [(COB_SDO_REQUEST + node, request) for node in nodes]
         out = frames(len(orders), fd=bus.fd)

@@ -26,18 +26,18 @@ NAMES: Mapping[str, tuple[str, ...]] = {
 }
 """Accepted names of each quantity; ``q`` also stands for columns ``q1..qn``."""
 
-ABSENT = "-"
+OMITTED = "-"
 """Name with which a quantity of a file is left out."""
 
 EFFORTS: tuple[Quantity, ...] = ("torque", "current", "voltage")
-_UNEVEN = 0.01
+_STEP_TOLERANCE = 0.01
 """Largest deviation of a sampling step from the median step, relative."""
-_FAR_OUT, _TOO_STRONG = 3.0, 10.0
+_POSITION_FACTOR, _TORQUE_FACTOR = 3.0, 10.0
 """Positions and torques beyond these multiples of the joint's limits are taken as a wrong unit."""
 
-_STILL = 1e-3
+_MOVED_SHARE = 1e-3
 """Share of its position range that a joint must move for its demand to be checked."""
-_UNFOLLOWED = 0.5
+_UNEXPLAINED_SHARE = 0.5
 """Largest share of the power of a joint's motion that its demand may leave unexplained."""
 
 Table = dict[str, NDArray[np.float64]]
@@ -139,10 +139,10 @@ def import_recording(
         raise DataError(
             f"{path}: expected columns q1..q{robot.n} and tau1..tau{robot.n} (or current, voltage); found {have}"
         )
-    known = _known(raw["demand"]) if "demand" in raw else slice(0, len(raw["position"]))
+    known = _rows_with_demand(raw["demand"]) if "demand" in raw else slice(0, len(raw["position"]))
     _check_units(path, robot, fields, raw, known)
     if polled and known != slice(0, len(raw["position"])):
-        raise DataError(f"{source.place(0, 'demand')}: --polled needs a demand in every row, or --map demand={ABSENT}")
+        raise DataError(f"{source.place(0, 'demand')}: --polled needs a demand in every row, or --map demand={OMITTED}")
     facts = {"source": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     if effort is not None:
         facts |= {"effort": effort.name, "effort_sha256": hashlib.sha256(effort.read_bytes()).hexdigest()}
@@ -169,7 +169,7 @@ def import_recording(
     return Recording(None, robot, None, rate, streams, counters=counters, metadata=facts)
 
 
-def _known(demand: NDArray[np.float64]) -> slice:
+def _rows_with_demand(demand: NDArray[np.float64]) -> slice:
     """Return the rows from the first to the last with a demand; a capture has none before the first set point."""
     rows = np.flatnonzero(~np.isnan(demand).all(axis=1))
     return slice(int(rows[0]), int(rows[-1]) + 1) if rows.size else slice(0, len(demand))
@@ -316,7 +316,7 @@ def _bad_line(path: Path, delimiter: str | None, columns: int, skip: int) -> str
 
 def _pick(source: Source, quantity: str, n: int, names: Mapping[str, str]) -> NDArray[np.float64] | None:
     """Return the (N, n) values of a quantity, or ``None`` if the file has none or it is to be left out."""
-    if names.get(quantity) == ABSENT:
+    if names.get(quantity) == OMITTED:
         return None
     for base in (names[quantity],) if quantity in names else NAMES[quantity]:
         whole = source.table.get(base)
@@ -335,7 +335,9 @@ def _pick(source: Source, quantity: str, n: int, names: Mapping[str, str]) -> ND
             values = np.stack([source.table[name] for name in labels], axis=1)
         else:
             continue
-        _check_finite(source, values, labels, _known(values) if quantity == "demand" else slice(0, len(values)))
+        _check_finite(
+            source, values, labels, _rows_with_demand(values) if quantity == "demand" else slice(0, len(values))
+        )
         return np.ascontiguousarray(values)
     if quantity in names:
         raise DataError(f"{source.path}: nothing named {names[quantity]!r}; found {', '.join(source.table)}")
@@ -359,10 +361,10 @@ def _rate(source: Source, names: Mapping[str, str]) -> float:
     if steps.size == 0:
         raise DataError(f"{source.path}: a single row is not a recording")
     median = float(np.median(steps))
-    back = np.flatnonzero(steps <= 0)
-    if back.size:
-        raise DataError(f"{source.place(int(back[0]) + 1, 't')}: time does not increase")
-    uneven = np.flatnonzero(np.abs(steps - median) > _UNEVEN * median)
+    backward = np.flatnonzero(steps <= 0)
+    if backward.size:
+        raise DataError(f"{source.place(int(backward[0]) + 1, 't')}: time does not increase")
+    uneven = np.flatnonzero(np.abs(steps - median) > _STEP_TOLERANCE * median)
     if uneven.size:
         k = int(uneven[0])
         raise DataError(
@@ -390,11 +392,11 @@ def _check_units(path: Path, robot: RobotConfig, fields: Mapping[str, Field], ra
         if name in ("position", "demand"):
             joint = values @ np.linalg.inv(transmission).T if motor else values
             limits = [max(abs(end) for end in j.limits.position) for j in robot.joints]
-            factor, hint = _FAR_OUT, "rad (or m), joint side unless --motor-side"
+            factor, hint = _POSITION_FACTOR, "rad (or m), joint side unless --motor-side"
         elif name == "torque":
             joint = values @ transmission if motor else values
             limits = [j.limits.torque for j in robot.joints]
-            factor, hint = _TOO_STRONG, "N m (or N), joint side unless --motor-side"
+            factor, hint = _TORQUE_FACTOR, "N m (or N), joint side unless --motor-side"
         else:
             continue
         peaks = np.abs(joint).max(axis=0)
@@ -410,11 +412,11 @@ def _check_units(path: Path, robot: RobotConfig, fields: Mapping[str, Field], ra
 def _check_demand(path: Path, robot: RobotConfig, demand: NDArray[np.float64], position: NDArray[np.float64]) -> None:
     """Refuse a demand that does not move like the joints: another unit, or another quantity."""
     motion = np.sum((position - position.mean(axis=0)) ** 2, axis=0)
-    missed = np.sum((demand - demand.mean(axis=0) - position + position.mean(axis=0)) ** 2, axis=0)
-    for k in np.flatnonzero(missed > _UNFOLLOWED * motion):
+    residual = np.sum((demand - demand.mean(axis=0) - position + position.mean(axis=0)) ** 2, axis=0)
+    for k in np.flatnonzero(residual > _UNEXPLAINED_SHARE * motion):
         joint, moved, wanted = robot.joints[k], np.ptp(position[:, k]), np.ptp(demand[:, k])
-        if moved > _STILL * np.ptp(joint.limits.position):
+        if moved > _MOVED_SHARE * np.ptp(joint.limits.position):
             raise DataError(
                 f"{path}: {joint.name} did not follow its demand, which spans {wanted:.4g} where the position spans "
-                f"{moved:.4g}: expected the same unit; --map demand={ABSENT} leaves it out"
+                f"{moved:.4g}: expected the same unit; --map demand={OMITTED} leaves it out"
             )

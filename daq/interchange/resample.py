@@ -18,13 +18,13 @@ from armident.configs import DataError
 WINDOW = 21
 """Increments in the median filter: odd, far shorter than any motion, and longer than a burst of missed samples."""
 
-SLOW = 0.02
+SLOW_SHARE = 0.02
 """Share of the largest increment below which the number of samples is not resolved."""
 
-DOUBTFUL = 0.25
+AMBIGUOUS = 0.25
 """Distance of an advance from a whole number of samples above which it is ambiguous."""
 
-MOST_DOUBTFUL = 0.05
+MOST_AMBIGUOUS = 0.05
 """Share of ambiguous advances above which the rows are not samples of one clock."""
 
 Floats = NDArray[np.float64]
@@ -67,8 +67,8 @@ def onto_even_clock(raw: Mapping[str, Floats]) -> EvenClockSamples:
         If the rows do not fit an even clock, or there are too few.
     """
     rows = np.concatenate(list(raw.values()), axis=1)
-    fresh = np.append(True, np.any(rows[1:] != rows[:-1], axis=1))
-    index = np.flatnonzero(fresh)
+    changed = np.append(True, np.any(rows[1:] != rows[:-1], axis=1))
+    index = np.flatnonzero(changed)
     if index.size <= WINDOW:
         raise DataError(
             f"only {index.size} of {rows.shape[0]} rows differ from the row before: too few to find a clock"
@@ -90,16 +90,16 @@ def onto_even_clock(raw: Mapping[str, Floats]) -> EvenClockSamples:
 def _advances(q: Floats, rows: Ints) -> Ints:
     """Return the samples from each row (N, n) to the next, (N - 1,); during standstill, the number of ``rows`` read."""
     steps = np.diff(q, axis=0)
-    usual = median_filter(steps, size=(WINDOW, 1), mode="nearest")
-    power = np.sum(usual**2, axis=1)
-    moving = power > SLOW**2 * power.max()
+    median_steps = median_filter(steps, size=(WINDOW, 1), mode="nearest")
+    power = np.sum(median_steps**2, axis=1)
+    moving = power > SLOW_SHARE**2 * power.max()
     if not moving.any():
         raise DataError("nothing moves: the clock of the controller cannot be found")
-    advance = np.sum(steps[moving] * usual[moving], axis=1) / power[moving]
-    doubtful = float(np.mean(np.abs(advance - np.round(advance)) > DOUBTFUL))
-    if doubtful > MOST_DOUBTFUL:
+    advance = np.sum(steps[moving] * median_steps[moving], axis=1) / power[moving]
+    ambiguous = float(np.mean(np.abs(advance - np.round(advance)) > AMBIGUOUS))
+    if ambiguous > MOST_AMBIGUOUS:
         raise DataError(
-            f"{100 * doubtful:.0f} % of the rows are not a whole number of samples after the row before: "
+            f"{100 * ambiguous:.0f} % of the rows are not a whole number of samples after the row before: "
             "not read from a controller with an even clock"
         )
     ticks = rows.astype(np.int64)

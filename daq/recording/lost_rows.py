@@ -116,13 +116,13 @@ class LostRows:
         """
         self._gathered.add(stream, sync)
 
-    def lose(self, rows: RowRanges) -> None:
+    def add_lost(self, rows: RowRanges) -> None:
         """Count rows that never came into a chunk as lost."""
         self._lost = self._lost.before(rows)
 
     def failed(self) -> None:
         """Count the rows of the current chunk as lost; its events are kept."""
-        self.lose(self._gathered.take())
+        self.add_lost(self._gathered.take())
 
     def written(self) -> None:
         """Clear all: the chunk was written, with the gaps and events that were pending."""

@@ -105,7 +105,7 @@ class TriggeredSeries:
         self._until = max(self._until or 0, t_ns + self._after_ns)
         self._open(t_ns)
 
-    def turn(self, t_ns: int) -> Path | None:
+    def rotate(self, t_ns: int) -> Path | None:
         """End an event that is over at ``t_ns`` (ns UTC), or begin a new file if the current one is full.
 
         Returns
@@ -118,7 +118,7 @@ class TriggeredSeries:
         if self._series is None or self._until is None:
             return None
         if t_ns <= self._until:
-            return self._series.turn(t_ns)
+            return self._series.rotate(t_ns)
         last = self._series.path
         self._end()
         return last

@@ -85,7 +85,7 @@ class RecordingSeries:
         """
         self._max_bytes, self._max_ns = max_bytes, max_ns
 
-    def turn(self, t_ns: int) -> Path | None:
+    def rotate(self, t_ns: int) -> Path | None:
         """Begin a new file if the current one is full at ``t_ns``, the time (ns UTC) of the next rows.
 
         Returns

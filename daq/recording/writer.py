@@ -231,7 +231,7 @@ class RecordingWriter:
         """Count rows as lost that were never handed over, because the disk was too slow."""
         self.lost_rows += rows.rows
         self.problem = f"{self.path}: {DISK_STALLED}"
-        self._unwritten.lose(rows)
+        self._unwritten.add_lost(rows)
 
     def take_over(self, other: "RecordingWriter") -> None:
         """Record the lost rows and unwritten events of another writer, whose file could not be finished."""

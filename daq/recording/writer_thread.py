@@ -23,7 +23,7 @@ MOST_WAITING_BYTES = 128 << 20
 CATCH_UP = 2.0
 """Largest write rate of a backlog, over the rate at which its rows came: reading the buses has priority."""
 
-_Do = Callable[[], object]
+_Task = Callable[[], object]
 _Rows = tuple[NDArray[np.int64], NDArray[np.int64], Mapping[str, NDArray[Any]]]
 
 
@@ -42,7 +42,7 @@ class _State:
 class _Work:
     """Work for the thread, with size (bytes), number and duration (ns) of its rows."""
 
-    do: _Do
+    run: _Task
     bytes: int = 0
     rows: int = 0
     took_ns: int = 0
@@ -84,7 +84,7 @@ class _Chunk:
     def write(self, series: RecordingSeries | TriggeredSeries) -> None:
         """Write the content to a series."""
         if self.since is not None:
-            series.turn(self.since)
+            series.rotate(self.since)
         # Gaps first: a truncated file then lists the gaps of all rows it has.
         for gaps, found_ns in self.gaps:
             series.add_gaps(gaps, found_ns)
@@ -126,11 +126,11 @@ class QueuedSeries:
         self._chunk = _Chunk()
         self._state = _State(series.path, series.lost_rows, series.problem, 0)
         self._work: SimpleQueue[_Work | threading.Event | None] = SimpleQueue()
-        self._hurry = threading.Event()
+        self._unpaced = threading.Event()
         self._failure: BaseException | None = None
         # Bytes and rows handed over and written: each counter is changed by one thread only.
         self._put_bytes = self._put_rows = self._done_bytes = self._done_rows = 0
-        self._left_out, self._left_out_rows, self._told_rows = RowRanges(every), 0, 0
+        self._left_out, self._left_out_rows, self._reported_rows = RowRanges(every), 0, 0
         self._thread: threading.Thread | None = threading.Thread(target=self._run, name="disk", daemon=True)
         self._thread.start()
 
@@ -170,7 +170,7 @@ class QueuedSeries:
         max_ns
             Time span, ns; ``None``: no limit.
         """
-        self._do(lambda: self._series.limit(max_bytes, max_ns))
+        self._enqueue(lambda: self._series.limit(max_bytes, max_ns))
 
     def gather(self, chunk_ns: int) -> None:
         """Set the time for which rows are gathered, ns."""
@@ -184,13 +184,13 @@ class QueuedSeries:
         before_ns, after_ns
             Time before and after a trigger, ns.
         """
-        self._do(lambda: self._series.keep(before_ns, after_ns))
+        self._enqueue(lambda: self._series.keep(before_ns, after_ns))
 
     def trigger(self, t_ns: int) -> None:
         """Trigger an event at ``t_ns`` (ns UTC) in a series that writes only events."""
-        self._do(lambda: self._series.trigger(t_ns))
+        self._enqueue(lambda: self._series.trigger(t_ns))
 
-    def turn(self, t_ns: int) -> None:
+    def rotate(self, t_ns: int) -> None:
         """Allow a new file to begin before the next rows, whose first time is ``t_ns`` (ns UTC)."""
         if self._chunk.since is None:
             self._chunk.since = t_ns
@@ -216,13 +216,13 @@ class QueuedSeries:
         self._check()
         size = sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
         # Resume at half the limit: a slow disk causes a few long gaps instead of many short ones.
-        room = self._most_bytes // 2 if self._left_out else self._most_bytes
-        if self._chunk.bytes + self._put_bytes - self._done_bytes + size > room:
+        allowed_bytes = self._most_bytes // 2 if self._left_out else self._most_bytes
+        if self._chunk.bytes + self._put_bytes - self._done_bytes + size > allowed_bytes:
             self._left_out.add(stream, sync)
             self._left_out_rows += len(sync)
             return
-        self._own_up()
-        self.turn(int(t_ns[0]))
+        self._report_left_out()
+        self.rotate(int(t_ns[0]))
         self._chunk.add(stream, (sync, t_ns, raw), size)
         if self._chunk.span_ns >= self._chunk_ns:
             self._hand_over()
@@ -245,7 +245,7 @@ class QueuedSeries:
 
     def flush(self) -> None:
         """Write all rows and events to the disk; return when this is done."""
-        self._own_up()
+        self._report_left_out()
         self._hand_over()
         self._wait()
 
@@ -273,22 +273,22 @@ class QueuedSeries:
         self._end()
         self._series.__exit__(kind, error, at)
 
-    def _own_up(self) -> None:
+    def _report_left_out(self) -> None:
         """Report rows left out to the series, before the next rows."""
         if not self._left_out:
             return
         left_out, rows = self._left_out.take(), self._left_out_rows
 
-        def tell() -> None:
+        def report() -> None:
             self._series.leave_out(left_out)
-            self._told_rows = rows
+            self._reported_rows = rows
 
-        self._do(tell)
+        self._enqueue(report)
 
-    def _do(self, do: _Do) -> None:
+    def _enqueue(self, run: _Task) -> None:
         """Run a function in the thread, after all rows gathered so far."""
         self._hand_over()
-        self._put(_Work(do))
+        self._put(_Work(run))
 
     def _hand_over(self) -> None:
         chunk, self._chunk = self._chunk, _Chunk()
@@ -309,15 +309,15 @@ class QueuedSeries:
     def _wait(self) -> None:
         """Wait until all work is done."""
         done = threading.Event()
-        self._hurry.set()
+        self._unpaced.set()
         self._work.put(done)
         done.wait()
-        self._hurry.clear()
+        self._unpaced.clear()
         self._check()
 
     def _end(self) -> None:
         if self._thread is not None:
-            self._hurry.set()
+            self._unpaced.set()
             self._work.put(None)
             self._thread.join()
             self._thread = None
@@ -330,15 +330,15 @@ class QueuedSeries:
             began = time.monotonic_ns()
             try:
                 if self._failure is None:
-                    work.do()
+                    work.run()
             except BaseException as error:
                 # Raised when the next work is handed over.
                 self._failure = error
             series = self._series
-            self._state = _State(series.path, series.lost_rows, series.problem, self._told_rows)
+            self._state = _State(series.path, series.lost_rows, series.problem, self._reported_rows)
             self._done_bytes += work.bytes
             self._done_rows += work.rows
             if not self._work.empty():
                 # While SYNC pauses, a chunk may take long to fill.
                 wanted_ns = min(work.took_ns, self._chunk_ns) / CATCH_UP
-                self._hurry.wait(1e-9 * max(0.0, wanted_ns - (time.monotonic_ns() - began)))
+                self._unpaced.wait(1e-9 * max(0.0, wanted_ns - (time.monotonic_ns() - began)))

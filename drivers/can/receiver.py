@@ -176,7 +176,7 @@ class Receiver:
         try:
             got = entry.bus.receive(entry.batch)
             if got and entry.down_since is not None:
-                self._back(k, entry)
+                self._report_up(k, entry)
             return got
         except BusDown as error:
             if entry.down_since is None:
@@ -193,15 +193,15 @@ class Receiver:
                 return
         else:
             try:
-                fresh = entry.open()
+                reopened = entry.open()
             except ArmidentError:
                 return
             entry.lost_before += entry.bus.drops()
             entry.bus.close()
-            entry.bus = fresh
-        self._back(k, entry)
+            entry.bus = reopened
+        self._report_up(k, entry)
 
-    def _back(self, k: int, entry: _BusState) -> None:
+    def _report_up(self, k: int, entry: _BusState) -> None:
         assert entry.down_since is not None
         seconds = time.monotonic() - entry.down_since
         entry.down_since = None

@@ -9,8 +9,8 @@ from armident.configs.schema.session import Bus
 from armident.drivers.can.filtered_socket import FilteredSocket
 from armident.drivers.canopen.objects import COB_HEARTBEAT
 
-HELD_UP_S = 0.1
-"""Interval of updates (s) above which the consumer is taken to have been held up."""
+DELAYED_S = 0.1
+"""Interval of updates (s) above which the consumer counts as delayed."""
 
 
 class HeartbeatSocket:
@@ -40,8 +40,8 @@ class HeartbeatSocket:
         for batch in self._socket.read():
             # Stamps are wall-clock times, which may be stepped: only their age is used.
             ages = (time.time_ns() - batch["t_ns"]) * 1e-9
-            came = time.monotonic() - np.maximum(ages, 0.0)
-            found += zip((batch["can_id"] - COB_HEARTBEAT).tolist(), came.tolist(), strict=True)
+            received = time.monotonic() - np.maximum(ages, 0.0)
+            found += zip((batch["can_id"] - COB_HEARTBEAT).tolist(), received.tolist(), strict=True)
         return found
 
     def close(self) -> None:
@@ -52,8 +52,8 @@ class HeartbeatSocket:
 class HeartbeatMonitor:
     """Time without heartbeat of each drive.
 
-    A machine that was held up stamps frames late or loses them. If the consumer was held up, the longest pause of all
-    drives in that time does not count as silence of any drive. Each silence is shortened in this way only once.
+    A delayed machine stamps frames late or loses them. If the consumer was delayed, the longest pause of all drives in
+    that time does not count as silence of any drive. Each silence is shortened in this way only once.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class HeartbeatMonitor:
     def __init__(self, drives: Iterable[str], now: float) -> None:
         self._last = dict.fromkeys(drives, now)
         self._ended = dict.fromkeys(self._last, 0.0)
-        self._excused: set[str] = set()
+        self._shortened: set[str] = set()
         self.updated = now
         """Time of the last update, s, monotonic clock."""
 
@@ -86,11 +86,11 @@ class HeartbeatMonitor:
         times = [before, *(min(max(at, before), now) for _, at in ordered), now]
         k = max(range(len(times) - 1), key=lambda i: times[i + 1] - times[i])
         pause = times[k + 1] - times[k]
-        held_up = now - before > HELD_UP_S and pause > HELD_UP_S
+        delayed = now - before > DELAYED_S and pause > DELAYED_S
         self._take(ordered[:k])
-        for drive in self._last if held_up else ():
-            if drive not in self._excused:
-                self._excused.add(drive)
+        for drive in self._last if delayed else ():
+            if drive not in self._shortened:
+                self._shortened.add(drive)
                 self._last[drive] += pause
         self._take(ordered[k:])
 
@@ -98,7 +98,7 @@ class HeartbeatMonitor:
         for drive, at in heartbeats:
             self._ended[drive] = max(self._ended[drive], at - self._last[drive])
             self._last[drive] = max(self._last[drive], at)
-            self._excused.discard(drive)
+            self._shortened.discard(drive)
 
     def silence(self, drive: str) -> float:
         """Time since the last heartbeat of a drive at the last update, s.

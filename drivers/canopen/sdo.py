@@ -70,11 +70,11 @@ class DriveSdo:
         except SdoAbortedError as error:
             raise ConfigError(f"{self.label}: refuses to read {_name(index, sub)}: {_abort(error)}") from error
         except SdoCommunicationError as error:
-            raise self._silent() from error
+            raise self._no_answer() from error
         except (struct.error, IndexError) as error:
-            raise self._garbled(index, sub) from error
+            raise self._invalid_answer(index, sub) from error
         except (can.CanError, OSError) as error:
-            raise self._down(error) from error
+            raise self._bus_down(error) from error
         return int(struct.unpack("<" + code, data)[0])
 
     def poll(self, index: int, sub: int, code: str, answer_s: float) -> int | None:
@@ -139,11 +139,11 @@ class DriveSdo:
         except SdoAbortedError as error:
             raise ConfigError(f"{self.label}: refuses {_name(index, sub)} = {value:X}h: {_abort(error)}") from error
         except SdoCommunicationError as error:
-            raise self._silent() from error
+            raise self._no_answer() from error
         except (struct.error, IndexError) as error:
-            raise self._garbled(index, sub) from error
+            raise self._invalid_answer(index, sub) from error
         except (can.CanError, OSError) as error:
-            raise self._down(error) from error
+            raise self._bus_down(error) from error
 
     def write(self, index: int, sub: int, value: int, code: str) -> None:
         """Write an object and read it back.
@@ -167,7 +167,7 @@ class DriveSdo:
         if found != value:
             raise ConfigError(f"{self.label}: {_name(index, sub)} reads {found:X}h after writing {value:X}h")
 
-    def _silent(self) -> ArmidentError:
+    def _no_answer(self) -> ArmidentError:
         if self._bus.interface == "socketcan":
             # A bus that is down looks like a silent drive; opening it distinguishes the two.
             try:
@@ -179,10 +179,10 @@ class DriveSdo:
             "is the drive on, and the node id right?"
         )
 
-    def _garbled(self, index: int, sub: int) -> ConfigError:
+    def _invalid_answer(self, index: int, sub: int) -> ConfigError:
         return ConfigError(f"{self.label}: its answer about {_name(index, sub)} is no SDO answer (CiA 301)")
 
-    def _down(self, error: Exception) -> BusDown:
+    def _bus_down(self, error: Exception) -> BusDown:
         return BusDown(f"bus {self._bus.channel}: {error}")
 
 

@@ -66,7 +66,7 @@ class SyncStats:
     overruns
         Number of SYNCs that were late by more than a period.
     skipped
-        Number of periods by which the time grid was moved because the producer was held up.
+        Number of periods by which the time grid was moved because the producer was delayed.
     realtime
         ``True`` if the loop ran with real-time priority.
     unsent

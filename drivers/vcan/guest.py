@@ -30,7 +30,7 @@ GRACE_S = 15.0
 """Time for a command to end after a signal, before the guest is killed, s."""
 NICENESS = -10
 """Nice value of the guest."""
-MALLOC_KEEPS = "glibc.malloc.mmap_threshold=1073741824:glibc.malloc.trim_threshold=1073741824"
+MALLOC_TUNABLES = "glibc.malloc.mmap_threshold=1073741824:glibc.malloc.trim_threshold=1073741824"
 """Tunables of glibc that keep freed memory in the process, because page faults are slow in a guest."""
 CACHES = {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib", "XDG_CACHE_HOME": "guest"}
 """Environment variables of cache folders, and their default folders in the cache of armident. The user's own caches are
@@ -90,11 +90,11 @@ def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable:
     environment["PATH"] = f"{environment.get('PATH', os.defpath)}:/usr/sbin:/sbin:{root / 'bin'}"
     environment["ARMIDENT_GUEST"] = "1"
     # A page fault costs a guest many times what it costs the host: let freed memory stay with its process.
-    environment.setdefault("GLIBC_TUNABLES", MALLOC_KEEPS)
+    environment.setdefault("GLIBC_TUNABLES", MALLOC_TUNABLES)
     for cache in caches:
         cache.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        cpu = stack.enter_context(_cpu_of_our_own())
+        cpu = stack.enter_context(_reserved_cpu())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="armident-vcan-")))
         _write_scripts(folder, root, command, environment, buses, [folder, Path.cwd(), *caches, *writable])
         _boot(folder, root, cpu, memory)
@@ -136,7 +136,7 @@ def _write_scripts(
 
 
 @contextmanager
-def _cpu_of_our_own() -> Iterator[int]:
+def _reserved_cpu() -> Iterator[int]:
     """Reserve one CPU that no other guest uses, if there is one.
 
     The guest's kernel and its processes switch at every system call, which takes many times as long between CPUs.
@@ -158,7 +158,7 @@ def _boot(folder: Path, root: Path, cpu: int, memory: str) -> None:
     """Boot the guest and wait until it has powered off."""
     libc = ctypes.CDLL(None, use_errno=True)
 
-    def pin_and_tie() -> None:
+    def set_up_child() -> None:
         os.sched_setaffinity(0, {cpu})
         libc.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
         # A bus at 5 kHz needs priority over other processes; only root may raise it. Where the scheduler groups
@@ -188,7 +188,7 @@ def _boot(folder: Path, root: Path, cpu: int, memory: str) -> None:
                 stdout=log,
                 stderr=log,
                 pass_fds=passed,
-                preexec_fn=pin_and_tie,
+                preexec_fn=set_up_child,
                 start_new_session=True,
                 env={**os.environ, "TMPDIR": str(_memory_folder())},
             )
@@ -216,9 +216,9 @@ def _forwarding(guest: "subprocess.Popen[bytes]", channel: int) -> Iterator[None
         os.write(channel, signal.Signals(number).name.removeprefix("SIG").encode() + b"\n")
         if not deadline:
             deadline.append(time.monotonic() + GRACE_S)
-            threading.Thread(target=switch_off, daemon=True).start()
+            threading.Thread(target=kill_in_time, daemon=True).start()
 
-    def switch_off() -> None:
+    def kill_in_time() -> None:
         try:
             guest.wait(max(0.0, deadline[0] - time.monotonic()))
         except subprocess.TimeoutExpired:

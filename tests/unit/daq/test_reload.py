@@ -142,7 +142,7 @@ def test_no_row_is_lost_if_rotation_is_switched_on_during_a_capture(tmp_path: Pa
                 options = session.recording.model_copy(update={"rotate_minutes": 0.1 / 60})
                 writer.limit(*limits(options))
             part = slice(first, first + 100)
-            writer.turn(int(samples.t_ns[first]))
+            writer.rotate(int(samples.t_ns[first]))
             raw = {name: values[part] for name, values in samples.raw.items()}
             writer.append("samples", samples.sync[part], samples.t_ns[part], raw)
         writer.close({})

@@ -36,7 +36,7 @@ def feed(
     samples = recording.samples
     for first in range(span[0], samples.sync.size if span[1] < 0 else span[1], step):
         part = slice(first, first + step)
-        series.turn(int(samples.t_ns[part][0]))
+        series.rotate(int(samples.t_ns[part][0]))
         rows = {name: values[part] for name, values in samples.raw.items()}
         series.append("samples", samples.sync[part], samples.t_ns[part], rows)
         for number in triggers:
@@ -140,7 +140,7 @@ def test_a_disk_that_refuses_is_told_and_tried_again(tmp_path: Path) -> None:
     series = TriggeredSeries(refusing, BEFORE_NS, 10**12)
     feed(series, recording, [1000])
     assert series.problem == "no space"
-    series.turn(int(recording.samples.t_ns[-1]) + 11_000_000_000)
+    series.rotate(int(recording.samples.t_ns[-1]) + 11_000_000_000)
     assert tried == [1, 1]
     series.close({})
     # The file has the last rows; older ones had left the ring buffer.

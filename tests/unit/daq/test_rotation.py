@@ -42,7 +42,7 @@ def write(series: RecordingSeries | QueuedSeries, recording: Recording, step: in
     samples, demand = recording.streams["samples"], recording.streams["demand"]
     for first in range(0, samples.sync.size, step):
         part = slice(first, first + step)
-        finished.append(series.turn(int(samples.t_ns[part][0])))
+        finished.append(series.rotate(int(samples.t_ns[part][0])))
         for stream in (samples, demand):
             here = (stream.sync >= samples.sync[part][0]) & (stream.sync <= samples.sync[part][-1])
             rows = {name: values[here] for name, values in stream.raw.items()}

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from armident.configs import load_robot, load_session
 from armident.configs.units import counts_per_si
-from armident.daq.capture.setpoints import REST_SPAN_S, REST_STEP_S, SHAKE_COUNTS, StandstillDetector
+from armident.daq.capture.setpoints import NOISE_COUNTS, REST_SPAN_S, REST_STEP_S, StandstillDetector
 
 SESSION, ROBOT = load_session("tx40_cell.yaml"), load_robot("tx40.yaml")
 SPAN = round(REST_SPAN_S / SESSION.sync_period)
@@ -44,7 +44,7 @@ def test_the_turning_point_of_an_oscillation_is_no_standstill(joint: int) -> Non
 
 def test_noise_of_two_encoder_counts_is_no_motion() -> None:
     standstill, rng = StandstillDetector(SESSION, ROBOT), np.random.default_rng(1)
-    seen = [standstill.update(k, rng.integers(0, round(SHAKE_COUNTS), 6, endpoint=True)) for k in range(3 * SPAN)]
+    seen = [standstill.update(k, rng.integers(0, round(NOISE_COUNTS), 6, endpoint=True)) for k in range(3 * SPAN)]
     assert set(seen[SPAN:]) == {True}
 
 

@@ -208,7 +208,7 @@ def test_rows_for_which_there_is_no_room_are_counted_and_become_gaps(
         disk.set()
         until(lambda: series.waiting_rows == 0)
         for first in range(2500, 3000, 50):
-            series.turn(int(samples.t_ns[first]))
+            series.rotate(int(samples.t_ns[first]))
             append(series, samples, first, first + 50)
             lost.append(series.lost_rows)
             until(lambda: series.waiting_rows == 0)
@@ -243,12 +243,12 @@ def test_an_event_tells_what_its_last_seconds_lack(tmp_path: Path, disk: threadi
         disk.clear()
         # The end of the first event waits for the disk, and all later work waits for it.
         for first in range(200, 2500, 50):
-            series.turn(int(recording.samples.t_ns[first]))
+            series.rotate(int(recording.samples.t_ns[first]))
             append(series, recording.samples, first, first + 50)
         assert series.lost_rows > 0
         disk.set()
         until(lambda: series.waiting_rows == 0)
-        series.turn(int(recording.samples.t_ns[2500]))
+        series.rotate(int(recording.samples.t_ns[2500]))
         append(series, recording.samples, 2500, 3000)
         series.trigger(int(recording.samples.t_ns[2999]))
         series.flush()
