@@ -25,7 +25,7 @@ INTERRUPTED = 130
 
 EPILOG = (
     "Exit codes: 0 done, 2 usage or configuration, 3 the data cannot support the request, "
-    "4 changed or unexplained, 1 anything else."
+    "4 changed or unexplained, 1 any other error."
 )
 
 
@@ -107,7 +107,7 @@ def _reported(function: Callable[..., Any]) -> Callable[..., Any]:
             if isinstance(error, ArmidentError):
                 print(f"armident: {_one_line(error)}", file=sys.stderr)
                 raise typer.Exit(error.exit_code) from None
-            hint = f" (--debug or {DEBUG_VARIABLE}=1 shows where)"
+            hint = f" (--debug or {DEBUG_VARIABLE}=1 prints the traceback)"
             print(f"armident: {type(error).__name__}: {_one_line(error)}{hint}", file=sys.stderr)
             raise typer.Exit(1) from None
 

@@ -71,7 +71,7 @@ def import_(
         Path | None, typer.Option("--effort", help="Second CSV file with one effort column per joint.")
     ] = None,
     motor_side: Annotated[
-        bool, typer.Option("--motor-side", help="Values are those of the motors, not of the joints.")
+        bool, typer.Option("--motor-side", help="Values are on the motor side, not on the joint side.")
     ] = False,
     rate: Annotated[
         float | None, typer.Option("--rate", help="Sampling rate, Hz; default: column t.", min=0.001)

@@ -96,7 +96,7 @@ def _bus_load(session: SessionConfig, config: str | Path) -> Check:
         if bus.bitrate is not None
     ]
     if not speeds:
-        return Check("bus load", "ok", "a virtual bus has no bit rate to fill")
+        return Check("bus load", "ok", "virtual bus, without a bit rate to exceed")
     try:
         check_fits(session, str(config))
     except ConfigError as error:
@@ -109,7 +109,9 @@ def _interface(bus: Bus) -> Iterator[Check]:
     name = bus.channel
     if bus.interface == "udp_multicast":
         yield Check(
-            "bus", "warning", "UDP multicast instead of CAN: frames may be lost, times are not those of the kernel"
+            "bus",
+            "warning",
+            "UDP multicast instead of CAN, which may lose frames and has no kernel times; use it for trials only",
         )
         return
     if not have_socketcan():
@@ -190,7 +192,7 @@ def _clock() -> Check:
         return Check("clock", "warning", f"source {name}; its state is unknown: {error.strerror}")
     if not state.synchronised:
         return Check(
-            "clock", "warning", f"source {name}, not synchronised: run chrony, or times of several machines drift apart"
+            "clock", "warning", f"source {name}, not synchronised: times of several machines drift apart; run chrony"
         )
     error_ms, offset = state.error_us * 1e-3, state.offset_us
     return Check("clock", "ok", f"source {name}, synchronised, {offset:+.1f} us off, error about {error_ms:.3g} ms")

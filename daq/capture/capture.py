@@ -130,7 +130,9 @@ def capture(
         if trigger is None:
             log.info("recording to %s", writer.path, extra={"event": "capture_start", "file": writer.path})
         else:
-            log.info("keeping the last %g s; written on %s", trigger.before_s, ", ".join(trigger.events))
+            log.info(
+                "keeping the last %g s in memory; a file is written on: %s", trigger.before_s, ", ".join(trigger.events)
+            )
         notifier.ready(f"{session.cell}: recording")
         failure = recorder.record()
         notifier.stopping()

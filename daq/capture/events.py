@@ -123,7 +123,7 @@ class EventHandler:
         """Warn once of every TPDO whose length differs from its mapping."""
         for stream, joint in sorted(set(self._assembler.wrong_lengths) - self._reported):
             self._reported.add((stream, joint))
-            text = f"{joint}: TPDO of {stream} has another length than mapped; was its mapping changed?"
+            text = f"{joint}: TPDO of {stream} has another length than mapped; check its PDO mapping"
             self._sink.mark("note", self._sync, text)
             log.warning("%s", text, extra={"event": "mapping", "axis": joint, "stream": stream, "sync": self._sync})
 

@@ -136,9 +136,9 @@ class Health:
         lost, before = self._sink.lost_rows, self._lost_rows
         self._lost_rows = lost
         if lost > before and self._writing:
-            log.warning("rows are not being written, streaming goes on: %s", self._sink.problem)
+            log.warning("rows cannot be written, streaming continues: %s", self._sink.problem)
         elif lost == before and not self._writing:
-            log.info("writing again; %d rows were not written", lost)
+            log.info("rows are written again; %d rows were lost", lost)
         self._writing = lost == before
         waits_s = self._sink.waiting_rows * self._plan.session.sync_period
         if waits_s > SLOW_DISK_S and not self._slow:

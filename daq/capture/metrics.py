@@ -53,7 +53,7 @@ class Metrics:
         try:
             self._server, self._thread = start_http_server(port, address, registry)
         except OSError as error:
-            raise ConfigError(f"metrics: {address}:{port} cannot be listened on: {error.strerror}") from error
+            raise ConfigError(f"metrics: cannot listen on {address}:{port}: {error.strerror}") from error
         self._collected = collected
 
     @property

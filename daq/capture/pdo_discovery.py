@@ -98,7 +98,7 @@ def bus_statistics(channel: str, frames: Frames) -> BusStatistics:
     """
     is_sync = frames["can_id"] == COB_SYNC
     if np.count_nonzero(is_sync) < FEWEST_FRAMES:
-        raise ConfigError(f"bus {channel}: no SYNC received; TPDOs are discovered by their interval in SYNCs")
+        raise ConfigError(f"bus {channel}: no SYNC received; start its SYNC producer")
     period_us = float(np.median(np.diff(frames["t_ns"][is_sync]))) / 1000
     number = np.cumsum(is_sync)
     identifiers = {}
@@ -141,8 +141,8 @@ def with_sent_streams(session: SessionConfig, buses: list[BusStatistics]) -> Ses
     for bus in buses:
         if abs(bus.period_us / session.sync.period_us - 1) > PERIOD_TOLERANCE:
             raise ConfigError(
-                f"bus {bus.channel}: SYNC comes every {bus.period_us:.0f} us, "
-                f"the session says sync.period_us {session.sync.period_us}"
+                f"bus {bus.channel}: SYNC has a period of {bus.period_us:.0f} us, "
+                f"but sync.period_us of the session is {session.sync.period_us}"
             )
     by_channel = {bus.channel: bus for bus in buses}
     streams: dict[str, Stream] = {}
@@ -153,21 +153,25 @@ def with_sent_streams(session: SessionConfig, buses: list[BusStatistics]) -> Ses
             continue
         silent = [drive.joint for drive, stream in zip(session.drives, found, strict=True) if stream is None]
         if silent:
-            raise ConfigError(f"TPDO{tpdo}: {present[0].joint} sends it, {', '.join(silent)} not; all drives have to")
+            raise ConfigError(
+                f"TPDO{tpdo}: sent by {present[0].joint}, but not by {', '.join(silent)}; map it on all drives"
+            )
         first = found[0]
         for drive, stream in zip(session.drives, found, strict=True):
             if stream != first:
-                raise ConfigError(f"TPDO{tpdo}: {drive.joint} sends something else than {session.drives[0].joint}")
+                raise ConfigError(
+                    f"TPDO{tpdo}: {drive.joint} has another mapping than {session.drives[0].joint}; map all alike"
+                )
         assert first is not None
         name = next((n for n, s in session.streams.items() if s.tpdo == tpdo), None)
         if name is None:
             name = "samples" if first.every == 1 and "samples" not in streams else f"tpdo{tpdo}"
         streams[name] = first
-        source = "as the session says" if session.streams.get(name) == first else "as the EDS says"
+        source = "as in the session" if session.streams.get(name) == first else "as in the EDS"
         objects, every = ", ".join(first.objects), max(first.every, first.pack)
         log.info("TPDO%d is %s: %s on every %d. SYNC, %s", tpdo, name, objects, every, source)
     if "samples" not in streams or streams["samples"].every != 1:
-        raise ConfigError("no TPDO comes on every SYNC: there is nothing to record as samples")
+        raise ConfigError("no drive sends a TPDO on every SYNC; a recording needs one for its samples")
     return session.model_copy(update={"streams": streams})
 
 
@@ -188,12 +192,12 @@ def _stream(session: SessionConfig, drive: DriveNode, tpdo: int, bus: BusStatist
         if stream.tpdo == tpdo and same:
             return stream
     if isinstance(objects, str):
-        raise ConfigError(f"{sender}: no stream of the session agrees, and {objects}")
+        raise ConfigError(f"{sender}: no stream of the session matches, and {objects}")
     size = TpdoLayout.of(objects, "EDS", 1, fd).size
     if fd_length(size) != length:
         raise ConfigError(
-            f"{sender}: {drive.eds.name} maps {size} bytes by default ({', '.join(objects) or 'nothing'}) and the session "
-            "has no stream of this length and interval; add the objects of the TPDO to streams"
+            f"{sender}: {drive.eds.name} maps {size} bytes by default ({', '.join(objects) or 'nothing'}), "
+            "and no stream has this length and interval; add the objects of the TPDO to streams"
         )
     if session.sync.counter % sent.every:
         raise ConfigError(f"{sender}: its interval does not divide sync.counter {session.sync.counter}")

@@ -114,12 +114,12 @@ def load_plan(
     check_fits(session, str(config))
     if sniff_s is not None:
         if not listen_only:
-            raise ConfigError("--sniff: only with --listen-only; otherwise drives are configured as the session says")
+            raise ConfigError("--sniff: needs --listen-only; without it, the capture maps the TPDOs itself")
         session = discover_pdos(session, sniff_s)
     trajectory = None
     if session.setpoints is not None and not listen_only:
         if session.sync.role != "producer":
-            raise ConfigError(f"{config}: setpoints need sync.role producer; only who sends SYNC can play them")
+            raise ConfigError(f"{config}: setpoints need sync.role: producer, because each set point follows a SYNC")
         trajectory = load_trajectory(session.setpoints.trajectory)
         trajectory.check(robot, str(session.setpoints.trajectory))
     directory = out if out is not None else session.recording.directory

@@ -380,7 +380,7 @@ class Recorder:
                 seen, last_s = self.sink.last_sync, time.monotonic()
                 if seen >= since and standstill.update(seen, self.sink.last_raw["position"]):
                     return
-        log.info("the arm was not seen to come to rest; its drives are disabled all the same")
+        log.info("no standstill detected after the quick stop; the drives are disabled anyway")
 
     def _await_answers(self) -> None:
         """Record until no answer is outstanding, or none has come for ``LATE_S``.

@@ -75,7 +75,7 @@ class Reloader:
             self._refuse(str(error))
             return
         self._session = session
-        what = ", ".join(changed) if changed else "nothing has changed"
+        what = ", ".join(changed) if changed else "the session has not changed"
         log.info("reloaded %s: %s", self._config, what, extra={"event": "reloaded"})
 
     def close(self) -> None:
@@ -101,13 +101,15 @@ class Reloader:
         session = load_session(self._config)
         fixed = [key for key in differences(self._session, session) if not key.startswith(CHANGEABLE)]
         if fixed:
-            raise ConfigError(f"{self._config}: {', '.join(fixed)}: cannot change while it is captured")
+            raise ConfigError(
+                f"{self._config}: {', '.join(fixed)}: cannot change during a capture; restart the capture"
+            )
         if load_robot(session.robot) != self._plan.robot:
-            raise ConfigError(f"{session.robot}: the robot cannot change while it is captured")
+            raise ConfigError(f"{session.robot}: the robot cannot change during a capture; restart the capture")
         return session
 
     def _refuse(self, why: str) -> None:
-        log.warning("not reloaded, the capture goes on as before: %s", why, extra={"event": "reload_refused"})
+        log.warning("not reloaded, the capture continues unchanged: %s", why, extra={"event": "reload_refused"})
 
 
 def differences(one: SessionConfig, other: SessionConfig) -> Iterator[str]:

@@ -68,13 +68,13 @@ class Commands:
             # The payload is decoded only after these checks: it may have any size.
             size = 0 if query.payload is None else len(query.payload)
             if not self.allowed:
-                query.reply_err("commands are not enabled: zenoh.commands in the session configuration")
+                query.reply_err("commands are not enabled; set zenoh.commands: true in the session configuration")
             elif known is None:
                 query.reply_err(f"no command {name[:40]!r}; there are {', '.join(COMMANDS)}")
             elif size > _LONGEST_TEXT:
                 query.reply_err(f"a text of {size} bytes is longer than {_LONGEST_TEXT}")
             elif self._waiting.qsize() >= _MOST_WAITING:
-                query.reply_err(f"{_MOST_WAITING} commands are waiting already")
+                query.reply_err(f"{_MOST_WAITING} commands are waiting already; try again later")
             else:
                 text = "" if query.payload is None else bytes(query.payload).decode(errors="replace")
                 self._waiting.put(Command(known, text))

@@ -86,7 +86,7 @@ class MotionMonitor:
 
     def __init__(self, session: SessionConfig, robot: RobotConfig, limits: Limits) -> None:
         if session.setpoints is None:
-            raise ConfigError("setpoints: a session without them moves nothing, there is nothing to guard")
+            raise ConfigError("setpoints: missing, so the arm does not move; the guard needs a session with set points")
         self._robot, self._limits, n = robot, limits, robot.n
         shape = len(session.all_buses), IDENTIFIERS
         self._kind, self._joint = np.full(shape, -1, np.int64), np.zeros(shape, np.int64)
@@ -198,7 +198,7 @@ class MotionMonitor:
             return f"{joint.name}: its drive has left the NMT state operational (state {int(found)})"
         if code == SILENT:
             return f"{joint.name}: no heartbeat for {found:.2f} s"
-        return f"no SYNC for {found:.2f} s in the middle of the motion; has the capture died?"
+        return f"no SYNC for {found:.2f} s during the motion; check the capture"
 
 
 def _byte_offsets(stream: Stream) -> dict[str, int]:

@@ -65,7 +65,7 @@ def recording_from_log(path: Path, session: SessionConfig, robot: RobotConfig) -
             where = f" of {bus.channel}" if len(read) > 1 else ""
             raise DataError(
                 f"{path}: no SYNC ({COB_SYNC:X}h) among its {frames_of_it.size} frames{where}: "
-                "samples cannot be told apart"
+                "samples cannot be matched"
             )
     assembler = Assembler(
         [stream.bus for stream in streams],

@@ -120,7 +120,7 @@ def import_recording(
     if unknown:
         raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
     if polled and rate_hz is None:
-        raise ConfigError("--polled: say the rate of the controller's clock with --rate")
+        raise ConfigError("--polled: needs --rate, the sampling rate of the controller")
     source = _pair(path, effort, robot) if effort is not None else _load(path, robot)
     rate = rate_hz if rate_hz is not None else _rate(source, names)
     side: Side = "motor" if motor_side else "joint"
@@ -225,7 +225,7 @@ def _mat(path: Path) -> dict[str, NDArray[Any]]:
         try:
             arrays: dict[str, Any] = loadmat(path)
         except NotImplementedError as error:
-            raise ValueError("MAT version 7.3 is not read; save it with -v7") from error
+            raise ValueError("MAT version 7.3 is not supported; save it with -v7") from error
         return arrays
 
     try:
@@ -340,7 +340,7 @@ def _pick(source: Source, quantity: str, n: int, names: Mapping[str, str]) -> ND
         )
         return np.ascontiguousarray(values)
     if quantity in names:
-        raise DataError(f"{source.path}: nothing named {names[quantity]!r}; found {', '.join(source.table)}")
+        raise DataError(f"{source.path}: no array named {names[quantity]!r}; found {', '.join(source.table)}")
     return None
 
 
@@ -356,7 +356,7 @@ def _rate(source: Source, names: Mapping[str, str]) -> float:
     """Return the sampling rate from the time column, 1/s."""
     times = _pick(source, "time", 1, names)
     if times is None:
-        raise DataError(f"{source.path}: no time column t; say the sampling rate with --rate")
+        raise DataError(f"{source.path}: no time column t; give the sampling rate with --rate")
     steps = np.diff(times[:, 0])
     if steps.size == 0:
         raise DataError(f"{source.path}: a single row is not a recording")
@@ -369,7 +369,7 @@ def _rate(source: Source, names: Mapping[str, str]) -> float:
         k = int(uneven[0])
         raise DataError(
             f"{source.place(k + 1, 't')}: a step of {steps[k]:.6g} s where {median:.6g} s is usual; "
-            "say the sampling rate with --rate if the samples are even"
+            "give the sampling rate with --rate if the samples are even"
         )
     return float(steps.size / (times[-1, 0] - times[0, 0]))
 
@@ -417,6 +417,6 @@ def _check_demand(path: Path, robot: RobotConfig, demand: NDArray[np.float64], p
         joint, moved, wanted = robot.joints[k], np.ptp(position[:, k]), np.ptp(demand[:, k])
         if moved > _MOVED_SHARE * np.ptp(joint.limits.position):
             raise DataError(
-                f"{path}: {joint.name} did not follow its demand, which spans {wanted:.4g} where the position spans "
-                f"{moved:.4g}: expected the same unit; --map demand={OMITTED} leaves it out"
+                f"{path}: {joint.name} moved by {moved:.4g}, but its demand by {wanted:.4g}: "
+                f"give both in the same unit, or omit the demand with --map demand={OMITTED}"
             )

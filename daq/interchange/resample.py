@@ -70,9 +70,7 @@ def onto_even_clock(raw: Mapping[str, Floats]) -> EvenClockSamples:
     changed = np.append(True, np.any(rows[1:] != rows[:-1], axis=1))
     index = np.flatnonzero(changed)
     if index.size <= WINDOW:
-        raise DataError(
-            f"only {index.size} of {rows.shape[0]} rows differ from the row before: too few to find a clock"
-        )
+        raise DataError(f"only {index.size} of {rows.shape[0]} rows differ from the row before: too few to resample")
     advances = _advances(raw["position"][index], np.diff(index))
     # The same position with another effort is still the same sample.
     kept = np.append(True, advances > 0)
@@ -94,13 +92,13 @@ def _advances(q: Floats, rows: Ints) -> Ints:
     power = np.sum(median_steps**2, axis=1)
     moving = power > SLOW_SHARE**2 * power.max()
     if not moving.any():
-        raise DataError("nothing moves: the clock of the controller cannot be found")
+        raise DataError("no joint moves: the sampling clock cannot be determined; omit --polled")
     advance = np.sum(steps[moving] * median_steps[moving], axis=1) / power[moving]
     ambiguous = float(np.mean(np.abs(advance - np.round(advance)) > AMBIGUOUS))
     if ambiguous > MOST_AMBIGUOUS:
         raise DataError(
-            f"{100 * ambiguous:.0f} % of the rows are not a whole number of samples after the row before: "
-            "not read from a controller with an even clock"
+            f"{100 * ambiguous:.0f} % of the rows do not fit an even clock; "
+            "omit --polled if they were not polled from a controller"
         )
     ticks = rows.astype(np.int64)
     ticks[moving] = np.maximum(0, np.round(advance)).astype(np.int64)

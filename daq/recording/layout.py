@@ -138,7 +138,7 @@ class StreamLayout:
             dtypes = tuple(_text(f["dtype"]) for f in data["fields"])
             layout = cls(_text(data["name"]), data["every"], tuple(map(_text, data["joints"])), fields, dtypes)
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-            raise DataError(f"a stream layout that cannot be understood: {_short(error)}") from error
+            raise DataError(f"an invalid stream layout: {_short(error)}") from error
         for what, values, known in (
             ("quantity", [f.quantity for f in fields], get_args(Quantity)),
             ("side", [f.side for f in fields], get_args(Side)),
@@ -150,7 +150,7 @@ class StreamLayout:
         if len(set(names)) < len(names) or len(set(layout.joints)) < len(layout.joints):
             raise DataError("a stream layout that names a field or a joint twice")
         if type(layout.every) is not int or layout.every < 1 or not fields or not layout.joints:
-            raise DataError("a stream layout without fields or joints, or that never comes")
+            raise DataError("a stream layout without fields, joints or interval")
         return layout
 
     @cached_property
@@ -271,7 +271,7 @@ class StreamLayout:
         differing = octets[:whole].view(np.uint64) ^ template[:whole].view(np.uint64)
         differing &= mask[:whole].view(np.uint64)
         if differing.any() or ((octets[whole:] ^ template[whole:]) & mask[whole:]).any():
-            raise DataError(f"messages of topic {self.topic} are not laid out as their channel says")
+            raise DataError(f"messages of topic {self.topic} do not have the layout of their channel")
         for field in self.fields:
             values = raw[field.name]
             for j in range(len(self.joints)):

@@ -180,7 +180,9 @@ def join_parts(parts: "Sequence[Recording]") -> "Recording":
         pieces = [part.streams[name] for part in parts if name in part.streams]
         sync = np.concatenate([piece.sync for piece in pieces])
         if len(pieces) != len(parts) or np.any(np.diff(sync) <= 0):
-            raise DataError(f"{last.path}: stream {name} does not go on from file to file; are they of one capture?")
+            raise DataError(
+                f"{last.path}: stream {name} does not continue the file before; join the files of one capture in order"
+            )
         raw = {field: np.concatenate([piece.raw[field] for piece in pieces]) for field in stream.fields}
         streams[name] = replace(stream, sync=sync, t_ns=np.concatenate([piece.t_ns for piece in pieces]), raw=raw)
     missing = "; ".join(part.missing for part in parts if part.missing is not None) or None

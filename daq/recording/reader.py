@@ -115,7 +115,7 @@ class _Content:
             else:
                 self.marks.append(mark_from(entries))
         except (ValueError, RecursionError) as error:
-            raise DataError(f"topic {topic}: an event that cannot be understood: {_one_line(error)}") from error
+            raise DataError(f"topic {topic}: an invalid event: {_one_line(error)}") from error
 
 
 def _read(path: Path, mapped: mmap.mmap) -> Recording:
@@ -143,10 +143,10 @@ def _recording(path: Path, content: _Content) -> Recording:
     scan = content.scan
     head = scan.metadata.get(RECORDING)
     if head is None:
-        reason = f"no metadata {RECORDING!r}" if scan.finished else "torn before its first chunk"
+        reason = f"no metadata {RECORDING!r}" if scan.finished else "truncated before its first chunk"
         raise DataError(f"{path}: an MCAP file, but not a recording of armident ({reason})")
     if head.get("check") == CHECK and scan.head_crc is None:
-        raise DataError(f"{path}: torn before its first chunk, or its head is damaged")
+        raise DataError(f"{path}: truncated before its first chunk, or its head is damaged")
     if head.get("schema") != SCHEMA:
         raise DataError(f"{path}: a recording of schema {head.get('schema')!r}, this version reads {SCHEMA}")
     streams = {layout.name: _stream(content.rows_of(k), layout) for k, layout in scan.layouts.items()}
@@ -159,7 +159,7 @@ def _recording(path: Path, content: _Content) -> Recording:
         rate = float(head["sample_rate_hz"])
         counters = {key: int(value) for key, value in scan.metadata.get(COUNTERS, {}).items()}
     except (KeyError, ValidationError, ValueError) as error:
-        raise DataError(f"{path}: its configuration cannot be understood: {_one_line(error)}") from error
+        raise DataError(f"{path}: its configuration is invalid: {_one_line(error)}") from error
     joints = tuple(joint.name for joint in robot.joints)
     for layout in scan.layouts.values():
         if layout.joints != joints:

@@ -215,7 +215,7 @@ class _Contents:
             if not (isinstance(item, RecordItem) and item.opcode == Opcode.DATA_END):
                 self.end = item.end
         if RECORDING not in self.scan.metadata:
-            raise DataError("an MCAP file, but not a recording of armident, or torn before its first chunk")
+            raise DataError("an MCAP file, but not a recording of armident, or truncated before its first chunk")
         self._add_tail()
         missing = self.scan.missing(self._last_sync)
         self.missing = "; ".join(recovered_words(self.scan.metadata) + missing) if missing else None

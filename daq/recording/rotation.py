@@ -101,7 +101,10 @@ class RecordingSeries:
         try:
             self._writer = self._next()
         except ConfigError as error:
-            self._problem, self._not_before = f"writing on into {full.path}: {error}", t_ns + RETRY_NS
+            self._problem, self._not_before = (
+                f"no new file can be created, rows continue in {full.path}: {error}",
+                t_ns + RETRY_NS,
+            )
             return None
         self._since, self._not_before = t_ns, None
         self._finish(full)

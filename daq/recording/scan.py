@@ -250,7 +250,7 @@ class RecordingScan:
             since = "from the start" if last_sync is None else f"after SYNC {last_sync}"
             words.append(
                 f"the file was not finished: rows {since} and the counters are missing"
-                f" ({len(self._data) - self.end} bytes of a torn record left out)"
+                f" ({len(self._data) - self.end} bytes of an incomplete record left out)"
             )
         return words
 
@@ -303,7 +303,7 @@ class RecordingScan:
         except (KeyError, ValueError) as error:
             raise mcap.MalformedRecord("a checksum record without a checksum") from error
         if not 0 < size <= at or zlib.crc32(self._data[at - size : at], self.head_crc or 0) != crc:
-            raise mcap.MalformedRecord(f"the {size} bytes before byte {at} are not what was written")
+            raise mcap.MalformedRecord(f"wrong checksum of the {size} bytes before byte {at}")
         return crc
 
     def _add_channel(self, channel: Channel) -> None:
@@ -338,10 +338,10 @@ class RecordingScan:
         if layout is not None:
             count = layout.run_length(raw, at, channel_id)
             if count == 0:
-                raise DataError(f"a message of topic {layout.topic} is not as long as its channel says")
+                raise DataError(f"a message of topic {layout.topic} has another length than its channel states")
             return MessageRun(channel_id, at, at + count * layout.record[0].itemsize, count)
         if channel_id not in self.channels:
-            raise mcap.MalformedRecord(f"messages of a channel {channel_id} that this file has not")
+            raise mcap.MalformedRecord(f"messages of a channel {channel_id} that the file does not define")
         return MessageRun(channel_id, at, end, 1)
 
 

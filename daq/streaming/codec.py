@@ -100,7 +100,7 @@ def decode_block(data: bytes) -> Block:
         raise DataError(f"a block of version {version}, this program reads {VERSION}")
     body = memoryview(data)[_HEAD.size :]
     if head_size > min(len(body), _LARGEST_HEAD):
-        raise DataError("a block shorter than its head says")
+        raise DataError("a block shorter than its head states")
     if zlib.crc32(body) != crc:
         raise DataError("a block whose checksum is wrong")
     try:
@@ -108,7 +108,7 @@ def decode_block(data: bytes) -> Block:
         sequence, rows = _count(head["sequence"]), _count(head["rows"])
         layout = StreamLayout.from_json(json.dumps(head["layout"]))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DataError(f"a block whose head cannot be understood: {_short(error)}") from error
+        raise DataError(f"a block with an invalid head: {_short(error)}") from error
     shape = rows, len(layout.joints)
     dtypes = [np.dtype(dtype).newbyteorder("<") for dtype in layout.dtypes]
     size = rows * (16 + sum(dtype.itemsize for dtype in dtypes) * len(layout.joints))
@@ -156,7 +156,7 @@ def decode_event(data: bytes) -> dict[str, Any]:
     needed = _NEEDED.get(event["kind"], {})
     for key, kinds in needed.items():
         if key not in event or not isinstance(event[key], kinds) or isinstance(event[key], bool):
-            raise DataError(f"an event {event['kind']} whose {key!r} is missing or cannot be understood")
+            raise DataError(f"an event {event['kind']} whose {key!r} is missing or invalid")
     # Listeners use the name of the capture as a file name.
     if "capture" in needed and not _CAPTURE.fullmatch(event["capture"]):
         raise DataError(f"an event of a capture named {event['capture']!r:.60}")
@@ -264,20 +264,20 @@ def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str
         metadata = {str(key): str(value) for key, value in start["metadata"].items()}
         path = Path(end["paths"][-1]) if end["paths"] else None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-        raise DataError(f"an event that cannot be understood: {_short(error)}") from error
+        raise DataError(f"an invalid event: {_short(error)}") from error
     if not 0.0 < rate < math.inf:
-        raise DataError(f"an event that cannot be understood: a rate of {rate} samples/s")
+        raise DataError(f"an invalid event: a rate of {rate} samples/s")
     joints = tuple(joint.name for joint in robot.joints)
     if {layout.joints for layout in layouts} != {joints} or len({la.name for la in layouts}) < len(layouts):
-        raise DataError("an event that cannot be understood: streams of other joints than the robot's")
+        raise DataError("an invalid event: its streams have other joints than its robot")
     if "samples" not in {layout.name for layout in layouts}:
-        raise DataError("an event that cannot be understood: no stream of samples")
+        raise DataError("an invalid event: no stream of samples")
     by_number = {block.sequence: block for block in blocks if 0 <= block.sequence < total}
     ordered = [by_number[k] for k in sorted(by_number)]
     known = {layout.name: layout for layout in layouts}
     for block in ordered:
         if known.get(block.layout.name) != block.layout:
-            raise DataError(f"a block of stream {block.layout.name!r} is not laid out as the start event says")
+            raise DataError(f"a block of stream {block.layout.name!r} does not have the layout of the start event")
     lost = total - len(by_number)
     return Recording(
         path=path,

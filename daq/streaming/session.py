@@ -82,7 +82,8 @@ def open_session(session: SessionConfig, role: Role) -> zenoh.Session:
     except zenoh.ZError as error:
         place = ", ".join(session.zenoh.listen) or endpoints(session).get(role, "")
         raise ConfigError(
-            f"zenoh: no session as {role} at {place} (does another {role} of cell {session.cell} run?): {_short(error)}"
+            f"zenoh: cannot open a session as {role} at {place}, "
+            f"is another {role} of cell {session.cell} running? ({_short(error)})"
         ) from error
 
 

@@ -287,7 +287,9 @@ class RawSocket:
             if deadline is None:
                 deadline = time.monotonic() + SEND_TIMEOUT
             elif time.monotonic() > deadline:
-                raise BusDown(f"bus {self.channel}: the transmit queue does not drain; is another node on the bus?")
+                raise BusDown(
+                    f"bus {self.channel}: the transmit queue does not drain; check that another node is on the bus"
+                )
             time.sleep(1e-3)
         return sent
 

@@ -15,7 +15,7 @@ from armident.configs.schema.session import Bus
 from armident.drivers.can.frames import ERROR_FLAG, BusDown, Filter, FrameBus, Frames
 from armident.drivers.can.socketcan import RawSocket
 
-UDP_WARNING = "udp_multicast carries the bus over UDP and may lose frames: fit for low rates, not for measuring"
+UDP_WARNING = "udp_multicast carries the bus over UDP and may lose frames: use it for trials, not for measurements"
 """Warning of programs that run on this bus."""
 
 EXTENDED_FLAG = 0x8000_0000

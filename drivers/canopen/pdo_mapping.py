@@ -51,14 +51,14 @@ def _check_scales(sdo: DriveSdo, robot: str, joint: Joint) -> None:
         if not turns or abs(increments / turns - expected) > 0.5:
             raise ConfigError(
                 f"{sdo.label}: encoder has {increments}/{turns} counts per turn (608Fh), "
-                f"robot {robot} says {expected:g}; is it another drive?"
+                f"robot {robot} says {expected:g}; check drive and robot configuration"
             )
     if joint.drive.signal == "current":
         rated = sdo.read(od.RATED_CURRENT, 0, "I")
         if rated != od.rated_milliamperes(joint.drive):
             raise ConfigError(
                 f"{sdo.label}: rated current is {rated} mA (6075h), robot {robot} says "
-                f"{od.rated_milliamperes(joint.drive)} mA; is it another drive?"
+                f"{od.rated_milliamperes(joint.drive)} mA; check drive and robot configuration"
             )
 
 

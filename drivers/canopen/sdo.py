@@ -176,11 +176,11 @@ class DriveSdo:
                 return error
         return ConfigError(
             f"{self.label}: does not answer on {self._bus.channel} within {self._timeout:g} s; "
-            "is the drive on, and the node id right?"
+            "check its supply and its node id"
         )
 
     def _invalid_answer(self, index: int, sub: int) -> ConfigError:
-        return ConfigError(f"{self.label}: its answer about {_name(index, sub)} is no SDO answer (CiA 301)")
+        return ConfigError(f"{self.label}: its answer for {_name(index, sub)} is no valid SDO response (CiA 301)")
 
     def _bus_down(self, error: Exception) -> BusDown:
         return BusDown(f"bus {self._bus.channel}: {error}")

@@ -107,7 +107,7 @@ def test_the_default_mapping_of_an_eds_is_discovered_and_nothing_is_sent(vcan_bu
     with checked_silence(vcan_bus, 6):
         code, out, err = listening(vcan_bus, tmp_path, "--sniff", "1", drives=drives)
     assert code == 0, err
-    assert "TPDO1 is samples: position, current on every 1. SYNC, as the EDS says" in err
+    assert "TPDO1 is samples: position, current on every 1. SYNC, as in the EDS" in err
     recording = read_recording(json.loads(out)["recording"])
     assert sorted(recording.samples.raw) == ["current", "position"]
     assert recording.counters["samples.rows"] >= 300
@@ -126,7 +126,7 @@ def test_a_tpdo_of_another_length_than_mapped_is_detected(vcan_bus: str, tmp_pat
     with checked_silence(vcan_bus, 6):
         code, out, err = listening(vcan_bus, tmp_path)
     assert code == 0, err
-    assert "joint_1: TPDO of samples has another length than mapped; was its mapping changed?" in err
+    assert "joint_1: TPDO of samples has another length than mapped; check its PDO mapping" in err
     recording = read_recording(json.loads(out)["recording"])
     assert recording.counters["samples.rows"] == 0
     assert recording.counters["tpdo_wrong_length"] > 1000

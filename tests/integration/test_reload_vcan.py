@@ -53,7 +53,7 @@ def test_no_sync_is_lost_during_a_reload(vcan_bus: str, tmp_path: Path) -> None:
     session_file(tmp_path, vcan_bus, "reloaded", **(plain | {"heartbeat_ms": 77}))
     os.kill(process.pid, signal.SIGHUP)
     *_, refusal = lines_until(process, "not reloaded")
-    assert refusal.endswith("reloaded.yaml: heartbeat_ms: cannot change while it is captured\n")
+    assert refusal.endswith("reloaded.yaml: heartbeat_ms: cannot change during a capture; restart the capture\n")
 
     wait_for_file(tmp_path / "out", 50_000, process)
     directly = urllib.request.build_opener(urllib.request.ProxyHandler({}))

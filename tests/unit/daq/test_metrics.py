@@ -43,7 +43,7 @@ def test_health_is_served_as_counters_and_gauges_of_the_cell() -> None:
 def test_an_occupied_port_is_a_configuration_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(ConfigError, match=rf"metrics: 127\.0\.0\.1:{port} cannot be listened on: Address already"):
+        with pytest.raises(ConfigError, match=rf"metrics: cannot listen on 127\.0\.0\.1:{port}: Address already"):
             Metrics("127.0.0.1", port, {"cell": "a", "robot": "b"})
 
 

@@ -45,8 +45,8 @@ def test_streams_of_the_session_are_verified(late: float, caplog: pytest.LogCapt
     caplog.set_level(logging.INFO, "armident")
     assert discovered(received, session).streams == session.streams
     assert caplog.messages == [
-        "TPDO1 is samples: position, current, status on every 1. SYNC, as the session says",
-        "TPDO2 is demand: demand on every 5. SYNC, as the session says",
+        "TPDO1 is samples: position, current, status on every 1. SYNC, as in the session",
+        "TPDO2 is demand: demand on every 5. SYNC, as in the session",
     ]
 
 
@@ -66,11 +66,11 @@ def test_packed_samples_are_discovered_by_length_and_interval(caplog: pytest.Log
 @pytest.mark.parametrize(
     ("tpdos", "period_us", "message"),
     [
-        (six(8, 1), 1000, "SYNC comes every 1000 us, the session says sync.period_us 200"),
-        ({0x181: (8, 1)}, 200, "TPDO1: joint_1 sends it, joint_2, .* not"),
+        (six(8, 1), 1000, "SYNC has a period of 1000 us, but sync.period_us of the session is 200"),
+        ({0x181: (8, 1)}, 200, "TPDO1: sent by joint_1, but not by joint_2, "),
         (six(8, 2), 200, "181h with 8 bytes, every 2 SYNC: .* maps 2 bytes by default"),
-        (six(4, 5, 0x280), 200, "no TPDO comes on every SYNC"),
-        ({}, 200, "no TPDO comes on every SYNC"),
+        (six(4, 5, 0x280), 200, "no drive sends a TPDO on every SYNC"),
+        ({}, 200, "no drive sends a TPDO on every SYNC"),
     ],
 )
 def test_unknown_mappings_are_refused(tpdos: dict[int, tuple[int, int]], period_us: int, message: str) -> None:

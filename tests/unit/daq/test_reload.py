@@ -46,7 +46,7 @@ class Capture:
 
     def take(self, session: SessionConfig) -> None:
         if session.metrics.port == 1:
-            raise ConfigError("metrics: 127.0.0.1:1 cannot be listened on")
+            raise ConfigError("metrics: cannot listen on 127.0.0.1:1")
         self.taken.append(session)
 
     def reload(self) -> str:
@@ -65,7 +65,7 @@ def test_changeable_keys_are_applied(caplog: pytest.LogCaptureFixture, tmp_path:
     cell(tmp_path / "cell.yaml", recording={"rotate_mb": 7.0, "keep_days": 3.0}, zenoh={"commands": True})
     assert capture.reload().endswith("cell.yaml: recording.keep_days, recording.rotate_mb, zenoh.commands")
     assert capture.taken[-1].recording.rotate_mb == 7.0
-    assert capture.reload().endswith("nothing has changed")
+    assert capture.reload().endswith("the session has not changed")
     capture.reloader.close()
 
 
@@ -83,7 +83,7 @@ def test_options_of_a_trigger_can_change_and_its_presence_cannot(
     assert trigger is not None
     assert (trigger.before_s, trigger.events) == (8.0, ("emcy",))
     cell(path)
-    assert "recording.trigger: cannot change while it is captured" in capture.reload()
+    assert "recording.trigger: cannot change during a capture" in capture.reload()
     capture.reloader.close()
 
 
@@ -97,7 +97,7 @@ def test_options_of_a_trigger_can_change_and_its_presence_cannot(
         ({"streams": {"samples": {"tpdo": 1, "objects": ["position", "current"]}}}, "streams.samples.objects"),
         ({"heartbeat_ms": 50, "cell": "other"}, "cell, heartbeat_ms"),
         ({"recordings": {}}, "recordings: unknown key; did you mean 'recording'?"),
-        ({"metrics": {"port": 1}}, "metrics: 127.0.0.1:1 cannot be listened on"),
+        ({"metrics": {"port": 1}}, "metrics: cannot listen on 127.0.0.1:1"),
     ],
 )
 def test_other_keys_are_refused_and_the_capture_goes_on(
@@ -106,7 +106,7 @@ def test_other_keys_are_refused_and_the_capture_goes_on(
     capture = Capture(caplog, cell(tmp_path / "cell.yaml"))
     cell(tmp_path / "cell.yaml", **changes)
     line = capture.reload()
-    assert line.startswith("warning: not reloaded, the capture goes on as before: ")
+    assert line.startswith("warning: not reloaded, the capture continues unchanged: ")
     assert named in line
     assert "\n" not in line
     assert capture.taken == []
@@ -121,7 +121,7 @@ def test_a_changed_robot_is_refused(caplog: pytest.LogCaptureFixture, tmp_path: 
     robot.write_text((HERE / "robots" / "tx40.yaml").read_text())
     capture = Capture(caplog, cell(tmp_path / "cell.yaml", robot=str(robot)))
     robot.write_text(robot.read_text().replace("name: tx40", "name: tx41"))
-    assert "the robot cannot change while it is captured" in capture.reload()
+    assert "the robot cannot change during a capture" in capture.reload()
     capture.reloader.close()
 
 

@@ -44,7 +44,10 @@ def test_the_number_of_waiting_commands_is_limited() -> None:
                 time.sleep(0.01)
             refused = [reply.err for _ in range(100) for reply in querier.get(payload=b"x")]
         assert len(commands.pending()) == 32
-        assert bytes(next(err for err in refused if err is not None).payload) == b"32 commands are waiting already"
+        assert (
+            bytes(next(err for err in refused if err is not None).payload)
+            == b"32 commands are waiting already; try again later"
+        )
         assert commands.pending() == []
 
 
@@ -52,7 +55,7 @@ def test_commands_are_refused_if_the_session_does_not_permit_them() -> None:
     cell = session(False)
     with open_session(cell, "capture") as own:
         commands = Commands(own, Keys(cell.cell, "tx40"), cell.zenoh.commands)
-        with pytest.raises(DataError, match=r"commands are not enabled: zenoh\.commands"):
+        with pytest.raises(DataError, match=r"commands are not enabled; set zenoh\.commands"):
             send_command(cell, "tx40", Command("stop"))
         assert commands.pending() == []
 

@@ -118,7 +118,7 @@ def test_an_event_goes_on_in_further_files(tmp_path: Path) -> None:
     whole = join_parts([read_recording(path) for path in series.paths])
     assert np.all(np.diff(whole.samples.sync) == 1)
     assert whole.samples.sync[-1] >= 2300
-    with pytest.raises(DataError, match="does not go on from file to file"):
+    with pytest.raises(DataError, match="does not continue the file before"):
         join_parts([read_recording(path) for path in reversed(series.paths)])
 
 
