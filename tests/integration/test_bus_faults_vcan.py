@@ -41,7 +41,7 @@ def events_until(receiver: Receiver, kind: str) -> list[BusEvent]:
 
 
 @pytest.mark.parametrize("removed", [False, True])
-def test_a_bus_that_is_back_is_read_again(vcan_buses: list[str], removed: bool) -> None:
+def test_a_bus_is_read_again_after_an_outage(vcan_buses: list[str], removed: bool) -> None:
     """An interface that was down keeps its socket; one that was removed gets a new one. The other bus works on."""
     names = vcan_buses
     with Receiver([partial(RawSocket, name) for name in names]) as receiver:

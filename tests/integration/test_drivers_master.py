@@ -114,7 +114,7 @@ def events_within(master: DriveMaster, seconds: float, kind: str) -> list[DriveE
     return events
 
 
-def test_drives_are_mapped_as_the_session_says_and_end_up_in_operation(vcan_bus: str) -> None:
+def test_drives_are_mapped_by_the_session_and_enabled(vcan_bus: str) -> None:
     with cell(vcan_bus) as (session, robot, servos), DriveMaster(session, robot) as master:
         master.configure()
         for k, servo in servos.items():
@@ -137,7 +137,7 @@ def test_drives_are_mapped_as_the_session_says_and_end_up_in_operation(vcan_bus:
         assert {s.state for s in servos.values()} == {DriveState.SWITCH_ON_DISABLED}
 
 
-def test_a_mapping_is_changed_only_while_its_pdo_is_off(vcan_bus: str) -> None:
+def test_a_mapping_is_changed_only_while_its_pdo_is_disabled(vcan_bus: str) -> None:
     with cell(vcan_bus, nodes=(1,)) as (session, robot, servos), DriveMaster(session, robot) as master:
         master.configure()
         valid = {0x1800 + k: k == 0 for k in range(4)}
@@ -166,7 +166,9 @@ def test_a_missing_drive_is_named_with_its_joint(vcan_bus: str) -> None:
         (od.RATED_CURRENT, 0, 1600, r"rated current is 1600 mA \(6075h\), robot tx40 says 2500 mA"),
     ],
 )
-def test_a_wrong_node_is_refused_with_what_it_is(vcan_bus: str, index: int, sub: int, value: int, message: str) -> None:
+def test_a_wrong_node_is_refused_with_its_identity(
+    vcan_bus: str, index: int, sub: int, value: int, message: str
+) -> None:
     with cell(vcan_bus, nodes=(1,)) as (session, robot, servos), DriveMaster(session, robot) as master:
         servos[1].put(index, sub, value)
         with pytest.raises(ConfigError, match=message):
@@ -229,7 +231,7 @@ def test_an_emcy_becomes_an_event_with_its_text(vcan_bus: str) -> None:
         assert "excess drive temperature" in event.text
 
 
-def test_an_emcy_is_not_lost_while_canopen_has_no_time(vcan_bus: str) -> None:
+def test_an_emcy_is_not_lost_while_the_canopen_thread_is_delayed(vcan_bus: str) -> None:
     """Messages of fewer than eight bytes are valid."""
     short = frames(1)
     short["can_id"], short["length"] = od.COB_EMCY + 1, 3
@@ -249,7 +251,7 @@ def test_an_emcy_is_not_lost_while_canopen_has_no_time(vcan_bus: str) -> None:
         assert "earth leakage on the output side (error register 02h)" in second.text
 
 
-def test_a_lost_heartbeat_is_reported_once_and_its_return_too(vcan_bus: str) -> None:
+def test_loss_and_return_of_a_heartbeat_are_each_reported_once(vcan_bus: str) -> None:
     with cell(vcan_bus) as (session, robot, servos), DriveMaster(session, robot) as master:
         master.configure()
         master.start()
@@ -262,7 +264,7 @@ def test_a_lost_heartbeat_is_reported_once_and_its_return_too(vcan_bus: str) -> 
         assert any(e.joint == "joint_1" for e in events_within(master, 5.0, "heartbeat_back"))
 
 
-def test_foreign_sdo_writes_are_known_at_once_and_distinguished_from_our_own(
+def test_foreign_sdo_writes_are_detected_and_distinguished_from_own_ones(
     vcan_bus: str,
 ) -> None:
     request = frames(1)
@@ -295,14 +297,14 @@ def test_foreign_sdo_writes_are_known_at_once_and_distinguished_from_our_own(
         assert set(master.unverified_mapping) == {"joint_2"}
 
 
-def test_a_bus_that_goes_down_under_the_master_is_no_missing_drive(vcan_bus: str) -> None:
+def test_a_bus_outage_is_not_reported_as_a_missing_drive(vcan_bus: str) -> None:
     with cell(vcan_bus) as (session, robot, _), DriveMaster(session, robot) as master:
         subprocess.run(["ip", "link", "set", "dev", vcan_bus, "down"], check=True)
         with pytest.raises(BusDown, match=f"bus {vcan_bus}"):
             master.configure()
 
 
-def test_a_bus_that_is_not_there_is_a_configuration_error() -> None:
+def test_a_missing_bus_is_a_configuration_error() -> None:
     session = load_session("tx40_cell")
     session = session.model_copy(update={"bus": session.bus.model_copy(update={"channel": "vcan97"})})
     with pytest.raises(ConfigError, match="bus vcan97: no such CAN interface"):

@@ -21,7 +21,7 @@ def numbered(first: int, count: int) -> Frames:
     return batch
 
 
-def test_a_bus_that_had_nothing_is_asked_again_behind_every_batch_of_another(vcan_buses: list[str]) -> None:
+def test_an_empty_bus_is_read_again_after_every_batch_of_another(vcan_buses: list[str]) -> None:
     quiet, busy = vcan_buses
     with (
         RawSocket(quiet, filters=()) as one,

@@ -58,7 +58,7 @@ def test_every_dropped_frame_is_counted(vcan_bus: str) -> None:
         assert first.size + second.size + third.size + fourth.size + receiver.dropped == 1002
 
 
-def test_frames_dropped_behind_the_last_one_are_known_before_another_comes(vcan_bus: str) -> None:
+def test_frames_dropped_after_the_last_received_one_are_counted(vcan_bus: str) -> None:
     with RawSocket(vcan_bus, filters=()) as sender, RawSocket(vcan_bus, receive_buffer=8192) as receiver:
         assert receiver.drops() == 0
         sender.send(numbered(500))
@@ -86,7 +86,7 @@ def test_own_frames_are_received_only_on_request(vcan_bus: str) -> None:
         assert drain(echoing)["can_id"].tolist() == [0x123, 0x124]
 
 
-def test_poll_returns_as_soon_as_a_frame_is_there_and_not_before_the_timeout_otherwise(vcan_bus: str) -> None:
+def test_poll_returns_when_a_frame_arrives_or_at_the_timeout(vcan_bus: str) -> None:
     with RawSocket(vcan_bus, filters=()) as sender, RawSocket(vcan_bus) as receiver:
         begin = time.monotonic()
         assert not receiver.poll(0.1)
@@ -112,7 +112,7 @@ def test_a_bus_that_goes_down_is_reported_by_every_operation_and_usable_again_on
         assert drain(receiver)["can_id"].tolist() == [0x80]
 
 
-def test_an_interface_that_is_not_there_is_a_configuration_error() -> None:
+def test_a_missing_interface_is_a_configuration_error() -> None:
     with pytest.raises(ConfigError, match="bus can97: no such CAN interface"):
         RawSocket("can97")
 

@@ -52,7 +52,7 @@ def test_every_sync_number_is_sent_once_with_its_counter(vcan_bus: str) -> None:
     assert got["data"][:, 0].tolist() == [k % 10 + 1 for k in range(producer.sent)]
 
 
-def test_syncs_stay_on_the_time_grid_but_for_the_periods_counted_as_skipped(vcan_bus: str) -> None:
+def test_syncs_stay_on_the_time_grid_except_for_skipped_periods(vcan_bus: str) -> None:
     producer = producer_on(vcan_bus)
     got = record(vcan_bus, producer, lambda: producer.sent >= 500)
     stats = producer.stats()
@@ -111,14 +111,14 @@ def test_a_plan_given_later_starts_at_the_knot_that_play_returns(vcan_bus: str) 
     assert number[got["can_id"] == COBS[0]].tolist() == [first + 5 * m - 1 for m in range(10)]
 
 
-def test_after_the_last_row_the_drives_hear_no_more_set_points(vcan_bus: str) -> None:
+def test_no_set_points_follow_the_last_row(vcan_bus: str) -> None:
     plan = SetpointPlan(np.zeros((2, 2), dtype=np.int32), COBS, every=5)
     producer = producer_on(vcan_bus, plan=plan)
     got = record(vcan_bus, producer, lambda: producer.sent >= 60)
     assert len(rows_of(got, COBS[0])) == 2
 
 
-def test_a_bus_that_goes_down_is_a_reason_to_raise_until_it_is_back(vcan_bus: str) -> None:
+def test_a_bus_that_is_down_raises_until_it_is_up_again(vcan_bus: str) -> None:
     producer = producer_on(vcan_bus)
     with producer:
         while producer.sent < 10:
@@ -157,7 +157,7 @@ def test_several_buses_get_every_sync_and_each_its_own_set_points(vcan_buses: li
     assert np.count_nonzero(got[1]["can_id"] == 0x202) == 0
 
 
-def test_one_bus_that_goes_down_keeps_none_from_the_others(vcan_buses: list[str]) -> None:
+def test_an_outage_of_one_bus_does_not_affect_the_others(vcan_buses: list[str]) -> None:
     producer = SyncProducer([Bus(channel=name) for name in vcan_buses], PERIOD_US, 240)
     with RawSocket(vcan_buses[0]) as one, RawSocket(vcan_buses[1]) as other:
         with producer:

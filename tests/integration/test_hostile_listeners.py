@@ -164,7 +164,7 @@ def test_a_listener_changes_nothing_in_the_recording(roles: tuple[str, ...], tmp
           f"memory grew by {grown / 1e6:.0f} MB, {asked} commands, {sum(floods)} queries")  # fmt: skip
 
 
-def test_a_good_listener_hears_everything_beside_a_frozen_one(tmp_path: Path) -> None:
+def test_a_listener_receives_everything_beside_a_frozen_one(tmp_path: Path) -> None:
     cell = "hostile_beside"
     session = load_session("tx40_cell.yaml").model_copy(update={"cell": cell})
     robot = load_robot(session.robot)

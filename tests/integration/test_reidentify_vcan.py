@@ -64,7 +64,7 @@ def one_line(err: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_an_arm_is_the_same_and_then_it_is_worn(vcan_bus: str, tmp_path: Path) -> None:
+def test_an_unchanged_arm_and_a_worn_arm_are_distinguished(vcan_bus: str, tmp_path: Path) -> None:
     """First run, second run, a tenth more friction in joint 2: exit codes, words, history and diagnosis."""
     config = cell_file(tmp_path, vcan_bus, "weekly", sync={"period_us": 1000})
     with arm(config, "--seed", "1"):
@@ -148,13 +148,13 @@ def test_ctrl_c_stops_the_arm_and_ends_with_one_line(vcan_bus: str, tmp_path: Pa
     print(f"last stop order {(stops[-1] - sent) * 1e-6:.2f} ms after the signal")
 
 
-def test_drives_that_are_not_there_are_one_line(vcan_bus: str, tmp_path: Path) -> None:
+def test_missing_drives_are_one_error_line(vcan_bus: str, tmp_path: Path) -> None:
     config = cell_file(tmp_path, vcan_bus, "nobody", sdo_timeout_s=0.2)
     _, err = finished(job(config, tmp_path), 2)
     assert "node 1 (joint_1): does not answer" in one_line(err)
 
 
-def test_a_bus_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+def test_a_missing_bus_is_one_error_line(tmp_path: Path) -> None:
     config = cell_file(tmp_path, "vcan77", "nobus")
     _, err = finished(job(config, tmp_path), 2)
     assert "bus vcan77: no such CAN interface" in one_line(err)

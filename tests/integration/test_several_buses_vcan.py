@@ -143,7 +143,7 @@ def test_replayed_samples_arrive_unchanged_on_all_buses(shipped: str, channels: 
     assert np.array_equal(got["position"][: n - 5], played["position"][k : k + n - 5])
 
 
-def test_a_bus_that_goes_down_is_a_gap_of_its_axes_until_it_is_back(channels: list[str], tmp_path: Path) -> None:
+def test_a_bus_outage_is_a_gap_of_its_axes(channels: list[str], tmp_path: Path) -> None:
     session = session_file(tmp_path, "tx40_two_fd.yaml", channels, sync=SLOW)
     with robot(session):
         process = start("capture", "--config", session, "--out", tmp_path / "out", "--json")

@@ -125,7 +125,7 @@ def test_a_command_that_does_not_exist_is_127() -> None:
     assert launch(["no-such-command-here"]).returncode == 127
 
 
-def test_packages_that_are_missing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VCAN_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("VCAN_DEBS", str(tmp_path))
     (tmp_path / "patchelf_0.14_amd64.deb").touch()
@@ -134,7 +134,7 @@ def test_packages_that_are_missing_are_named(tmp_path: Path, monkeypatch: pytest
     assert "lacks user-mode-linux, libc6, busybox-static, can-utils" in reason
 
 
-def test_a_torn_package_is_one_line_and_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_truncated_package_is_one_error_line_and_leaves_no_files(tmp_path: Path) -> None:
     debs = tmp_path / "debs"
     debs.mkdir()
     for name in packages.GUEST_PACKAGES + packages.HOST_PACKAGES:
@@ -155,7 +155,7 @@ def test_without_socketcan_a_bus_is_refused_with_the_command_to_try() -> None:
 
 
 @pytest.mark.vcan
-def test_a_bus_is_made_once_and_removed(vcan_bus: str) -> None:
+def test_a_bus_is_created_once_and_removed(vcan_bus: str) -> None:
     ensure_vcan(vcan_bus)
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
         raw.bind((vcan_bus,))
@@ -166,6 +166,6 @@ def test_a_bus_is_made_once_and_removed(vcan_bus: str) -> None:
 
 
 @pytest.mark.vcan
-def test_a_bus_that_cannot_be_made_names_the_administrators_command() -> None:
+def test_the_error_of_a_bus_that_cannot_be_created_names_the_administrators_command() -> None:
     with pytest.raises(ConfigError, match="an administrator must run: sudo modprobe vcan && sudo ip link add dev"):
         ensure_vcan("a-name-longer-than-the-kernel-takes")

@@ -144,7 +144,7 @@ def test_every_sync_is_answered_by_every_drive_and_set_points_are_followed(confi
         assert np.abs(position[4::5][: demand.size] - demand).max() < 12_000
 
 
-def test_drives_that_are_behind_obey_at_the_same_sync(config: Path) -> None:
+def test_lagging_drives_act_on_a_stop_at_the_same_sync(config: Path) -> None:
     """Frames that waited while the process was stopped are read at once; the stop takes effect between them."""
     session = load_session(config)
     before, after = 30, 20
@@ -229,7 +229,7 @@ def test_nmt_states_govern_boot_up_heartbeat_sdo_and_pdo(config: Path) -> None:
             network.disconnect()
 
 
-def test_a_replayed_recording_arrives_sample_by_sample(config: Path, tmp_path: Path) -> None:
+def test_a_replayed_recording_arrives_unchanged(config: Path, tmp_path: Path) -> None:
     session = load_session(config)
     robot = load_robot(session.robot)
     trajectory = Trajectory(

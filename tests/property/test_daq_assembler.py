@@ -134,7 +134,7 @@ def test_the_result_does_not_depend_on_how_frames_are_split(faults: Faults, cuts
 @given(losses)
 @example(Faults(sync={0}))
 @example(Faults(sync={COUNT - 1}, tpdo={(COUNT - 1, 0), (COUNT - 2, 0)}))
-def test_what_is_received_belongs_to_its_sync_where_frames_are_lost(faults: Faults) -> None:
+def test_received_samples_belong_to_their_sync_if_frames_are_lost(faults: Faults) -> None:
     sync, data, _, _ = run(bus(COUNT, faults), COUNT, [])
     lost = {k for k, _ in faults.tpdo | faults.short} | faults.sync
     for stream in STREAMS:
@@ -148,7 +148,7 @@ def test_what_is_received_belongs_to_its_sync_where_frames_are_lost(faults: Faul
 
 @settings(max_examples=100)
 @given(delays, splits)
-def test_late_answers_are_no_loss(faults: Faults, cuts: list[int]) -> None:
+def test_late_answers_lose_no_sample(faults: Faults, cuts: list[int]) -> None:
     sync, data, gaps, _ = run(bus(COUNT, faults), COUNT, cuts)
     assert gaps == []
     for stream in STREAMS:
@@ -157,7 +157,7 @@ def test_late_answers_are_no_loss(faults: Faults, cuts: list[int]) -> None:
 
 
 @pytest.mark.parametrize("cuts", [[], list(range(0, 10_000, 97))])
-def test_drives_that_are_all_behind_for_a_minute_and_a_half_lose_nothing(cuts: list[int]) -> None:
+def test_a_lag_of_all_drives_for_ninety_seconds_loses_no_sample(cuts: list[int]) -> None:
     behind = Faults(late={k: max(1, min(k, 1500, 4800 - k)) for k in range(300, 4700)})
     sync, data, gaps, counters = run(bus(5000, behind), 5000, cuts)
     assert gaps == []
@@ -165,7 +165,7 @@ def test_drives_that_are_all_behind_for_a_minute_and_a_half_lose_nothing(cuts: l
     assert np.array_equal(data["samples"][:, 1, :4].copy().view("<u4")[:, 0], np.arange(5000))
 
 
-def test_a_sample_lost_while_all_are_behind_costs_none_that_came_prompt() -> None:
+def test_a_loss_while_all_drives_lag_costs_no_prompt_sample() -> None:
     """The burst that was lost in is undecidable, nothing before it and nothing after it."""
     faults = Faults(tpdo={(600, 1)}, late={k: 1800 - k for k in range(500, 1800)})
     sync, data, gaps, _ = run(bus(5000, faults), 5000, [])
@@ -174,7 +174,7 @@ def test_a_sample_lost_while_all_are_behind_costs_none_that_came_prompt() -> Non
     assert np.array_equal(data["samples"][:, 1, :4].copy().view("<u4")[:, 0], sync["samples"])
 
 
-def test_dropped_frames_end_the_patience() -> None:
+def test_dropped_frames_shorten_the_wait_for_answers() -> None:
     """Nobody answers SYNC 100 as far as we know: waited for if nothing is known to be missing, given up if it is."""
     frames = bus(1000, Faults(tpdo={(100, j) for j in range(3)}))
     patient, told = Assembler(STREAMS, JOINTS, PERIOD_NS), Assembler(STREAMS, JOINTS, PERIOD_NS)
@@ -234,7 +234,7 @@ def test_a_jump_of_the_clock_is_no_gap() -> None:
         assert assembler.counters["samples.rows"] == COUNT
 
 
-def test_a_producer_that_was_held_up_has_lost_nothing() -> None:
+def test_a_delayed_producer_loses_no_sample() -> None:
     """As long as a turn of its counter, while answers are late and more SYNCs have been sent than were read."""
     frames = bus(COUNT, Faults(late={k: 400 - k for k in range(100, 300)}))
     frames["t_ns"][len(frames) // 2 :] += 245 * PERIOD_NS

@@ -32,7 +32,7 @@ def events(rng: np.random.Generator, count: int, stalls: Stalls, silent_us: int)
     return sorted(out, key=lambda event: event[0])
 
 
-def test_no_answer_before_a_silence_is_taken_for_another() -> None:
+def test_no_answer_before_a_silence_is_matched_to_another_sync() -> None:
     """Of 1000 captures; and what is in doubt is near a time at which they stood still."""
     for seed in range(1000):
         rng = np.random.default_rng(seed)

@@ -41,7 +41,7 @@ def sent(rng: np.random.Generator, count: int, stalls: int) -> list[Frames]:
 
 
 @pytest.mark.parametrize("stalls", [1, 4, 20])
-def test_buses_of_a_master_that_is_held_up_keep_together(stalls: int) -> None:
+def test_buses_of_a_delayed_master_get_equal_numbers(stalls: int) -> None:
     for seed in range(30):
         rng = np.random.default_rng(seed)
         count = 4000

@@ -164,7 +164,7 @@ def test_buses_of_another_master_are_aligned_by_counter_and_time(streams: tuple[
     assert set(sync.tolist()) | missing == set(range(COUNT - 20))
 
 
-def test_masters_that_count_otherwise_are_refused() -> None:
+def test_masters_with_different_counters_are_refused() -> None:
     assembler = Assembler((PLAIN,), JOINTS, PERIOD_NS, first_counter=None, bus_of=BUS_OF)
     assembler.push(bus_frames(0, (PLAIN,), Faults(), 1)[:300], bus=0)
     with pytest.raises(DataError, match="SYNC counter"):
@@ -177,7 +177,7 @@ def test_one_lost_packed_tpdo_is_one_gap_of_as_many_samples() -> None:
     assert sync["samples"].size == COUNT - 10
 
 
-def test_a_bus_that_is_off_is_a_gap_of_its_axes_alone() -> None:
+def test_a_bus_outage_is_a_gap_of_its_axes_only() -> None:
     """Known to be down: the others go on at once, and nothing of it is missing once it is back."""
     assembler = Assembler((PLAIN,), JOINTS, PERIOD_NS, bus_of=BUS_OF)
     off = Faults(off=(1, 100, 180))
@@ -221,7 +221,7 @@ def test_late_answers_are_counted() -> None:
     assert assembler.counters["tpdo_late"] == 2
 
 
-def test_frames_that_waited_while_their_bus_was_taken_for_down_are_no_turn_of_the_counter() -> None:
+def test_frames_delayed_while_their_bus_counted_as_down_add_no_counter_turn() -> None:
     """It is back before we know: what came meanwhile is older than the SYNCs of the others, and given up."""
     assembler = Assembler((PLAIN,), JOINTS, PERIOD_NS, bus_of=BUS_OF)
     per_bus = [bus_frames(b, (PLAIN,), Faults()) for b in range(3)]

@@ -39,7 +39,7 @@ def captured(rows: int = 3000, lost: slice = slice(0)) -> Recording:
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_recording_comes_back_from_every_kind_of_log(tmp_path: Path, suffix: str) -> None:
+def test_a_recording_survives_the_round_trip_through_every_log_format(tmp_path: Path, suffix: str) -> None:
     recording = captured()
     write_log(recording, tmp_path / f"bus{suffix}")
 
@@ -59,7 +59,7 @@ def test_a_recording_comes_back_from_every_kind_of_log(tmp_path: Path, suffix: s
     assert [p.name for p in tmp_path.iterdir()] == [f"bus{suffix}"]
 
 
-def test_a_sync_that_the_log_lacks_is_a_gap(tmp_path: Path) -> None:
+def test_a_sync_missing_from_the_log_is_a_gap(tmp_path: Path) -> None:
     write_log(captured(lost=slice(1000, 1030)), tmp_path / "bus.log")
     read = recording_from_log(tmp_path / "bus.log", SESSION, ROBOT)
     assert read.counters["samples.expected"] == 3000
@@ -70,7 +70,7 @@ def test_a_sync_that_the_log_lacks_is_a_gap(tmp_path: Path) -> None:
     assert not missing & set(read.samples.sync.tolist())
 
 
-def test_an_answer_that_the_log_lacks_is_a_gap_of_its_joint(tmp_path: Path) -> None:
+def test_an_answer_missing_from_the_log_is_a_gap_of_its_joint(tmp_path: Path) -> None:
     write_log(captured(), tmp_path / "bus.log")
     lines = (tmp_path / "bus.log").read_text().splitlines()
     third = f" {captured_streams(SESSION, ROBOT)[0].bus.cob_ids[2]:03X}#"
@@ -84,7 +84,7 @@ def test_an_answer_that_the_log_lacks_is_a_gap_of_its_joint(tmp_path: Path) -> N
     assert any(g.first <= 500 <= g.last for g in gaps)
 
 
-def test_of_several_buses_the_sessions_is_taken(tmp_path: Path) -> None:
+def test_the_bus_of_the_session_is_read_from_a_log_of_several_buses(tmp_path: Path) -> None:
     write_log(captured(200), tmp_path / "one.log")
     channel = SESSION.bus.channel
     other = (tmp_path / "one.log").read_text().replace(f" {channel} ", " can7 ")
@@ -96,7 +96,7 @@ def test_of_several_buses_the_sessions_is_taken(tmp_path: Path) -> None:
         recording_from_log(tmp_path / "both.log", elsewhere, ROBOT)
 
 
-def test_what_is_no_log_of_this_cell_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_is_no_log_of_this_cell_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
         recording_from_log(tmp_path / "gone.log", SESSION, ROBOT)
     for suffix in (".log", ".blf", ".asc"):
@@ -118,7 +118,7 @@ def test_what_is_no_log_of_this_cell_is_refused_in_one_line(tmp_path: Path) -> N
     assert not (tmp_path / "never.log").exists()
 
 
-def test_import_and_export_know_the_logs(tmp_path: Path) -> None:
+def test_the_import_and_export_commands_accept_logs(tmp_path: Path) -> None:
     write_recording(captured(400), tmp_path / "a.mcap")
     run = CliRunner().invoke
     out = run(application(["export"]), ["export", str(tmp_path / "a.mcap"), "--out", str(tmp_path / "a.blf")])
@@ -131,7 +131,7 @@ def test_import_and_export_know_the_logs(tmp_path: Path) -> None:
     assert run(application(["import"]), [*back, "--rate", "5"]).exit_code == 2
 
 
-def test_a_recording_of_several_buses_comes_back_from_a_log_of_all_of_them(tmp_path: Path) -> None:
+def test_a_recording_of_several_buses_survives_the_round_trip_through_one_log(tmp_path: Path) -> None:
     session = load_session("tx40_six_buses.yaml")
     one = captured()
     samples = one.streams["samples"]
@@ -155,7 +155,7 @@ def test_a_recording_of_several_buses_comes_back_from_a_log_of_all_of_them(tmp_p
         )
 
 
-def test_a_session_on_can_fd_has_no_classic_log(tmp_path: Path) -> None:
+def test_logs_are_refused_for_a_session_on_can_fd(tmp_path: Path) -> None:
     session = load_session("tx40_two_fd.yaml")
     with pytest.raises(ConfigError, match="CAN FD"):
         write_log(replace(captured(), session=session), tmp_path / "bus.log")

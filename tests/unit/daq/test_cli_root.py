@@ -72,14 +72,14 @@ def test_an_unforeseen_error_is_one_line_and_exit_code_1() -> None:
     assert err.startswith("armident: ValueError: unforeseen")
 
 
-def test_debug_shows_where_an_error_came_from() -> None:
+def test_debug_prints_the_traceback_of_an_error() -> None:
     code, _, err = call("--debug", "refuse", "bug")
     assert code == 1
     assert "Traceback" in err
     assert "in refuse" in err
 
 
-def test_an_interrupt_ends_with_130_and_silently() -> None:
+def test_an_interrupt_exits_with_130_without_output() -> None:
     assert call("refuse", "interrupt") == (130, "", "")
 
 
@@ -107,7 +107,7 @@ def test_help_lists_every_command_with_its_first_line() -> None:
     assert "Exit codes: 0 done" in out
 
 
-def test_a_command_whose_module_is_missing_is_listed_as_unavailable_and_says_why_when_called() -> None:
+def test_a_command_with_a_missing_module_is_listed_as_unavailable_and_reports_the_module() -> None:
     assert "(unavailable)" in call("--help")[1]
     code, out, err = call("absent", "--whatever", "it", "is")
     assert (code, out, err.count("\n")) == (1, "", 1)

@@ -97,7 +97,7 @@ def broken(what: str, path: Path) -> Path:
         ("ragged", r"a\.csv: line 6 has 14 columns, expected 13"),
     ],
 )
-def test_what_is_wrong_with_a_csv_is_said_in_one_line(tmp_path: Path, what: str, words: str) -> None:
+def test_an_invalid_csv_is_reported_in_one_line(tmp_path: Path, what: str, words: str) -> None:
     with pytest.raises(DataError, match=words) as caught:
         import_recording(broken(what, tmp_path / "a.csv"), TX40)
     assert "\n" not in str(caught.value)
@@ -108,7 +108,7 @@ def test_a_file_of_another_robot_is_refused(tmp_path: Path) -> None:
         import_recording(write_csv(tmp_path / "a.csv", table()), load_robot("emps.yaml"))
 
 
-def test_unknown_kinds_and_absent_files_are_usage_errors(tmp_path: Path) -> None:
+def test_unknown_formats_and_missing_files_are_configuration_errors(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
         import_recording(tmp_path / "a.csv", TX40)
     (tmp_path / "a.xls").write_text("")
@@ -118,7 +118,7 @@ def test_unknown_kinds_and_absent_files_are_usage_errors(tmp_path: Path) -> None
         import_recording(write_csv(tmp_path / "b.csv", table()), TX40, names={"speed": "v"})
 
 
-def test_the_emps_file_is_understood_by_its_own_names(shared_data: Path) -> None:
+def test_the_emps_file_is_imported_by_its_own_names(shared_data: Path) -> None:
     recording = import_recording(shared_data / "emps" / "DATA_EMPS.mat", load_robot("emps.yaml"))
     assert recording.samples.sync.size == 24_841
     assert recording.sample_rate_hz == pytest.approx(1000.0, rel=1e-4)
@@ -126,7 +126,7 @@ def test_the_emps_file_is_understood_by_its_own_names(shared_data: Path) -> None
     assert recording.samples.fields["voltage"].side == "motor"
 
 
-def test_the_measured_tx40_is_a_pair_of_files(shared_data: Path, tmp_path: Path) -> None:
+def test_the_measured_tx40_is_imported_from_a_pair_of_files(shared_data: Path, tmp_path: Path) -> None:
     tx40 = shared_data / "tx40"
     recording = import_recording(
         tx40 / "pos_read_data.csv", TX40, effort=tx40 / "curr_data.csv", motor_side=True, rate_hz=5000.0
@@ -150,7 +150,7 @@ def moving_panda(rate_hz: float = 1000.0, seconds: float = 4.0) -> tuple[np.ndar
     )
 
 
-def test_rows_read_without_waiting_are_put_back_on_the_clock_of_the_controller(tmp_path: Path) -> None:
+def test_polled_rows_are_resampled_onto_the_clock_of_the_controller(tmp_path: Path) -> None:
     q, tau = moving_panda()
     rng = np.random.default_rng(5)
     # Rows of a program that polls too early or too late: one in 15 repeated, one in 12 missed, a stall of 8.
@@ -173,7 +173,7 @@ def test_rows_read_without_waiting_are_put_back_on_the_clock_of_the_controller(t
     assert int(recording.metadata["polled.repeated"]) + int(recording.metadata["polled.interpolated"]) > 300
 
 
-def test_rows_of_no_clock_are_refused(tmp_path: Path) -> None:
+def test_rows_without_an_even_clock_are_refused(tmp_path: Path) -> None:
     q, tau = moving_panda()
     t = np.sort(np.random.default_rng(1).uniform(0.0, 4.0, len(q)))
     for name, values in (("q", q), ("tau", tau)):
@@ -189,7 +189,7 @@ def test_rows_of_no_clock_are_refused(tmp_path: Path) -> None:
         import_recording(tmp_path / "q.txt", PANDA, effort=tmp_path / "tau.txt", rate_hz=1000.0, polled=True)
 
 
-def test_a_demand_in_another_unit_is_refused_and_can_be_left_out(tmp_path: Path) -> None:
+def test_a_demand_in_another_unit_is_refused_unless_omitted(tmp_path: Path) -> None:
     q, tau = moving_panda()
     path = tmp_path / "a.npz"
     np.savez(path, positions=q, torques=tau, target_positions=np.deg2rad(q))
@@ -202,7 +202,7 @@ def test_a_demand_in_another_unit_is_refused_and_can_be_left_out(tmp_path: Path)
 
 
 @pytest.mark.parametrize("kind", ["csv", "npz", "mat", "parquet"])
-def test_a_demand_that_begins_later_and_ends_sooner_comes_back(tmp_path: Path, kind: str) -> None:
+def test_a_demand_shorter_than_the_samples_survives_the_round_trip(tmp_path: Path, kind: str) -> None:
     """Like the demand of every capture, which is on every fifth SYNC."""
     values = table()
     demand = values[:, 1:7] + 0.001

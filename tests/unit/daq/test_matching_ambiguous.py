@@ -36,27 +36,27 @@ def bus(count: int, first: dict[int, list[tuple[int, int]]]) -> list[tuple[int, 
     return events
 
 
-def test_an_answer_sent_again_behind_the_next_sync_is_never_taken_for_its_answer() -> None:
+def test_an_answer_repeated_behind_the_next_sync_is_not_matched_to_it() -> None:
     assembler, sync, value = assembled(bus(50, {20: [(10, 19), (50, 20)]}), 50)
     assert np.array_equal(value, sync)
     assert set(range(50)) - set(sync.tolist()) == {20}
     assert assembler.counters["tpdo_duplicate"] == 1
 
 
-def test_a_frame_sent_twice_is_dropped_where_its_bytes_tell() -> None:
+def test_a_repeated_frame_is_dropped_if_its_bytes_identify_it() -> None:
     _, sync, value = assembled(bus(50, {20: [(50, 20), (60, 20)]}), 50)
     assert np.array_equal(value, sync)
     assert sync.size == 50
 
 
-def test_a_late_answer_that_is_sent_twice_is_not_taken_for_the_next_one() -> None:
+def test_a_repeated_late_answer_is_not_matched_to_the_next_sync() -> None:
     """The next answer, which is late too, is not taken for the one after it."""
     _, sync, value = assembled(bus(60, {30: [], 31: [(40, 30), (50, 30)], 32: [(40, 31), (50, 32)]}), 60)
     assert np.array_equal(value, sync)
     assert sync.size == 60
 
 
-def test_late_answers_of_a_drive_that_rests_are_given_out_all_the_same() -> None:
+def test_late_answers_with_equal_bytes_are_not_dropped_as_repetitions() -> None:
     """At standstill all answers have the same bytes, repeated or not."""
     late = {k: [] if k % 4 else [(10 * i, 7) for i in range(4)] for k in range(17, 37)}
     rest = {k: [(50, 7)] for k in range(60)}
@@ -66,7 +66,7 @@ def test_late_answers_of_a_drive_that_rests_are_given_out_all_the_same() -> None
     assert assembler.counters["tpdo_duplicate"] == 0
 
 
-def test_a_late_answer_before_a_lost_one_is_given_up_by_a_drive_that_is_late_at_times() -> None:
+def test_a_late_answer_before_a_lost_one_is_discarded_if_the_drive_lagged_before() -> None:
     """Answer 10 is late and arrives with 11, so late answers are known to occur. Then 30 is late and 31 is lost."""
     late = {10: [], 11: [(40, 10), (50, 11)], 30: [], 31: [(50, 30)]}
     _, sync, value = assembled(bus(60, late), 60)
@@ -74,7 +74,7 @@ def test_a_late_answer_before_a_lost_one_is_given_up_by_a_drive_that_is_late_at_
     assert {30, 31} == set(range(60)) - set(sync.tolist())
 
 
-def test_late_answers_before_a_silence_are_not_taken_for_prompt_ones() -> None:
+def test_late_answers_before_a_silence_are_not_matched_as_prompt_ones() -> None:
     """From 40 on each answer follows the next SYNC, two of them in pairs, and the last two are lost."""
     late = {40: [], 41: [(50, 40)], 42: [(50, 41)], 43: [(50, 42), (60, 43)], 44: [], 45: [(50, 44)], 46: [(50, 45)]}
     late |= {47: [], 48: [(40, 46), (50, 47)], 49: [(50, 48)], 50: [(50, 49)], 51: [(50, 50)]}
@@ -90,14 +90,14 @@ def test_prompt_answers_before_a_silence_are_kept() -> None:
     assert np.array_equal(sync, np.arange(51))
 
 
-def test_a_frame_sent_twice_does_not_move_those_before_it() -> None:
+def test_a_repeated_frame_does_not_shift_the_answers_before_it() -> None:
     """Answer 30 is lost, 45 is repeated: as many frames as SYNCs, like two late answers."""
     _, sync, value = assembled(bus(60, {30: [], 31: [], 45: [(50, 45), (60, 45)]}), 60)
     assert np.array_equal(value, sync)
     assert set(range(30)) | set(range(46, 60)) <= set(sync.tolist())
 
 
-def test_tpdos_are_suspect_from_the_moment_somebody_writes_to_their_mapping() -> None:
+def test_tpdos_are_unverified_from_a_write_to_their_mapping_on() -> None:
     def write(index: int) -> bytes:
         return bytes([0x23]) + index.to_bytes(2, "little") + bytes(5)
 
@@ -109,7 +109,7 @@ def test_tpdos_are_suspect_from_the_moment_somebody_writes_to_their_mapping() ->
     assert assembler.counters["frames_unknown"] == 0
 
 
-def test_what_was_written_before_it_was_confirmed_is_no_change() -> None:
+def test_a_write_before_the_mapping_was_verified_is_no_change() -> None:
     assembler = Assembler(STREAMS, ("a", "b"), PERIOD, nodes=(1, 2))
     assembler.mark_unverified("a", T0 + 5_000_000, T0 + 5_000_000)
     batch = frames(1)
@@ -125,7 +125,7 @@ def test_what_was_written_before_it_was_confirmed_is_no_change() -> None:
     assert assembler.counters["samples.rows"] == 3
 
 
-def test_a_master_that_is_held_up_for_half_a_turn_of_its_counter_has_sent_none_in_between() -> None:
+def test_a_master_delayed_by_half_a_counter_turn_has_sent_no_sync_meanwhile() -> None:
     assembler = Assembler(STREAMS, ("a", "b"), PERIOD)
     batch = frames(40)
     k = np.arange(40)

@@ -74,7 +74,7 @@ def answers(k: int) -> Sent:
     return [(0x181, k), (0x182, k)]
 
 
-def test_a_lost_answer_keeps_rows_waiting_for_some_ten_milliseconds_and_costs_one() -> None:
+def test_a_lost_answer_delays_rows_by_some_ten_milliseconds_and_costs_one_row() -> None:
     bench = Bench()
     for k in range(500):
         bench.push(k, answers(k)[k == 100 :])
@@ -84,7 +84,7 @@ def test_a_lost_answer_keeps_rows_waiting_for_some_ten_milliseconds_and_costs_on
     assert bench.waited <= LONGEST_WAIT
 
 
-def test_losses_of_both_drives_are_told_apart_one_after_the_other() -> None:
+def test_consecutive_losses_of_both_drives_are_distinguished() -> None:
     bench = Bench()
     lost = {(100, 0x181), (110, 0x182), (125, 0x181), (300, 0x182), (301, 0x182)}
     for k in range(800):
@@ -93,7 +93,7 @@ def test_losses_of_both_drives_are_told_apart_one_after_the_other() -> None:
     assert bench.missing(800) == {100, 110, 125, 300, 301}
 
 
-def test_a_drive_that_falls_silent_keeps_nothing_waiting_for_long() -> None:
+def test_a_silent_drive_delays_rows_only_briefly() -> None:
     bench = Bench()
     for k in range(1000):
         bench.push(k, answers(k)[200 <= k < 600 :])
@@ -104,7 +104,7 @@ def test_a_drive_that_falls_silent_keeps_nothing_waiting_for_long() -> None:
 
 
 @pytest.mark.parametrize("held", [5, 35])
-def test_a_drive_that_holds_its_answers_back_for_a_moment_loses_none(held: int) -> None:
+def test_a_drive_that_pauses_briefly_loses_no_answer(held: int) -> None:
     bench = Bench()
     for k in range(400):
         burst = [(0x181, i) for i in range(100, 100 + held + 1)] if k == 100 + held else [(0x181, k)]
@@ -114,7 +114,7 @@ def test_a_drive_that_holds_its_answers_back_for_a_moment_loses_none(held: int) 
 
 
 @pytest.mark.parametrize("rate", [2, 7, 60])
-def test_answers_that_come_after_they_were_given_up_are_nobody_elses(rate: int) -> None:
+def test_answers_to_discarded_rows_are_not_matched_to_other_rows(rate: int) -> None:
     """A drive is silent for 120 SYNCs, then sends all answers at ``rate`` per period, and is prompt again."""
     bench, queue = Bench(), list[int]()
     for k in range(700):
@@ -128,7 +128,7 @@ def test_answers_that_come_after_they_were_given_up_are_nobody_elses(rate: int) 
 
 
 @pytest.mark.parametrize("stale", [0, 3, 42])
-def test_after_an_outage_what_is_late_is_matched_and_what_is_stale_is_dropped(stale: int) -> None:
+def test_after_an_outage_late_answers_are_matched_and_stale_ones_dropped(stale: int) -> None:
     """Bus 2 is off for 200 SYNCs; its drives send ``stale`` earlier answers afterwards and are late by 300 SYNCs."""
     bench, queue = Bench(buses=2), list[int]()
     for k in range(1500):
@@ -149,7 +149,7 @@ def test_after_an_outage_what_is_late_is_matched_and_what_is_stale_is_dropped(st
 
 
 @pytest.mark.parametrize("burst", [0, 60])
-def test_drives_that_are_late_on_buses_of_their_own_are_no_witnesses_against_each_other(burst: int) -> None:
+def test_drives_on_separate_buses_do_not_prove_losses_of_each_other(burst: int) -> None:
     """All drives pause for 150 SYNCs, and the host with them: each bus is read in long batches."""
     stream = TpdoStream("samples", 1, (0x181, 0x181, 0x181), 8)
     assembler = Assembler((stream,), ("a", "b", "c"), PERIOD_NS, bus_of=(0, 1, 2))
@@ -165,7 +165,7 @@ def test_drives_that_are_late_on_buses_of_their_own_are_no_witnesses_against_eac
     assert assembler.counters["samples.rows"] == 1000
 
 
-def test_what_is_missing_on_one_bus_casts_no_doubt_on_another() -> None:
+def test_frames_missing_on_one_bus_make_no_sample_of_another_ambiguous() -> None:
     """Joint a pauses and answers in a burst shortly after an outage of bus 2."""
     bench = Bench(buses=2)
     stream = TpdoStream("samples", 1, (0x181, 0x182, 0x181, 0x182), 8)
@@ -181,7 +181,7 @@ def test_what_is_missing_on_one_bus_casts_no_doubt_on_another() -> None:
     assert assembler.counters["samples.in_gaps"] == 100
 
 
-def test_a_foreign_master_that_was_held_up_at_its_first_syncs_is_one_master() -> None:
+def test_a_foreign_master_delayed_at_its_first_syncs_is_recognised_as_one_master() -> None:
     """The second bus is read after the first has had more SYNCs, with a pause among them."""
     bench = Bench(buses=2, foreign=True)
     held = [T0 + k * PERIOD_NS + (k >= 30) * 9 * PERIOD_NS for k in range(300)]

@@ -51,7 +51,7 @@ def test_a_stock_reader_shows_joints_in_si_units(tmp_path: Path) -> None:
     assert shown[3].joint_1.demand == pytest.approx((inverse @ demand.si("demand")[row])[0], rel=1e-12, abs=1e-9)
 
 
-def test_readers_of_ours_leave_them_alone_and_they_take_little(tmp_path: Path) -> None:
+def test_our_reader_ignores_previews_and_they_add_little_size(tmp_path: Path) -> None:
     written(tmp_path / "with.mcap", 50.0)
     written(tmp_path / "without.mcap", 0.0)
     plain, shown = read_recording(tmp_path / "without.mcap"), read_recording(tmp_path / "with.mcap")
@@ -63,7 +63,7 @@ def test_readers_of_ours_leave_them_alone_and_they_take_little(tmp_path: Path) -
     assert sizes[0] < 1.1 * sizes[1]
 
 
-def test_a_torn_file_with_them_is_healed(tmp_path: Path) -> None:
+def test_a_truncated_file_with_previews_is_recovered(tmp_path: Path) -> None:
     written(tmp_path / "r.mcap", 50.0, close=False)
     before = read_recording(tmp_path / "r.mcap")
     healed = recover_recording(tmp_path / "r.mcap")

@@ -166,13 +166,13 @@ def write_chunked(recording: Recording, path: Path, chunk_ns: int = 20_000_000) 
     return writer
 
 
-def test_batches_and_chunks_leave_no_trace_in_the_numbers(tmp_path: Path) -> None:
+def test_values_do_not_depend_on_batches_and_chunks(tmp_path: Path) -> None:
     recording = make_recording(3000)
     write_chunked(recording, tmp_path / "r.mcap").close(recording.counters)
     assert read_recording(tmp_path / "r.mcap").sha256 == recording.sha256
 
 
-def test_a_file_cut_anywhere_opens_up_to_its_last_whole_chunk(tmp_path: Path) -> None:
+def test_a_truncated_file_is_read_up_to_its_last_complete_chunk(tmp_path: Path) -> None:
     recording = make_recording(2000)
     write_chunked(recording, tmp_path / "whole.mcap").close({})
     data = (tmp_path / "whole.mcap").read_bytes()
@@ -201,7 +201,7 @@ def test_an_unclosed_file_loses_at_most_one_chunk(tmp_path: Path) -> None:
     assert f"after SYNC {read.samples.sync[-1]}" in read.missing
 
 
-def test_a_flipped_bit_in_a_chunk_is_found_and_named(tmp_path: Path) -> None:
+def test_a_flipped_bit_in_a_chunk_is_detected_and_reported(tmp_path: Path) -> None:
     recording = make_recording(2000)
     write_chunked(recording, tmp_path / "r.mcap").close({})
     data = bytearray((tmp_path / "r.mcap").read_bytes())
@@ -218,7 +218,7 @@ def test_a_flipped_bit_in_a_chunk_is_found_and_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"), [(b"", "empty"), (b"t,q1\n0,1\n", "not an MCAP"), (b"\x89MCAP0\r\n\x01", "truncated before")]
 )
-def test_what_is_not_a_recording_is_named(tmp_path: Path, content: bytes, words: str) -> None:
+def test_a_file_that_is_no_recording_is_refused_with_its_kind(tmp_path: Path, content: bytes, words: str) -> None:
     (tmp_path / "x.mcap").write_bytes(content)
     with pytest.raises(DataError, match=words):
         read_recording(tmp_path / "x.mcap")
@@ -233,12 +233,12 @@ def test_another_tool_s_mcap_is_not_a_recording(tmp_path: Path) -> None:
         read_recording(tmp_path / "x.mcap")
 
 
-def test_no_such_recording_is_a_usage_error(tmp_path: Path) -> None:
+def test_a_missing_recording_is_a_configuration_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such recording"):
         read_recording(tmp_path / "x.mcap")
 
 
-def test_a_place_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failed_creation_leaves_no_file(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot be written"):
         write_recording(make_recording(10), tmp_path / "file" / "r.mcap")
@@ -270,7 +270,7 @@ def test_a_file_has_its_head_as_soon_as_it_has_its_name(tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_what_is_there_is_not_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, links: bool) -> None:
+def test_an_existing_file_is_not_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, links: bool) -> None:
     if not links:
         # Error of a memory card's file system.
         monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(PermissionError(1, "Operation not permitted")))
@@ -309,7 +309,7 @@ def with_chunks(data: bytes, change: Callable[[bytearray], None]) -> bytes:
     return bytes(out) + mcap.MAGIC
 
 
-def test_sizes_that_a_file_claims_are_no_reason_to_reserve_memory(tmp_path: Path) -> None:
+def test_memory_is_not_reserved_by_sizes_stated_in_a_file(tmp_path: Path) -> None:
     write_chunked(make_recording(2000), tmp_path / "r.mcap").close({})
     data = (tmp_path / "r.mcap").read_bytes()
     for size in (2**28, 2**31, 2**40, 2**63, 2**64 - 1):
@@ -325,7 +325,7 @@ def test_sizes_that_a_file_claims_are_no_reason_to_reserve_memory(tmp_path: Path
         assert peak < 20e6
 
 
-def test_a_recording_that_lies_about_its_number_of_rows_is_read_all_the_same(tmp_path: Path) -> None:
+def test_a_recording_with_a_wrong_number_of_rows_in_its_summary_is_read(tmp_path: Path) -> None:
     recording = make_recording(2000)
     write_chunked(recording, tmp_path / "r.mcap").close({})
     data = (tmp_path / "r.mcap").read_bytes()
@@ -353,7 +353,7 @@ def test_a_flipped_bit_in_the_head_is_found(at: str, tmp_path: Path) -> None:
         read_recording(tmp_path / "r.mcap")
 
 
-def test_counters_that_were_damaged_are_left_out_and_said(tmp_path: Path) -> None:
+def test_damaged_counters_are_left_out_and_reported(tmp_path: Path) -> None:
     recording = make_recording(300)
     write_chunked(recording, tmp_path / "r.mcap").close({"frames": 12345})
     data = (tmp_path / "r.mcap").read_bytes().replace(b"12345", b"12346")
@@ -364,7 +364,7 @@ def test_counters_that_were_damaged_are_left_out_and_said(tmp_path: Path) -> Non
     assert "is damaged and left out" in str(read.missing)
 
 
-def test_a_chunk_of_another_recording_is_not_taken_for_one_of_this(tmp_path: Path) -> None:
+def test_a_chunk_of_another_recording_is_detected(tmp_path: Path) -> None:
     one, other = make_recording(300, seed=1), make_recording(300, seed=2)
     write_chunked(one, tmp_path / "1.mcap").close({})
     write_chunked(replace(other, metadata={"host": "y"}), tmp_path / "2.mcap").close({})

@@ -41,7 +41,7 @@ def stock_count(path: Path) -> int:
         return found
 
 
-def test_a_file_cut_anywhere_is_healed_to_what_our_reader_finds_in_it(tmp_path: Path) -> None:
+def test_a_truncated_file_is_recovered_to_the_rows_that_our_reader_finds(tmp_path: Path) -> None:
     recording = make_recording(2000)
     path = tmp_path / "r.mcap"
     write_chunked(recording, tmp_path / "whole.mcap").close({})
@@ -60,7 +60,7 @@ def test_a_file_cut_anywhere_is_healed_to_what_our_reader_finds_in_it(tmp_path: 
         assert recover_recording(path).missing is None
 
 
-def test_the_index_of_a_healed_file_is_that_of_a_finished_one(tmp_path: Path) -> None:
+def test_the_index_of_a_recovered_file_equals_that_of_a_finished_one(tmp_path: Path) -> None:
     recording = make_recording(2000)
     writer = write_chunked(recording, tmp_path / "r.mcap")
     writer.flush()
@@ -101,7 +101,7 @@ def test_damage_in_the_middle_is_left_out_and_the_damaged_file_kept(tmp_path: Pa
     assert sorted(p.name for p in tmp_path.iterdir()) == ["r.mcap", "r.mcap.damaged"]
 
 
-def test_a_complete_file_is_left_alone(tmp_path: Path) -> None:
+def test_a_complete_file_is_not_changed(tmp_path: Path) -> None:
     write_chunked(make_recording(300), tmp_path / "r.mcap").close({})
     before = (tmp_path / "r.mcap").read_bytes()
     assert recover_recording(tmp_path / "r.mcap").missing is None
@@ -116,7 +116,7 @@ def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
     assert recover_recording(tmp_path / "r.mcap").missing is None
 
 
-def test_what_is_no_recording_is_refused_and_left_alone(tmp_path: Path) -> None:
+def test_a_file_that_is_no_recording_is_refused_and_not_changed(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such recording"):
         recover_recording(tmp_path / "gone.mcap")
     for name, content in (("empty", b""), ("text", b"t,q1\n0,1\n"), ("begun", b"\x89MCAP0\r\n\x01")):
@@ -133,7 +133,7 @@ def test_what_is_no_recording_is_refused_and_left_alone(tmp_path: Path) -> None:
         recover_recording(tmp_path / "other.mcap")
 
 
-def test_the_command_says_what_is_missing(tmp_path: Path) -> None:
+def test_the_command_prints_the_missing_parts(tmp_path: Path) -> None:
     data = torn(make_recording(1000), tmp_path / "r.mcap", 0.6)
     app = application(["recover"])
     shown = CliRunner().invoke(app, ["recover", str(tmp_path / "r.mcap")])
@@ -153,7 +153,7 @@ def test_the_former_name_of_the_command_still_works(tmp_path: Path) -> None:
     assert "r.mcap: recovered: " in shown.stdout
 
 
-def test_a_file_recovered_by_version_0_1_still_says_what_it_lacks(
+def test_missing_parts_of_a_file_recovered_by_version_0_1_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     torn(make_recording(1000), tmp_path / "r.mcap", 0.6)
@@ -183,7 +183,7 @@ for first in range(0, 20_000, 20):
 
 
 @pytest.mark.slow
-def test_a_writer_killed_at_any_moment_leaves_a_file_that_heals(tmp_path: Path) -> None:
+def test_a_writer_killed_at_any_moment_leaves_a_recoverable_file(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     whole = make_recording(20_000).samples
     for k in range(6):

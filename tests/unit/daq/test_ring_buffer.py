@@ -57,7 +57,7 @@ def spans(series: TriggeredSeries) -> list[tuple[int, int]]:
     return found
 
 
-def test_an_event_is_written_with_what_came_before_and_after(tmp_path: Path) -> None:
+def test_an_event_is_written_with_the_rows_before_and_after_it(tmp_path: Path) -> None:
     recording = make_recording(6000)
     series = triggered(recording, tmp_path)
     feed(series, recording, [2000, 4000])
@@ -74,7 +74,7 @@ def test_an_event_is_written_with_what_came_before_and_after(tmp_path: Path) -> 
         np.testing.assert_array_equal(read.samples.raw["position"], recording.samples.raw["position"][kept])
 
 
-def test_how_much_is_kept_can_change_while_it_is_captured(tmp_path: Path) -> None:
+def test_the_time_around_events_can_change_during_a_capture(tmp_path: Path) -> None:
     recording = make_recording(6000)
     series = triggered(recording, tmp_path)
     feed(series, recording, [1000], span=(0, 2000))
@@ -122,7 +122,7 @@ def test_an_event_goes_on_in_further_files(tmp_path: Path) -> None:
         join_parts([read_recording(path) for path in reversed(series.paths)])
 
 
-def test_a_disk_that_refuses_is_told_and_tried_again(tmp_path: Path) -> None:
+def test_a_write_error_is_reported_and_writing_is_retried(tmp_path: Path) -> None:
     recording = make_recording(6000)
     begin = beginner(recording)
     tried: list[int] = []

@@ -61,7 +61,7 @@ def test_joints_of_other_names_are_taken_in_their_order(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found["q"], q)
 
 
-def test_what_ros_reads_is_what_was_written(tmp_path: Path) -> None:
+def test_ros_reads_the_written_values(tmp_path: Path) -> None:
     q, tau = motion(6)
     columns = {f"q{j + 1}": q[:, j] for j in range(6)} | {f"tau{j + 1}": tau[:, j] for j in range(6)}
     write_joint_states(tmp_path / "a.mcap", NAMES, T0 + np.arange(200) * 1_000_000, columns)
@@ -74,7 +74,7 @@ def test_what_ros_reads_is_what_was_written(tmp_path: Path) -> None:
     assert decoded[3].header.stamp.nanosec == 3_000_000
 
 
-def test_what_is_wrong_with_a_bag_is_said(tmp_path: Path) -> None:
+def test_an_invalid_bag_is_reported_in_one_line(tmp_path: Path) -> None:
     q, tau = motion(6)
     with pytest.raises(DataError, match=r"no joint joint_6 of tx40 among"):
         read_joint_states(states(tmp_path / "a.mcap", [*NAMES[:5], "tool"], q, tau), TX40)

@@ -86,7 +86,7 @@ def test_without_limits_it_is_one_file_of_the_plain_name(tmp_path: Path) -> None
     assert [p.name for p in tmp_path.iterdir()] == [f"{NAME}.mcap"]
 
 
-def test_where_no_new_file_can_be_begun_the_old_one_goes_on(tmp_path: Path) -> None:
+def test_rows_continue_in_the_old_file_if_no_new_one_can_be_created(tmp_path: Path) -> None:
     recording = make_recording(3000)
     begin = beginner(recording)
     refused: list[Path] = []
@@ -109,7 +109,7 @@ def test_where_no_new_file_can_be_begun_the_old_one_goes_on(tmp_path: Path) -> N
     np.testing.assert_array_equal(part.samples.sync, recording.samples.sync)
 
 
-def test_a_full_disk_costs_rows_and_not_the_rest(tmp_path: Path) -> None:
+def test_a_full_disk_costs_only_the_rows_of_that_time(tmp_path: Path) -> None:
     recording = make_recording(6000)
     mark = Mark("note", 2500, int(recording.samples.t_ns[0]), "said while it was full")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -146,7 +146,7 @@ def test_a_full_disk_costs_rows_and_not_the_rest(tmp_path: Path) -> None:
     assert mark in read.marks
 
 
-def test_a_file_that_could_not_be_finished_has_its_gaps_told_by_the_next(tmp_path: Path) -> None:
+def test_gaps_of_an_unfinished_file_are_recorded_in_the_next_one(tmp_path: Path) -> None:
     recording = make_recording(3000)
     samples, begin = recording.samples, beginner(recording)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -174,7 +174,7 @@ def made(directory: Path, stamp: str, name: str = "tx40", suffix: str = ".mcap")
 NOW = datetime.datetime(2026, 11, 20, 12, tzinfo=datetime.UTC)
 
 
-def test_recordings_are_deleted_for_their_age(tmp_path: Path) -> None:
+def test_recordings_are_deleted_by_age(tmp_path: Path) -> None:
     old, damaged = made(tmp_path, "20261001T000000"), made(tmp_path, "20261002T000000", suffix=".0003.mcap.damaged")
     young = made(tmp_path, "20261119T000000")
     others = [
@@ -187,7 +187,7 @@ def test_recordings_are_deleted_for_their_age(tmp_path: Path) -> None:
     assert sorted(tmp_path.iterdir()) == sorted([young, *others])
 
 
-def test_the_oldest_go_until_there_is_space_enough(tmp_path: Path) -> None:
+def test_the_oldest_recordings_are_deleted_until_there_is_enough_space(tmp_path: Path) -> None:
     paths = [made(tmp_path, f"202611{day:02d}T000000") for day in range(1, 9)]
 
     def free(_: Path) -> int:
@@ -197,7 +197,7 @@ def test_the_oldest_go_until_there_is_space_enough(tmp_path: Path) -> None:
     assert prune(tmp_path, "tx40", NOW, None, 500, free) == []
 
 
-def test_a_file_that_is_being_written_stays(tmp_path: Path) -> None:
+def test_a_file_that_is_being_written_is_not_deleted(tmp_path: Path) -> None:
     first, second = made(tmp_path, "20261001T000000"), made(tmp_path, "20261002T000000")
     with first.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)

@@ -11,7 +11,7 @@ import pytest
 from armident.daq.interchange.sandbox import read_in_subprocess
 
 
-def test_arrays_arrive_and_what_is_none_stays_behind() -> None:
+def test_only_arrays_are_returned() -> None:
     found = read_in_subprocess(
         lambda: {"q": np.arange(6.0).reshape(3, 2), "name": "x", "words": np.array(["a"]), "i": np.arange(3)}
     )
@@ -34,7 +34,7 @@ def hang() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("read", "words"), [(refuse, "no such"), (crash, "SIGSEGV"), (hang, "SIGKILL")])
-def test_a_reader_that_fails_is_told_of(read: Any, words: str) -> None:
+def test_a_failing_reader_is_reported(read: Any, words: str) -> None:
     begin = time.monotonic()
     with pytest.raises(ValueError, match=words):
         read_in_subprocess(read, longest_s=1.0)

@@ -71,14 +71,14 @@ def test_systemd_takes_every_unit(path: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", [p for p in UNITS if p.suffix == ".service"], ids=lambda path: path.name)
-def test_commands_of_units_are_ours(path: Path) -> None:
+def test_commands_of_units_exist(path: Path) -> None:
     found = commands(path)
     assert found
     for words in found:
         accepted(words)
 
 
-def test_the_timer_runs_weekly_the_service_of_its_name_and_never_late() -> None:
+def test_the_timer_runs_its_service_weekly_and_catches_up_no_missed_run() -> None:
     """An arm must not move because a machine was switched on."""
     timer = Unit(HERE / "systemd" / "armident-reidentify@.timer")["Timer"]
     assert timer["OnCalendar"].startswith("Sun ")
@@ -86,7 +86,7 @@ def test_the_timer_runs_weekly_the_service_of_its_name_and_never_late() -> None:
     assert (HERE / "systemd" / "armident-reidentify@.service").is_file()
 
 
-def test_the_job_ends_a_capture_and_has_real_time() -> None:
+def test_the_job_may_end_a_capture_and_use_real_time_priority() -> None:
     service = Unit(HERE / "systemd" / "armident-reidentify@.service")
     assert service["Unit"]["Conflicts"] == "armident-capture@%i.service"
     assert service["Service"]["Type"] == "oneshot"

@@ -80,7 +80,7 @@ def test_a_block_is_decoded_to_the_last_bit() -> None:
 
 
 @given(st.binary(max_size=300))
-def test_bytes_that_are_no_block_are_refused_in_words(data: bytes) -> None:
+def test_bytes_that_are_no_block_are_refused(data: bytes) -> None:
     with pytest.raises(DataError):
         decode_block(data)
     with pytest.raises(DataError):
@@ -88,7 +88,7 @@ def test_bytes_that_are_no_block_are_refused_in_words(data: bytes) -> None:
 
 
 @given(st.data())
-def test_a_damaged_block_is_refused_in_words(data: st.DataObject) -> None:
+def test_a_damaged_block_is_refused(data: st.DataObject) -> None:
     good = bytearray(encode_block(blocks(1)[0]))
     place = data.draw(st.integers(0, len(good) - 1))
     good[place] ^= data.draw(st.integers(1, 255))
@@ -102,7 +102,7 @@ def test_a_damaged_block_is_refused_in_words(data: st.DataObject) -> None:
     "change",
     [{"rows": -1}, {"rows": 2**40}, {"rows": 49}, {"rows": "x"}, {"layout": {}}, {"layout": None}, {"sequence": None}],
 )
-def test_a_block_that_lies_about_itself_is_refused_in_words(change: dict[str, Any]) -> None:
+def test_a_block_with_an_inconsistent_head_is_refused(change: dict[str, Any]) -> None:
     data = encode_block(blocks(1)[0])
     size = struct.unpack_from("<I", data, 6)[0]
     head = json.dumps(json.loads(data[14 : 14 + size]) | change).encode()
@@ -124,14 +124,14 @@ def test_the_stream_and_the_file_are_the_same_recording(tmp_path: Path) -> None:
     assert (read.gaps, read.marks, read.counters) == (recording.gaps, recording.marks, recording.counters)
 
 
-def test_missing_blocks_are_said() -> None:
+def test_missing_blocks_are_reported() -> None:
     made = blocks(4)
     start, end = events(cell("a"), len(made))
     assert assemble(start, made[:-2], end).missing == "2 of 8 blocks did not arrive"
 
 
 @pytest.mark.parametrize("name", ["../../etc/x", "/tmp/x", "", ".x", "a/b", "a\x00b", 5, "x" * 300])
-def test_a_capture_whose_name_is_no_file_name_is_refused(name: object) -> None:
+def test_a_capture_name_that_is_no_file_name_is_refused(name: object) -> None:
     start, end = events(cell("a"), 1)
     for event in (start, end):
         with pytest.raises(DataError, match="capture"):
@@ -139,7 +139,7 @@ def test_a_capture_whose_name_is_no_file_name_is_refused(name: object) -> None:
 
 
 @pytest.mark.parametrize("lacking", ["blocks", "counters", "gaps", "marks", "paths", "capture"])
-def test_an_end_that_lacks_something_is_refused(lacking: str) -> None:
+def test_an_incomplete_end_event_is_refused(lacking: str) -> None:
     _, end = events(cell("a"), 1)
     with pytest.raises(DataError, match=f"experiment_end whose '{lacking}' is missing"):
         decode_event(json.dumps({key: value for key, value in end.items() if key != lacking}).encode())
@@ -151,7 +151,7 @@ def test_blocks_of_another_capture_are_refused() -> None:
         assemble(start, [], end | {"capture": "c2"})
 
 
-def test_a_listener_that_comes_late_gets_everything() -> None:
+def test_a_late_subscriber_gets_all_blocks() -> None:
     session = cell("late_listener")
     keys = Keys(session.cell, "tx40")
     made = blocks(50)
@@ -195,7 +195,7 @@ def test_a_full_queue_drops_blocks_and_counts_them() -> None:
     assert elapsed < 1.0
 
 
-def test_events_that_nobody_takes_are_bounded_and_of_health_the_last_waits() -> None:
+def test_waiting_events_are_bounded_and_only_the_latest_health_message_waits() -> None:
     session = cell("many_events")
     publisher = Publisher(session, Keys(session.cell, "tx40"))
     # Holding the queue's lock blocks the sending thread, like a listener that delays a put.
@@ -218,5 +218,5 @@ def test_a_second_capture_of_a_cell_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["peer", "client", "router", "tls"])
-def test_the_ready_made_configurations_are_zenoh_s(name: str) -> None:
+def test_the_shipped_zenoh_configurations_are_valid(name: str) -> None:
     zenoh.Config.from_file(str(config_path(f"zenoh/{name}.json5")))

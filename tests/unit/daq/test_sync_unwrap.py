@@ -49,7 +49,7 @@ def answered(numbers: list[int], late_ns: Callable[[int], int] = lambda k: 0) ->
     return out
 
 
-def test_a_master_that_is_held_up_at_times_has_never_been_so_for_a_turn_of_the_counter_by_chance() -> None:
+def test_a_pause_of_one_counter_turn_of_an_irregular_master_is_no_loss() -> None:
     """If the time stamps are irregular, a pause of exactly one turn is no evidence for missing SYNCs either."""
     listener = Listener()
     stalls = {400: 37, 700: 90, 900: OVERFLOW, 1500: 2 * OVERFLOW}
@@ -60,7 +60,7 @@ def test_a_master_that_is_held_up_at_times_has_never_been_so_for_a_turn_of_the_c
 
 @pytest.mark.parametrize("turns", [0.76, 1.1, 3.2])
 @pytest.mark.parametrize("cut", [False, True])
-def test_a_master_that_was_held_up_has_sent_nothing_meanwhile(turns: float, cut: bool) -> None:
+def test_a_delayed_master_has_sent_no_sync_meanwhile(turns: float, cut: bool) -> None:
     listener = Listener()
     stall = round(turns * OVERFLOW) * PERIOD_NS
     sent = answered(list(range(1000)), lambda k: stall if k >= 500 else 0)
@@ -72,7 +72,7 @@ def test_a_master_that_was_held_up_has_sent_nothing_meanwhile(turns: float, cut:
 
 
 @pytest.mark.parametrize("why", ["dropped", "down", "bus-off"])
-def test_whole_turns_are_missing_where_frames_are_known_to_be(why: str) -> None:
+def test_whole_counter_turns_count_as_missing_only_if_frames_are_missing(why: str) -> None:
     listener = Listener()
     listener.push(answered(list(range(500))))
     if why == "down":
@@ -84,13 +84,13 @@ def test_whole_turns_are_missing_where_frames_are_known_to_be(why: str) -> None:
     assert outages(listener.finish()) == [(500, 500 + 2 * OVERFLOW - 1)]
 
 
-def test_an_outage_that_nobody_noticed_is_told_by_the_counter_and_its_length_by_the_time() -> None:
+def test_an_unreported_outage_is_detected_by_the_counter_and_measured_by_the_time() -> None:
     listener = Listener()
     listener.push(answered([*range(500), *range(1217, 1500)]))
     assert outages(listener.finish()) == [(500, 1216)]
 
 
-def test_what_is_known_to_be_missing_counts_for_the_next_sync_alone() -> None:
+def test_known_missing_frames_affect_only_the_next_sync() -> None:
     listener = Listener()
     stall = round(1.1 * OVERFLOW) * PERIOD_NS
     sent = answered(list(range(1000)), lambda k: stall if k >= 500 else 0)
@@ -100,7 +100,7 @@ def test_what_is_known_to_be_missing_counts_for_the_next_sync_alone() -> None:
 
 
 @pytest.mark.parametrize(("dropped", "passed", "at_most"), [(0, 50, 0), (13, 50, 13), (700, 50, 50), (7, 0, 0)])
-def test_no_more_syncs_are_unseen_than_frames_were_dropped_or_periods_have_passed(
+def test_unreceived_syncs_are_bounded_by_dropped_frames_and_elapsed_periods(
     dropped: int, passed: int, at_most: int
 ) -> None:
     listener = Listener()
@@ -113,11 +113,11 @@ def test_no_more_syncs_are_unseen_than_frames_were_dropped_or_periods_have_passe
     assert listener.assembler.counters["samples.expected"] == 100 + at_most
 
 
-def test_nothing_is_unseen_before_the_first_sync() -> None:
+def test_no_sync_is_unreceived_before_the_first_one() -> None:
     assert Listener().assembler.most_unreceived([40], T0) == 0
 
 
-def test_what_one_bus_had_to_drop_another_one_may_have_received() -> None:
+def test_a_sync_dropped_on_one_bus_may_be_received_on_another() -> None:
     assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, None, bus_of=(0, 1))
     for bus, count in ((0, 100), (1, 90)):
         both = answered(list(range(count)))
@@ -128,7 +128,7 @@ def test_what_one_bus_had_to_drop_another_one_may_have_received() -> None:
 
 
 @pytest.mark.parametrize("held_up", [0.0, 0.3, 0.9, 5.0])
-def test_a_bus_whose_frames_waited_finds_its_numbers_by_the_times_of_another(held_up: float) -> None:
+def test_delayed_frames_of_a_bus_are_numbered_by_the_times_of_another_bus(held_up: float) -> None:
     """The master is delayed by turns of its counter while one bus waits: nominal periods would give wrong turns."""
     count, before, after = 60_000, 22_000, 30_000
     assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, 1, bus_of=(0, 1))
@@ -150,9 +150,7 @@ def test_a_bus_whose_frames_waited_finds_its_numbers_by_the_times_of_another(hel
 @pytest.mark.parametrize("turns", [1.0, 1.1, 2.4, 40.0])
 @pytest.mark.parametrize("lost", [0, 700])
 @pytest.mark.parametrize("held_up", [0.0, 2.0])
-def test_our_own_syncs_are_told_by_when_we_sent_them_where_frames_are_lost(
-    turns: float, lost: int, held_up: float
-) -> None:
+def test_own_syncs_are_numbered_by_their_send_times_if_frames_are_lost(turns: float, lost: int, held_up: float) -> None:
     assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW)
     stall = round(turns * OVERFLOW) * PERIOD_NS
     sent = answered(list(range(2000)), lambda k: stall if k >= 500 else 0)
@@ -170,7 +168,7 @@ def test_our_own_syncs_are_told_by_when_we_sent_them_where_frames_are_lost(
 
 @pytest.mark.parametrize("back", [502, 762, 1400])
 @pytest.mark.parametrize("known", [False, True])
-def test_what_waited_behind_an_outage_is_older_than_what_another_bus_had_meanwhile(back: int, known: bool) -> None:
+def test_frames_delayed_by_an_outage_are_older_than_those_of_another_bus(back: int, known: bool) -> None:
     """One bus is read up to SYNC 1900 before the frames that the other has received since its return."""
     assembler = Assembler([STREAM], ("joint_1", "joint_2"), PERIOD_NS, OVERFLOW, 1, bus_of=(0, 1))
     sent = answered(list(range(2000)))

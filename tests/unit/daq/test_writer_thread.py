@@ -61,7 +61,7 @@ def until(true: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-def test_every_row_is_in_exactly_one_file_as_without_a_thread(tmp_path: Path) -> None:
+def test_files_are_the_same_with_and_without_the_thread(tmp_path: Path) -> None:
     recording = make_recording(3000)
     series = QueuedSeries(
         RecordingSeries(beginner(recording, 2 * CHUNK_NS), tmp_path, NAME, max_bytes=60_000), EVERY, CHUNK_NS
@@ -96,7 +96,7 @@ def test_a_killed_capture_loses_no_more_than_a_chunk(tmp_path: Path) -> None:
             assert rows is None or recording.samples.t_ns[first] - rows[-1] <= CHUNK_NS + 2_000_000
 
 
-def test_a_disk_that_stands_still_costs_no_row(tmp_path: Path, disk: threading.Event) -> None:
+def test_a_stalled_disk_costs_no_row(tmp_path: Path, disk: threading.Event) -> None:
     recording = make_recording(3000)
     series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
     with series:
@@ -115,7 +115,7 @@ def test_a_disk_that_stands_still_costs_no_row(tmp_path: Path, disk: threading.E
     assert read_recording(path).samples.sync.tolist() == recording.samples.sync.tolist()
 
 
-def test_what_has_waited_is_not_written_all_at_once(tmp_path: Path, disk: threading.Event) -> None:
+def test_a_backlog_is_written_at_a_limited_rate(tmp_path: Path, disk: threading.Event) -> None:
     """Reading the buses needs processor time, too, when the disk works again."""
     recording = make_recording(1500)
     series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
@@ -135,7 +135,7 @@ def test_what_has_waited_is_not_written_all_at_once(tmp_path: Path, disk: thread
     assert read_recording(path).samples.sync.tolist() == sync[sync < 1500].tolist()
 
 
-def test_a_clock_that_is_set_keeps_nothing_waiting(tmp_path: Path, disk: threading.Event) -> None:
+def test_a_clock_step_does_not_delay_writing(tmp_path: Path, disk: threading.Event) -> None:
     recording = make_recording(1500)
     stream = recording.samples
     stream.t_ns[700:] += 3_600_000_000_000
@@ -151,7 +151,7 @@ def test_a_clock_that_is_set_keeps_nothing_waiting(tmp_path: Path, disk: threadi
     assert read_recording(path).samples.sync.tolist() == stream.sync[stream.sync < 1500].tolist()
 
 
-def test_the_end_waits_for_nothing_but_the_disk(
+def test_the_end_writes_the_backlog_without_rate_limit(
     tmp_path: Path, disk: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the write rate of this test, the waiting rows would take hours."""
@@ -167,7 +167,7 @@ def test_the_end_waits_for_nothing_but_the_disk(
     assert read_recording(path).samples.sync.tolist() == recording.samples.sync.tolist()
 
 
-def test_rows_are_gathered_for_as_long_as_was_said_last(tmp_path: Path) -> None:
+def test_the_latest_gathering_time_applies(tmp_path: Path) -> None:
     recording = make_recording(1500)
     series = QueuedSeries(RecordingSeries(beginner(recording, 2 * CHUNK_NS), tmp_path, NAME), EVERY, CHUNK_NS)
     sizes = []
@@ -187,7 +187,7 @@ def test_rows_are_gathered_for_as_long_as_was_said_last(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("limits", [{}, {"max_bytes": 60_000}])
-def test_rows_for_which_there_is_no_room_are_counted_and_become_gaps(
+def test_rows_beyond_the_memory_limit_are_counted_and_become_gaps(
     tmp_path: Path, disk: threading.Event, limits: dict[str, int]
 ) -> None:
     recording = make_recording(3000)
@@ -230,7 +230,7 @@ def test_rows_for_which_there_is_no_room_are_counted_and_become_gaps(
     assert np.array_equal(np.sort(np.concatenate([kept, left_out])), samples.sync[samples.sync < 3000])
 
 
-def test_an_event_tells_what_its_last_seconds_lack(tmp_path: Path, disk: threading.Event) -> None:
+def test_an_event_lists_the_gaps_of_its_last_seconds(tmp_path: Path, disk: threading.Event) -> None:
     recording = make_recording(3000)
     inner = TriggeredSeries(
         lambda number: RecordingSeries(beginner(recording), tmp_path, f"event{number}"), 10**9, 10**8
@@ -264,7 +264,7 @@ def test_an_event_tells_what_its_last_seconds_lack(tmp_path: Path, disk: threadi
     assert np.array_equal(np.sort(np.concatenate([kept, left_out])), written)
 
 
-def test_gaps_and_marks_wait_for_the_disk_however_many_rows_do(tmp_path: Path, disk: threading.Event) -> None:
+def test_gaps_and_marks_are_kept_beyond_the_memory_limit_of_rows(tmp_path: Path, disk: threading.Event) -> None:
     recording = make_recording(1000)
     gap = Gap("samples", 1000, 1007, "joint_1", "no answer")
     series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS, most_bytes=10_000)
@@ -279,7 +279,7 @@ def test_gaps_and_marks_wait_for_the_disk_however_many_rows_do(tmp_path: Path, d
     assert gap in read_recording(series.paths[0]).gaps
 
 
-def test_what_fails_in_the_thread_is_raised_where_rows_come_from(tmp_path: Path) -> None:
+def test_an_error_in_the_thread_is_raised_in_append(tmp_path: Path) -> None:
     recording = make_recording(100)
     with QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), {"samples": 1}, CHUNK_NS) as series:
         series.append("another", np.arange(3), np.arange(3), {})
@@ -289,7 +289,7 @@ def test_what_fails_in_the_thread_is_raised_where_rows_come_from(tmp_path: Path)
             append(series, recording.samples, 0, 50)
 
 
-def test_a_disk_that_does_not_take_the_end_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_error_at_the_end_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = make_recording(100)
     with QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS) as series:
         append(series, recording.samples, 0, 50)
@@ -302,6 +302,6 @@ def test_a_disk_that_does_not_take_the_end_is_told(tmp_path: Path, monkeypatch: 
             series.close({})
 
 
-def test_nothing_is_left_of_a_capture_that_did_not_begin(tmp_path: Path) -> None:
+def test_a_capture_that_did_not_begin_leaves_no_file(tmp_path: Path) -> None:
     QueuedSeries(RecordingSeries(beginner(make_recording(100)), tmp_path, NAME), EVERY, CHUNK_NS).abort()
     assert list(tmp_path.iterdir()) == []

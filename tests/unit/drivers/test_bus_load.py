@@ -94,7 +94,7 @@ def physical(name: str, data_bitrate: int | None = None) -> SessionConfig:
     return session.model_copy(update={"buses": tuple(b.model_copy(update=changed) for b in session.all_buses)})
 
 
-def test_the_shipped_sessions_of_several_buses_fit_physical_ones_as_they_say() -> None:
+def test_the_shipped_sessions_of_several_buses_fit_physical_buses() -> None:
     check_fits(physical("tx40_six_buses"))
     check_fits(physical("tx40_one_fd", 5_000_000))
     two = physical("tx40_two_fd", 5_000_000)
@@ -136,7 +136,7 @@ def table(*options: str) -> str:
     return done.stdout + done.stderr
 
 
-def test_a_bus_with_fd_remains_one_at_another_bit_rate() -> None:
+def test_a_bus_with_fd_keeps_fd_at_another_bit_rate() -> None:
     shipped = "tx40_one_fd.yaml"
     assert "vcan0: a CAN FD bus needs --data-bitrate, too" in table("--config", shipped, "--bitrate", "1000000")
     both = table("--config", shipped, "--bitrate", "1000000", "--data-bitrate", "5000000")

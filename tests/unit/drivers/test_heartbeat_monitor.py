@@ -18,7 +18,7 @@ def update_regularly(monitor: HeartbeatMonitor, until: float, since: float = 0.0
         monitor.update([], since + step * k)
 
 
-def test_heartbeats_that_waited_between_updates_are_no_silence() -> None:
+def test_heartbeats_that_arrive_between_updates_are_no_silence() -> None:
     monitor = HeartbeatMonitor("ab", 0.0)
     monitor.update([*beats("a", 0.1, 1.9), *beats("b", 0.05, 1.95)], 2.0)
     assert monitor.ended_silence("a") == pytest.approx(0.1, abs=0.01)
@@ -41,7 +41,7 @@ def test_a_silent_drive_is_detected_in_time() -> None:
 
 
 @pytest.mark.parametrize("heard", [[], [("a", 1.0), ("b", 1.0)]])
-def test_a_machine_that_was_held_up_reports_no_silence(heard: list[tuple[str, float]]) -> None:
+def test_a_delayed_machine_reports_no_silence(heard: list[tuple[str, float]]) -> None:
     """In two cases: heartbeats of that time are stamped late, or have not been received yet."""
     monitor = HeartbeatMonitor("ab", 0.0)
     monitor.update([("a", 0.15), ("b", 0.2)], 0.22)
@@ -53,7 +53,7 @@ def test_a_machine_that_was_held_up_reports_no_silence(heard: list[tuple[str, fl
     assert monitor.silence("a") > 0.4
 
 
-def test_a_machine_that_is_held_up_repeatedly_still_detects_a_silent_drive() -> None:
+def test_a_repeatedly_delayed_machine_still_detects_a_silent_drive() -> None:
     monitor = HeartbeatMonitor("a", 0.0)
     for k in range(1, 5):
         monitor.update([], 0.3 * k)

@@ -23,7 +23,7 @@ def test_the_samples_stream_fills_eight_bytes_in_mapping_order() -> None:
 
 
 @given(st.integers(-(2**31), 2**31 - 1), st.integers(-(2**15), 2**15 - 1), st.integers(0, 2**16 - 1))
-def test_decoding_gives_back_what_a_drive_packs(position: int, current: int, status: int) -> None:
+def test_decoding_returns_the_packed_values(position: int, current: int, status: int) -> None:
     packed = (
         position.to_bytes(4, "little", signed=True)
         + current.to_bytes(2, "little", signed=True)
@@ -136,7 +136,7 @@ def test_a_packed_tpdo_maps_the_arrays_sample_by_sample() -> None:
     assert len(layout.entries) == 20
 
 
-def test_what_does_not_fit_a_classic_frame_names_can_fd() -> None:
+def test_the_error_of_an_oversized_tpdo_names_can_fd() -> None:
     with pytest.raises(ConfigError, match=r"8 bytes of a TPDO; a bus with fd: true carries 64"):
         TpdoLayout.of(["position", "velocity", "current"])
     with pytest.raises(ConfigError, match=r"11 times 6 bytes .* do not fit into the 64 bytes"):

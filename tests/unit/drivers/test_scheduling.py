@@ -17,7 +17,7 @@ def may_rise() -> bool:
     return bool(int(effective.split()[1], 16) >> 23 & 1)
 
 
-def test_one_thread_comes_before_the_others_and_goes_back() -> None:
+def test_priority_is_raised_for_one_thread_and_restored() -> None:
     done, other = threading.Event(), threading.Thread(target=lambda: done.wait())
     other.start()
     try:
@@ -32,7 +32,7 @@ def test_one_thread_comes_before_the_others_and_goes_back() -> None:
         other.join()
 
 
-def test_real_time_priority_is_of_one_thread_and_reported() -> None:
+def test_real_time_priority_applies_to_one_thread_and_is_reported() -> None:
     said: list[tuple[bool, int]] = []
 
     def run() -> None:

@@ -30,7 +30,7 @@ def test_a_temperature_is_read_and_scaled() -> None:
         assert until(lambda: poll.celsius() == {"joint_1": pytest.approx(-12.3)})
 
 
-def test_a_drive_without_one_is_not_asked() -> None:
+def test_a_drive_without_a_temperature_object_is_not_polled() -> None:
     liar, sdo = new_drive()
     with TemperaturePoll([sdo]) as poll:
         time.sleep(0.05)
@@ -38,7 +38,7 @@ def test_a_drive_without_one_is_not_asked() -> None:
     assert liar.asked == 0
 
 
-def test_a_drive_that_does_not_answer_is_forgotten_and_asked_again_later() -> None:
+def test_the_temperature_of_a_silent_drive_is_dropped_and_polled_again_later() -> None:
     liar, sdo = new_drive(temperature=PLACE)
     liar.objects = {(0x2030, 2): b"\x0a\x00"}
     liar.script = SILENT
@@ -79,7 +79,7 @@ def test_a_command_waits_for_a_poll_no_longer_than_the_answer_time() -> None:
     assert sdo.node.sdo.RESPONSE_TIMEOUT == 5.0
 
 
-def test_the_liar_is_a_drive_when_it_does_not_lie() -> None:
+def test_the_faulty_drive_behaves_like_a_drive_without_its_fault() -> None:
     liar, sdo = new_drive()
     assert isinstance(liar, LyingDrive)
     sdo.write(od.HEARTBEAT_PRODUCER, 0, 100, "H")

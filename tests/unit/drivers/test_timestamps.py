@@ -35,7 +35,7 @@ def test_spacing_is_that_of_the_hardware_and_the_base_that_of_the_machine(drift:
     assert np.diff(times)[settled].std() < 0.05 * np.diff(software)[settled].std()
 
 
-def test_a_clock_that_is_set_begins_anew() -> None:
+def test_a_clock_step_restarts_the_estimate_of_the_offset() -> None:
     true, software, hardware = stamps(20_000, 0.0)
     clock = InterfaceClock()
     clock.to_utc(software[:10_000], hardware[:10_000])
@@ -59,5 +59,5 @@ def test_control_messages_lie_where_the_kernel_puts_them() -> None:
     assert (fields["seconds"][1], fields["hardware_seconds"][1], fields["drops"][1]) == (16, 48, 80)
 
 
-def test_an_interface_that_is_not_there_has_no_hardware_stamps() -> None:
+def test_a_missing_interface_has_no_hardware_stamps() -> None:
     assert not has_hardware_timestamps("can97")

@@ -35,7 +35,7 @@ def collect(bus: UdpBus, n: int, seconds: float = 10.0) -> Frames:
     return np.concatenate(parts)
 
 
-def test_frames_arrive_as_they_were_sent_and_only_those_the_filter_lets_through(receiver: UdpBus) -> None:
+def test_sent_frames_arrive_unchanged_and_filtered(receiver: UdpBus) -> None:
     sent = frames(20)
     sent["can_id"] = np.where(np.arange(20) % 2, 0x7A1, 0x6A1)
     sent["length"] = np.arange(20) % 9
