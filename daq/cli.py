@@ -19,7 +19,7 @@ from armident.daq.logs import StderrHandler, log_to
 
 GROUP = "armident.commands"
 DEBUG_VARIABLE = "ARMIDENT_DEBUG"
-"""Environment variable that does what ``--debug`` does."""
+"""Environment variable with the effect of ``--debug``."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C: 128 plus SIGINT, as shells have it."""
 

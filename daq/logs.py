@@ -34,7 +34,7 @@ class LineFormatter(logging.Formatter):
 
 
 class StderrHandler(logging.Handler):
-    """Writes records as lines to what ``sys.stderr`` is at that time.
+    """Writes records as lines to the present ``sys.stderr``.
 
     Parameters
     ----------

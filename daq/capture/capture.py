@@ -77,11 +77,11 @@ def capture(
     plan
         Session, robot, trajectory and options of the capture.
     stop
-        Event that ends the capture; the file is finished nevertheless.
+        Set it to end the capture; the file is finished nevertheless.
     save
-        Event that requests a file with the last seconds, where a trigger decides when rows are written.
+        Set it to write the last seconds, in a capture with triggers.
     reload
-        Event that requests a reload of the configuration, where the plan was read from a file.
+        Set it to read the configuration again, if the plan was read from a file.
 
     Returns
     -------

@@ -89,7 +89,7 @@ class EventHandler:
             self._stop_moving(event.text)
 
     def on_frames_dropped_at_end(self, dropped: int, syncs: int) -> None:
-        """Note that the kernel dropped frames behind the last one that was received.
+        """Note that the kernel dropped frames after the last received one.
 
         Parameters
         ----------

@@ -1,8 +1,8 @@
 """Discovery of the TPDOs that drives send, by listening alone.
 
 Frames that come on every n-th SYNC, always with the same length, are TPDOs of the drives whose EDS gives them their
-COB-ID. Frames contain no information about their mapping. The mapping is that of the session if its length and interval
-agree, else the default of the EDS if its length agrees. Other TPDOs are refused.
+COB-ID. Frames do not describe their contents. The mapping is that of the session if its length and interval agree, else
+the default of the EDS if its length agrees. Anything else is refused.
 """
 
 import logging

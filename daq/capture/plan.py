@@ -21,7 +21,7 @@ from armident.drivers.canopen.objects import COB_SDO_REQUEST, COB_SYNC
 
 @dataclass(frozen=True)
 class CapturePlan:
-    """Configuration and options of a capture.
+    """Configuration and options of one capture.
 
     Parameters
     ----------

@@ -28,8 +28,8 @@ _LONGEST_CLOSE_S = 5.0
 class Publisher:
     """Publishes blocks, events, health and status of a capture.
 
-    Blocks wait in a queue of ``session.zenoh.queue_blocks``. If it is full they are dropped and counted; the file is
-    complete nevertheless. Subscribers detect missing blocks by sequence numbers, and can query the last
+    Blocks wait in a queue of ``session.zenoh.queue_blocks``. If it is full they are dropped and counted; the file
+    remains complete. Subscribers detect missing blocks by sequence numbers, and can query the last
     ``cache_blocks``. Events are dropped only if thousands wait. Of health and status only the latest waits.
 
     Parameters

@@ -31,8 +31,8 @@ _START_TOLERANCE = 1e-4
 class StandstillDetector:
     """Detects from the newest positions that an arm has come to rest.
 
-    An arm stands still if no joint exceeds 0.2 % of its velocity limit on average over any 10 ms of the last 50 ms. The
-    turning point of an oscillation is thus no standstill. Two encoder counts are no motion.
+    An arm is at standstill if no joint exceeds 0.2 % of its velocity limit, averaged over any 10 ms of the last 50 ms.
+    The turning point of an oscillation is thus no standstill. Two encoder counts are no motion.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class StandstillDetector:
         self._since = 0
 
     def update(self, sync: int, counts: NDArray[np.integer]) -> bool:
-        """Process new positions; return True if the arm stands still, ``False`` during the first 50 ms.
+        """Take positions and return True if the arm stands still; ``False`` during the first 50 ms.
 
         Parameters
         ----------

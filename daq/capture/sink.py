@@ -109,7 +109,7 @@ class Sink:
         self._place_marks(False)
 
     def trigger(self) -> None:
-        """Write the seconds before and after the newest sample, if the session records only around triggers."""
+        """Write the seconds before and after the newest sample, in a capture with triggers."""
         self._writer.trigger(self.last_ns)
 
     def move_mark(self, kind: MarkKind, sync: int, text: str) -> None:
@@ -144,7 +144,7 @@ class Sink:
             self._writer.rotate(int(samples.t_ns[0]))
             self.last_ns = self.last_ns or int(samples.t_ns[0])
         if batch.gaps:
-            # Before the rows behind them: a file that is cut off has all gaps of its rows.
+            # Before the rows that follow them: a truncated file then lists all gaps of its rows.
             self.gaps += batch.gaps
             self._writer.add_gaps(batch.gaps, self.last_ns)
         for stream in self._streams:

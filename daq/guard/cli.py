@@ -17,7 +17,7 @@ def guard(
     """Monitor a moving arm on its bus, and stop its drives within one cycle when a limit is violated.
 
     The guard commands a quick stop (CiA 402) when a joint exceeds its limits of position, velocity, torque or following
-    error. So it does on EMCY, a lost heartbeat, a drive that leaves the state operational, missing SYNC during the
+    error. It does so on EMCY, a lost heartbeat, a drive that leaves the state operational, missing SYNC during the
     motion, Ctrl-C and SIGTERM. `armident reidentify` runs a guard beside every capture.
 
     Example: armident guard --config tx40_cell.yaml

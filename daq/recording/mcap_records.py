@@ -196,7 +196,7 @@ def read_chunk(content: memoryview) -> ChunkContent:
     Raises
     ------
     MalformedRecord
-        If the content is shorter than its lengths say.
+        If the content is shorter than the lengths in it.
     """
     at = _CHUNK_HEAD.size + 4
     if len(content) < at:

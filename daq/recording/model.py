@@ -91,7 +91,7 @@ class Gap:
     joint
         Joint whose samples are missing; ``None``: all joints.
     reason
-        Cause, in words.
+        Description of the cause.
     """
 
     stream: str

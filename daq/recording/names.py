@@ -25,7 +25,7 @@ The first one covers the head of the file. Those at the end continue the head's 
 """
 
 RECOVERED = "armident.recovered"
-"""Metadata of a recovered file: the missing parts, in words."""
+"""Metadata of a recovered file: a description of the missing parts."""
 
 RECOVERED_OLD = "armident.healed"
 """Name of `RECOVERED` up to version 0.1, still read."""

@@ -67,7 +67,7 @@ def read_recording(path: Path | str) -> Recording:
 
 
 def recovered_words(metadata: dict[str, dict[str, str]]) -> list[str]:
-    """Describe the parts that a recovered file lacked; empty if it was not recovered.
+    """Return a description of the parts that a recovered file lacks; empty if it was not recovered.
 
     Parameters
     ----------

@@ -232,7 +232,7 @@ class RecordingScan:
         self.finished = self.finished and bytes(self._data[-len(mcap.MAGIC) :]) == mcap.MAGIC
 
     def missing(self, last_sync: int | None) -> list[str]:
-        """Describe the missing parts of the file, after the iteration; empty for a complete file.
+        """Return descriptions of the missing parts, after the iteration; empty for a complete file.
 
         Parameters
         ----------

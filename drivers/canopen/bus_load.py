@@ -1,7 +1,7 @@
 """Load of CAN buses: bits of classic and FD frames, load of a session by bus, and alternatives that fit.
 
-Classic frames: Davis, Burns, Bril and Lukkien (2007). CAN FD: ISO 11898-1:2015. Its arbitration is at the nominal bit
-rate, the part between bit rate switch and CRC delimiter at the data bit rate. Its CRC field has fixed stuff bits.
+Classic frames: Davis, Burns, Bril and Lukkien (2007). CAN FD: ISO 11898-1:2015, with arbitration at the nominal bit
+rate and the part between bit rate switch and CRC delimiter at the data bit rate. The CRC field has fixed stuff bits.
 """
 
 from collections.abc import Iterator

@@ -222,7 +222,7 @@ class DriveMaster:
                 self._report("emcy", sdo, emcy.t_ns, emcy.text(sdo.emcy_texts), emcy.code)
             for node, index, t_ns in network.sdo_writes():
                 joint = self._joints[channel, node]
-                # Our own writes fall into a time that is unverified already.
+                # Own writes fall into a time span that is unverified already.
                 if t_ns > max(self._started_ns, self.unverified_mapping.get(joint, (0, 0))[1]):
                     self._on_foreign_write(by_joint[joint], index, t_ns)
 

@@ -89,7 +89,7 @@ def run(command: Sequence[str], buses: int = 1, memory: str = "4096M", writable:
     ]
     environment["PATH"] = f"{environment.get('PATH', os.defpath)}:/usr/sbin:/sbin:{root / 'bin'}"
     environment["ARMIDENT_GUEST"] = "1"
-    # A page fault costs a guest many times what it costs the host: let freed memory stay with its process.
+    # A page fault is many times slower in a guest than on the host: freed memory stays with its process.
     environment.setdefault("GLIBC_TUNABLES", MALLOC_TUNABLES)
     for cache in caches:
         cache.mkdir(parents=True, exist_ok=True)

@@ -178,12 +178,12 @@ class Worker:
             process.join()
             seen, syncs_by_bus = farm.finish(), [list(state.syncs) for state in farm.buses]
         words = log_text(log)
-        explained = OF_ANOTHER if setup.answer_faults.spoilt else None
+        explained = OF_ANOTHER if setup.answer_faults.disturbed else None
         undone = [name for name in faults if name in ORDERED and ORDERED[name] not in setup.answer_faults.done]
         faults = [name for name in faults if name not in undone]
         if process.exitcode != 0:
             what = [f"the capture ended with {process.exitcode}"]
-            if setup.answer_faults.full_at_end and UNFINISHED in words and _torn_only(out):
+            if setup.answer_faults.full_at_end and UNFINISHED in words and _truncated_only(out):
                 what, explained = [f"{what[0]}: {UNFINISHED}"], UNFINISHED
             shutil.rmtree(out)
             return Round(number, faults, _shape(producing, buses), 0, 0, 0, 0, what, [], words), explained
@@ -234,7 +234,7 @@ class Worker:
             time.sleep(0.02)
 
 
-def _torn_only(folder: Path) -> bool:
+def _truncated_only(folder: Path) -> bool:
     """Return whether all files are readable, and the unfinished one is reported as such."""
     return any([bool(read_recording(path).missing) for path in folder.glob("*.mcap")])
 

@@ -50,7 +50,7 @@ def violations(
     last = max((syncs[-1] for syncs in syncs_by_bus if syncs), default=-1)
     if counters["samples.expected"] < last + 1 + (int(shift[-1]) if shift.size else 0):
         found.append(f"{last + 1} SYNCs went over the bus, {counters['samples.expected']} are accounted for")
-    # The frames that the kernel dropped behind the last one may all be SYNCs, or none of them.
+    # The frames that the kernel dropped after the last one may all be SYNCs, or none of them.
     surplus = counters["samples.expected"] - last - 1
     if not turns and not producing and not 0 <= surplus <= counters["sync_unseen"]:
         found.append(f"{last + 1} SYNCs were sent, {counters['samples.expected']} are accounted for")

@@ -93,7 +93,7 @@ class AnswerFaults:
 
     ``lost`` are not sent, ``twice`` sent twice, ``again`` sent once more behind the next SYNC, and ``late`` sent behind
     the SYNC of that number. ``skipped`` SYNCs are not sent by the farm as the master. ``done`` has the names of the
-    first three if they occurred; they do not while the farm itself is late. ``spoilt`` is set if it became late
+    first three if they occurred; they do not while the farm itself is late. ``disturbed`` is set if it became late
     meanwhile. ``done`` also has ``full`` if the disk refused a write; ``full_at_end`` is set if it did so to the end of
     the capture.
     """
@@ -104,11 +104,11 @@ class AnswerFaults:
     late: dict[tuple[int, int], int] = field(default_factory=dict)
     skipped: set[int] = field(default_factory=set)
     done: set[str] = field(default_factory=set)
-    spoilt: bool = False
+    disturbed: bool = False
     full_at_end: bool = False
 
     @cached_property
-    def touched(self) -> set[int]:
+    def faulty_syncs(self) -> set[int]:
         """SYNCs with a faulty answer."""
         return {k for k, _ in (*self.lost, *self.twice, *self.again, *self.late)}
 
@@ -318,7 +318,7 @@ class Farm:
             return False
         return True
 
-    def beside(self, work: Callable[[], object]) -> None:
+    def run_in_thread(self, work: Callable[[], object]) -> None:
         """Run a function in a thread of its own."""
         self._helpers.append(threading.Thread(target=work, daemon=True))
         self._helpers[-1].start()
@@ -389,12 +389,12 @@ class Farm:
                 if not self.begun and bus_state.witness is not None:
                     self._begin()
                 disorderly = bool(bus_state.repeats) or (
-                    bus_state.prompt and bus_state.last in self.answer_faults.touched
+                    bus_state.prompt and bus_state.last in self.answer_faults.faulty_syncs
                 )
                 self._answer(bus_state, bus_state.last, int(one["data"][0]))
                 bus_state.sent_ns = time.time_ns()
                 if self.answer_faults.done and disorderly:
-                    self.answer_faults.spoilt |= bus_state.sent_ns - stamp >= PROMPT * self._period * 1e9
+                    self.answer_faults.disturbed |= bus_state.sent_ns - stamp >= PROMPT * self._period * 1e9
         return 0.005
 
     def _number_of(self, bus_state: _FarmBus, counter: int, stamp: int) -> None:
@@ -456,7 +456,7 @@ class Farm:
             n = self._put(out, n, COB_SYNC, bytes([counter]))
         answer_faults = self.answer_faults
         if (
-            k not in answer_faults.touched
+            k not in answer_faults.faulty_syncs
             and not bus_state.held
             and not bus_state.repeats
             and self._send_plain(bus_state, k, counter, with_sync)

@@ -145,7 +145,7 @@ def _lost_ms(times: NDArray[np.int64], period_ns: int) -> float:
     """Return the time of the lost samples, ms.
 
     ``times`` (ns) begin with the last SYNC that is in the files and end with the kill. An interval counts for at most
-    one period: no samples are lost while the whole machine stands still.
+    one period: no samples are lost while the whole machine is stopped.
     """
     return float(np.minimum(np.diff(times), period_ns).sum()) / 1e6 if times.size > 2 else 0.0
 

@@ -292,7 +292,7 @@ def _stopped(setup: RoundSetup) -> None:
             time.sleep(length)
             os.kill(setup.pid(), signal.SIGCONT)
 
-    setup.actions.append((begin, lambda: setup.farm.beside(stop)))
+    setup.actions.append((begin, lambda: setup.farm.run_in_thread(stop)))
 
 
 def sync_missing(setup: RoundSetup) -> Evidence:
@@ -330,7 +330,7 @@ def disk_full(setup: RoundSetup) -> Evidence:
         syncs = setup.farm.buses[0].syncs
         setup.answer_faults.full_at_end = bool(syncs) and syncs[-1] >= setup.syncs - NEAR_END
 
-    setup.actions.append((setup.at(1.1), lambda: setup.farm.beside(fill)))
+    setup.actions.append((setup.at(1.1), lambda: setup.farm.run_in_thread(fill)))
     # While drives lag, rows wait in memory and nothing is written.
     return lambda done: (
         done.counters["tpdo_late"] > BEHIND or (done.counters["writer.rows_lost"] > 0 and done.gap(None, NOT_WRITTEN))
@@ -383,7 +383,7 @@ CONSUMER = (kernel_drop, sync_missing, sync_stops)
 FAULTS = {fault.__name__: fault for fault in (*ANY, *PRODUCER, *CONSUMER)}
 EXCLUSIVE = (
     {"sync_stops", "kernel_drop", "held_up", "bus_down"},
-    # While a drive owes an answer, rows stay in memory: nothing is written to the disk.
+    # While an answer is outstanding, rows stay in memory: nothing is written to the disk.
     *(
         {"disk_full", name}
         for name in (

@@ -46,7 +46,7 @@ def test_every_dropped_frame_is_counted(vcan_bus: str) -> None:
     with RawSocket(vcan_bus, filters=()) as sender, RawSocket(vcan_bus, receive_buffer=8192) as receiver:
         sender.send(numbered(500))
         first = drain(receiver)
-        # the count comes with the next frame that finds room
+        # the count comes with the next received frame
         sender.send(numbered(1))
         second = drain(receiver)
         assert 0 < first.size < 500

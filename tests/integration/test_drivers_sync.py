@@ -58,7 +58,7 @@ def test_syncs_stay_on_the_time_grid_except_for_skipped_periods(vcan_bus: str) -
     stats = producer.stats()
     grid = (got.size - 1 + stats.skipped) * PERIOD_US
     elapsed = (got["t_ns"][-1] - got["t_ns"][0]) / 1000
-    # first and last SYNC may each be late, by no more than the producer itself says
+    # first and last SYNC may each be late, by no more than the producer reports
     assert abs(elapsed - grid) <= stats.late_max_us + 2000
     assert 0 <= stats.late_p50_us <= stats.late_p99_us <= stats.late_max_us + 5
 

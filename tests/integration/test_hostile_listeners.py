@@ -1,4 +1,4 @@
-"""Whoever listens to a capture changes nothing in it: frozen, slow, or flooding it with what it did not ask for."""
+"""Subscribers do not affect a capture, even if they are frozen, slow, or flood it with invalid messages."""
 
 import json
 import os
@@ -91,7 +91,7 @@ def listening(role: str, cell: str, log: Path) -> Iterator["subprocess.Popen[str
 
 
 def batches(session: SessionConfig, robot: RobotConfig) -> Iterator[Batch]:
-    """What the assembler gives every 20 ms: rows of every stream, and a gap now and then."""
+    """Output of the assembler every 20 ms: rows of every stream, and sometimes a gap."""
     rng = np.random.default_rng(0)
     streams = captured_streams(session, robot)
     for k in range(round(SECONDS / EVERY_S)):
@@ -157,7 +157,7 @@ def test_a_listener_changes_nothing_in_the_recording(roles: tuple[str, ...], tmp
     assert publisher.offered == len(streams) * len(fed)
     assert deepest <= session.zenoh.queue_blocks
     assert grown < MEMORY
-    # Whoever floods us was heard, and refused where it asked for nonsense.
+    # The flooding subscriber was received, and its invalid requests were refused.
     floods = [int(path.read_text().split()[-1]) for path in tmp_path.glob("hostile.*")]
     assert all(count > 100 for count in floods)
     print(f"\n{roles}: held up {longest * 1e3:.1f} ms at most, queue {deepest}, {publisher.dropped} blocks dropped, "

@@ -49,7 +49,7 @@ def job(config: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
 
 
 def finished(process: subprocess.Popen[str], code: int) -> tuple[dict[str, Any], str]:
-    """Its document and what it said on the way."""
+    """Its document and its log."""
     out, err = process.communicate(timeout=240)
     assert process.returncode == code, err
     return (json.loads(out) if out else {}), err

@@ -1,4 +1,4 @@
-"""Whatever happens on the bus, every SYNC is accounted for: received, or in the gap list."""
+"""Every SYNC is accounted for under any fault of the bus: received, or in the gap list."""
 
 from dataclasses import dataclass, field
 
@@ -23,7 +23,7 @@ T0 = 1_700_000_000_000_000_000
 
 @dataclass
 class Faults:
-    """What goes wrong: ``tpdo`` and ``sync`` get lost, ``twice`` comes twice, answers ``late`` by some SYNCs."""
+    """Faults: ``tpdo`` and ``sync`` are lost, ``twice`` is sent twice, answers are ``late`` by some SYNCs."""
 
     tpdo: set[tuple[int, int]] = field(default_factory=set)
     sync: set[int] = field(default_factory=set)
@@ -33,7 +33,7 @@ class Faults:
 
 
 def payload(k: int, joint: int) -> bytes:
-    """Bytes that say which SYNC and joint they answer."""
+    """Data that encodes SYNC and joint of the answer."""
     return k.to_bytes(4, "little") + bytes([joint, 0, 0, 0])
 
 
@@ -89,7 +89,7 @@ def pairs(count: int) -> st.SearchStrategy[set[tuple[int, int]]]:
 COUNT = 300
 losses = st.builds(Faults, tpdo=pairs(COUNT), sync=st.sets(st.integers(0, COUNT - 1), max_size=8), short=pairs(COUNT))
 delays = st.builds(Faults, late=st.dictionaries(st.integers(0, COUNT - 20), st.integers(1, 15), max_size=12))
-anything = st.builds(
+mixed = st.builds(
     Faults,
     tpdo=pairs(COUNT),
     sync=st.sets(st.integers(0, COUNT - 1), max_size=8),
@@ -101,7 +101,7 @@ splits = st.lists(st.integers(0, 10_000), max_size=6)
 
 
 @settings(max_examples=150)
-@given(anything, splits)
+@given(mixed, splits)
 def test_every_sync_is_received_or_in_a_gap_and_the_counters_add_up(faults: Faults, cuts: list[int]) -> None:
     frames = bus(COUNT, faults)
     sync, _, gaps, counters = run(frames, COUNT, cuts)
@@ -120,7 +120,7 @@ def test_every_sync_is_received_or_in_a_gap_and_the_counters_add_up(faults: Faul
 
 
 @settings(max_examples=100)
-@given(anything, splits)
+@given(mixed, splits)
 def test_the_result_does_not_depend_on_how_frames_are_split(faults: Faults, cuts: list[int]) -> None:
     frames = bus(COUNT, faults)
     one, many = run(frames, COUNT, []), run(frames, COUNT, cuts)
@@ -140,7 +140,7 @@ def test_received_samples_belong_to_their_sync_if_frames_are_lost(faults: Faults
     for stream in STREAMS:
         expected = [[list(payload(int(k), j)) for j in range(3)] for k in sync[stream.name]]
         assert np.array_equal(data[stream.name], np.array(expected, np.uint8).reshape(-1, 3, 8))
-        # A TPDO lost beside a lost SYNC can make a neighbour undecidable, nothing farther than that.
+        # A TPDO lost next to a lost SYNC can make a neighbour ambiguous, but no other SYNC.
         near = {k + d * stream.every for k in lost for d in range(-2, 3)}
         due = set(range(stream.every - 1, COUNT, stream.every))
         assert due - near <= set(sync[stream.name].tolist())
@@ -166,7 +166,7 @@ def test_a_lag_of_all_drives_for_ninety_seconds_loses_no_sample(cuts: list[int])
 
 
 def test_a_loss_while_all_drives_lag_costs_no_prompt_sample() -> None:
-    """The burst that was lost in is undecidable, nothing before it and nothing after it."""
+    """Only the burst that contains the loss is ambiguous."""
     faults = Faults(tpdo={(600, 1)}, late={k: 1800 - k for k in range(500, 1800)})
     sync, data, gaps, _ = run(bus(5000, faults), 5000, [])
     assert {(g.joint, g.reason) for g in gaps} <= {("joint_2", "lost"), ("joint_2", "ambiguous order")}
@@ -175,17 +175,17 @@ def test_a_loss_while_all_drives_lag_costs_no_prompt_sample() -> None:
 
 
 def test_dropped_frames_shorten_the_wait_for_answers() -> None:
-    """Nobody answers SYNC 100 as far as we know: waited for if nothing is known to be missing, given up if it is."""
+    """No drive answers SYNC 100: the answers are awaited, or discarded if frames are known to be missing."""
     frames = bus(1000, Faults(tpdo={(100, j) for j in range(3)}))
-    patient, told = Assembler(STREAMS, JOINTS, PERIOD_NS), Assembler(STREAMS, JOINTS, PERIOD_NS)
+    patient, informed = Assembler(STREAMS, JOINTS, PERIOD_NS), Assembler(STREAMS, JOINTS, PERIOD_NS)
     half = len(frames) // 2
     assert patient.push(frames[:half]).rows["samples"].sync[-1] < 100
-    told.push(frames[:half], dropped=True)
-    told.push(frames[half:])
+    informed.push(frames[:half], dropped=True)
+    informed.push(frames[half:])
     patient.push(frames[half:])
     assert patient.outstanding == 1
-    assert told.counters["samples.rows"] > 700
-    for assembler in (patient, told):
+    assert informed.counters["samples.rows"] > 700
+    for assembler in (patient, informed):
         gaps = assembler.finish(1000).gaps
         assert assembler.counters["samples.rows"] == 999
         assert patient is not assembler or gaps == (Gap("samples", 100, 100, None, "lost"),)

@@ -1,4 +1,4 @@
-"""Drives that stand still at times, answer in order when they go on, and fall silent: nothing is taken for another."""
+"""Drives that pause at times, then answer in order, and fall silent: no answer is matched to another SYNC."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ Stalls = list[tuple[int, int]]
 
 
 def moved(at: int, stalls: Stalls) -> int:
-    """When a drive goes on that would have done something at a time, us."""
+    """Time of an action after the pauses of a drive, us."""
     for begin, took in sorted(stalls):
         if begin <= at < begin + took:
             at = begin + took
@@ -33,7 +33,7 @@ def events(rng: np.random.Generator, count: int, stalls: Stalls, silent_us: int)
 
 
 def test_no_answer_before_a_silence_is_matched_to_another_sync() -> None:
-    """Of 1000 captures; and what is in doubt is near a time at which they stood still."""
+    """In 1000 captures; ambiguous samples are near a pause."""
     for seed in range(1000):
         rng = np.random.default_rng(seed)
         count, silent_us = int(rng.integers(60, 200)), int(rng.integers(0, 3000))

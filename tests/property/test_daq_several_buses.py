@@ -1,4 +1,4 @@
-"""Several buses and packed samples: every SYNC is accounted for, and what is received belongs to its SYNC and axis."""
+"""Several buses and packed samples: every SYNC is accounted for, and samples belong to their SYNC and axis."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -38,12 +38,12 @@ class Faults:
 
 
 def sample(k: int, joint: int) -> bytes:
-    """Six bytes that say which SYNC and joint they are of."""
+    """Six bytes that encode SYNC and joint."""
     return k.to_bytes(4, "little", signed=True) + bytes([joint, 0xA5])
 
 
 def bus_frames(bus: int, streams: tuple[TpdoStream, ...], faults: Faults, origin: int = 1) -> NDArray[np.void]:
-    """What comes on one bus in ``COUNT`` SYNCs."""
+    """Frames of one bus in ``COUNT`` SYNCs."""
     out = np.zeros(COUNT * 16, FD_FRAME)
     n = 0
 
@@ -178,7 +178,7 @@ def test_one_lost_packed_tpdo_is_one_gap_of_as_many_samples() -> None:
 
 
 def test_a_bus_outage_is_a_gap_of_its_axes_only() -> None:
-    """Known to be down: the others go on at once, and nothing of it is missing once it is back."""
+    """The bus is known to be down: the others continue at once, and it loses no sample afterwards."""
     assembler = Assembler((PLAIN,), JOINTS, PERIOD_NS, bus_of=BUS_OF)
     off = Faults(off=(1, 100, 180))
     per_bus = [bus_frames(b, (PLAIN,), off) for b in range(3)]
@@ -222,7 +222,7 @@ def test_late_answers_are_counted() -> None:
 
 
 def test_frames_delayed_while_their_bus_counted_as_down_add_no_counter_turn() -> None:
-    """It is back before we know: what came meanwhile is older than the SYNCs of the others, and given up."""
+    """The bus is up before this is known: its frames are older than the SYNCs of the others, and are discarded."""
     assembler = Assembler((PLAIN,), JOINTS, PERIOD_NS, bus_of=BUS_OF)
     per_bus = [bus_frames(b, (PLAIN,), Faults()) for b in range(3)]
     batches: list[Batch] = []

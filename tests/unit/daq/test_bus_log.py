@@ -65,7 +65,7 @@ def test_a_sync_missing_from_the_log_is_a_gap(tmp_path: Path) -> None:
     assert read.counters["samples.expected"] == 3000
     assert read.counters["samples.rows"] + read.counters["samples.in_gaps"] == 3000
     missing = {n for g in read.gaps if g.stream == "samples" for n in range(g.first, g.last + 1)}
-    # The answers beside the gap may or may not belong to the SYNC before it.
+    # The answers next to the gap may or may not belong to the SYNC before it.
     assert set(range(1000, 1030)) <= missing <= set(range(999, 1031))
     assert not missing & set(read.samples.sync.tolist())
 

@@ -89,7 +89,7 @@ def test_a_torque_above_the_limit_is_detected_and_one_below_is_not(
 
 
 def test_the_offending_frame_does_not_depend_on_the_batches(session: SessionConfig, robot: RobotConfig) -> None:
-    """The offending frame is the first sample behind the limit of joint 3."""
+    """The offending frame is the first sample beyond the limit of joint 3."""
     q = np.zeros((400, robot.n))
     q[:, 2] = np.linspace(2.3, 2.5, 400)
     bus = on_the_bus(robot, q)

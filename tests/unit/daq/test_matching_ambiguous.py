@@ -1,4 +1,4 @@
-"""Ambiguous samples are discarded: answers beside lost ones, repeated frames, TPDOs with a changed mapping."""
+"""Ambiguous samples are discarded: answers next to lost ones, repeated frames, TPDOs with a changed mapping."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ def test_a_repeated_frame_is_dropped_if_its_bytes_identify_it() -> None:
 
 
 def test_a_repeated_late_answer_is_not_matched_to_the_next_sync() -> None:
-    """The next answer, which is late too, is not taken for the one after it."""
+    """The next answer, which is late too, is not matched to the SYNC after it."""
     _, sync, value = assembled(bus(60, {30: [], 31: [(40, 30), (50, 30)], 32: [(40, 31), (50, 32)]}), 60)
     assert np.array_equal(value, sync)
     assert sync.size == 60

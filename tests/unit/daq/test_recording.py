@@ -238,7 +238,7 @@ def test_a_missing_recording_is_a_configuration_error(tmp_path: Path) -> None:
         read_recording(tmp_path / "x.mcap")
 
 
-def test_a_failed_creation_leaves_no_file(tmp_path: Path) -> None:
+def test_an_unwritable_path_is_a_configuration_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot be written"):
         write_recording(make_recording(10), tmp_path / "file" / "r.mcap")

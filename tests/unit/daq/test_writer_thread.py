@@ -61,7 +61,7 @@ def until(true: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-def test_files_are_the_same_with_and_without_the_thread(tmp_path: Path) -> None:
+def test_every_row_is_in_exactly_one_file(tmp_path: Path) -> None:
     recording = make_recording(3000)
     series = QueuedSeries(
         RecordingSeries(beginner(recording, 2 * CHUNK_NS), tmp_path, NAME, max_bytes=60_000), EVERY, CHUNK_NS

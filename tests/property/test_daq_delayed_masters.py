@@ -1,4 +1,4 @@
-"""A master that is held up anywhere, also between two buses: buses are never numbered apart from each other."""
+"""A master delayed at any point, also between two buses: all buses get equal SYNC numbers."""
 
 import numpy as np
 import pytest
@@ -16,9 +16,9 @@ STREAMS = (TpdoStream("samples", 1, (0x181,) * BUSES, 8),)
 
 
 def sent(rng: np.random.Generator, count: int, stalls: int) -> list[Frames]:
-    """What each bus carries: SYNC after SYNC, on one bus after the other, and at once its drive's answer.
+    """Frames of each bus: SYNC after SYNC, on one bus after the other, each followed by its drive's answer.
 
-    The master rests as long as is left of a period, and goes on from where it is when it has been held up.
+    The master sleeps for the rest of a period; after a delay it continues without catching up.
     """
     held = np.zeros(2 * BUSES * count)
     held[rng.integers(held.size, size=stalls)] = rng.uniform(1, 1000, stalls) * PERIOD_NS
@@ -62,6 +62,6 @@ def test_buses_of_a_delayed_master_get_equal_numbers(stalls: int) -> None:
         data = np.concatenate([b.rows["samples"].data for b in batches])
         number = data[:, :, :8].copy().view("<i8")[:, :, 0]
         assert np.all(number == number[:, :1]), f"seed {seed}: values of several SYNCs in one row"
-        # A time of whole turns of the counter may be taken for SYNCs that were missed, by all of them.
+        # A delay of whole counter turns may count as missed SYNCs, on all buses.
         assert np.all((sync - number[:, 0]) % OVERFLOW == 0), seed
         assert sync.size > 0.95 * count, seed
