@@ -32,7 +32,8 @@ from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.faults.check import violations
 from tests.faults.farm import Farm
 from tests.faults.plan import EVERY_FAULT, FAULTS, ORDERED, ROTATE_S, Outcome, Plan, RoundSetup, random_plan
-from tests.faults.recorder import Capture, Recorders, log_text, result, warm
+from tests.faults.recorder import log_text, result, start_capture
+from tests.fixtures.processes import ForkedProcess
 
 PERIOD_US = 1000
 DISK_BYTES = 3 << 20
@@ -111,7 +112,6 @@ class Worker:
 
     def __init__(self, name: str, seed: int) -> None:
         self._seed, self._name = seed, name
-        self._recorders = Recorders()
         self._folder = Path(tempfile.mkdtemp(prefix="armident-faults-"))
         self._disk = self._folder / "disk"
         self._disk.mkdir()
@@ -133,7 +133,6 @@ class Worker:
         """Remove buses, disk and files."""
         for farm in self._farms.values():
             farm.close()
-        self._recorders.close()
         subprocess.run(["umount", str(self._disk)], check=False)
         for channel in self._channels:
             remove_vcan(channel)
@@ -169,20 +168,20 @@ class Worker:
         out, log = self._disk / f"r{number}a{attempt}", self._folder / f"r{number}a{attempt}"
         out.mkdir()
         small = SMALL_BUFFER if "kernel_drop" in faults else None
-        process = self._recorders.start(path, out, log, seconds if producing else None, small)
+        process = start_capture(path, out, log, seconds if producing else None, small)
         pids.append(process.pid)
         try:
             self._wait(process, farm, log, producing)
         finally:
             process.kill()
-            process.join()
+            process.wait()
             seen, syncs_by_bus = farm.finish(), [list(state.syncs) for state in farm.buses]
         words = log_text(log)
         explained = OF_ANOTHER if setup.answer_faults.disturbed else None
         undone = [name for name in faults if name in ORDERED and ORDERED[name] not in setup.answer_faults.done]
         faults = [name for name in faults if name not in undone]
-        if process.exitcode != 0:
-            what = [f"the capture ended with {process.exitcode}"]
+        if process.returncode != 0:
+            what = [f"the capture ended with {process.returncode}"]
             if setup.answer_faults.full_at_end and UNFINISHED in words and _truncated_only(out):
                 what, explained = [f"{what[0]}: {UNFINISHED}"], UNFINISHED
             shutil.rmtree(out)
@@ -214,12 +213,12 @@ class Worker:
         )  # fmt: skip
         return found, explained
 
-    def _wait(self, process: Capture, farm: Farm, log: Path, producing: bool) -> None:
+    def _wait(self, process: ForkedProcess, farm: Farm, log: Path, producing: bool) -> None:
         """Wait for the end of the capture; a foreign master starts when it is ready, and ends before it."""
         deadline = time.monotonic() + LONGEST_S
         stopped = producing
         since = None
-        while process.exitcode is None and time.monotonic() < deadline:
+        while process.returncode is None and time.monotonic() < deadline:
             if farm.failed is not None:
                 raise farm.failed
             if not producing and not farm.begun:
@@ -245,7 +244,6 @@ def _shape(producing: bool, buses: int) -> str:
 
 def run_rounds(rounds: int, seed: int, jobs: int, plans: Sequence[Plan] = (), only: Sequence[str] = ()) -> list[Round]:
     """Run rounds in several processes at once, since most of their time is spent waiting."""
-    warm()
     sys.setswitchinterval(SWITCH_S)
     context = multiprocessing.get_context("fork")
     numbers, done = context.Queue(), context.Queue()

@@ -33,7 +33,7 @@ from armident.drivers.canopen.objects import COB_SYNC
 from armident.drivers.vcan import ensure_vcan, remove_vcan
 from tests.faults.bus import session_file
 from tests.faults.farm import read_syncs
-from tests.faults.recorder import Recorders, log_text, warm
+from tests.faults.recorder import log_text, start_capture
 from tests.faults.sender import Sender, current_of, position_of
 
 RATES_HZ = (1000, 2000, 5000)
@@ -61,13 +61,11 @@ class Worker:
 
     def __init__(self, name: str, seed: int) -> None:
         self._name, self._seed = name, seed
-        self._recorders = Recorders()
         self._folder = Path(tempfile.mkdtemp(prefix="armident-kill-"))
         ensure_vcan(name)
 
     def close(self) -> None:
         """Remove bus and files."""
-        self._recorders.close()
         remove_vcan(self._name)
         shutil.rmtree(self._folder)
 
@@ -84,9 +82,9 @@ class Worker:
             RawSocket(self._name, filters=[(COB_SYNC, STANDARD_ID_MASK)]) as witness,
             Sender([self._name], 10**6 // rate, lossy=lossy) as sender,
         ):
-            capture = self._recorders.start(path, out, log, listen_only=True)
+            capture = start_capture(path, out, log, listen_only=True)
             deadline = time.monotonic() + LONGEST_WAIT_S
-            while "recording to" not in log_text(log) and capture.exitcode is None and time.monotonic() < deadline:
+            while "recording to" not in log_text(log) and capture.returncode is None and time.monotonic() < deadline:
                 time.sleep(0.01)
             time.sleep(0.1)
             sender.go()
@@ -94,11 +92,11 @@ class Worker:
             # SYNCs after the kill are no loss.
             at_ns = time.time_ns()
             capture.kill()
-            capture.join()
+            capture.wait()
             sender.stop()
             received = read_syncs(witness)
         received = received[received[:, 0] <= at_ns, 0]
-        wrong = [] if capture.exitcode == -signal.SIGKILL else [f"ended with {capture.exitcode}: {log_text(log)}"]
+        wrong = [] if capture.returncode == -signal.SIGKILL else [f"ended with {capture.returncode}: {log_text(log)}"]
         files, kept = sorted(out.glob("*.mcap")), 0
         try:
             kept = self._checked(files, received, wrong)
@@ -152,7 +150,6 @@ def _lost_ms(times: NDArray[np.int64], period_ns: int) -> float:
 
 def run_rounds(rounds: int, seed: int, jobs: int) -> list[Kill]:
     """Run rounds in several processes at once."""
-    warm()
     context = multiprocessing.get_context("fork")
     numbers, done = context.Queue(), context.Queue()
     for number in [*range(rounds), *[None] * jobs]:

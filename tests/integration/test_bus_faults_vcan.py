@@ -16,12 +16,12 @@ from armident.drivers.can.receiver import BusEvent, Receiver
 from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen.objects import NmtCommand
 from armident.drivers.vcan import ensure_vcan, remove_vcan
+from tests.fixtures.processes import armident
 from tests.integration.test_several_buses_vcan import (
     SLOW,
     gaps_of_samples,
     robot,
     session_file,
-    start,
     wait_for_line,
 )
 
@@ -82,7 +82,7 @@ def test_a_drive_that_reboots_is_configured_again_and_its_errors_are_logged(vcan
     texts = {0xFF01: "encoder battery low"}
     session = session_file(tmp_path, "tx40_replay.yaml", [vcan_bus] * 6, sync=SLOW, emcy_texts=texts)
     with robot(session):
-        process = start("capture", "--config", session, "--out", tmp_path / "out", "--json")
+        process = armident("capture", "--config", session, "--out", tmp_path / "out", "--json")
         log = wait_for_line(process, "recording to")
         time.sleep(1.5)
         with RawSocket(vcan_bus, filters=()) as other:

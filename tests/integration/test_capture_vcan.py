@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 import urllib.request
@@ -21,10 +20,10 @@ from armident.configs.units import counts_per_si
 from armident.daq.capture.capture import capture, load_plan
 from armident.daq.matching.assembler import LATE_S
 from armident.daq.recording import read_recording
+from tests.fixtures.processes import ForkedProcess, armident
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
 
-ARMIDENT = [sys.executable, "-c", "from armident.daq.cli import main; main()"]
 COUNTED = ("samples.expected", "samples.rows", "samples.in_gaps", "kernel_drops")
 
 
@@ -42,16 +41,10 @@ def session_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
     return path
 
 
-def run(*arguments: Any, **options: Any) -> subprocess.Popen[str]:
-    """Start an armident command as a process."""
-    command = ARMIDENT + [str(a) for a in arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
-
-
 @pytest.fixture
-def robot(vcan_bus: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+def robot(vcan_bus: str, tmp_path: Path) -> Iterator[ForkedProcess]:
     """The virtual arm on the bus, when it is ready."""
-    process = run("robot", "--config", session_file(tmp_path, vcan_bus, "robot"))
+    process = armident("robot", "--config", session_file(tmp_path, vcan_bus, "robot"))
     assert process.stdout is not None
     assert "ready" in process.stdout.readline()
     yield process
@@ -60,7 +53,7 @@ def robot(vcan_bus: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     process.communicate(timeout=60)
 
 
-def wait_for_file(folder: Path, size: int, process: subprocess.Popen[str]) -> Path:
+def wait_for_file(folder: Path, size: int, process: ForkedProcess) -> Path:
     """Wait until a recording is larger than ``size`` bytes; return its path."""
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline and process.poll() is None:
@@ -75,7 +68,7 @@ def wait_for_file(folder: Path, size: int, process: subprocess.Popen[str]) -> Pa
 def test_ten_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path: Path) -> None:
     """With set points, and marks at begin and end of the motion."""
     session = session_file(tmp_path, vcan_bus, "ten_seconds")
-    process = run("capture", "--config", session, "--out", tmp_path / "out", "--json")
+    process = armident("capture", "--config", session, "--out", tmp_path / "out", "--json")
     out, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
     document = json.loads(out)
@@ -101,7 +94,7 @@ def test_ten_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path:
 def test_sixty_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_path: Path) -> None:
     """On a busy machine the capture waits for drives that lag."""
     session = session_file(tmp_path, vcan_bus, "minute", setpoints=None)
-    process = run("capture", "--config", session, "--duration", "60", "--out", tmp_path / "out", "--json")
+    process = armident("capture", "--config", session, "--duration", "60", "--out", tmp_path / "out", "--json")
     out, err = process.communicate(timeout=230)
     assert process.returncode == 0, err
     recording = read_recording(json.loads(out)["recording"])
@@ -113,11 +106,11 @@ def test_sixty_seconds_at_5_khz_and_six_axes_lose_nothing(vcan_bus: str, tmp_pat
 
 
 def test_the_end_waits_for_drives_that_are_stopped_for_seconds(
-    vcan_bus: str, robot: subprocess.Popen[str], tmp_path: Path
+    vcan_bus: str, robot: ForkedProcess, tmp_path: Path
 ) -> None:
     """All drives answer the last SYNCs later than the limit for a single lost answer: there are no gaps."""
     session = session_file(tmp_path, vcan_bus, "starved", sync={"period_us": 1000}, setpoints=None)
-    process = run("capture", "--config", session, "--duration", "3", "--out", tmp_path / "out", "--json")
+    process = armident("capture", "--config", session, "--duration", "3", "--out", tmp_path / "out", "--json")
     wait_for_file(tmp_path / "out", 20_000, process)
     robot.send_signal(signal.SIGSTOP)
     try:
@@ -135,9 +128,9 @@ def test_the_end_waits_for_drives_that_are_stopped_for_seconds(
     assert expected == rows == 3000
 
 
-def test_the_end_does_not_wait_for_dead_drives(vcan_bus: str, robot: subprocess.Popen[str], tmp_path: Path) -> None:
+def test_the_end_does_not_wait_for_dead_drives(vcan_bus: str, robot: ForkedProcess, tmp_path: Path) -> None:
     session = session_file(tmp_path, vcan_bus, "died", sync={"period_us": 1000}, setpoints=None)
-    process = run("capture", "--config", session, "--duration", "3", "--out", tmp_path / "out", "--json")
+    process = armident("capture", "--config", session, "--duration", "3", "--out", tmp_path / "out", "--json")
     wait_for_file(tmp_path / "out", 20_000, process)
     robot.kill()
     assert process.stderr is not None
@@ -157,7 +150,7 @@ def test_no_sample_is_lost_between_files(vcan_bus: str, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     old = tmp_path / "out" / "tx40-20200101T000000-000Z.mcap"
     old.write_bytes(b"old")
-    process = run("capture", "--config", session, "--duration", "6", "--out", tmp_path / "out", "--json")
+    process = armident("capture", "--config", session, "--duration", "6", "--out", tmp_path / "out", "--json")
     out, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
     document = json.loads(out)
@@ -182,7 +175,7 @@ def test_a_trigger_writes_only_the_time_around_events(vcan_bus: str, tmp_path: P
         "sync": {"period_us": 1000},
     }
     session = session_file(tmp_path, vcan_bus, "events", setpoints=None, **changes)
-    process = run("capture", "--config", session, "--out", tmp_path / "out")
+    process = armident("capture", "--config", session, "--out", tmp_path / "out")
     assert process.stderr is not None
     log = ""
     while "keeping the last 20 s" not in log:
@@ -194,7 +187,7 @@ def test_a_trigger_writes_only_the_time_around_events(vcan_bus: str, tmp_path: P
     with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(address, timeout=10) as answer:
         assert 'armident_frames_total{cell="events",robot="tx40"}' in answer.read().decode()
     for words in (["mark", "gripper changed"], ["save"]):
-        command = run("command", *words, "--config", session)
+        command = armident("command", *words, "--config", session)
         out, err = command.communicate(timeout=60)
         assert command.returncode == 0, err
         assert out == f"{words[0]}: accepted\n"
@@ -202,7 +195,7 @@ def test_a_trigger_writes_only_the_time_around_events(vcan_bus: str, tmp_path: P
     time.sleep(3.0)
     process.send_signal(signal.SIGUSR1)
     time.sleep(1.0)
-    run("command", "stop", "--config", session).communicate(timeout=60)
+    armident("command", "stop", "--config", session).communicate(timeout=60)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     files = [Path(name) for name in out.split()]
@@ -220,7 +213,7 @@ def test_a_trigger_writes_only_the_time_around_events(vcan_bus: str, tmp_path: P
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_capture_with_a_finished_file(vcan_bus: str, tmp_path: Path, number: signal.Signals) -> None:
     session = session_file(tmp_path, vcan_bus, "signal", sync={"period_us": 1000}, setpoints=None)
-    process = run("capture", "--config", session, "--out", tmp_path / "out")
+    process = armident("capture", "--config", session, "--out", tmp_path / "out")
     path = wait_for_file(tmp_path / "out", 20_000, process)
     process.send_signal(number)
     _, err = process.communicate(timeout=60)
@@ -285,7 +278,7 @@ def test_a_capture_that_ends_during_a_motion_stops_the_arm(vcan_bus: str, tmp_pa
     assert np.abs(velocity[-20:]).max() < 0.05
 
 
-def refused(process: subprocess.Popen[str], out: Path, code: int) -> str:
+def refused(process: ForkedProcess, out: Path, code: int) -> str:
     """Return the error line of a command, after a check that it left no files."""
     _, err = process.communicate(timeout=120)
     lines = [line for line in err.splitlines() if line.startswith("armident:")]
@@ -298,14 +291,14 @@ def refused(process: subprocess.Popen[str], out: Path, code: int) -> str:
 
 def test_a_missing_drive_is_one_error_line_and_leaves_no_files(vcan_bus: str, tmp_path: Path) -> None:
     session = session_file(tmp_path, vcan_bus, "nobody", sdo_timeout_s=0.2)
-    line = refused(run("capture", "--config", session, "--out", tmp_path / "out"), tmp_path / "out", 2)
+    line = refused(armident("capture", "--config", session, "--out", tmp_path / "out"), tmp_path / "out", 2)
     assert "node 1" in line
     assert "joint_1" in line
 
 
 def test_a_missing_bus_is_one_error_line_and_leaves_no_files(tmp_path: Path) -> None:
     session = session_file(tmp_path, "vcan77", "nobus")
-    line = refused(run("capture", "--config", session, "--out", tmp_path / "out"), tmp_path / "out", 2)
+    line = refused(armident("capture", "--config", session, "--out", tmp_path / "out"), tmp_path / "out", 2)
     assert "vcan77" in line
     assert "ip link" in line
 
@@ -315,7 +308,7 @@ def test_a_bus_that_goes_down_ends_the_capture_with_a_finished_file_and_one_erro
     vcan_bus: str, tmp_path: Path
 ) -> None:
     session = session_file(tmp_path, vcan_bus, "down", sync={"period_us": 1000}, setpoints=None)
-    process = run("capture", "--config", session, "--out", tmp_path / "out")
+    process = armident("capture", "--config", session, "--out", tmp_path / "out")
     path = wait_for_file(tmp_path / "out", 20_000, process)
     subprocess.run(["ip", "link", "set", vcan_bus, "down"], check=True)
     _, err = process.communicate(timeout=60)
@@ -330,13 +323,13 @@ def test_a_bus_that_goes_down_ends_the_capture_with_a_finished_file_and_one_erro
 def test_listen_only_records_the_same_and_sends_nothing(vcan_bus: str, tmp_path: Path) -> None:
     one = session_file(tmp_path, vcan_bus, "active", sync={"period_us": 1000}, setpoints=None)
     two = session_file(tmp_path, vcan_bus, "silent", sync={"period_us": 1000}, setpoints=None)
-    silent = run("capture", "--config", two, "--out", tmp_path / "two", "--listen-only", "--json")
+    silent = armident("capture", "--config", two, "--out", tmp_path / "two", "--listen-only", "--json")
     wait_for_file(tmp_path / "two", 1000, silent)
     sent_before = int(Path(f"/sys/class/net/{vcan_bus}/statistics/tx_packets").read_text())
     time.sleep(1.0)
     heartbeats = int(Path(f"/sys/class/net/{vcan_bus}/statistics/tx_packets").read_text()) - sent_before
     assert heartbeats <= 6 * 12, "without another master, only the drives' heartbeats are on the bus"
-    active = run("capture", "--config", one, "--out", tmp_path / "one", "--duration", "3", "--json")
+    active = armident("capture", "--config", one, "--out", tmp_path / "one", "--duration", "3", "--json")
     out, err = active.communicate(timeout=120)
     assert active.returncode == 0, err
     os.kill(silent.pid, signal.SIGINT)

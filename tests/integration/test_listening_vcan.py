@@ -16,7 +16,8 @@ from armident.daq.recording import read_recording
 from armident.drivers.can.frames import Frames, frame, frames
 from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen.objects import COB_EMCY
-from tests.integration.test_several_buses_vcan import session_file, start
+from tests.fixtures.processes import armident
+from tests.integration.test_several_buses_vcan import session_file
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
 
@@ -73,10 +74,10 @@ def checked_silence(channel: str, length: int, every: int = 1) -> Iterator[None]
     assert drives.foreign == []
 
 
-def listening(channel: str, folder: Path, *options: Any, **changes: Any) -> tuple[int, str, str]:
+def listening(channel: str, folder: Path, *options: Any, **changes: Any) -> tuple[int | None, str, str]:
     """Return exit code, stdout and stderr of a capture of 2 s with --listen-only."""
     session = session_file(folder, "tx40_replay.yaml", [channel] * 6, sync=SYNC, **changes)
-    process = start(
+    process = armident(
         "capture", "--config", session, "--out", folder / "out", "--listen-only", "--duration", "2", "--json", *options
     )
     out, err = process.communicate(timeout=100)

@@ -3,8 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,19 +17,18 @@ from armident.daq.recording import read_recording
 from armident.drivers.can.frames import Frames, frame, frames
 from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen.objects import COB_EMCY, DriveState, drive_state
+from tests.fixtures.processes import ForkedProcess, armident
 from tests.statistics.weeks import WORN, cell_file
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(280)]
 
-ARMIDENT = [sys.executable, "-m", "armident.daq.cli"]
 QUICK = {"sync": {"period_us": 2000}}
 
 
 @contextmanager
 def arm(config: Path, *options: str) -> Iterator[None]:
     """The virtual arm on the bus, ready."""
-    command = [*ARMIDENT, "robot", "--config", str(config), *options]
-    robot = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    robot = armident("robot", "--config", config, *options)
     assert robot.stdout is not None
     try:
         assert "ready" in robot.stdout.readline()
@@ -41,14 +38,13 @@ def arm(config: Path, *options: str) -> Iterator[None]:
         robot.communicate(timeout=60)
 
 
-def job(config: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
+def job(config: Path, folder: Path, *options: str) -> ForkedProcess:
     """The command, with a history and results of its own."""
-    command = [*ARMIDENT, "reidentify", "--config", str(config), "--store", f"sqlite:///{folder}/history.sqlite"]
-    command += ["--out", str(folder / "out"), "--json", *options]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    words = ["reidentify", "--config", config, "--store", f"sqlite:///{folder}/history.sqlite"]
+    return armident(*words, "--out", folder / "out", "--json", *options)
 
 
-def finished(process: subprocess.Popen[str], code: int) -> tuple[dict[str, Any], str]:
+def finished(process: ForkedProcess, code: int) -> tuple[dict[str, Any], str]:
     """Its document and its log."""
     out, err = process.communicate(timeout=240)
     assert process.returncode == code, err
@@ -163,7 +159,7 @@ def test_a_missing_bus_is_one_error_line(tmp_path: Path) -> None:
 Rows = list[tuple[int, int, bytes]]
 
 
-def _await_motion(listener: RawSocket, process: subprocess.Popen[str]) -> Rows:
+def _await_motion(listener: RawSocket, process: ForkedProcess) -> Rows:
     """Everything on the bus until the set points have been played for half a second or so."""
     batch, rows, seen = frames(4096), Rows(), 0
     until = time.monotonic() + 120
@@ -177,7 +173,7 @@ def _await_motion(listener: RawSocket, process: subprocess.Popen[str]) -> Rows:
     return rows
 
 
-def _until_ended(listener: RawSocket, process: subprocess.Popen[str]) -> Rows:
+def _until_ended(listener: RawSocket, process: ForkedProcess) -> Rows:
     """Everything on the bus until the command has ended."""
     batch, rows = frames(4096), Rows()
     until = time.monotonic() + 200

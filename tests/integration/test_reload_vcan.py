@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import subprocess
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -15,7 +14,8 @@ import pytest
 import yaml
 
 from armident.daq.recording import join_parts, read_recording
-from tests.integration.test_capture_vcan import robot, run, session_file, wait_for_file
+from tests.fixtures.processes import ForkedProcess, armident
+from tests.integration.test_capture_vcan import robot, session_file, wait_for_file
 
 __all__ = ["robot"]
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
 COUNTED = ("samples.expected", "samples.rows", "samples.in_gaps", "kernel_drops")
 
 
-def lines_until(process: "subprocess.Popen[str]", word: str) -> Iterator[str]:
+def lines_until(process: ForkedProcess, word: str) -> Iterator[str]:
     """Yield the lines of stderr up to the first with a word."""
     assert process.stderr is not None
     for line in process.stderr:
@@ -41,7 +41,7 @@ def test_no_sync_is_lost_during_a_reload(vcan_bus: str, tmp_path: Path) -> None:
     plain["drives"] = [drive | {"temperature": warm} for drive in data["drives"]]
     session_file(tmp_path, vcan_bus, "reloaded", **plain)
     arguments = "--config", tmp_path / "reloaded.yaml", "--out", tmp_path / "out", "--json"
-    process = run("capture", *arguments, stdin=subprocess.DEVNULL)
+    process = armident("capture", *arguments)
     wait_for_file(tmp_path / "out", 50_000, process)
 
     session_file(tmp_path, vcan_bus, "reloaded", **plain, recording={"rotate_minutes": 0.01}, metrics={"port": 0})

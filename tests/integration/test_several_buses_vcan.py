@@ -3,7 +3,6 @@
 import json
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,10 +16,10 @@ import yaml
 from armident.configs import config_path
 from armident.daq.recording import Recording, read_recording
 from armident.drivers.vcan import ensure_vcan, remove_vcan
+from tests.fixtures.processes import ForkedProcess, armident
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(240)]
 
-ARMIDENT = [sys.executable, "-c", "from armident.daq.cli import main; main()"]
 SLOW = {"role": "producer", "period_us": 1000, "counter": 240}
 
 
@@ -52,16 +51,10 @@ def session_file(folder: Path, shipped: str, channels: list[str], **changes: Any
     return path
 
 
-def start(*arguments: Any) -> subprocess.Popen[str]:
-    """Start an armident command as a process."""
-    command = ARMIDENT + [str(a) for a in arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
 @contextmanager
-def robot(session: Path, *options: Any) -> Iterator[subprocess.Popen[str]]:
+def robot(session: Path, *options: Any) -> Iterator[ForkedProcess]:
     """Run the virtual arm on the session's buses."""
-    process = start("robot", "--config", session, *options)
+    process = armident("robot", "--config", session, *options)
     assert process.stdout is not None
     line = process.stdout.readline()
     assert "ready" in line, process.communicate(timeout=10)
@@ -76,13 +69,13 @@ def robot(session: Path, *options: Any) -> Iterator[subprocess.Popen[str]]:
 
 def captured(session: Path, out: Path, *options: Any) -> tuple[Recording, str]:
     """Run a capture; return its recording and its stderr."""
-    process = start("capture", "--config", session, "--out", out, "--json", *options)
+    process = armident("capture", "--config", session, "--out", out, "--json", *options)
     stdout, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
     return read_recording(json.loads(stdout)["recording"]), err
 
 
-def wait_for_line(process: subprocess.Popen[str], text: str) -> str:
+def wait_for_line(process: ForkedProcess, text: str) -> str:
     """Return the stderr of a process up to the line with a text."""
     assert process.stderr is not None
     log = ""
@@ -146,7 +139,7 @@ def test_replayed_samples_arrive_unchanged_on_all_buses(shipped: str, channels: 
 def test_a_bus_outage_is_a_gap_of_its_axes(channels: list[str], tmp_path: Path) -> None:
     session = session_file(tmp_path, "tx40_two_fd.yaml", channels, sync=SLOW)
     with robot(session):
-        process = start("capture", "--config", session, "--out", tmp_path / "out", "--json")
+        process = armident("capture", "--config", session, "--out", tmp_path / "out", "--json")
         log = wait_for_line(process, "recording to")
         time.sleep(2.0)
         subprocess.run(["ip", "link", "set", channels[1], "down"], check=True)

@@ -2,8 +2,6 @@
 
 import json
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +11,20 @@ import yaml
 
 from armident.configs import config_path
 from armident.daq.recording import read_recording
+from tests.fixtures.processes import armident
 from tests.tx40_reference import TABLE_B4, published_estimate
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.timeout(280)]
 
-ARMIDENT = [sys.executable, "-m", "armident.daq.cli"]
 PLAYED_S = 7.6
 """The arm stands still from 7.5 s on."""
 
 
-def armident(*arguments: Any) -> str:
-    done = subprocess.run([*ARMIDENT, *map(str, arguments)], capture_output=True, text=True, timeout=240, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+def output_of(*words: Any) -> str:
+    command = armident(*words)
+    output, errors = command.communicate(timeout=240)
+    assert command.returncode == 0, errors
+    return output
 
 
 def test_the_replayed_recording_arrives_whole_and_gives_the_published_parameters(
@@ -33,7 +32,7 @@ def test_the_replayed_recording_arrives_whole_and_gives_the_published_parameters
 ) -> None:
     measured = shared_data / "tx40"
     recording = tmp_path / "tx40.mcap"
-    armident(
+    output_of(
         *("import", measured / "pos_read_data.csv", "--effort", measured / "curr_data.csv", "--motor-side"),
         *("--rate", 5000, "--config", "tx40.yaml", "--out", recording),
     )
@@ -45,14 +44,12 @@ def test_the_replayed_recording_arrives_whole_and_gives_the_published_parameters
     cell = tmp_path / "cell.yaml"
     cell.write_text(yaml.safe_dump(data))
 
-    robot = subprocess.Popen(
-        [*ARMIDENT, "robot", "--config", str(cell), "--replay", str(recording)], stdout=subprocess.PIPE, text=True
-    )
+    robot = armident("robot", "--config", cell, "--replay", recording)
     try:
         assert robot.stdout is not None
         assert "ready" in robot.stdout.readline()
         captured = json.loads(
-            armident("capture", "--config", cell, "--duration", PLAYED_S, "--out", tmp_path / "out", "--json")
+            output_of("capture", "--config", cell, "--duration", PLAYED_S, "--out", tmp_path / "out", "--json")
         )
     finally:
         robot.send_signal(signal.SIGTERM)
@@ -65,7 +62,7 @@ def test_the_replayed_recording_arrives_whole_and_gives_the_published_parameters
     rows = slice(0, 37_000)
     assert (np.abs(played.si("position")[rows] - original.si("position")[rows]) <= 0.5001 * count).all()
 
-    result = json.loads(armident("identify", captured["recording"], "--json", "--out", tmp_path / "result"))
+    result = json.loads(output_of("identify", captured["recording"], "--json", "--out", tmp_path / "result"))
     values = {p["name"]: p["value"] for p in result["parameters"]}
     assert len(values) == 61
     assert result["relative_error_pct"] <= 5.1

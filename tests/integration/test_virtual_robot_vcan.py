@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,12 +22,11 @@ from armident.drivers.canopen.master import DriveMaster
 from armident.drivers.canopen.objects import COB_SYNC, Control, DriveState, NmtCommand, drive_state
 from armident.drivers.canopen.sync_producer import SetpointPlan, SyncProducer
 from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.processes import armident
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(120)]
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-RUN = "import logging, sys; from pathlib import Path; from armident.virtual_robot.cli import robot; "
-RUN += "logging.basicConfig(level=logging.INFO, format='%(message)s'); robot(config=Path(sys.argv[1]), "
 
 
 @dataclass
@@ -42,12 +39,9 @@ class Output:
 
 
 @contextmanager
-def robot_process(config: Path, options: str = "noise=0.0") -> Iterator[Output]:
+def robot_process(config: Path, *options: object) -> Iterator[Output]:
     """Run the virtual arm in a separate process during the block, then stop it with SIGTERM."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", RUN + options + ")", str(config)],
-        cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    process = armident("robot", "--config", config, *(options or ("--noise", 0)))
     output = Output(process.pid)
     try:
         assert process.stdout is not None
@@ -240,7 +234,7 @@ def test_a_replayed_recording_arrives_unchanged(config: Path, tmp_path: Path) ->
     recording = simulate_recording(robot, trajectory, seed=4, settle=0.1)
     path = tmp_path / "measured.mcap"
     write_recording(recording, path)
-    with robot_process(config, f"replay=Path({str(path)!r})") as output, DriveMaster(session, robot) as master:
+    with robot_process(config, "--replay", path) as output, DriveMaster(session, robot) as master:
         master.configure()
         master.start()
         sync = SyncProducer(session.bus, session.sync.period_us, session.sync.counter)

@@ -11,15 +11,11 @@ an unchanged arm was called changed, or the worn one was not.
 import argparse
 import json
 import multiprocessing
-import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import suppress
-from multiprocessing import reduction
-from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,6 +24,7 @@ import yaml
 
 from armident.configs import ArmidentError, config_path
 from armident.identify.monitoring.reidentify.record_run import record_run
+from tests.fixtures.processes import ForkedProcess, armident
 
 PERIOD_US = 2000
 """SYNC period: six axes on a bus of a guest with one CPU, beside guard, capture and arm."""
@@ -39,7 +36,6 @@ WORN = {
     "description": "a tenth more friction in joint 2",
     "effects": [{"effect": "friction_drift", "joint": "joint_2", "parameters": {"change": 0.1, "time_constant": 1e-6}}],
 }
-PRELOADED = ("armident.daq.capture.capture", "armident.daq.guard.run", "armident.virtual_robot.run")
 
 
 def cell_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
@@ -57,70 +53,16 @@ def cell_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
     return path
 
 
-class Forked:
-    """An armident command in a process that has imported everything already."""
-
-    def __init__(self, words: Sequence[str], out: int, err: int) -> None:
-        self._process = _server().Process(target=_command, args=(list(words), _Passed(out), _Passed(err)))
-        self._process.start()
-
-    def poll(self) -> int | None:
-        return self._process.exitcode
-
-    def wait(self, timeout: float | None = None) -> int:
-        self._process.join(timeout)
-        if self._process.exitcode is None:
-            raise subprocess.TimeoutExpired("armident", timeout or 0.0)
-        return self._process.exitcode
-
-    def send_signal(self, sig: int) -> None:
-        if self._process.pid is not None:
-            with suppress(ProcessLookupError):
-                os.kill(self._process.pid, sig)
-
-    def kill(self) -> None:
-        self._process.kill()
+def start_forked(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> ForkedProcess:
+    """As `armident.identify.monitoring.reidentify.record_run.start_process`, without the time for imports."""
+    return armident(*words, stdout=out, stderr=err)
 
 
-class _Passed:
-    """A file descriptor that is handed over to the process to be started."""
-
-    def __init__(self, descriptor: int) -> None:
-        self.descriptor = descriptor
-
-    def __getstate__(self) -> Any:
-        return reduction.DupFd(self.descriptor)
-
-    def __setstate__(self, passed: Any) -> None:
-        self.descriptor = passed.detach()
-
-
-def start_forked(words: Sequence[str], out: IO[bytes], err: IO[bytes]) -> Forked:
-    """As `armident.identify.monitoring.reidentify.record_run.start_process`."""
-    return Forked(words, out.fileno(), err.fileno())
-
-
-def _server() -> ForkServerContext:
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(PRELOADED))
-    return context
-
-
-def _command(words: list[str], out: _Passed, err: _Passed) -> None:
-    from armident.daq.cli import main
-
-    for number, file in ((1, out), (2, err)):
-        os.dup2(file.descriptor, number)
-    main(words)
-
-
-def robot_on(config: Path, log: Path, seed: int, scenario: Path | None) -> Forked:
+def robot_on(config: Path, log: Path, seed: int, scenario: Path | None) -> ForkedProcess:
     """The virtual arm of a lane, ready."""
     words = ["robot", "--config", str(config), "--seed", str(seed)]
     with log.open("wb+") as file:
-        robot = Forked(
-            words + ([] if scenario is None else ["--scenario", str(scenario)]), file.fileno(), file.fileno()
-        )
+        robot = armident(*words, *([] if scenario is None else ["--scenario", scenario]), stdout=file, stderr=file)
         until = time.monotonic() + 120
         while b"ready" not in log.read_bytes():
             if robot.poll() is not None or time.monotonic() > until:
