@@ -17,8 +17,8 @@ from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Assembler
 from armident.drivers.can.receiver import Receiver
 
-SLOW_DISK_S = 1.0
-"""The disk is slow when rows of this time wait for it, s."""
+LONGEST_WAIT_S = 1.0
+"""Longest time of rows that wait to be written without a warning, s."""
 
 log = logging.getLogger(__name__)
 
@@ -132,7 +132,7 @@ class Health:
         self._publisher.status({"state": "recording", "sync": self._assembler.last_sync})
 
     def _check_disk(self) -> None:
-        """Log when the disk refuses rows or is slow, and when that is over."""
+        """Log when the disk refuses rows or keeps rows waiting, and when that is over."""
         lost, before = self._sink.lost_rows, self._lost_rows
         self._lost_rows = lost
         if lost > before and self._writing:
@@ -141,11 +141,11 @@ class Health:
             log.info("rows are written again; %d rows were lost", lost)
         self._writing = lost == before
         waits_s = self._sink.waiting_rows * self._plan.session.sync_period
-        if waits_s > SLOW_DISK_S and not self._slow:
-            log.warning("the disk is slow: %.1f s of rows wait for it", waits_s)
-        elif self._slow and waits_s <= SLOW_DISK_S:
-            log.info("the disk has caught up")
-        self._slow = waits_s > SLOW_DISK_S
+        if waits_s > LONGEST_WAIT_S and not self._slow:
+            log.warning("%.1f s of rows wait to be written: the disk is slow or the processor is busy", waits_s)
+        elif self._slow and waits_s <= LONGEST_WAIT_S:
+            log.info("no rows wait to be written any more")
+        self._slow = waits_s > LONGEST_WAIT_S
 
 
 def _clock() -> dict[str, Value]:
