@@ -1,7 +1,7 @@
 """Identification, diagnosis, comparison and trajectory design, as ``import armident`` offers them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -49,8 +49,49 @@ Robot = RobotConfig | str | Path
 Recorded = Recording | str | Path
 
 
+class _Result:
+    """Result that prints itself, shows itself in a notebook and writes a report."""
+
+    def report(self, path: str | Path) -> Path:
+        """Write the report, one HTML file that needs nothing else.
+
+        Parameters
+        ----------
+        path
+            The file to write; its folder is made.
+
+        Returns
+        -------
+        Path
+            The file.
+        """
+        file = Path(path)
+        write_atomically(file, self._html())
+        return file
+
+    def __repr__(self) -> str:
+        table = self._table()
+        return self._summary() if table is None else f"{self._summary()}\n{table}"
+
+    def _repr_html_(self) -> str:
+        table = self._table()
+        return f"<p>{escape(self._summary())}</p>{'' if table is None else table._repr_html_()}"
+
+    def _html(self) -> str:
+        """Return the report."""
+        raise NotImplementedError
+
+    def _summary(self) -> str:
+        """Return one line of text."""
+        raise NotImplementedError
+
+    def _table(self) -> Table | None:
+        """Return the table below the line, if there is one."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, repr=False)
-class Identification:
+class Identification(_Result):
     """The dynamic model of a robot identified from recordings; SI units, joint side.
 
     Parameters
@@ -105,32 +146,13 @@ class Identification:
         """Remarks on data and result, one sentence each."""
         return tuple(self.document.warnings)
 
-    def report(self, path: str | Path) -> Path:
-        """Write the report, one HTML file that needs nothing else.
-
-        Parameters
-        ----------
-        path
-            The file to write; its folder is made.
-
-        Returns
-        -------
-        Path
-            The file.
-        """
-        from armident.identify.report.identification import identification_report
-
-        file = Path(path)
-        write_atomically(file, identification_report(self.recordings, self.robot, self.result, self.document))
-        return file
-
     def save(self, folder: str | Path) -> tuple[Path, Path]:
         """Write ``identification.json`` and ``report.html``.
 
         Parameters
         ----------
         folder
-            Where to write them; made if it does not exist.
+            Folder of the files; made if it does not exist.
 
         Returns
         -------
@@ -141,11 +163,10 @@ class Identification:
         write_atomically(document, to_json(self.document))
         return document, self.report(Path(folder) / "report.html")
 
-    def __repr__(self) -> str:
-        return f"{self._summary()}\n{self._essential()}"
+    def _html(self) -> str:
+        from armident.identify.report.identification import identification_report
 
-    def _repr_html_(self) -> str:
-        return f"<p>{escape(self._summary())}</p>{self._essential()._repr_html_()}"
+        return identification_report(self.recordings, self.robot, self.result, self.document)
 
     def _summary(self) -> str:
         document = self.document
@@ -156,7 +177,7 @@ class Identification:
             f"{essential} of {len(document.parameters)} base parameters essential, {state}"
         )
 
-    def _essential(self) -> Table:
+    def _table(self) -> Table:
         rows = [(p.name, p.value, p.std, p.relative_std_pct, p.unit) for p in self.document.parameters if p.essential]
         return Table(("name", "value", "std", "std %", "unit"), rows)
 
@@ -251,7 +272,7 @@ def identify(
 
 
 @dataclass(frozen=True, repr=False)
-class Diagnosis:
+class Diagnosis(_Result):
     """Disagreement of a model with recordings, and the effects that explain it.
 
     Parameters
@@ -299,32 +320,13 @@ class Diagnosis:
         gap = self.document.gap.validation
         return gap.before.all, gap.after.all
 
-    def report(self, path: str | Path) -> Path:
-        """Write the report, one HTML file that needs nothing else.
-
-        Parameters
-        ----------
-        path
-            The file to write; its folder is made.
-
-        Returns
-        -------
-        Path
-            The file.
-        """
-        from armident.identify.report.diagnosis import diagnosis_report
-
-        file = Path(path)
-        write_atomically(file, diagnosis_report(self.result, self.document))
-        return file
-
     def save(self, folder: str | Path) -> DiagnosisDocument:
         """Write ``diagnosis.json``, ``report.html`` and, where effects were found, the new model ``model.yaml``.
 
         Parameters
         ----------
         folder
-            Where to write them; made if it does not exist.
+            Folder of the files; made if it does not exist.
 
         Returns
         -------
@@ -337,17 +339,17 @@ class Diagnosis:
             write_atomically(model, robot_yaml(self.robot))
             document = document.model_copy(update={"model": str(model)})
         write_atomically(place / "diagnosis.json", to_json(document))
-        from armident.identify.report.diagnosis import diagnosis_report
-
-        write_atomically(place / "report.html", diagnosis_report(self.result, document))
+        written = replace(self, document=document)
+        written.report(place / "report.html")
         return document
 
-    def __repr__(self) -> str:
-        return f"{self._summary()}\n{self.findings}" if self.document.findings else self._summary()
+    def _html(self) -> str:
+        from armident.identify.report.diagnosis import diagnosis_report
 
-    def _repr_html_(self) -> str:
-        table = self.findings._repr_html_() if self.document.findings else ""
-        return f"<p>{escape(self._summary())}</p>{table}"
+        return diagnosis_report(self.result, self.document)
+
+    def _table(self) -> Table | None:
+        return self.findings if self.document.findings else None
 
     def _summary(self) -> str:
         before, after = self.gap_pct
