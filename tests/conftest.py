@@ -8,6 +8,10 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+# Set before numpy is imported; child processes inherit it. There is one test process per processor, and threads of
+# OpenBLAS that wait for each other took half of the CPU time.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from armident.drivers.vcan import ensure_vcan, have_socketcan, remove_vcan
 from tests.fixtures.store import use_folder
 
