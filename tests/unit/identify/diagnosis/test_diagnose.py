@@ -6,18 +6,22 @@ import pytest
 from armident.configs import ConfigError, RobotConfig, load_robot
 from armident.configs.schema.robot import Effect
 from armident.configs.schema.scenario import HiddenEffect
-from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
 from armident.identify.effects.effect import Place
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import arm_model, stanza_of
 from armident.identify.identification.api import identify_recording
-from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
 from armident.identify.report.files import robot_yaml
-from tests.fixtures.arms import recording
-from tests.fixtures.store import shared
+from tests.fixtures.arms import FAST, recording
+from tests.fixtures.diagnoses import diagnosis
 
-REPEATS = 3
+MOTION = "tx40_excitation"
+WORN = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
+
+at_both_rates = pytest.mark.parametrize(
+    ("period", "repeats"), [(FAST, 1), pytest.param(None, 3, marks=pytest.mark.proof)], ids=["1 kHz", "5 kHz"]
+)
+"""`make test` has one repetition at 1 kHz, a tenth of the CPU time; `make proof` three at the rate of the drives."""
 
 
 @pytest.fixture(scope="module")
@@ -25,26 +29,18 @@ def robot() -> RobotConfig:
     return load_robot("tx40.yaml")
 
 
-@shared
-def diagnosed(seed: int, *effects: HiddenEffect) -> Diagnosis:
-    robot = load_robot("tx40")
-    data = recording("tx40", "tx40_excitation", seed, *effects, repeats=REPEATS)
-    experiments, notes = experiments_from_recording(data, robot)
-    return diagnose(experiments, [], robot, notes=notes)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_plant_without_hidden_effects_has_no_gap(seed: int) -> None:
-    document = diagnosed(seed).document
+@at_both_rates
+def test_a_plant_without_hidden_effects_has_no_gap(period: float | None, repeats: int) -> None:
+    document = diagnosis("tx40", MOTION, 1, period=period, repeats=repeats).document
     assert document.verdict == "no_gap"
     assert document.gap.validation.before == document.gap.validation.after
 
 
 @pytest.mark.slow
-def test_a_worn_joint_is_named_and_its_size_is_right() -> None:
-    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
-    found = diagnosed(0, worn)
+@at_both_rates
+def test_a_worn_joint_is_named_and_its_size_is_right(period: float | None, repeats: int) -> None:
+    found = diagnosis("tx40", MOTION, 4, WORN, period=period, repeats=repeats)
     (finding,) = found.document.findings
     assert (finding.effect, finding.joint) == ("asymmetric_viscous_friction", "joint_2")
     assert finding.gap_after < finding.gap_before
@@ -54,17 +50,17 @@ def test_a_worn_joint_is_named_and_its_size_is_right() -> None:
 
 
 @pytest.mark.slow
-def test_a_cogging_motor_is_named_with_its_harmonic() -> None:
+@at_both_rates
+def test_a_cogging_motor_is_named_with_its_harmonic(period: float | None, repeats: int) -> None:
     cogging = HiddenEffect(effect="cogging_torque", joint="joint_3", parameters={"amplitude": 1.2, "harmonic": 1.0})
-    finding = diagnosed(1, cogging).document.findings[0]
+    finding = diagnosis("tx40", MOTION, 1, cogging, period=period, repeats=repeats).document.findings[0]
     assert (finding.effect, finding.joint) == ("cogging_torque", "joint_3")
     assert finding.parameters["harmonic"] == 1.0
 
 
 @pytest.mark.slow
 def test_held_out_error_of_the_joint_falls_with_every_finding() -> None:
-    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.4})
-    document = diagnosed(2, worn).document
+    document = diagnosis("tx40", MOTION, 4, WORN, period=FAST, repeats=1).document
     assert document.findings
     assert all(f.gap_after < f.gap_before for f in document.findings)
     assert document.gap.validation.after.all < document.gap.validation.before.all
@@ -115,23 +111,25 @@ def test_a_stanza_with_a_parameter_of_another_effect_is_refused(robot: RobotConf
 
 @pytest.mark.slow
 def test_identifying_with_the_effect_inside_brings_the_torque_error_down(robot: RobotConfig) -> None:
-    worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.4})
-    data = recording("tx40", "tx40_excitation", 3, worn, repeats=REPEATS)
-    model = diagnosed(3, worn).robot
+    data = recording("tx40", MOTION, 4, WORN, repeats=1, period=FAST)
+    model = diagnosis("tx40", MOTION, 4, WORN, period=FAST, repeats=1).robot
     plain = identify_recording(data, robot, Options(method="idim-ls")).document
     better = identify_recording(data, model, Options(method="idim-ls")).document
     assert better.relative_error_pct_by_joint["joint_2"] < plain.relative_error_pct_by_joint["joint_2"]
     (added,) = [p for p in better.parameters if p.name == "fva2"]
-    # 0.4 of the 5.5 N m s/rad of table B.4.
-    assert added.value == pytest.approx(0.4 * 5.5, abs=3 * added.std)
+    # 0.2 of the 5.53 N m s/rad of table B.4.
+    assert added.value == pytest.approx(0.2 * 5.53, abs=3 * added.std)
     assert added.unit == "N m s/rad"
 
 
 @pytest.mark.slow
-def test_a_slow_drive_is_found_where_the_simulated_loop_does_not_tell(robot: RobotConfig) -> None:
+@pytest.mark.parametrize(
+    ("period", "repeats"), [(FAST, 2), pytest.param(None, 3, marks=pytest.mark.proof)], ids=["1 kHz", "5 kHz"]
+)
+def test_a_slow_drive_is_found_where_the_simulated_loop_does_not_tell(period: float | None, repeats: int) -> None:
     """The wrist's drives hardly follow their references, with and without the lag, also in simulation."""
     slow = HiddenEffect(effect="actuator_bandwidth", joint="joint_5", parameters={"time_constant": 0.032})
-    document = diagnosed(2, slow).document
+    document = diagnosis("tx40", MOTION, 2, slow, period=period, repeats=repeats).document
     (finding,) = document.findings
     assert (finding.effect, finding.joint) == ("actuator_bandwidth", "joint_5")
     assert finding.gap_after < 0.8 * finding.gap_before

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from armident.configs import RobotConfig, load_robot
 from armident.configs.schema.scenario import HiddenEffect
-from armident.daq.recording import Recording, write_recording
-from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
-from armident.identify.document import Finding, IdentificationDocument
+from armident.daq.recording import write_recording
+from armident.identify.diagnosis.diagnose import diagnose
+from armident.identify.document import Finding
 from armident.identify.identification.from_recording import experiments_from_recording
-from tests.fixtures.arms import FAST, recording, tx40_baseline
+from tests.fixtures.arms import recording
+from tests.fixtures.diagnoses import WORN_AND_SPRUNG, diagnosis
 
 pytestmark = pytest.mark.slow
 
@@ -38,48 +38,26 @@ TIGHT_SPOT = Effect(
 '''
 
 
-def recorded(
-    robot: RobotConfig, seed: int, *effects: HiddenEffect, trajectory: str = "tx40_excitation", repeats: int = 2
-) -> Recording:
-    return recording(robot.name, trajectory, seed, *effects, repeats=repeats, period=FAST)
-
-
-def diagnosed(data: Recording, robot: RobotConfig, baseline: IdentificationDocument | None = None) -> Diagnosis:
-    experiments, notes = experiments_from_recording(data, robot)
-    return diagnose(experiments, [], robot, notes=notes, baseline=baseline)
-
-
-@pytest.mark.parametrize(
-    "hidden",
-    [
-        HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.1}),
-        HiddenEffect(effect="joint_spring", joint="joint_1", parameters={"stiffness": 60.0}),
-    ],
-    ids=lambda hidden: str(hidden.effect),
-)
-def test_the_resulting_model_has_no_gap_on_a_new_recording(hidden: HiddenEffect) -> None:
-    robot = load_robot("emps")
-    first = diagnosed(recorded(robot, 1, hidden, trajectory="emps_1", repeats=1), robot)
-    assert [f.effect for f in first.document.findings] == [hidden.effect]
-    again = diagnosed(recorded(robot, 2, hidden, trajectory="emps_1", repeats=1), first.robot)
-    assert again.document.verdict == "no_gap"
+def test_the_resulting_model_has_no_gap_on_a_new_recording() -> None:
+    first = diagnosis("emps", "emps_1", 1, *WORN_AND_SPRUNG)
+    assert {f.effect for f in first.document.findings} == {hidden.effect for hidden in WORN_AND_SPRUNG}
+    experiments, _ = experiments_from_recording(recording("emps", "emps_1", 2, *WORN_AND_SPRUNG), first.robot)
+    assert diagnose(experiments, [], first.robot).document.verdict == "no_gap"
 
 
 def test_what_could_hide_does_up_to_the_size_that_is_told_and_no_further() -> None:
-    robot = load_robot("emps")
-    told = diagnosed(recorded(robot, 1, trajectory="emps_1", repeats=1), robot).document
+    told = diagnosis("emps", "emps_1", 1).document
     assert told.verdict == "no_gap"
     (spring,) = [h for h in told.detection_limits if h.effect == "joint_spring"]
     for share, found in ((0.2, []), (2.0, ["joint_spring"])):
         stiffness = share * spring.limits["ks"]
         hidden = HiddenEffect(effect="joint_spring", joint="joint_1", parameters={"stiffness": stiffness})
-        document = diagnosed(recorded(robot, 2, hidden, trajectory="emps_1", repeats=1), robot).document
+        document = diagnosis("emps", "emps_1", 2, hidden).document
         assert [f.effect for f in document.findings] == found, share
 
 
 def against_baseline(seed: int, *effects: HiddenEffect) -> list[Finding]:
-    robot = load_robot("tx40")
-    return diagnosed(recorded(robot, seed, *effects), robot, tx40_baseline()).document.findings
+    return diagnosis("tx40", "tx40_excitation", seed, *effects, against_baseline=True).document.findings
 
 
 def test_other_friction_of_one_joint_is_another_number_and_no_structure() -> None:
@@ -102,9 +80,8 @@ def test_the_gain_of_one_drive_is_named() -> None:
 
 def test_a_drive_that_gives_twice_its_torque_is_sized_by_what_the_model_with_it_predicts() -> None:
     """Of the torque that the model without it predicts, which reports half of it, it would be another share."""
-    robot = load_robot("tx40")
     gain = HiddenEffect(effect="drive_gain_error", joint="joint_1", parameters={"error": 0.96})
-    document = diagnosed(recorded(robot, 8, gain, trajectory="tx40_1", repeats=3), robot).document
+    document = diagnosis("tx40", "tx40_1", 8, gain).document
     (finding,) = document.findings
     assert (finding.effect, finding.joint) == ("drive_gain_error", "joint_1")
     std = finding.evidence["std"]["gain_error"]
@@ -115,10 +92,9 @@ def test_a_drive_that_gives_twice_its_torque_is_sized_by_what_the_model_with_it_
 
 
 def test_like_joints_that_were_exchanged_are_found_though_nothing_else_is_amiss() -> None:
-    robot = load_robot("tx40")
     both = {"position": 1.0, "torque": 1.0}
     exchanged = HiddenEffect(effect="joint_order", joint="joint_4", other="joint_5", parameters=both)
-    document = diagnosed(recorded(robot, 5, exchanged, trajectory="tx40_4", repeats=3), robot).document
+    document = diagnosis("tx40", "tx40_4", 5, exchanged, repeats=3).document
     assert [(f.effect, f.joint, f.other) for f in document.findings] == [("joint_order", "joint_4", "joint_5")]
 
 
@@ -150,12 +126,11 @@ def test_an_effect_of_somebody_else_is_listed(elsewhere: dict[str, str]) -> None
 
 
 def test_an_effect_of_somebody_else_is_found_by_name(elsewhere: dict[str, str], tmp_path: Path) -> None:
-    robot = load_robot("emps")
     bump = HiddenEffect(
         effect="torque_bump", joint="joint_1", parameters={"torque": 3.0, "position": 0.06, "width": 0.01}
     )
     file = tmp_path / "bump.mcap"
-    write_recording(recorded(robot, 7, bump, trajectory="emps_1", repeats=1), file)
+    write_recording(recording("emps", "emps_1", 7, bump), file)
 
     def run(environment: dict[str, str]) -> dict[str, object]:
         done = subprocess.run(

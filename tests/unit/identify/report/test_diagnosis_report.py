@@ -5,28 +5,20 @@ import re
 import numpy as np
 import pytest
 
-from armident.configs import load_robot
-from armident.configs.schema.scenario import HiddenEffect
-from armident.identify.diagnosis.diagnose import Diagnosis, diagnose
-from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.diagnosis.diagnose import Diagnosis
 from armident.identify.report.diagnosis import SHOWN, diagnosis_report, followed_variable, telling_stretch
-from tests.fixtures.arms import recording
-
-HIDDEN = (
-    HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_1", parameters={"ratio": 0.15}),
-    HiddenEffect(effect="joint_spring", joint="joint_1", parameters={"stiffness": 80.0}),
-)
+from tests.fixtures import diagnoses
+from tests.fixtures.diagnoses import WORN_AND_SPRUNG
 
 
 @pytest.fixture(scope="module")
 def diagnosis() -> Diagnosis:
-    robot = load_robot("emps")
-    experiments, _ = experiments_from_recording(recording("emps", "emps_1", 1, *HIDDEN), robot)
-    found = diagnose(experiments, [], robot)
-    assert {f.effect for f in found.document.findings} == {h.effect for h in HIDDEN}
+    found = diagnoses.diagnosis("emps", "emps_1", 1, *WORN_AND_SPRUNG)
+    assert {f.effect for f in found.document.findings} == {h.effect for h in WORN_AND_SPRUNG}
     return found
 
 
+@pytest.mark.slow
 def test_the_curves_without_and_with_a_finding_are_those_of_its_errors(diagnosis: Diagnosis) -> None:
     def error(torque: np.ndarray) -> float:
         rest = diagnosis.measured - torque
@@ -38,17 +30,19 @@ def test_the_curves_without_and_with_a_finding_are_those_of_its_errors(diagnosis
         assert error(diagnosis.after) == pytest.approx(finding.gap_after, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_every_finding_has_a_picture_of_its_own_in_a_page_that_needs_no_other_file(diagnosis: Diagnosis) -> None:
     page = diagnosis_report(diagnosis, diagnosis.document)
     sources = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert all(source.startswith("data:image/svg+xml;base64,") for source in sources)
     pictures = re.findall(r'<img alt="residual of joint_1" src="([^"]*)"', page)
-    assert len(set(pictures)) == len(HIDDEN)
+    assert len(set(pictures)) == len(WORN_AND_SPRUNG)
     for finding in diagnosis.document.findings:
         for name, value in finding.parameters.items():
             assert f'<td>{name}</td><td class="n">{value:.4g}</td>' in page
 
 
+@pytest.mark.slow
 def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: Diagnosis) -> None:
     told = diagnosis.document.simulated
     assert told is not None
@@ -61,6 +55,7 @@ def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: D
     assert "Dependence of the residual" in page
 
 
+@pytest.mark.slow
 def test_a_finding_is_drawn_over_what_it_follows(diagnosis: Diagnosis) -> None:
     over = {}
     for finding, lacking in zip(diagnosis.document.findings, diagnosis.lacking, strict=True):

@@ -9,12 +9,13 @@ from armident.identify.document import IdentificationDocument, load_document
 from armident.identify.identification.api import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.report.files import write_identification
-from tests.fixtures.arms import recording
+from tests.fixtures.arms import FAST, recording
 
 
 @pytest.fixture(scope="module")
 def outcome() -> IdentificationOutcome:
-    return identify_recording(recording("tx40", "tx40_excitation", 1), options=Options(method="idim-ls"))
+    data = recording("tx40", "tx40_excitation", 1, repeats=1, period=FAST)
+    return identify_recording(data, options=Options(method="idim-ls"))
 
 
 @pytest.fixture(scope="module")
