@@ -19,8 +19,8 @@ from armident.identify.diagnosis.repeats import repeats
 from armident.identify.diagnosis.study import Study, build_study
 from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
-from armident.identify.thesis.recordings import measured_emps
 from tests.fixtures.arms import FAST, recording
+from tests.fixtures.diagnoses import measured_diagnosis
 
 pytestmark = pytest.mark.slow
 
@@ -138,7 +138,7 @@ def test_slow_torques_that_nothing_knows_are_no_noise_even_without_a_repetition(
 
 
 def test_two_recordings_of_a_healthy_arm_have_no_gap() -> None:
-    assert diagnose([recorded(2), recorded(3)], [], robot()).document.verdict == "no_gap"
+    assert diagnose([recorded(0), recorded(1)], [], robot()).document.verdict == "no_gap"
 
 
 def test_two_recordings_of_one_motion_show_an_effect_outside_the_catalogue() -> None:
@@ -148,6 +148,7 @@ def test_two_recordings_of_one_motion_show_an_effect_outside_the_catalogue() -> 
     assert document.noise_floor.by_joint["joint_2"] < document.gap.validation.after.by_joint["joint_2"]
 
 
+@pytest.mark.proof
 def test_a_measured_arm_whose_residual_is_far_from_noise_is_not_said_to_have_no_gap(shared_data: Path) -> None:
     file = shared_data / "kuka_lwr4" / "measurements_3.npz"
     if not file.is_file():
@@ -166,12 +167,10 @@ def test_a_measured_arm_whose_residual_is_far_from_noise_is_not_said_to_have_no_
 @pytest.fixture(scope="module")
 def own_last_third(shared_data: Path) -> Diagnosis:
     """EMPS, whose held-out part makes the motion of the training part again."""
-    measured = measured_emps(shared_data)
-    if measured is None:
-        pytest.skip("no DATA_EMPS.mat in the measured data")
-    return diagnose([measured.experiment], [], load_robot("emps"))
+    return measured_diagnosis(shared_data, "emps", "emps")
 
 
+@pytest.mark.proof
 def test_nothing_is_stated_of_the_emps_that_does_not_convince(own_last_third: Diagnosis) -> None:
     document = own_last_third.document
     stated = {f.effect for f in document.findings}
@@ -185,6 +184,7 @@ def test_nothing_is_stated_of_the_emps_that_does_not_convince(own_last_third: Di
     assert all(f.confidence < 0.5 and f.effect not in stated for f in document.considered)
 
 
+@pytest.mark.proof
 def test_what_the_findings_leave_of_the_emps_is_no_noise_and_said_to_be_unexplained(own_last_third: Diagnosis) -> None:
     document = own_last_third.document
     assert document.verdict == "partly_explained"
