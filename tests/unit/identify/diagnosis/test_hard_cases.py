@@ -15,7 +15,7 @@ from armident.virtual_robot.json_server import simulate_request
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 proof = pytest.mark.proof
-"""Of the TX40, whose cases take a quarter of a minute each, `make test` runs three; the suite runs all of them."""
+"""`make test` runs cases of the EMPS and one of the TX40; the suite runs all of them."""
 
 
 def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]]:
@@ -38,6 +38,7 @@ def diagnosed(name: str, folder: Path) -> tuple[dict[str, Any], dict[str, float]
     return json.loads(to_json(document)), hidden
 
 
+@proof
 def test_a_late_torque_of_joint_2_is_found_in_the_loop_that_it_makes(tmp_path: Path) -> None:
     """The simulated loop without the delay speaks against the delay."""
     told, hidden = diagnosed("effect time_delay joint_2 obvious tx40 run 1", tmp_path)
@@ -61,7 +62,7 @@ def test_a_late_torque_is_no_friction_that_yields_where_noise_hides_what_the_loo
     assert abs(found["parameters"]["delay"] - hidden["delay"]) < 3.0 * found["evidence"]["std"]["delay"]
 
 
-@pytest.mark.parametrize("run", [1, 4])
+@pytest.mark.parametrize("run", [1, pytest.param(4, marks=proof)])
 def test_a_link_that_swings_beyond_the_bandwidth_is_found_where_measured_positions_bring_more_noise(
     run: int, tmp_path: Path
 ) -> None:
@@ -79,7 +80,8 @@ def test_a_link_that_swings_beyond_the_bandwidth_is_found_where_measured_positio
     )
 
 
-@pytest.mark.parametrize("run", [2, pytest.param(5, marks=proof)])
+@proof
+@pytest.mark.parametrize("run", [2, 5])
 def test_a_link_on_a_spring_is_found_at_its_own_joint_although_the_one_before_shows_more_of_it(
     run: int, tmp_path: Path
 ) -> None:
@@ -186,7 +188,7 @@ def test_what_shows_at_no_joint_alone_shows_at_all_of_them_together(tmp_path: Pa
     assert [rest["varies_with"] for rest in told["unexplained"]] == ["motion"]
 
 
-@pytest.mark.parametrize("run", [3, 4])
+@pytest.mark.parametrize("run", [3, pytest.param(4, marks=proof)])
 def test_a_saturated_drive_is_found_where_a_stiff_loop_moves_the_same_without_it(run: int, tmp_path: Path) -> None:
     """Simulated and measured velocity differ by a ten-thousandth either way; the torques by five times."""
     told, hidden = diagnosed(f"effect drive_gain_saturation joint_1 obvious emps run {run}", tmp_path)

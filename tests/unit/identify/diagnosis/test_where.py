@@ -39,7 +39,7 @@ def studied(*effects: HiddenEffect, seed: int) -> tuple[Fit, Workshop]:
 
 @cache
 def healthy() -> tuple[Fit, Workshop]:
-    return studied(seed=41)
+    return studied(seed=7)
 
 
 @cache

@@ -19,7 +19,7 @@ from armident.identify.robot.relaxation import simulate_with_terms
 from armident.identify.robot.simulation import simulate
 from armident.identify.signals.bandpass import butterworth
 from armident.virtual_robot.inertias import plant_parameters
-from tests.fixtures.arms import recording
+from tests.fixtures.arms import FAST, recording
 
 DT = 1e-3
 
@@ -136,7 +136,7 @@ def _on_joint_1(torque: Any, robot: RobotConfig) -> Any:
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "idim-piv", "didim"])
 def test_every_method_estimates_a_term_with_the_rest(robot: RobotConfig, method: Method) -> None:
     worn = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.4})
-    data = recording("tx40", "tx40_excitation", 3, worn)
+    data = recording("tx40", "tx40_excitation", 3, worn, period=FAST)
     known = with_effects(robot, Effect(effect="asymmetric_viscous_friction", joint="joint_2"))
     document = identify_recording(data, known, Options(method=method)).document
     (added,) = [p for p in document.parameters if p.name == "fva2"]
@@ -148,7 +148,7 @@ def test_every_method_estimates_a_term_with_the_rest(robot: RobotConfig, method:
 
 @pytest.mark.slow
 def test_a_wrong_drive_gain_is_identified_beside_the_dynamics(robot: RobotConfig) -> None:
-    data = recording("tx40", "tx40_excitation", 4)
+    data = recording("tx40", "tx40_excitation", 4, period=FAST)
     joints = list(robot.joints)
     drive = joints[1].drive
     joints[1] = joints[1].model_copy(update={"drive": drive.model_copy(update={"gain": 1.2 * drive.gain})})
