@@ -1,6 +1,7 @@
 """Processes of the suite and its file of results."""
 
 import json
+import math
 import os
 import signal
 import threading
@@ -12,12 +13,14 @@ import pytest
 
 from armident.configs import ArmidentError, ConfigError, DataError, load_robot
 from armident.identify.document import DiagnosisDocument
+from armident.identify.evaluation import plant_process
 from armident.identify.evaluation.cases import Case
 from armident.identify.evaluation.diagnosis_process import DiagnosisProcess
 from armident.identify.evaluation.plant_process import PlantProcess
 from armident.identify.evaluation.store import CaseResult, Store, code_version
 from armident.identify.evaluation.tasks import DiagnosisTask, diagnose_file, reduced_model
 from armident.identify.evaluation.workers import CaseRunner
+from tests.conftest import REPOSITORY
 
 EMPS = {
     "robot": "emps.yaml", "trajectory": "trajectories/emps_excitation.yaml", "repeats": 1, "period": 1e-3, "seed": 1,
@@ -32,6 +35,15 @@ def spring(stiffness: object) -> dict[str, object]:
     }  # fmt: skip
 
 
+@pytest.fixture
+def refusing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace the simulation by a server that starts faster, for tests of the process only."""
+    monkeypatch.setattr(plant_process, "SERVER", "tests.fixtures.refusing_plant")
+    paths = [str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+
+
+@pytest.mark.slow
 def test_a_plant_simulates_recordings_and_evaluates_strengths_relative_to_its_joint(tmp_path: Path) -> None:
     plant = PlantProcess(tmp_path / "plant.log")
     try:
@@ -41,6 +53,8 @@ def test_a_plant_simulates_recordings_and_evaluates_strengths_relative_to_its_jo
         with pytest.raises(ArmidentError, match=r"joint_spring of joint_1: parameters.stiffness: 's \* fd': unknown"):
             plant.request({"id": 2, **EMPS, "effects": [spring("s * fd")], "out": str(tmp_path / "b.mcap")}, 60)
         assert not (tmp_path / "b.mcap").exists()
+        with pytest.raises(ArmidentError, match=r"plant: ConfigError: none\.yaml"):
+            plant.request(REFUSED, 60)
     finally:
         plant.close()
 
@@ -48,6 +62,7 @@ def test_a_plant_simulates_recordings_and_evaluates_strengths_relative_to_its_jo
 REFUSED = {"id": 1, "robot": "none.yaml", "trajectory": "trajectories/emps_excitation.yaml"}
 
 
+@pytest.mark.usefixtures("refusing")
 def test_a_plant_that_dies_fails_one_request_and_is_restarted(tmp_path: Path) -> None:
     plant = PlantProcess(tmp_path / "plant.log")
     try:
@@ -66,6 +81,7 @@ def test_a_plant_that_dies_fails_one_request_and_is_restarted(tmp_path: Path) ->
         plant.close()
 
 
+@pytest.mark.usefixtures("refusing")
 def test_a_plant_that_exceeds_its_memory_limit_answers_and_is_restarted(tmp_path: Path) -> None:
     for limit, ended in ((1 << 20, True), (64 << 30, False)):
         plant = PlantProcess(tmp_path / "plant.log", limit)
@@ -78,6 +94,7 @@ def test_a_plant_that_exceeds_its_memory_limit_answers_and_is_restarted(tmp_path
             plant.close()
 
 
+@pytest.mark.usefixtures("refusing")
 def test_a_plant_that_does_not_answer_in_time_is_ended(tmp_path: Path) -> None:
     plant = PlantProcess(tmp_path / "plant.log")
     try:
@@ -96,6 +113,7 @@ def gone(pid: int) -> bool:
     return not Path(f"/proc/{pid}").exists()
 
 
+@pytest.mark.slow
 def test_a_diagnosis_worker_that_dies_or_hangs_fails_one_task_and_is_replaced(tmp_path: Path) -> None:
     diagnosis = DiagnosisProcess(tmp_path / "diagnosis.log")
     try:
@@ -114,10 +132,15 @@ def test_a_diagnosis_worker_that_dies_or_hangs_fails_one_task_and_is_replaced(tm
             diagnosis.run(time.sleep, 60, 0.3)
         assert diagnosis.pid is None
         assert gone(second or 0)
-        with pytest.raises(ArmidentError, match=r"diagnosis: (Data|Config)Error: .*none\.mcap"):
-            diagnosis.run(diagnose_file, NO_FILE, 120)
+        with pytest.raises(ArmidentError, match=r"diagnosis: ConfigError: none\.yaml"):
+            diagnosis.run(load_robot, "none.yaml", 120)
     finally:
         diagnosis.close()
+
+
+def test_the_task_of_a_missing_recording_fails_with_its_name() -> None:
+    with pytest.raises((DataError, ConfigError), match=r"none\.mcap"):
+        diagnose_file(NO_FILE)
 
 
 def test_a_diagnosis_worker_that_exceeds_its_memory_limit_is_replaced_after_its_result(tmp_path: Path) -> None:
@@ -134,17 +157,11 @@ def test_an_unexpected_error_of_a_task_is_its_result_and_its_trace_is_in_the_log
     diagnosis = DiagnosisProcess(tmp_path / "diagnosis.log")
     try:
         with pytest.raises(ArmidentError, match="diagnosis: ValueError: math domain error"):
-            diagnosis.run(_root, -1.0, 120)
-        assert diagnosis.run(_root, 4.0, 120) == 2.0
+            diagnosis.run(math.sqrt, -1.0, 120)
+        assert diagnosis.run(math.sqrt, 4.0, 120) == 2.0
     finally:
         diagnosis.close()
     assert "Traceback" in (tmp_path / "diagnosis.log").read_text()
-
-
-def _root(value: float) -> float:
-    import math
-
-    return math.sqrt(value)
 
 
 def test_a_stopped_worker_fails_its_task_and_starts_no_other(tmp_path: Path) -> None:
@@ -160,6 +177,7 @@ def test_a_stopped_worker_fails_its_task_and_starts_no_other(tmp_path: Path) -> 
         killer.join()
 
 
+@pytest.mark.usefixtures("refusing")
 def test_the_failure_of_a_case_is_its_result_and_the_run_continues(tmp_path: Path) -> None:
     cases = [Case("clean", None, "emps", f"no_{k}.yaml", str(EMPS["trajectory"]), 1, 1e-3, 1) for k in range(2)]
     store = Store(tmp_path / "results.jsonl", "one")
