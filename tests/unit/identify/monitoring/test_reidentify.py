@@ -13,9 +13,9 @@ import pytest
 import sqlalchemy as sa
 import yaml
 
-from armident.configs import ConfigError, DataError, config_path, load_robot, load_session, load_trajectory
+from armident.configs import ConfigError, DataError, config_path, load_robot, load_session
 from armident.configs.schema.scenario import Scenario
-from armident.daq.recording import write_recording
+from armident.daq.recording import Recording, write_recording
 from armident.identify.document import IdentificationDocument, load_document, to_json
 from armident.identify.identification.api import identify_recording
 from armident.identify.monitoring.change_test import compare
@@ -24,31 +24,37 @@ from armident.identify.monitoring.reidentify.baseline import baseline_of
 from armident.identify.monitoring.reidentify.fleet import cluster
 from armident.identify.monitoring.reidentify.run import prepare
 from armident.identify.monitoring.reidentify.summary import change_lines, meaning_of, place_of
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import FAST, recording
+from tests.fixtures.store import shared
 from tests.statistics.weeks import WORN
 
 NOW = datetime.datetime(2026, 3, 1, tzinfo=datetime.UTC)
+WEEKS = {"a_monday": (1, ()), "b_tuesday": (2, ()), "d_worn": (3, Scenario.model_validate(WORN).effects)}
+"""Seed of the noise, and hidden effects."""
+
+
+def week(name: str) -> Recording:
+    seed, effects = WEEKS[name]
+    return recording("tx40", "tx40_excitation", seed, *effects, period=FAST, setpoint_every=1)
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two weeks of an arm, and one with a tenth more friction in joint 2."""
     folder = tmp_path_factory.mktemp("weeks")
-    robot, trajectory = load_robot("tx40.yaml"), load_trajectory("trajectories/tx40_excitation.yaml")
-    worn = Scenario.model_validate(WORN)
-    for name, seed, scenario in (("a_monday", 1, None), ("b_tuesday", 2, None), ("d_worn", 3, worn)):
-        recording = simulate_recording(robot, trajectory, seed, 1.0, scenario, 0.001, 1)
-        write_recording(recording, folder / f"{name}.mcap")
+    for name in WEEKS:
+        write_recording(week(name), folder / f"{name}.mcap")
     return folder
 
 
-@pytest.fixture(scope="module")
-def documents(recordings: Path) -> dict[str, IdentificationDocument]:
-    from armident.daq.recording import read_recording
+@shared
+def document(name: str) -> IdentificationDocument:
+    return identify_recording(week(name)).document
 
-    return {
-        path.stem: identify_recording(read_recording(path)).document for path in sorted(recordings.glob("*_*.mcap"))
-    }
+
+@pytest.fixture(scope="module")
+def documents() -> dict[str, IdentificationDocument]:
+    return {name: document(name) for name in WEEKS}
 
 
 def cell(folder: Path, **changes: Any) -> Path:
@@ -188,12 +194,15 @@ def test_a_fleet_is_compared_in_order_and_survives_a_failed_recording(recordings
 
 
 @pytest.mark.slow
-def test_a_scheduler_by_address_does_the_same_work(recordings: Path, tmp_path: Path) -> None:
+def test_a_scheduler_by_address_does_the_same_work(tmp_path: Path) -> None:
     from distributed import LocalCluster
 
-    shutil.copy(recordings / "a_monday.mcap", tmp_path)
-    shutil.copy(recordings / "b_tuesday.mcap", tmp_path)
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as remote:
+    for name, seed in (("a_monday", 1), ("b_tuesday", 2)):
+        write_recording(recording("emps", "emps_excitation", seed), tmp_path / f"{name}.mcap")
+    # The worker is a thread of this process, which has imported everything.
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address=None
+    ) as remote:
         done = fleet(tmp_path, "--scheduler", remote.scheduler_address, "--json")
     assert done.returncode == 0, done.stderr
     runs = json.loads(done.stdout)["runs"]
@@ -215,6 +224,7 @@ def test_a_cluster_that_is_not_there_is_one_line(scheduler: str | None, workers:
         pytest.fail("there is a cluster")
 
 
+@pytest.mark.slow
 def test_no_recording_matches_is_one_line(tmp_path: Path) -> None:
     done = fleet(tmp_path, "--workers", "1")
     assert done.returncode == 2
