@@ -2,7 +2,6 @@
 
 import datetime
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,9 +11,11 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 import yaml
+from typer.testing import CliRunner, Result
 
 from armident.configs import ConfigError, DataError, config_path, load_robot, load_session
 from armident.configs.schema.scenario import Scenario
+from armident.daq.cli import application
 from armident.daq.recording import Recording, write_recording
 from armident.identify.document import IdentificationDocument, load_document, to_json
 from armident.identify.identification.api import identify_recording
@@ -24,7 +25,7 @@ from armident.identify.monitoring.reidentify.baseline import baseline_of
 from armident.identify.monitoring.reidentify.fleet import cluster
 from armident.identify.monitoring.reidentify.run import prepare
 from armident.identify.monitoring.reidentify.summary import change_lines, meaning_of, place_of
-from tests.fixtures.arms import FAST, recording
+from tests.fixtures.arms import FAST, hide, recording
 from tests.fixtures.store import shared
 from tests.statistics.weeks import WORN
 
@@ -34,17 +35,9 @@ WEEKS = {"a_monday": (1, ()), "b_tuesday": (2, ()), "d_worn": (3, Scenario.model
 
 
 def week(name: str) -> Recording:
+    """Two weeks of an arm, and one with a tenth more friction in joint 2."""
     seed, effects = WEEKS[name]
     return recording("tx40", "tx40_excitation", seed, *effects, period=FAST, setpoint_every=1)
-
-
-@pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two weeks of an arm, and one with a tenth more friction in joint 2."""
-    folder = tmp_path_factory.mktemp("weeks")
-    for name in WEEKS:
-        write_recording(week(name), folder / f"{name}.mcap")
-    return folder
 
 
 @shared
@@ -164,33 +157,39 @@ def test_parameters_have_places_and_meanings(name: str, place: str, meaning: str
     assert meaning_of(name) == meaning
 
 
-def fleet(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "armident.daq.cli", "reidentify", "--recordings", str(folder / "[a-z]_*.mcap")]
-    command += ["--store", store(folder), "--out", str(folder / "results"), *options]
-    return subprocess.run(command, capture_output=True, text=True, timeout=250, check=False)
+def fleet_words(folder: Path, *options: str) -> list[str]:
+    words = ["reidentify", "--recordings", str(folder / "[a-z]_*.mcap"), "--store", store(folder)]
+    return [*words, "--out", str(folder / "results"), *options]
+
+
+def fleet_in_process(folder: Path, *options: str) -> Result:
+    """Run the command without a process of its own, which would import everything anew."""
+    return CliRunner().invoke(application(["reidentify"]), fleet_words(folder, *options))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_fleet_is_compared_in_order_and_survives_a_failed_recording(recordings: Path, tmp_path: Path) -> None:
+def test_a_fleet_is_compared_in_order_and_survives_a_failed_recording(tmp_path: Path) -> None:
     """One line per recording and one history; one file is not a recording."""
-    for path in recordings.glob("*.mcap"):
-        shutil.copy(path, tmp_path)
+    friction = hide("friction_drift", "joint_1", change=0.1, time_constant=1e-6)
+    for name, seed, effects in (("a_monday", 1, ()), ("b_tuesday", 2, ()), ("d_worn", 3, (friction,))):
+        write_recording(recording("emps", "emps_excitation", seed, *effects), tmp_path / f"{name}.mcap")
     (tmp_path / "c_broken.mcap").write_bytes(b"not a recording")
-    done = fleet(tmp_path, "--workers", "2")
+    command = [sys.executable, "-m", "armident.daq.cli", *fleet_words(tmp_path, "--workers", "2")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=250, check=False)
     assert done.returncode == 4, done.stderr
     monday, tuesday, broken, worn = done.stdout.splitlines()
-    assert "a_monday.mcap: first run of tx40: the baseline" in monday
+    assert "a_monday.mcap: first run of emps: the baseline" in monday
     assert "b_tuesday.mcap: no change" in tuesday
     assert "c_broken.mcap: failed: " in broken
-    assert "d_worn.mcap: CHANGED: joint_2: " in worn
+    assert "d_worn.mcap: CHANGED: joint_1: " in worn
     with sa.create_engine(store(tmp_path)).connect() as connection:
         assert connection.execute(sa.text("select count(*) from identifications")).scalar() == 3
         assert connection.execute(sa.text("select count(*) from recordings")).scalar() == 3
         drifted = connection.execute(sa.text("select drifted from comparisons order by identification")).scalars().all()
     assert [bool(each) for each in drifted] == [False, True]
     results = tmp_path / "results" / "d_worn.identification" / "identification.json"
-    assert load_document(results, IdentificationDocument).robot == "tx40"
+    assert load_document(results, IdentificationDocument).robot == "emps"
 
 
 @pytest.mark.slow
@@ -203,8 +202,8 @@ def test_a_scheduler_by_address_does_the_same_work(tmp_path: Path) -> None:
     with LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address=None
     ) as remote:
-        done = fleet(tmp_path, "--scheduler", remote.scheduler_address, "--json")
-    assert done.returncode == 0, done.stderr
+        done = fleet_in_process(tmp_path, "--scheduler", remote.scheduler_address, "--json")
+    assert done.exit_code == 0, done.stderr
     runs = json.loads(done.stdout)["runs"]
     assert [Path(run["recording"]).stem for run in runs] == ["a_monday", "b_tuesday"]
     assert runs[1]["drift"]["drifted"] is False
@@ -224,10 +223,9 @@ def test_a_cluster_that_is_not_there_is_one_line(scheduler: str | None, workers:
         pytest.fail("there is a cluster")
 
 
-@pytest.mark.slow
 def test_no_recording_matches_is_one_line(tmp_path: Path) -> None:
-    done = fleet(tmp_path, "--workers", "1")
-    assert done.returncode == 2
+    done = fleet_in_process(tmp_path, "--workers", "1")
+    assert done.exit_code == 2
     assert "no such file" in done.stderr
 
 
