@@ -121,7 +121,11 @@ class Batch:
 
 
 class Assembler:
-    """Matches SYNC and TPDO frames; the result does not depend on the division of a bus's frames into batches.
+    """Matches SYNC and TPDO frames.
+
+    The result does not depend on the division of the frames of a single bus into batches. Drives on several buses are
+    compared with each other as far as their buses have been read. Thus the time at which a bus is read may decide if
+    late answers of its drives are assigned, or become a gap with the reason ``ambiguous order``.
 
     Parameters
     ----------
