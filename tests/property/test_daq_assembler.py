@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -100,7 +100,6 @@ mixed = st.builds(
 splits = st.lists(st.integers(0, 10_000), max_size=6)
 
 
-@settings(max_examples=150)
 @given(mixed, splits)
 def test_every_sync_is_received_or_in_a_gap_and_the_counters_add_up(faults: Faults, cuts: list[int]) -> None:
     frames = bus(COUNT, faults)
@@ -119,7 +118,6 @@ def test_every_sync_is_received_or_in_a_gap_and_the_counters_add_up(faults: Faul
     assert counters["sync_missing"] == len(faults.sync)
 
 
-@settings(max_examples=100)
 @given(mixed, splits)
 def test_the_result_does_not_depend_on_how_frames_are_split(faults: Faults, cuts: list[int]) -> None:
     frames = bus(COUNT, faults)
@@ -130,7 +128,6 @@ def test_the_result_does_not_depend_on_how_frames_are_split(faults: Faults, cuts
         assert np.array_equal(one[1][stream.name], many[1][stream.name])
 
 
-@settings(max_examples=100)
 @given(losses)
 @example(Faults(sync={0}))
 @example(Faults(sync={COUNT - 1}, tpdo={(COUNT - 1, 0), (COUNT - 2, 0)}))
@@ -146,7 +143,6 @@ def test_received_samples_belong_to_their_sync_if_frames_are_lost(faults: Faults
         assert due - near <= set(sync[stream.name].tolist())
 
 
-@settings(max_examples=100)
 @given(delays, splits)
 def test_late_answers_lose_no_sample(faults: Faults, cuts: list[int]) -> None:
     sync, data, gaps, _ = run(bus(COUNT, faults), COUNT, cuts)

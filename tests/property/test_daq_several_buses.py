@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -112,7 +112,6 @@ cuts = st.lists(st.integers(0, COUNT), max_size=5)
 kinds = st.sampled_from([(PLAIN,), (PLAIN, DEMAND), (PACKED,), (PACKED, DEMAND)])
 
 
-@settings(max_examples=150)
 @given(kinds, faults, cuts)
 def test_every_sync_of_every_bus_is_received_or_in_a_gap(
     streams: tuple[TpdoStream, ...], faults: Faults, cuts: list[int]
@@ -131,7 +130,6 @@ def test_every_sync_of_every_bus_is_received_or_in_a_gap(
     assert np.array_equal(data["samples"][:, :, :6], np.array(expected, np.uint8).reshape(-1, 4, 6))
 
 
-@settings(max_examples=80)
 @example((PLAIN,), Faults(tpdo={(0, 1), (0, 2), (0, 0)}, sync={(18, 1)}), [17])
 @example((PLAIN,), Faults(tpdo={(0, 1), (92, 2), (0, 0)}, sync={(102, 1)}), [101])
 @given(kinds, faults, cuts)

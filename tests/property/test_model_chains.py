@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from armident.configs import ConfigError, RobotConfig, load_robot
@@ -21,7 +21,6 @@ from tests.urdf_chains import configuration, link_frames, random_urdf
 chains = st.tuples(st.integers(0, 2**31), st.integers(1, 7), st.booleans())
 
 
-@settings(max_examples=30, deadline=None)
 @given(chains)
 def test_dynamics_agree_with_pinocchio_on_random_chains(chain: tuple[int, int, bool]) -> None:
     seed, n, right_angles = chain
@@ -53,7 +52,6 @@ def test_dynamics_agree_with_pinocchio_on_random_chains(chain: tuple[int, int, b
         )
 
 
-@settings(max_examples=30, deadline=None)
 @given(chains)
 def test_regressor_times_parameters_is_inverse_dynamics(chain: tuple[int, int, bool]) -> None:
     seed, n, right_angles = chain
@@ -93,7 +91,6 @@ def in_our_frames(bodies: list[Any], theirs_in_ours: Floats) -> Floats:
     return np.array([body.toDynamicParameters()[np.argsort(TO_OURS)] for body in placed])
 
 
-@settings(max_examples=30, deadline=None)
 @given(chains)
 def test_a_urdf_has_the_dynamics_that_pinocchio_reads_from_it(
     tmp_path_factory: pytest.TempPathFactory, chain: tuple[int, int, bool]
@@ -146,14 +143,12 @@ def assert_rules_and_qr_agree(robot: RobotConfig) -> None:
 
 
 @pytest.mark.parametrize("right_angles", [True, False])
-@settings(max_examples=75, deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 7))
 def test_rules_and_qr_find_the_same_base_parameters(right_angles: bool, seed: int, n: int) -> None:
     assert_rules_and_qr_agree(random_robot(np.random.default_rng(seed), n, right_angles))
 
 
 @pytest.mark.parametrize("right_angles", [True, False])
-@settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 7))
 def test_rules_and_qr_find_the_same_base_parameters_of_a_urdf(
     tmp_path_factory: pytest.TempPathFactory, right_angles: bool, seed: int, n: int

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from armident.configs import load_robot
@@ -40,7 +40,6 @@ def test_a_decimation_that_leaves_enough_stays_as_it_is() -> None:
     assert sufficient(wanted, DT, SAMPLES, decimated_rows(wanted, SAMPLES)) is wanted
 
 
-@settings(max_examples=30)
 @given(
     dt=st.sampled_from([2e-4, 1e-3, 5e-3]),
     cutoff=st.floats(0.05, 20.0),
