@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from armident.configs import RobotConfig, load_robot, load_trajectory
+from armident.configs import RobotConfig, load_robot
 from armident.identify.controller.crc import IdentifiedController, identify_crc
 from armident.identify.controller.nominal import saturation
 from armident.identify.controller.parametric import ControlLaw, identify_parametric
@@ -20,9 +20,9 @@ from armident.identify.robot.simulation import Simulation, simulate
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import Derivatives, differentiate
 from armident.virtual_robot.inertias import plant_parameters
-from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.servo import CONTROL_PERIOD, VELOCITY_FILTER_HZ, gains
+from tests.fixtures.arms import recording
 
 pytestmark = pytest.mark.slow
 
@@ -43,8 +43,7 @@ def robot() -> RobotConfig:
 
 @cache
 def recorded(noise: float) -> Experiment:
-    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
-    experiments, _ = experiments_from_recording(simulate_recording(robot(), trajectory, seed=3, noise=noise), robot())
+    experiments, _ = experiments_from_recording(recording("tx40", "tx40_excitation", 1, noise=noise), robot())
     return experiments[0]
 
 

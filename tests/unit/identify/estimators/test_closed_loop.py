@@ -5,14 +5,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from armident.configs import load_robot, load_trajectory
+from armident.configs import load_robot
 from armident.identify.estimators.idim_piv import idim_piv
 from armident.identify.experiment import Experiment
 from armident.identify.identification import solvers as methods
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Method, Options
 from armident.identify.identification.pipeline import identify_experiment
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import recording
 
 pytestmark = pytest.mark.slow
 
@@ -22,9 +22,8 @@ SLOW = 0.002
 
 @pytest.fixture(scope="module")
 def at_500_hz() -> list[Experiment]:
-    robot, trajectory = load_robot("tx40.yaml"), load_trajectory("trajectories/tx40_excitation.yaml")
-    recording = simulate_recording(robot, trajectory, 2, 1.0, None, SLOW, 1)
-    return experiments_from_recording(recording, robot)[0]
+    slow = recording("tx40", "tx40_excitation", 2, period=SLOW, setpoint_every=1)
+    return experiments_from_recording(slow, load_robot("tx40.yaml"))[0]
 
 
 @pytest.mark.parametrize("method", ["idim-iv", "idim-piv"])

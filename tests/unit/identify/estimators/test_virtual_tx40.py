@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from armident.configs import load_robot, load_trajectory
+from armident.configs import load_robot
 from armident.identify.controller.nominal import saturation
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
@@ -31,6 +31,7 @@ from armident.virtual_robot import servo
 from armident.virtual_robot.inertias import plant_parameters
 from armident.virtual_robot.offline import simulate_recording
 from armident.virtual_robot.plant import Plant
+from tests.fixtures.arms import recording, trajectory
 
 pytestmark = pytest.mark.slow
 
@@ -73,7 +74,7 @@ def cad() -> Floats:
 @cache
 def recorded(noise: float, steps: int = 1) -> Recorded:
     """One recording with encoders ``steps`` times as coarse as those of the TX40."""
-    robot = load_robot("tx40")
+    robot, motion = load_robot("tx40"), "tx40_excitation"
     joints = tuple(
         joint.model_copy(
             update={
@@ -82,9 +83,12 @@ def recorded(noise: float, steps: int = 1) -> Recorded:
         )
         for joint in robot.joints
     )
-    robot = robot.model_copy(update={"joints": joints})
-    trajectory = load_trajectory("trajectories/tx40_excitation.yaml")
-    experiments, _ = experiments_from_recording(simulate_recording(robot, trajectory, seed=0, noise=noise), robot)
+    if steps == 1:
+        made = recording("tx40", motion, 1, noise=noise)
+    else:
+        robot = robot.model_copy(update={"joints": joints})
+        made = simulate_recording(robot, trajectory(motion), seed=0, noise=noise)
+    experiments, _ = experiments_from_recording(made, robot)
     dt = experiments[0].dt
     signals = [differentiate(e.q, dt, "irwsm", None, 10.0) for e in experiments]
     decimation = design(dt, CUTOFF_HZ)

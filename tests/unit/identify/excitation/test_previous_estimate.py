@@ -1,29 +1,23 @@
 """Parameters and noise of an earlier identification in the design of the next experiment."""
 
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from armident.configs import DataError, config_path, load_robot, load_trajectory
+from armident.configs import DataError, load_robot, load_trajectory
 from armident.identify.cli import trajectory as trajectory_command
 from armident.identify.document import IdentificationDocument, to_json, write_atomically
 from armident.identify.excitation.previous_estimate import _deviation_below, previous_estimate
-from armident.identify.identification.api import identify_recording
 from armident.identify.identification.equations import LS_CUTOFF
-from armident.identify.identification.options import Options
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures.arms import identified
 
 pytestmark = pytest.mark.slow
 
 
-@cache
 def document() -> IdentificationDocument:
-    path = config_path("trajectories/tx40_excitation.yaml")
-    recording = simulate_recording(load_robot("tx40"), load_trajectory(str(path)), seed=21)
-    return identify_recording(recording, options=Options()).document
+    return identified("tx40", "tx40_excitation", 1).document
 
 
 def test_noise_below_a_frequency_is_the_filtered_noise() -> None:
