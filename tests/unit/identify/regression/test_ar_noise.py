@@ -74,10 +74,18 @@ def test_widening_is_two_of_akaikes_factors_and_leaves_filter_and_white_noise_al
     assert ArModel(np.empty(0), 4.0, 1.0).widened(100).variance == 4.0
 
 
-def test_errors_of_parameters_are_as_large_as_said_although_the_noise_model_is_an_estimate() -> None:
+# Over seeds 0 to 4 and 300 runs, the difference to the known noise model is 0.006 +- 0.007; unwidened it is 0.064. With
+# 60 runs the standard deviation is 0.016, hence both are bounded at three of these.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("runs", "most", "unwidened"), [(60, 0.054, 0.016), pytest.param(300, 0.035, 0.035, marks=pytest.mark.proof)]
+)
+def test_errors_of_parameters_are_as_large_as_said_although_the_noise_model_is_an_estimate(
+    runs: int, most: float, unwidened: float
+) -> None:
     # Noise with a long correlation time and parameters at low frequencies, as for a robot after rough decimation.
     coefficients = np.array([-0.80, 0.28, -0.24, 0.14, -0.16, 0.18, -0.10, 0.08, -0.18])
-    samples, parameters, runs = 700, 10, 300
+    samples, parameters = 700, 10
     rng = np.random.default_rng(0)
     said, known, plain = np.empty(runs), np.empty(runs), np.empty(runs)
     for run in range(runs):
@@ -95,9 +103,10 @@ def test_errors_of_parameters_are_as_large_as_said_although_the_noise_model_is_a
         said[run] = squared_distance(*weighted([block], models))
         order = models[0].order
         plain[run] = said[run] * ((samples + order) / (samples - order)) ** 2
-    # Over seeds 0 to 4 the difference to the known noise model is 0.006 +- 0.007; unwidened it is 0.064.
-    assert abs(np.mean(said - known)) < 0.035
-    assert np.mean(plain - known) > 0.035
+    assert abs(np.mean(said - known)) < most
+    assert np.mean(plain - known) > unwidened
+    # The scatter is common to both.
+    assert abs(np.mean(said - known)) < np.mean(plain - known)
 
 
 def test_stretches_of_a_long_series_say_what_the_parameters_absorbed() -> None:

@@ -127,7 +127,7 @@ def test_negative_friction_alone_becomes_zero_at_the_distance_of_its_own_t_value
 
 @pytest.mark.parametrize("far", [1.0, 30.0, 1000.0])
 def test_however_far_the_estimate_the_solver_ends(far: float) -> None:
-    for seed in range(8):
+    for seed in range(3):
         model, standard = small_arm(30 + seed, n=3)
         rng = np.random.default_rng(seed)
         base = model.base.regroup @ standard
@@ -192,7 +192,9 @@ def test_standard_deviations_of_parameters_determined_alone_are_those_of_the_est
             assert np.isnan(std)
 
 
-def test_the_verdict_calls_five_percent_of_physical_arms_at_the_edge_of_physics_incompatible_at_most() -> None:
+# With a true share of 5 %, the binomial bounds of probability 0.999 are 21 of 200 draws and 5 of 20.
+@pytest.mark.parametrize("runs", [20, pytest.param(200, marks=pytest.mark.proof)])
+def test_the_verdict_calls_five_percent_of_physical_arms_at_the_edge_of_physics_incompatible_at_most(runs: int) -> None:
     model, standard = small_arm(20)
     rng = np.random.default_rng(4)
     # The edge: no friction at all, and both links as thin as rods.
@@ -205,15 +207,16 @@ def test_the_verdict_calls_five_percent_of_physical_arms_at_the_edge_of_physics_
         standard[columns] = [*inertia[0], inertia[1, 1], inertia[1, 2], inertia[2, 2], *rod[:3, 3], rod[3, 3]]
     base = model.base.regroup @ standard
     covariance = covariance_of(base, rng)
-    runs, rejected, degrees = 200, 0, []
+    rejected, degrees = 0, []
     for _ in range(runs):
         found = nearest_consistent(model, rng.multivariate_normal(base, covariance), covariance)
         rejected += not found.compatible
         degrees.append(found.degrees)
     assert max(degrees) > 2
     assert rejected <= stats.binom.ppf(0.999, runs, 0.05)
-    # The bound is not an empty one: it is reached to within a factor of ten.
-    assert rejected >= 1
+    # The bound is not an empty one: it is reached to within a factor of ten. Of 20 draws at a share of 5 %, 36 % of the
+    # samples have no rejection at all, hence only the large sample proves this.
+    assert rejected >= 1 or runs < 200
 
 
 def test_bad_input_is_refused_with_what_is_wrong(tx40: ArmModel) -> None:
