@@ -13,11 +13,8 @@ pytestmark = pytest.mark.slow
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDERS = ("configs", "drivers", "daq", "identify", "virtual_robot", "tests")
-CALLS = (
-    ["-m", "armident.daq.cli", "effects", "stribeck_friction"],
-    ["-m", "armident.daq.cli", "bus-load", "--config", "tx40_cell.yaml"],
-    ["-c", "import armident.daq.capture.capture, armident.identify.monitoring.worker, armident.virtual_robot.run"],
-)
+COMMAND = ["-m", "armident.daq.cli", "bus-load", "--config", "tx40_cell.yaml"]
+IMPORT = ["-c", "import armident.daq.capture.capture, armident.identify.monitoring.worker, armident.virtual_robot.run"]
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +44,11 @@ def test_a_wheel_holds_every_file_that_the_packages_need(wheel: list[str]) -> No
     assert "armident/py.typed" in wheel
 
 
-@pytest.mark.parametrize("words", CALLS, ids=["effects", "bus-load", "import"])
-@pytest.mark.parametrize("python_path", [".", None], ids=["PYTHONPATH=.", "no PYTHONPATH"])
+@pytest.mark.parametrize(
+    ("words", "python_path"),
+    [(COMMAND, "."), (COMMAND, None), (IMPORT, ".")],
+    ids=["command with PYTHONPATH=.", "command", "import with PYTHONPATH=."],
+)
 def test_folders_of_our_names_in_the_working_directory_break_nothing(
     words: list[str], python_path: str | None, tmp_path: Path
 ) -> None:

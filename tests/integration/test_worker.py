@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from armident.configs import SessionConfig, load_robot, load_session, load_trajectory
+from armident.configs import SessionConfig, load_session
 from armident.configs.schema.session import IdentificationOptions
 from armident.daq.capture.publisher import Publisher
 from armident.daq.recording import Recording, StreamLayout, read_recording, write_recording
@@ -24,7 +24,7 @@ from armident.daq.streaming.codec import end_content, start_content
 from armident.identify.document import IdentificationDocument, from_json, load_document
 from armident.identify.identification.api import identify_recording
 from armident.identify.monitoring.worker import Worker
-from armident.virtual_robot.offline import simulate_recording
+from tests.fixtures import arms
 
 pytestmark = pytest.mark.slow
 
@@ -32,26 +32,32 @@ BLOCK_ROWS = 500
 LONGEST_S = 240.0
 
 
+def in_its_file(robot: str, folder: Path) -> Recording:
+    """A recording of a virtual arm as capture would have left it, in its file."""
+    recording = arms.recording(robot, f"{robot}_excitation", 1)
+    rows = {f"{name}.rows": int(s.sync.size) for name, s in recording.streams.items()}
+    path = folder / f"{robot}-test.mcap"
+    write_recording(replace(recording, session=load_session(f"{robot}_cell.yaml"), counters=rows), path)
+    return read_recording(path)
+
+
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """A recording of the virtual arm as capture would have left it, in its file."""
-    robot = load_robot("tx40.yaml")
-    recording = simulate_recording(robot, load_trajectory("trajectories/tx40_excitation.yaml"), seed=5)
-    rows = {f"{name}.rows": int(s.sync.size) for name, s in recording.streams.items()}
-    path = tmp_path_factory.mktemp("recordings") / "tx40-test.mcap"
-    write_recording(replace(recording, session=load_session("tx40_cell.yaml"), counters=rows), path)
-    return read_recording(path)
+    """A recording of the virtual axis, which is quickly identified."""
+    return in_its_file("emps", tmp_path_factory.mktemp("recordings"))
+
+
+def in_a_cell(robot: str, name: str, options: IdentificationOptions) -> SessionConfig:
+    """A cell of its own, so that tests beside each other do not hear each other."""
+    return load_session(f"{robot}_cell.yaml").model_copy(
+        update={"cell": f"test_{os.getpid()}_{abs(hash(name)) % 10**6}", "identification": options}
+    )
 
 
 @pytest.fixture
 def session(request: pytest.FixtureRequest) -> SessionConfig:
-    """A cell of its own, so that tests beside each other do not hear each other."""
-    return load_session("tx40_cell.yaml").model_copy(
-        update={
-            "cell": f"test_{os.getpid()}_{abs(hash(request.node.name)) % 10**6}",
-            "identification": IdentificationOptions(method="idim-ls"),
-        }
-    )
+    """A cell for one test."""
+    return in_a_cell("emps", request.node.name, IdentificationOptions(method="idim-ls"))
 
 
 def blocks_of(recording: Recording) -> Iterator[Block]:
@@ -96,10 +102,10 @@ def answers(session: SessionConfig, key: str) -> list[zenoh.Reply]:
     return replies
 
 
-def test_stream_and_file_give_the_same_numbers_to_the_last_bit(
-    captured: Recording, session: SessionConfig, tmp_path: Path
-) -> None:
-    session = session.model_copy(update={"identification": IdentificationOptions()})
+def test_stream_and_file_give_the_same_numbers_to_the_last_bit(tmp_path: Path) -> None:
+    """Six joints and the method that needs the set points."""
+    captured = in_its_file("tx40", tmp_path)
+    session = in_a_cell("tx40", "bits", IdentificationOptions())
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session)
         assert worker.result(LONGEST_S) == 0
@@ -127,7 +133,7 @@ def test_a_capture_too_long_for_the_memory_is_read_from_its_file(
         publish(captured, session)
         assert worker.result(LONGEST_S) == 0
     assert "samples from the file, identifying" in capfd.readouterr().out
-    document = load_document(tmp_path / "tx40-test.identification" / "identification.json", IdentificationDocument)
+    document = load_document(tmp_path / "emps-test.identification" / "identification.json", IdentificationDocument)
     assert document.recording.sha256 == captured.sha256
 
 
@@ -155,7 +161,7 @@ def test_a_block_that_never_comes_is_fetched_from_the_file(
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session, leave_out=3)
         assert worker.result(LONGEST_S) == 0
-    document = load_document(tmp_path / "tx40-test.identification" / "identification.json", IdentificationDocument)
+    document = load_document(tmp_path / "emps-test.identification" / "identification.json", IdentificationDocument)
     assert document.recording.sha256 == captured.sha256
 
 
@@ -175,7 +181,7 @@ def test_missing_blocks_without_a_file_end_with_exit_code_3_and_say_how_many(
 
 
 def test_payloads_that_are_not_ours_do_no_harm(captured: Recording, session: SessionConfig, tmp_path: Path) -> None:
-    keys = Keys(session.cell, "tx40")
+    keys = Keys(session.cell, "emps")
     with Worker(session, captured.robot, tmp_path) as worker:
         with open_session(session, "capture") as stranger:
             for junk in (b"", b"ARMB", np.random.default_rng(0).bytes(1000), b"{}"):
@@ -192,9 +198,9 @@ def test_status_tells_what_the_worker_does(captured: Recording, session: Session
         heard.put(json.loads(bytes(sample.payload)))
 
     with Worker(session, captured.robot, tmp_path) as worker, open_session(session, "observer") as observer:
-        observer.declare_subscriber(Keys(session.cell, "tx40").status, listen)
+        observer.declare_subscriber(Keys(session.cell, "emps").status, listen)
         until = time.monotonic() + 10.0
-        while not (tokens := list(observer.liveliness().get(Keys(session.cell, "tx40").alive("*")))):
+        while not (tokens := list(observer.liveliness().get(Keys(session.cell, "emps").alive("*")))):
             assert time.monotonic() < until, "the worker's token was never seen"
             time.sleep(0.1)
         assert [str(t.ok.key_expr).rsplit("/", 1)[-1] for t in tokens if t.ok] == ["worker"]

@@ -5,6 +5,7 @@ import importlib.metadata
 import inspect
 import re
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -53,7 +54,13 @@ def test_every_parameter_of_the_public_api_is_documented(
     assert not missing, f"{name}: not in its Parameters section: {', '.join(missing)}"
 
 
-def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
+@cache
+def functions() -> tuple[tuple[str, ast.FunctionDef], ...]:
+    """Top-level functions and methods of every package, with their places."""
+    return tuple(_functions())
+
+
+def _functions() -> Iterator[tuple[str, ast.FunctionDef]]:
     for package in PACKAGES:
         for path in sorted(
             (ROOT / package).glob("**/*.py") if package != "src/armident" else (ROOT / package).glob("*.py")
@@ -70,6 +77,7 @@ def commands() -> dict[str, Callable[..., Any]]:
     return {point.value: point.load() for point in importlib.metadata.entry_points(group=GROUP)}
 
 
+@pytest.mark.slow
 def test_every_parameter_of_a_public_function_is_documented() -> None:
     of_commands = {f"{value.partition(':')[0].replace('.', '/')} {value.partition(':')[2]}" for value in commands()}
     lacking = []

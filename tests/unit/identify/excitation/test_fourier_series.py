@@ -17,6 +17,8 @@ pytestmark = pytest.mark.slow
 NOISE = np.sqrt([1.537, 1.793, 0.9120, 0.2199, 0.6207, 0.2523])
 """Standard deviation of the torque noise of the TX40 after the decimate filter, N m (thesis table 6.3)."""
 
+EVALUATIONS = 120
+
 
 @pytest.fixture(scope="module")
 def robot() -> RobotConfig:
@@ -25,7 +27,7 @@ def robot() -> RobotConfig:
 
 @pytest.fixture(scope="module")
 def designed(robot: RobotConfig) -> Trajectory:
-    return design_trajectory(robot, 7.5, seed=1, noise=NOISE, evaluations=400, shape="fourier").trajectory
+    return design_trajectory(robot, 7.5, seed=1, noise=NOISE, evaluations=EVALUATIONS, shape="fourier").trajectory
 
 
 def test_a_sum_of_sines_is_what_the_file_says() -> None:
@@ -67,7 +69,7 @@ def test_a_designed_sum_is_at_rest_at_both_ends_and_keeps_the_limits(robot: Robo
 def test_fourier_series_are_as_precise_as_moves(robot: RobotConfig, designed: Trajectory) -> None:
     """Geometric mean of the standard deviations for as many candidates; condition number as in the thesis."""
     model = arm_model(robot)
-    moves = design_trajectory(robot, 7.5, seed=1, noise=NOISE, evaluations=400)
+    moves = design_trajectory(robot, 7.5, seed=1, noise=NOISE, evaluations=EVALUATIONS)
     sums = predict_precision(model, designed, NOISE)
     assert moves.std is not None
     assert sums.std is not None

@@ -44,7 +44,7 @@ def test_a_design_for_an_effect_estimates_it_more_precisely(
 def test_a_six_axis_design_shows_the_ripple_of_one_motor() -> None:
     robot = load_robot("tx40")
     aim = with_objective(robot, "cogging_torque", "joint_2", None)
-    design = design_trajectory(robot, 7.5, seed=0, noise=NOISE, evaluations=100, aim=aim)
+    design = design_trajectory(robot, 7.5, seed=0, noise=NOISE, evaluations=25, aim=aim)
     design.trajectory.check(robot)
     shipped = load_trajectory("trajectories/tx40_excitation.yaml")
     before = predict_precision(arm_model(robot), shipped, NOISE, aim=aim).wanted
