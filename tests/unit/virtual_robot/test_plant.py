@@ -81,6 +81,7 @@ def reference(plant: Plant, q: NDArray[np.float64], torques: NDArray[np.float64]
     return out
 
 
+@pytest.mark.slow
 def test_integration_stays_within_an_encoder_count_of_a_tight_reference(tx40: RobotConfig) -> None:
     start = np.array(inertias.rest_posture(tx40))
     t = np.arange(1000) * PERIOD

@@ -31,6 +31,7 @@ def closed_loop(
     return measured[:, None], reference[:, None], torque[:, None] + noise * rng.standard_normal((STEPS, 1))
 
 
+@pytest.mark.slow
 def test_a_pd_on_the_error_is_recovered_from_noisy_torque() -> None:
     stiffness, damping = 900.0, 60.0
     taps = np.array([stiffness + damping / DT, -damping / DT])

@@ -133,6 +133,7 @@ def test_refined_iv_keeps_the_filter_that_least_squares_loses_in_the_noise() -> 
     assert pole < 0.4
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_those_of_the_scatter_under_coloured_noise() -> None:
     drive, structure = Drive(pole=0.8), Structure(filtered="velocity")
     quiet = run(drive, steps=4000)
@@ -254,6 +255,7 @@ def test_recorded_gains_of_emps_come_out_to_four_digits(shared_data: Path) -> No
     assert value(law, "error_delay") == 0.0
 
 
+@pytest.mark.slow
 def test_recorded_gains_of_emps_come_out_under_pulses_and_so_does_their_size(shared_data: Path) -> None:
     data = emps(shared_data, "DATA_EMPS_PULSES.mat")
     force, pulses = FORCE_PER_VOLT * data["vir"], FORCE_PER_VOLT * data["pulses_N"]

@@ -65,6 +65,7 @@ def test_two_experiments_without_noise_give_the_truth(method: str) -> None:
     np.testing.assert_allclose(METHODS[method](both, start()).theta, a.truth, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["idim-ls", "idim-iv", "clie"])
 def test_standard_deviations_are_those_of_the_scatter(method: str) -> None:
     deviations = []
@@ -113,6 +114,7 @@ def test_clie_and_cloe_do_not_care_where_they_start() -> None:
     assert (np.abs(near.theta - far.theta) < 0.01 * near.std).all()
 
 
+@pytest.mark.slow
 def test_sep_pem_is_didim_with_white_residuals() -> None:
     data = coloured_torque(recorded(cutoff_hz=None), seed=1)
     plain, refined = didim(data.blocks, data.loop, start()), sep_pem(data.blocks, data.loop, start())
@@ -121,6 +123,7 @@ def test_sep_pem_is_didim_with_white_residuals() -> None:
     assert max(whiteness(series).fraction_outside for series in refined.residuals) <= 0.15
 
 
+@pytest.mark.slow
 def test_prefilter_of_idim_piv_lowers_the_scatter_under_coloured_noise() -> None:
     plain, refined, promised = [], [], []
     for seed in range(8):

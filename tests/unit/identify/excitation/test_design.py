@@ -58,6 +58,7 @@ def test_shipped_trajectory_is_seldom_slow(tx40: ArmModel) -> None:
     assert (design.slow_share < 0.2).all()
 
 
+@pytest.mark.slow
 def test_search_improves_repeats_and_keeps_the_limits(tx40: ArmModel) -> None:
     start, better, again = (
         design_trajectory(tx40.robot, 5.0, seed=3, noise=NOISE, evaluations=count) for count in (0, 150, 150)
