@@ -19,7 +19,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 NO_SOCKETCAN = "no SocketCAN in this kernel; run through `make test`"
 
 # Examples of each property: a few in `make test`, many in `make proof` and by hand.
-hypothesis.settings.register_profile("armident", deadline=None, print_blob=True, max_examples=20)
+hypothesis.settings.register_profile("armident", deadline=None, print_blob=True, max_examples=60)
 hypothesis.settings.register_profile("proof", deadline=None, print_blob=True, max_examples=200)
 hypothesis.settings.load_profile(os.environ.get("ARMIDENT_HYPOTHESIS_PROFILE", "armident"))
 
