@@ -104,6 +104,7 @@ def test_the_command_line_writes_what_the_api_returns(tmp_path: Path) -> None:
     assert [p["value"] for p in document["parameters"]] == list(result.theta)
 
 
+@pytest.mark.slow
 def test_two_recordings_tell_more_than_one(recording: armident.Recording, result: armident.Identification) -> None:
     second = armident.simulate_recording("tx40", "tx40_1", seed=2)
     both = armident.identify([recording, second], method="idim-ls")

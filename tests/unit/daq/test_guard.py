@@ -44,7 +44,6 @@ def monitor_of(session: SessionConfig, robot: RobotConfig) -> MotionMonitor:
     return MotionMonitor(session, robot, limits_of(robot))
 
 
-@pytest.mark.slow
 def test_a_motion_within_the_limits_is_no_alarm(session: SessionConfig, robot: RobotConfig) -> None:
     """The shipped trajectory, in batches of random size."""
     assert session.setpoints is not None

@@ -79,6 +79,7 @@ def test_standard_deviations_are_those_of_the_scatter(method: str) -> None:
     assert 0.75 < np.sqrt(np.mean(np.square(deviations))) < 1.25
 
 
+@pytest.mark.slow
 def test_scatter_of_didim_is_that_of_the_true_sensitivities() -> None:
     estimates = []
     for seed in range(24):
@@ -114,7 +115,6 @@ def test_clie_and_cloe_do_not_care_where_they_start() -> None:
     assert (np.abs(near.theta - far.theta) < 0.01 * near.std).all()
 
 
-@pytest.mark.slow
 def test_sep_pem_is_didim_with_white_residuals() -> None:
     data = coloured_torque(recorded(cutoff_hz=None), seed=1)
     plain, refined = didim(data.blocks, data.loop, start()), sep_pem(data.blocks, data.loop, start())
@@ -123,7 +123,6 @@ def test_sep_pem_is_didim_with_white_residuals() -> None:
     assert max(whiteness(series).fraction_outside for series in refined.residuals) <= 0.15
 
 
-@pytest.mark.slow
 def test_prefilter_of_idim_piv_lowers_the_scatter_under_coloured_noise() -> None:
     plain, refined, promised = [], [], []
     for seed in range(8):

@@ -91,6 +91,7 @@ def test_hausman_rejects_five_percent_of_exogenous_regressors_under_serial_corre
     assert size(draws)[0] <= rejections(p_values) <= size(draws)[1]
 
 
+@pytest.mark.slow
 def test_hausman_that_ignored_the_serial_correlation_would_reject_far_too_often(draws: int) -> None:
     rng = np.random.default_rng(1)
     p_values = []
