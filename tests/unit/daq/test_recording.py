@@ -142,7 +142,11 @@ def test_the_stock_reader_finds_a_time_span_by_the_index(tmp_path: Path) -> None
     recording = make_recording(2000)
     write_chunked(recording, tmp_path / "r.mcap").close({})
     with (tmp_path / "r.mcap").open("rb") as file:
-        found = list(make_reader(file).iter_messages(["/samples"], T0 + 100 * 200_000, T0 + 200 * 200_000))
+        found = list(
+            make_reader(file).iter_messages(
+                ["/samples"], starting_at=T0 + 100 * 200_000, ending_before=T0 + 200 * 200_000
+            )
+        )
     assert len(found) == 100
     assert found[0][2].sequence == 100
 
