@@ -8,8 +8,8 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-# Set before numpy is imported; child processes inherit it. There is one test process per processor, and threads of
-# OpenBLAS that wait for each other took half of the CPU time.
+# Set before numpy is imported; child processes inherit it. There is one test process per processor, so that more
+# threads of OpenBLAS only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from armident.drivers.vcan import ensure_vcan, have_socketcan, remove_vcan

@@ -18,10 +18,9 @@ from tests.fixtures.diagnoses import diagnosis
 MOTION = "tx40_excitation"
 WORN = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
 
-at_both_rates = pytest.mark.parametrize(
-    ("period", "repeats"), [(FAST, 1), pytest.param(None, 3, marks=pytest.mark.proof)], ids=["1 kHz", "5 kHz"]
-)
-"""`make test` has one repetition at 1 kHz, a tenth of the CPU time; `make proof` three at the rate of the drives."""
+RATES = [pytest.param(FAST, 1, id="1 kHz"), pytest.param(None, 3, id="5 kHz")]
+"""One repetition at 1 kHz, and three at the rate of the drives."""
+RATES_OF_PROOF = [RATES[0], pytest.param(None, 3, id="5 kHz", marks=pytest.mark.proof)]
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +29,7 @@ def robot() -> RobotConfig:
 
 
 @pytest.mark.slow
-@at_both_rates
+@pytest.mark.parametrize(("period", "repeats"), RATES)
 def test_a_plant_without_hidden_effects_has_no_gap(period: float | None, repeats: int) -> None:
     document = diagnosis("tx40", MOTION, 1, period=period, repeats=repeats).document
     assert document.verdict == "no_gap"
@@ -38,7 +37,7 @@ def test_a_plant_without_hidden_effects_has_no_gap(period: float | None, repeats
 
 
 @pytest.mark.slow
-@at_both_rates
+@pytest.mark.parametrize(("period", "repeats"), RATES)
 def test_a_worn_joint_is_named_and_its_size_is_right(period: float | None, repeats: int) -> None:
     found = diagnosis("tx40", MOTION, 4, WORN, period=period, repeats=repeats)
     (finding,) = found.document.findings
@@ -50,7 +49,7 @@ def test_a_worn_joint_is_named_and_its_size_is_right(period: float | None, repea
 
 
 @pytest.mark.slow
-@at_both_rates
+@pytest.mark.parametrize(("period", "repeats"), RATES_OF_PROOF)
 def test_a_cogging_motor_is_named_with_its_harmonic(period: float | None, repeats: int) -> None:
     cogging = HiddenEffect(effect="cogging_torque", joint="joint_3", parameters={"amplitude": 1.2, "harmonic": 1.0})
     finding = diagnosis("tx40", MOTION, 1, cogging, period=period, repeats=repeats).document.findings[0]

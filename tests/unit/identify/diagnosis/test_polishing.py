@@ -38,7 +38,7 @@ def with_spring(study: Study, frequency: float, damping: float) -> Effect:
     return Effect(effect="joint_elasticity", joint="joint_1", parameters=shapes)
 
 
-@pytest.mark.parametrize("frequency", [9.5, pytest.param(15.0, marks=pytest.mark.proof)])
+@pytest.mark.parametrize("frequency", [9.5, 15.0])
 def test_a_wrong_resonance_and_its_damping_are_put_right_together(study: Study, frequency: float) -> None:
     robot = study.robot.model_copy(update={"effects": (with_spring(study, frequency, 0.3),)})
     rigid = fit(study)
