@@ -3,7 +3,7 @@
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,8 @@ class Row:
         Conditions and proof that both computed the same.
     low, high
         Smallest and largest ratio of the rounds, where there are several.
+    fastest, slowest
+        Smallest and largest figure of ours over several runs, where there were several.
     """
 
     name: str
@@ -34,6 +36,8 @@ class Row:
     note: str = ""
     low: float | None = None
     high: float | None = None
+    fastest: float | None = None
+    slowest: float | None = None
 
 
 def best_of(function: Callable[[], object], repeat: int = 3) -> float:
@@ -61,3 +65,36 @@ def ratio_of_medians(ours: Sequence[float], alternative: Sequence[float]) -> tup
     """
     ratios = [theirs / mine for mine, theirs in zip(ours, alternative, strict=True)]
     return statistics.median(alternative) / statistics.median(ours), min(ratios), max(ratios)
+
+
+def median_of_runs(runs: Sequence[Sequence[Row]]) -> list[Row]:
+    """Combine the rows of several runs of the same benchmarks.
+
+    Parameters
+    ----------
+    runs
+        Rows of each run.
+
+    Returns
+    -------
+    list of Row
+        A row for each name of the first run: medians, the range of our figure, and the range of the ratio.
+    """
+    combined = []
+    for first in runs[0]:
+        rows = [row for run in runs for row in run if row.name == first.name]
+        ours, ratios = [row.ours for row in rows], [row.ratio for row in rows if row.ratio is not None]
+        others = [row.alternative for row in rows if row.alternative is not None]
+        combined.append(
+            replace(
+                first,
+                ours=statistics.median(ours),
+                alternative=statistics.median(others) if others else None,
+                ratio=statistics.median(ratios) if ratios else None,
+                low=min(ratios, default=None),
+                high=max(ratios, default=None),
+                fastest=min(ours),
+                slowest=max(ours),
+            )
+        )
+    return combined

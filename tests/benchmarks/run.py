@@ -2,8 +2,10 @@
 
 A module has ``run() -> list[Row]``, and ``NEEDS_VCAN = True`` if it needs ``vcan0``: those run in one process under the
 launcher. ``python -m tests.benchmarks.run [NAME...]`` runs only the named ones (``irwsm`` for ``bench_irwsm.py``).
+``--runs N`` repeats those without a bus and prints medians with their ranges; those on a bus have rounds of their own.
 """
 
+import argparse
 import dataclasses
 import importlib
 import json
@@ -14,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 
 from armident.drivers.vcan import launcher_command
-from tests.benchmarks.harness import Row
+from tests.benchmarks.harness import Row, median_of_runs
 
 HERE = Path(__file__).parent
 IN_CHILD = "--rows-to"
@@ -22,17 +24,25 @@ IN_CHILD = "--rows-to"
 
 def main(arguments: list[str]) -> int:
     """Run the benchmarks named in ``arguments`` (default: all); 1 if one of them could not be run."""
-    if arguments[:1] == [IN_CHILD]:
-        rows, failed = _run(arguments[2:])
-        Path(arguments[1]).write_text(json.dumps([dataclasses.asdict(row) for row in rows]))
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.run", description="Print a table of benchmarks.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="Benchmarks, e.g. irwsm. Default: all.")
+    parser.add_argument("--runs", type=int, default=1, help="Number of runs of benchmarks without a bus.")
+    parser.add_argument(IN_CHILD, type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.rows_to is not None:
+        rows, failed = _run([f"bench_{name}" for name in options.names])
+        options.rows_to.write_text(json.dumps([dataclasses.asdict(row) for row in rows]))
         return int(failed)
-    names = [f"bench_{name}" for name in arguments] or sorted(path.stem for path in HERE.glob("bench_*.py"))
+    names = [f"bench_{name}" for name in options.names] or sorted(path.stem for path in HERE.glob("bench_*.py"))
     on_vcan = [name for name in names if getattr(_module(name), "NEEDS_VCAN", False)]
-    rows, failed = _run([name for name in names if name not in on_vcan])
+    runs = [_run([name for name in names if name not in on_vcan]) for _ in range(options.runs)]
+    failed = any(failed for _, failed in runs)
+    rows = median_of_runs([rows for rows, _ in runs]) if options.runs > 1 else runs[0][0]
     if on_vcan:
         with tempfile.TemporaryDirectory() as folder:
             results = Path(folder) / "rows.json"
-            child = [sys.executable, "-m", "tests.benchmarks.run", IN_CHILD, str(results), *on_vcan]
+            child = [sys.executable, "-m", "tests.benchmarks.run", IN_CHILD, str(results)]
+            child += [name.removeprefix("bench_") for name in on_vcan]
             failed |= subprocess.run(launcher_command(child, buses=2), check=False).returncode != 0
             if results.exists():
                 rows += [Row(**row) for row in json.loads(results.read_text())]
@@ -67,7 +77,10 @@ def _print(rows: list[Row]) -> None:
         ratio = "" if row.ratio is None else f"{row.ratio:.3g}"
         if row.low is not None and row.high is not None:
             ratio += f" ({row.low:.3g} to {row.high:.3g})"
-        table.add_row(row.name, f"{row.ours:.4g}", alternative, ratio, row.unit, row.note)
+        ours = f"{row.ours:.4g}"
+        if row.fastest is not None and row.slowest is not None:
+            ours += f" ({row.fastest:.4g} to {row.slowest:.4g})"
+        table.add_row(row.name, ours, alternative, ratio, row.unit, row.note)
     # a redirected table is not squeezed into the width of a terminal that is not there
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 
