@@ -64,7 +64,7 @@ test: lint ## everything but the proofs, the tests on vcan included; a quarter o
 	if [ -n "$$failed" ]; then echo "FAILED: see above, .cache/tests.log and .cache/tests-vcan.log"; exit 1; fi
 
 # Hypothesis marks its own tests; the profile (tests/conftest.py) has more examples of each.
-proof: install ## tests that prove a statistic or repeat the suite, many examples of each property (tests/README.md), half an hour
+proof: install ## tests that prove a statistic or repeat the suite, many examples of each property (tests/README.md)
 	@export ARMIDENT_HYPOTHESIS_PROFILE=proof
 	$(MAKE) --no-print-directory -k -j2 NAME=proof SELECTED="proof or hypothesis" off-bus on-bus
 
