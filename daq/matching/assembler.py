@@ -124,8 +124,8 @@ class Assembler:
     """Matches SYNC and TPDO frames.
 
     The result does not depend on the division of the frames of a single bus into batches. Drives on several buses are
-    compared with each other as far as their buses have been read. Thus the time at which a bus is read may decide if
-    late answers of its drives are assigned, or become a gap with the reason ``ambiguous order``.
+    compared with each other as far as their buses have been read. Thus late answers of a drive may be assigned, or
+    become a gap with the reason ``ambiguous order``, as the time decides at which its bus is read.
 
     Parameters
     ----------

@@ -267,8 +267,8 @@ class RawSocket:
         Raises
         ------
         BusDown
-            If the interface went down or was removed, or if nothing could be sent for half a second (a physical bus
-            without another node acknowledges nothing).
+            If the interface went down or was removed, or if nothing could be sent for half a second. A physical bus
+            without another node acknowledges nothing.
         """
         if self._out is None:
             self._out = Messages(BATCH, control=False, fd=self.fd)

@@ -39,8 +39,8 @@ class Score:
     missed
         The verdict is ``no_gap`` although an effect is simulated.
     invisible
-        Not found, without another finding and without an unexplained rest, and the document states that the recording
-        cannot show the effect or that its size is below the detection limit. Of a pair, one may be found.
+        Not found, without another finding and without an unexplained rest. The document states that the recording
+        cannot show the effect, or that its size is below the detection limit. Of a pair, one may be found.
     extra
         Number of findings besides the simulated effects and their side effects.
     closed

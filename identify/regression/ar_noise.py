@@ -45,8 +45,8 @@ class ArModel:
         the filter was fitted to the residuals that it whitens. On other residuals of the same process its error has a
         variance ``(N + l) / (N - l)`` times as large (Akaike, Fitting autoregressive models for prediction, 1969).
         Second, an estimate weighted by the model scatters more than one weighted by the process itself. The excess is
-        the relative variance of an AR spectrum, ``2 l / N`` on the average of the frequencies (Berk, Consistent
-        autoregressive spectral estimates, 1974), less the part to which the parameters are insensitive.
+        the relative variance of an AR spectrum, less the part to which the parameters are insensitive. The former is
+        ``2 l / N`` on the average of the frequencies (Berk, Consistent autoregressive spectral estimates, 1974).
 
         Parameters
         ----------

@@ -1,8 +1,8 @@
 """Products of the instrumental-variable equations 6.30, joint by joint: rows are whitened, summed and forgotten.
 
-At the recorded rate the whitened regressor and instruments of six joints are as large as the recording many times
-over, and orthogonal triangularisation of them costs more than everything else. Instruments in nearly orthonormal
-combinations, found from a share of the rows, make plain sums of products as accurate.
+At the recorded rate the whitened regressor and instruments of six joints are many times as large as the recording.
+Their orthogonal triangularisation costs more than everything else. Instruments in nearly orthonormal combinations,
+found from a share of the rows, make plain sums of products as accurate.
 """
 
 import os

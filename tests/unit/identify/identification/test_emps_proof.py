@@ -1,8 +1,8 @@
 """EMPS: reproduction of both published fits, the cross-test and both closed-loop simulations, and IDIM-PIV.
 
 Published are the fits and errors of Janot, Gautier, Brunot 2019. Their simulations hold the control signal one sample
-late, take the velocity over two samples, start from zero, have a friction that switches at standstill, run on the time
-step between samples 9 and 10 (so that recording and simulation drift apart by up to 0.4 ms) and let the pulses rise
+late, take the velocity over two samples, start from zero, and have a friction that switches at standstill. They run on
+the time step between samples 9 and 10, so that recording and simulation drift apart by up to 0.4 ms. Their pulses rise
 linearly over a sample. Errors are relative 2-norms from sample 50 on: position, velocity and acceleration against the
 measured position after the zero-phase filter of the fit, force against the recorded voltage.
 """

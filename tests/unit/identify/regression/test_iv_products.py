@@ -28,15 +28,15 @@ NOISE = [
 
 
 def problem(
-    samples: int, columns: int, likeness: float = 0.0, left_out: bool = False
+    samples: int, columns: int, similarity: float = 0.0, left_out: bool = False
 ) -> tuple[list[Floats], list[ExperimentEquations]]:
-    """Two experiments of three joints; the last two regressors differ by a share of 10 to the ``-likeness``."""
+    """Two experiments of three joints; the last two regressors differ by a share of 10 to the ``-similarity``."""
     rng = np.random.default_rng(3)
     instruments, blocks = [], []
     for m in (samples, samples // 2):
         z = rng.standard_normal((m, 3, columns)) * np.logspace(-3, 3, columns)
-        z[:, :, -1] = z[:, :, -2] * (1 + 10.0**-likeness * rng.standard_normal((m, 3)))
-        x = z + 0.1 * np.abs(z).mean(axis=(0, 1)) * 10.0**-likeness * rng.standard_normal(z.shape)
+        z[:, :, -1] = z[:, :, -2] * (1 + 10.0**-similarity * rng.standard_normal((m, 3)))
+        x = z + 0.1 * np.abs(z).mean(axis=(0, 1)) * 10.0**-similarity * rng.standard_normal(z.shape)
         keep = np.ones((m, 3), dtype=np.bool_)
         if left_out:
             keep[::3, 0], keep[m // 2 :, 2] = False, False
@@ -60,7 +60,7 @@ def test_estimate_and_covariance_are_those_of_the_triangular_factors(samples: in
 
 
 def test_regressors_alike_to_six_digits_cost_the_sums_no_more_digits_than_the_triangular_factors() -> None:
-    instruments, blocks = problem(20000, 7, likeness=6.0)
+    instruments, blocks = problem(20000, 7, similarity=6.0)
     truth = 1 / np.logspace(-3, 3, 7)
     silent = [ExperimentEquations(b.x @ truth, b.x, b.keep, b.t) for b in blocks]
 
