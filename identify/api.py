@@ -1,5 +1,6 @@
 """Identification, diagnosis, comparison and trajectory design, as ``import armident`` offers them."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from html import escape
@@ -49,7 +50,7 @@ Robot = RobotConfig | str | Path
 Recorded = Recording | str | Path
 
 
-class _Result:
+class _Result(ABC):
     """Result that prints itself, shows itself in a notebook and writes a report."""
 
     def report(self, path: str | Path) -> Path:
@@ -77,17 +78,17 @@ class _Result:
         table = self._table()
         return f"<p>{escape(self._summary())}</p>{'' if table is None else table._repr_html_()}"
 
+    @abstractmethod
     def _html(self) -> str:
         """Return the report."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _summary(self) -> str:
         """Return one line of text."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _table(self) -> Table | None:
         """Return the table below the line, if there is one."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, repr=False)
