@@ -58,7 +58,7 @@ def test_the_rest_of_the_emps_is_unexplained_and_only_convincing_effects_are_sta
     stated = {f.effect for f in document.findings}
     assert stated <= {"asymmetric_viscous_friction", "presliding_friction", "nonlinear_viscous_friction"}
     assert all(0.5 <= f.confidence <= 1.0 for f in document.findings)
-    assert {stanza.effect for stanza in worn_screw.robot.effects} == stated
+    assert {entry.effect for entry in worn_screw.robot.effects} == stated
     assert document.verdict == "partly_explained"
     assert "motion" in {u.varies_with for u in document.unexplained}
     # The motions are different, so that the noise comes from the model of the residual: 3.55 of 4.36 %.
