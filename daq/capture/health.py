@@ -4,6 +4,7 @@ import logging
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from typing import Protocol
 
 from armident.configs import SessionConfig
 from armident.configs.schema.session import MetricsOptions
@@ -17,10 +18,65 @@ from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Assembler
 from armident.drivers.can.receiver import Receiver
 
-LONGEST_WAIT_S = 1.0
-"""Longest time of rows that wait to be written without a warning, s."""
+WARNED_SHARE = 0.1
+"""Share of the memory for waiting rows from which a warning is logged.
+
+Waiting rows lose nothing before the memory is full. At 0.1 of the default memory, a disk that writes nothing has
+stalled for half a minute, and five minutes remain to act.
+"""
 
 log = logging.getLogger(__name__)
+
+
+class _Writer(Protocol):
+    """Properties of a writer of rows that :class:`DiskCheck` reads."""
+
+    @property
+    def lost_rows(self) -> int: ...
+
+    @property
+    def waiting_rows(self) -> int: ...
+
+    @property
+    def waiting_share(self) -> float: ...
+
+    @property
+    def problem(self) -> str | None: ...
+
+
+class DiskCheck:
+    """Logs when the disk refuses rows or leaves too many rows waiting, and when that is over.
+
+    Parameters
+    ----------
+    writer
+        Writer of the rows.
+    """
+
+    def __init__(self, writer: _Writer) -> None:
+        self._writer = writer
+        self._lost_rows = 0
+        self._refuses = self._slow = False
+
+    def update(self) -> None:
+        """Compare the state of the writer with that of the last call."""
+        lost, before = self._writer.lost_rows, self._lost_rows
+        if lost > before and not self._refuses:
+            log.warning("rows cannot be written, streaming continues: %s", self._writer.problem)
+        elif lost == before and self._refuses:
+            log.info("rows are written again; %d rows were lost", lost)
+        self._lost_rows, self._refuses = lost, lost > before
+        share = self._writer.waiting_share
+        if share > WARNED_SHARE and not self._slow:
+            log.warning(
+                "%d rows wait for the disk, %.0f %% of the memory for them: rows are lost when it is full."
+                " Check the disk and the load of the processor.",
+                self._writer.waiting_rows,
+                100 * share,
+            )
+        elif share <= WARNED_SHARE and self._slow:
+            log.info("the disk keeps up again; %d rows wait for it", self._writer.waiting_rows)
+        self._slow = share > WARNED_SHARE
 
 
 class Health:
@@ -53,8 +109,8 @@ class Health:
         self._options = plan.session.metrics
         self.temperatures: Callable[[], dict[str, float]] = dict
         """Returns the temperature of each joint's drive (degrees Celsius) where it is known."""
-        self._frames_before = self._lost_rows = 0
-        self._writing, self._slow = True, False
+        self._frames_before = 0
+        self._disk = DiskCheck(sink)
 
     def serve(self, stack: ExitStack) -> None:
         """Serve metrics if the session configures a port, until the stack unwinds."""
@@ -101,7 +157,7 @@ class Health:
         counters = self._assembler.counters
         rate = (counters["frames"] - self._frames_before) / seconds
         self._frames_before = counters["frames"]
-        self._check_disk()
+        self._disk.update()
         health: dict[str, Value] = {
             "file": None if self._sink.path is None else self._sink.path.name,
             "rows_not_written": self._sink.lost_rows,
@@ -130,22 +186,6 @@ class Health:
         if metrics is not None:
             metrics.update(health)
         self._publisher.status({"state": "recording", "sync": self._assembler.last_sync})
-
-    def _check_disk(self) -> None:
-        """Log when the disk refuses rows or keeps rows waiting, and when that is over."""
-        lost, before = self._sink.lost_rows, self._lost_rows
-        self._lost_rows = lost
-        if lost > before and self._writing:
-            log.warning("rows cannot be written, streaming continues: %s", self._sink.problem)
-        elif lost == before and not self._writing:
-            log.info("rows are written again; %d rows were lost", lost)
-        self._writing = lost == before
-        waits_s = self._sink.waiting_rows * self._plan.session.sync_period
-        if waits_s > LONGEST_WAIT_S and not self._slow:
-            log.warning("%.1f s of rows wait to be written: the disk is slow or the processor is busy", waits_s)
-        elif self._slow and waits_s <= LONGEST_WAIT_S:
-            log.info("no rows wait to be written any more")
-        self._slow = waits_s > LONGEST_WAIT_S
 
 
 def _clock() -> dict[str, Value]:

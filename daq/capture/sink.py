@@ -71,6 +71,11 @@ class Sink:
         return self._writer.waiting_rows
 
     @property
+    def waiting_share(self) -> float:
+        """Used share of the memory for rows that wait for the disk."""
+        return self._writer.waiting_share
+
+    @property
     def problem(self) -> str | None:
         """Message of the last error in writing."""
         return self._writer.problem

@@ -160,6 +160,15 @@ class QueuedSeries:
         """Number of rows that wait for the disk."""
         return self._put_rows - self._done_rows
 
+    @property
+    def waiting_share(self) -> float:
+        """Used share of the memory for rows that wait for the disk, from 0 to 1."""
+        return self._waiting_bytes / self._most_bytes
+
+    @property
+    def _waiting_bytes(self) -> int:
+        return self._chunk.bytes + self._put_bytes - self._done_bytes
+
     def limit(self, max_bytes: int | None, max_ns: int | None) -> None:
         """Set the limits at which a new file begins.
 
@@ -217,7 +226,7 @@ class QueuedSeries:
         size = sync.nbytes + t_ns.nbytes + sum(values.nbytes for values in raw.values())
         # Resume at half the limit: a slow disk causes a few long gaps instead of many short ones.
         allowed_bytes = self._most_bytes // 2 if self._left_out else self._most_bytes
-        if self._chunk.bytes + self._put_bytes - self._done_bytes + size > allowed_bytes:
+        if self._waiting_bytes + size > allowed_bytes:
             self._left_out.add(stream, sync)
             self._left_out_rows += len(sync)
             return

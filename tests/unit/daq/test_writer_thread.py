@@ -1,5 +1,6 @@
 """Series written by a thread: no caller waits for the disk, and rows that are left out are counted and become gaps."""
 
+import logging
 import os
 import threading
 import time
@@ -12,6 +13,7 @@ import pytest
 from armident.configs import ConfigError
 from armident.configs.schema.session import RecordingOptions
 from armident.daq.capture.files import chunk_duration_ns
+from armident.daq.capture.health import DiskCheck
 from armident.daq.recording import (
     Gap,
     Mark,
@@ -24,6 +26,7 @@ from armident.daq.recording import (
 )
 from armident.daq.recording import writer_thread as queued
 from armident.daq.recording.lost_rows import NOT_WRITTEN
+from armident.daq.recording.writer_thread import MOST_WAITING_BYTES
 from tests.unit.daq.test_recording import make_recording
 from tests.unit.daq.test_rotation import NAME, beginner, write
 
@@ -94,6 +97,36 @@ def test_a_killed_capture_loses_no_more_than_a_chunk(tmp_path: Path) -> None:
             # Content of the file if the process were killed now.
             rows = read_recording(series.paths[0]).samples.t_ns if first > 150 else None
             assert rows is None or recording.samples.t_ns[first] - rows[-1] <= CHUNK_NS + 2_000_000
+
+
+def test_a_disk_that_writes_nothing_is_reported_long_before_rows_are_lost(
+    tmp_path: Path, disk: threading.Event, caplog: pytest.LogCaptureFixture
+) -> None:
+    recording = make_recording(3000)
+    whole = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, NAME), EVERY, CHUNK_NS)
+    with whole:
+        disk.clear()
+        write(whole, recording)
+        size = round(whole.waiting_share * MOST_WAITING_BYTES)
+        disk.set()
+    # Memory for six times these rows: their backlog uses a sixth, half of them a twelfth.
+    series = QueuedSeries(RecordingSeries(beginner(recording), tmp_path, "second"), EVERY, CHUNK_NS, 6 * size)
+    check = DiskCheck(series)
+    with series, caplog.at_level(logging.INFO):
+        disk.clear()
+        append(series, recording.samples, 0, 1500)
+        check.update()
+        assert caplog.messages == []
+        append(series, recording.samples, 1500, 3000)
+        check.update()
+        check.update()
+        (warning,) = caplog.messages
+        assert "% of the memory" in warning
+        assert series.lost_rows == 0
+        disk.set()
+        series.flush()
+        check.update()
+        assert caplog.messages[1:] == ["the disk keeps up again; 0 rows wait for it"]
 
 
 def test_a_stalled_disk_costs_no_row(tmp_path: Path, disk: threading.Event) -> None:
