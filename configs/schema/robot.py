@@ -128,6 +128,8 @@ class Effect(FrozenModel):
     ----------
     effect
         Name of the effect.
+    law
+        Formula of the effect, where it has several; empty: the first one. ``table`` is a free shape.
     joint, other
         Joint of the effect; second joint of an effect between two joints.
     parameters
@@ -137,6 +139,7 @@ class Effect(FrozenModel):
     """
 
     effect: Name
+    law: str = ""
     joint: Name
     other: Name | None = None
     parameters: dict[str, float] = Field(default_factory=dict)

@@ -42,7 +42,7 @@ class Candidate:
     @property
     def key(self) -> tuple[str, int, int | None]:
         """Name and place."""
-        return self.effect.name, self.place.joint, self.place.other
+        return self.effect.key, self.place.joint, self.place.other
 
     def closer(self) -> "Candidate":
         """The candidate for a loop that contains it, with the additional values that are useful there."""
@@ -208,7 +208,7 @@ class Workshop:
         kind = "measured" if effect.sudden else kind
 
         def key(shapes: Shapes) -> Key:
-            return (effect.name, place.joint, place.other, shapes, part, kind)
+            return (effect.key, place.joint, place.other, shapes, part, kind)
 
         missing = [shapes for shapes in grid if key(shapes) not in self.kept]
         stretches = [self._filtered(effect, place, missing, self.motion(s, kind)) for s in getattr(self.study, part)]

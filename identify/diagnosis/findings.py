@@ -66,7 +66,7 @@ def described(search: Search, first: State, final: State, left: Sequence[Disagre
 
 def _still_missing(final: State, stanza: Stanza) -> dict[str, float]:
     """Standard deviation of the parameter of a correction: that of a further correction in the final model."""
-    effect = known(stanza.effect)
+    effect = of_entry(stanza)
     place = place_of(stanza, effect, final.study.robot, stanza.effect)
     rest = judge(final.fit, Candidate(effect, place, ((),)), (), final.workshop)
     return {} if rest is None else {effect.linear[0].name: float(rest.std[0])}
@@ -76,7 +76,7 @@ def _finding(
     search: Search, rest: State, final: State, stanza: Stanza, std: dict[str, float], left: Sequence[Disagreement]
 ) -> Finding:
     study, material = final.study, search.settings.material
-    effect = known(stanza.effect)
+    effect = of_entry(stanza)
     place = place_of(stanza, effect, study.robot, stanza.effect)
     trials = [t for t in rest.trials if not t.forbidden]
     mine = next((t for t in trials if t.candidate.key == (effect.name, place.joint, place.other)), None)
@@ -181,7 +181,7 @@ def miswired(wiring: WiringFinding, robot: RobotConfig) -> list[Finding]:
     for stanza, words, p_value, rivals in zip(
         wiring.stanzas, wiring.words, wiring.p_values, wiring.alternatives, strict=True
     ):
-        effect, motor = known(stanza.effect), names.index(stanza.joint)
+        effect, motor = of_entry(stanza), names.index(stanza.joint)
         findings.append(
             Finding(
                 effect=effect.name,

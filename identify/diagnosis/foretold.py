@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from armident.configs.schema.robot import Effect as Stanza
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.recorded import put_right
-from armident.identify.effects.registry import known
+from armident.identify.effects.registry import known, of_entry
 from armident.identify.experiment import Experiment
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ def foretold(study: Study, theta: Array, other: Study, other_theta: Array) -> Fo
     """
     more = tuple(stanza for stanza in other.recorded if stanza not in study.recorded)
     undone = any(stanza not in other.recorded for stanza in study.recorded)
-    if undone or any(known(stanza.effect).rewires for stanza in more):
+    if undone or any(of_entry(stanza).rewires for stanza in more):
         return None
     before, after = [], []
     for own, right in zip(study.held, other.held, strict=True):

@@ -13,7 +13,7 @@ from armident.identify.diagnosis.state import padded, refit
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.whitening import whitened
 from armident.identify.effects.effect import Shape
-from armident.identify.effects.registry import known
+from armident.identify.effects.registry import known, of_entry
 from armident.identify.effects.terms import Term, arm_model, effect_terms
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ def _fitted(study: Study, robot: RobotConfig, before: Fit, *, simulate: bool) ->
     DataError
         If the motion does not determine the parameters of the model.
     """
-    if simulate and any(known(stanza.effect).predicts for stanza in robot.effects):
+    if simulate and any(of_entry(stanza).predicts for stanza in robot.effects):
         return refit(study, robot, before)[1]
     model = arm_model(robot)
     return fit(replace(before.study, robot=robot, model=model), padded(before, model))

@@ -3,7 +3,7 @@
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.trial import Trial
 from armident.identify.effects.recorded import of_recording
-from armident.identify.effects.registry import known
+from armident.identify.effects.registry import known, of_entry
 from armident.identify.effects.terms import stanza_of
 
 
@@ -20,7 +20,7 @@ def added(robot: RobotConfig, trial: Trial) -> RobotConfig:
     parameters = dict(trial.shapes) | values_of(trial)
     effect = trial.candidate.effect
     contained = tuple(p.name for p, there in zip(effect.linear, trial.contained, strict=True) if there)
-    spared = tuple(p.name for p in known(effect.name).linear if p.through is not None)
+    spared = tuple(p.name for p in known(effect.key).linear if p.through is not None)
     stanza = stanza_of(effect, trial.candidate.place, robot, parameters, contained + spared)
     return robot.model_copy(update={"effects": (*robot.effects, stanza)})
 
@@ -28,7 +28,7 @@ def added(robot: RobotConfig, trial: Trial) -> RobotConfig:
 def completed(robot: RobotConfig) -> RobotConfig | None:
     """Robot with the optional parameters of its last effect entry; ``None`` if there are none."""
     last = robot.effects[-1]
-    spared = [p.name for p in known(last.effect).linear if p.through is not None]
+    spared = [p.name for p in of_entry(last).linear if p.through is not None]
     if not any(name in last.without for name in spared):
         return None
     changed = last.model_copy(update={"without": tuple(name for name in last.without if name not in spared)})

@@ -17,7 +17,7 @@ from armident.identify.diagnosis.stanzas import stanza_number
 from armident.identify.diagnosis.study import ALIKE, Study
 from armident.identify.diagnosis.trial import Trial
 from armident.identify.diagnosis.whitening import rows_of_joints, whitened
-from armident.identify.effects.registry import known
+from armident.identify.effects.registry import known, of_entry
 from armident.identify.effects.terms import Term, arm_model, effect_terms
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.robot.arm import ArmModel
@@ -170,7 +170,7 @@ def _recorded_right(one: State, other: State, material: float) -> bool:
     ours, theirs = one.study.recorded, other.study.recorded
     differ = [s for s in ours if s not in theirs] + [s for s in theirs if s not in ours]
     where = [one.study.joints.index(stanza.joint) for stanza in differ]
-    if any(known(stanza.effect).rewires for stanza in differ):
+    if any(of_entry(stanza).rewires for stanza in differ):
         return False
     lost = one.study.likeness_lost(other.study, where, held=True)
     if not np.isfinite(lost):
@@ -223,7 +223,7 @@ def power_put_right(state: State, other: State) -> Array:
         State whose corrections are applied.
     """
     study = state.study
-    late = tuple(stanza for stanza in other.study.recorded if not known(stanza.effect).rewires)
+    late = tuple(stanza for stanza in other.study.recorded if not of_entry(stanza).rewires)
     total = np.zeros(study.robot.n)
     for e in residuals(study, study.held, state.fit.theta):
         total += np.sum(study.decimation(torque_put_right(e, study, late)) ** 2, axis=0)

@@ -169,6 +169,9 @@ class Effect:
     negligible
         ``(values, dt)`` to True if linear parameters (k,) are within the sampling convention at the sampling period
         ``dt``, s; ``None``: never.
+    law
+        Formula of the same dependence that differs from the first one in the catalogue; empty for the first one.
+        ``table`` is a free shape.
     """
 
     name: str
@@ -191,6 +194,12 @@ class Effect:
     sudden: bool = False
     physical: Callable[[Array, Mapping[str, float]], bool] | None = None
     negligible: Callable[[Array, float], bool] | None = None
+    law: str = ""
+
+    @property
+    def key(self) -> str:
+        """Name in the catalogue: that of the effect, with the law behind a slash unless it is the first one."""
+        return f"{self.name}/{self.law}" if self.law else self.name
 
     def allows(self, values: Array, std: Array, shapes: Mapping[str, float]) -> bool:
         """Return True if linear parameters (k,) with standard deviations (k,) are physically possible.

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from armident.identify.effects.effect import Effect, Linear, Place, Shape
 from armident.identify.effects.rotor import ROTOR
+from armident.identify.effects.tables import RANGE, hats, table, values
 from armident.identify.robot.compiled import compiled
 from armident.identify.robot.motion import Motion
 
@@ -63,6 +64,40 @@ def _stribeck(motion: Motion, place: Place, *, velocity: float, displacement: fl
     side = dahl(motion.q[:, j], displacement) if displacement > 0.0 else motion.sign[:, j]
     # The second column moves the model's Coulomb friction from the smoothed sign to the bristle.
     return np.stack([np.exp(-((motion.qd[:, j] / velocity) ** 2)) * side, side - motion.sign[:, j]], axis=1)
+
+
+def _stribeck_exponential(motion: Motion, place: Place, *, velocity: float) -> Array:
+    j = place.joint
+    return (np.exp(-np.abs(motion.qd[:, j]) / velocity) * motion.sign[:, j])[:, None]
+
+
+SPEEDS = (0.0, 0.05, 0.12, 0.25, 0.5, 1.0)
+"""Knots of the friction curve at low speed, over its highest speed: close to standstill, where friction is curved."""
+
+
+def _friction_curve(motion: Motion, place: Place, *, top: float) -> Array:
+    """Return piecewise linear functions of the speed; those at the last two knots are Coulomb and viscous friction."""
+    j = place.joint
+    speed = hats(np.abs(motion.qd[:, j]), top * np.array(SPEEDS))
+    return speed[:, : len(SPEEDS) - 2] * motion.sign[:, j, None]
+
+
+def tops(motion: Motion, joint: int) -> Sequence[float]:
+    """Return the top speed of a joint, rad/s or m/s.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
+    return [float(motion.top_speed[joint])]
+
+
+def _higher_at_rest(values: Array, shapes: Mapping[str, float]) -> bool:
+    """Return True if friction is highest at the lowest speeds."""
+    return bool(values[0] > 0.0 and values[0] >= values[-1])
 
 
 def bristles(motion: Motion, joint: int) -> Sequence[float]:
@@ -145,6 +180,11 @@ def _position_dependent(motion: Motion, place: Place, *, period: float) -> Array
     return np.stack([side * np.cos(angle), side * np.sin(angle)], axis=1)
 
 
+def _position_table(motion: Motion, place: Place, *, low: float, high: float) -> Array:
+    j = place.joint
+    return table(motion.q[:, j], low, high) * motion.sign[:, j, None]
+
+
 def turns(motion: Motion, joint: int) -> Sequence[float]:
     """Return periods in the joint's position, rad or m: fractions of a turn, or of the travel of a prismatic axis.
 
@@ -168,6 +208,30 @@ def _drift(motion: Motion, place: Place, *, time_constant: float) -> Array:
     j, whole = place.joint, max(motion.duration, motion.dt * motion.samples)
     progress = np.expm1(-motion.t / time_constant) / np.expm1(-whole / time_constant) - 0.5
     return np.stack([motion.sign[:, j] * progress, motion.qd[:, j] * progress], axis=1)
+
+
+def _drift_with_work(motion: Motion, place: Place, *, decay: float) -> Array:
+    """Return columns of a change of friction with the work that viscous friction has dissipated."""
+    j = place.joint
+    work = motion.dt * np.cumsum(motion.qd[:, j] ** 2)
+    progress = -np.expm1(-decay * work)
+    return np.stack([motion.sign[:, j] * progress, motion.qd[:, j] * progress], axis=1)
+
+
+def decays(motion: Motion, joint: int) -> Sequence[float]:
+    """Return rates of change with work: the work of the recording is a third of, once and three times the constant.
+
+    The unit is that of the inverse of the integral of the squared velocity, s/rad^2 or s/m^2.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
+    whole = max(float(motion.dt * np.sum(motion.qd[:, joint] ** 2)), 1e-12)
+    return [share / whole for share in (0.3, 1.0, 3.0, 10.0)]
 
 
 def warming(motion: Motion, joint: int) -> Sequence[float]:
@@ -233,6 +297,31 @@ EFFECTS = (
         excitation=("slow", "reversals"),
     ),
     Effect(
+        name="stribeck_friction",
+        law="exponential",
+        title="Stribeck friction",
+        says="additional friction at low speed that decreases with the speed: poor or squeezed-out lubricant",
+        reference="Bo, Pavelescu 1982, Wear 82(3), with exponent 1",
+        linear=(Linear("fst", TORQUE, sign=1),),
+        shapes=(Shape("velocity", ("rad/s", "m/s"), speeds),),
+        columns=_stribeck_exponential,
+        needs="slow motion in both directions",
+        excitation=("slow", "reversals"),
+    ),
+    Effect(
+        name="stribeck_friction",
+        law="table",
+        title="Stribeck friction",
+        says="additional friction at low speed that decreases with the speed: poor or squeezed-out lubricant",
+        reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5), measured curves",
+        linear=tuple(Linear(f"fst{k}", TORQUE) for k in range(len(SPEEDS) - 2)),
+        shapes=(Shape("top", ("rad/s", "m/s"), tops, continuous=(False, False)),),
+        columns=_friction_curve,
+        physical=_higher_at_rest,
+        needs="slow motion in both directions",
+        excitation=("slow", "reversals"),
+    ),
+    Effect(
         name="nonlinear_viscous_friction",
         title="nonlinear viscous friction",
         says="friction is not proportional to speed: shear thinning or churning of the lubricant",
@@ -286,6 +375,18 @@ EFFECTS = (
         excitation=("range", "reversals"),
     ),
     Effect(
+        name="position_dependent_friction",
+        law="table",
+        title="position-dependent friction",
+        says="Coulomb friction varies with the position of the joint: a bent shaft, a tight spot, uneven wear",
+        reference="Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators",
+        linear=values("fpt", TORQUE),
+        shapes=RANGE,
+        columns=_position_table,
+        needs="a wide range of joint positions, passed in both directions",
+        excitation=("range", "reversals"),
+    ),
+    Effect(
         name="friction_drift",
         title="friction drift",
         says="friction changes between the beginning and the end of the recording: the gear warms up",
@@ -293,6 +394,18 @@ EFFECTS = (
         linear=(Linear("fcdr", TORQUE), Linear("fvdr", VISCOUS)),
         shapes=(Shape("time_constant", ("s", "s"), warming),),
         columns=_drift,
+        needs="the same motion early and late in the recordings",
+        excitation=("repeats",),
+    ),
+    Effect(
+        name="friction_drift",
+        law="work",
+        title="friction drift",
+        says="friction changes with the work that it has dissipated: the gear warms up",
+        reference="Simoni et al. 2015, IROS, Modelling the temperature in joint friction of industrial manipulators",
+        linear=(Linear("fcdr", TORQUE), Linear("fvdr", VISCOUS)),
+        shapes=(Shape("decay", ("s/rad^2", "s/m^2"), decays),),
+        columns=_drift_with_work,
         needs="the same motion early and late in the recordings",
         excitation=("repeats",),
     ),

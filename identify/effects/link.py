@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.effects.effect import Effect, Linear, Place
+from armident.identify.effects.tables import RANGE, table, values
 from armident.identify.robot.chain import INERTIAL
 from armident.identify.robot.motion import Motion
 
@@ -12,6 +13,15 @@ Array = NDArray[np.float64]
 
 def _spring(motion: Motion, place: Place) -> Array:
     return motion.q[:, place.joint, None]
+
+
+def _stiffening_spring(motion: Motion, place: Place) -> Array:
+    q = motion.q[:, place.joint]
+    return np.stack([q, q**2, q**3], axis=1)
+
+
+def _spring_table(motion: Motion, place: Place, *, low: float, high: float) -> Array:
+    return table(motion.q[:, place.joint], low, high)
 
 
 def across(gravity: Array) -> Array:
@@ -84,6 +94,33 @@ EFFECTS = (
         reference="Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 9",
         linear=(Linear("ks", ("N m/rad", "N/m")),),
         columns=_spring,
+        needs="a wide range of joint positions",
+        excitation=("range",),
+    ),
+    Effect(
+        name="joint_spring",
+        law="cubic",
+        title="a spring at the joint",
+        says="a torque that grows faster than the joint's position: a stiffening spring, a bumper, a cable harness",
+        reference="Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 9",
+        linear=(
+            Linear("ks", ("N m/rad", "N/m")),
+            Linear("ks2", ("N m/rad^2", "N/m^2")),
+            Linear("ks3", ("N m/rad^3", "N/m^3")),
+        ),
+        columns=_stiffening_spring,
+        needs="a wide range of joint positions",
+        excitation=("range",),
+    ),
+    Effect(
+        name="joint_spring",
+        law="table",
+        title="a spring at the joint",
+        says="a torque that depends on the joint's position: a spring, a gravity compensator, a stiff cable harness",
+        reference="Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 9",
+        linear=values("kst", ("N m", "N")),
+        shapes=RANGE,
+        columns=_spring_table,
         needs="a wide range of joint positions",
         excitation=("range",),
     ),

@@ -8,7 +8,7 @@ import numpy as np
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Stanza
 from armident.identify.effects.effect import Recorded, motor_limit
-from armident.identify.effects.registry import known
+from armident.identify.effects.registry import of_entry
 from armident.identify.effects.wiring import rewired
 from armident.identify.experiment import Experiment
 
@@ -19,7 +19,7 @@ def of_recording(stanza: Stanza) -> bool:
     Wiring errors always do. A torque correction (delay, lag, saturation) does if the entry gives its value; otherwise
     the value is a parameter of the model and estimated with the rest.
     """
-    effect = known(stanza.effect)
+    effect = of_entry(stanza)
     return effect.rewires or (effect.undo is not None and bool(stanza.parameters.get(effect.linear[0].name)))
 
 
@@ -41,7 +41,7 @@ def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Exp
     experiments = rewired(experiments, robot)
     names = [joint.name for joint in robot.joints]
     for stanza in robot.effects:
-        effect = known(stanza.effect)
+        effect = of_entry(stanza)
         if effect.undo is None or not of_recording(stanza):
             continue
         motor, value = names.index(stanza.joint), stanza.parameters[effect.linear[0].name]

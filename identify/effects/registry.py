@@ -4,6 +4,7 @@ from functools import cache
 from importlib.metadata import entry_points
 
 from armident.configs import ConfigError
+from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects import drive, friction, link, numbers, transmission, wiring
 from armident.identify.effects.effect import Effect
 
@@ -22,7 +23,7 @@ def catalogue() -> dict[str, Effect]:
     """
     modules = (friction, link, transmission, drive, numbers, wiring)
     ours = [effect for module in modules for effect in module.EFFECTS]
-    found = {e.name: e for e in ours}
+    found = {e.key: e for e in ours}
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda p: p.name):
         where = f"effect {point.name} ({point.value})"
         try:
@@ -32,9 +33,9 @@ def catalogue() -> dict[str, Effect]:
         for effect in (loaded,) if isinstance(loaded, Effect) else tuple(loaded):
             if not isinstance(effect, Effect):
                 raise ConfigError(f"{where}: expected an Effect, got {type(effect).__name__}")
-            if effect.name in found:
-                raise ConfigError(f"{where}: an effect {effect.name!r} exists already")
-            found[effect.name] = effect
+            if effect.key in found:
+                raise ConfigError(f"{where}: an effect {effect.key!r} exists already")
+            found[effect.key] = effect
     return found
 
 
@@ -55,3 +56,19 @@ def known(name: str) -> Effect:
     if name not in effects:
         raise ConfigError(f"effects: {name!r} is not in the catalogue ({', '.join(effects)})")
     return effects[name]
+
+
+def of_entry(entry: Entry) -> Effect:
+    """Return the effect of an entry of a robot configuration, with the law that the entry names.
+
+    Parameters
+    ----------
+    entry
+        Entry of the ``effects`` of the configuration.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such effect, or no such law of it; the message lists all.
+    """
+    return known(f"{entry.effect}/{entry.law}" if entry.law else entry.effect)

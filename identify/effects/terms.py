@@ -9,7 +9,7 @@ from armident.configs import ConfigError, RobotConfig
 from armident.configs.schema.robot import Effect as Stanza
 from armident.identify.effects.effect import Effect, Linear, Place
 from armident.identify.effects.recorded import of_recording
-from armident.identify.effects.registry import known
+from armident.identify.effects.registry import of_entry
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.motion import Motion
 
@@ -104,7 +104,7 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
     terms: list[Term] = []
     taken: dict[str, int] = {}
     for k, stanza in enumerate(robot.effects):
-        effect = known(stanza.effect)
+        effect = of_entry(stanza)
         if of_recording(stanza):
             continue
         where = f"effects[{k}]: {stanza.effect} of {stanza.joint}"
@@ -180,7 +180,7 @@ def stanza_of(
     """
     other = None if place.other is None else robot.joints[place.other].name
     return Stanza(
-        effect=effect.name, joint=robot.joints[place.joint].name, other=other, parameters=parameters, without=without
+        effect=effect.name, law=effect.law, joint=robot.joints[place.joint].name, other=other, parameters=parameters, without=without
     )
 
 
