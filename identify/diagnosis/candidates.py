@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations, product
+from itertools import combinations, permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -302,6 +302,8 @@ def places(effect: Effect, n: int) -> list[Place]:
     """
     if effect.scope == "pair":
         return [Place(i, j) for i, j in combinations(range(n), 2)]
+    if effect.scope == "other":
+        return [Place(i, j) for i, j in permutations(range(n), 2)]
     if effect.scope == "arm":
         return [Place(0)]
     return [Place(j) for j in range(n)]
@@ -319,5 +321,6 @@ def grid(effect: Effect, motion: Motion, place: Place) -> tuple[Shapes, ...]:
     place
         Place of the effect.
     """
-    axes = [[(shape.name, float(v)) for v in shape.grid(motion, place.joint)] for shape in effect.shapes]
+    where = (place.joint, place.other) if effect.scope == "other" else (place.joint,)
+    axes = [[(shape.name, float(v)) for v in shape.grid(motion, *where)] for shape in effect.shapes]
     return tuple(product(*axes))

@@ -341,11 +341,10 @@ def _seen(q: Array, measured: Derivatives, dt: float) -> Derivatives:
 
 
 def _continued(experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Experiments one after the other on one axis of time, where they all begin at zero."""
-    out: list[Experiment] = []
+    """Experiments in absolute time where it is known; each begins at zero where their times overlap."""
     end = 0.0
     for e in experiments:
-        start = e.start if e.start >= end else end
-        out.append(replace(e, start=start))
-        end = start + e.dt * e.q.shape[0]
-    return out
+        if e.start < end:
+            return [replace(e, start=0.0) for e in experiments]
+        end = e.start + e.dt * e.q.shape[0]
+    return list(experiments)

@@ -14,8 +14,8 @@ from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
 
-Scope = Literal["joint", "motor", "pair", "arm"]
-"""Location of an effect: one joint, one motor, a pair of joints, or the whole arm.
+Scope = Literal["joint", "motor", "pair", "other", "arm"]
+"""Location of an effect: one joint, one motor, a pair of joints, a joint with a variable of another one, or the arm.
 
 A coupled transmission makes the effect of a motor act on several joints. The entry of an effect of the whole arm names
 the first joint in the configuration, that of a payload the last one.
@@ -172,6 +172,8 @@ class Effect:
     law
         Formula of the same dependence that differs from the first one in the catalogue; empty for the first one.
         ``table`` is a free shape.
+    order_of
+        ``motor`` if its nonlinear parameter is an order of the motor angle, found by order analysis of the residual.
     """
 
     name: str
@@ -195,11 +197,17 @@ class Effect:
     physical: Callable[[Array, Mapping[str, float]], bool] | None = None
     negligible: Callable[[Array, float], bool] | None = None
     law: str = ""
+    order_of: str = ""
 
     @property
     def key(self) -> str:
         """Name in the catalogue: that of the effect, with the law behind a slash unless it is the first one."""
         return f"{self.name}/{self.law}" if self.law else self.name
+
+    @property
+    def free(self) -> bool:
+        """True if the law is a free shape, whose parameters are torques at knots."""
+        return self.law == "table" or self.name == "unnamed"
 
     def allows(self, values: Array, std: Array, shapes: Mapping[str, float]) -> bool:
         """Return True if linear parameters (k,) with standard deviations (k,) are physically possible.

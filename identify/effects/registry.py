@@ -5,7 +5,7 @@ from importlib.metadata import entry_points
 
 from armident.configs import ConfigError
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.effects import drive, friction, link, numbers, transmission, wiring
+from armident.identify.effects import drive, friction, link, numbers, transmission, unnamed, wiring
 from armident.identify.effects.effect import Effect
 
 ENTRY_POINTS = "armident.effects"
@@ -21,7 +21,7 @@ def catalogue() -> dict[str, Effect]:
     ConfigError
         If an entry point cannot be loaded, is not an effect, or repeats a name.
     """
-    modules = (friction, link, transmission, drive, numbers, wiring)
+    modules = (friction, link, transmission, drive, numbers, wiring, unnamed)
     ours = [effect for module in modules for effect in module.EFFECTS]
     found = {e.key: e for e in ours}
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda p: p.name):

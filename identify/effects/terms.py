@@ -153,7 +153,7 @@ def place_of(stanza: Stanza, effect: Effect, robot: RobotConfig, where: str) -> 
     """
     names = [joint.name for joint in robot.joints]
     joint = names.index(stanza.joint)
-    if effect.scope != "pair":
+    if effect.scope not in ("pair", "other"):
         if stanza.other is not None:
             raise ConfigError(f"{where}: other: only an effect between two joints has one")
         return Place(joint)

@@ -207,11 +207,12 @@ def gaps(motion: Motion, joint: int) -> Sequence[float]:
 EFFECTS = (
     Effect(
         name="cogging_torque",
+        order_of="motor",
         title="a torque ripple of the motor",
         says="a torque ripple that is periodic in the motor angle: magnets of the motor, or an eccentric gear",
         reference="Petrovic et al. 2000, IEEE Trans. Power Electronics 15(6); Gandhi et al. 2002, ICRA",
         linear=(Linear("cgc", ("N m", "N")), Linear("cgs", ("N m", "N"))),
-        shapes=(Shape("harmonic", ("per rad of the motor", "rad/m"), harmonics, continuous=(False, True)),),
+        shapes=(Shape("harmonic", ("per rad of the motor", "rad/m"), harmonics, continuous=(False, False)),),
         columns=_cogging,
         needs="slow motion over several motor turns",
         scope="motor",

@@ -1,0 +1,72 @@
+"""Order analysis: torque ripple that is periodic in an angle, at any real order.
+
+The spectrum of the residual over the angle instead of over time: samples are summed in bins of the angle, and a fast
+Fourier transform of the bins gives every order at once. Orders stand out against the median of their neighbourhood.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+OVERSAMPLING = 8
+"""Bins per half period of the highest order; amplitudes there are attenuated by less than 1 %."""
+PADDING = 4
+"""Orders searched per independent order."""
+NEIGHBOURS = 32
+"""Independent orders from whose median the background is estimated."""
+PEAKS = 3
+"""Most orders returned."""
+
+
+def strongest_orders(
+    angle: Sequence[Array], residual: Sequence[Array], highest: float, lowest: float = 0.0
+) -> list[tuple[float, float]]:
+    """Return the strongest orders of a residual over an angle, with their power over the background, strongest first.
+
+    Parameters
+    ----------
+    angle
+        Angles of every stretch, rad (m for a prismatic joint), (N,) each.
+    residual
+        Residual torques, N m or N, (N,) each.
+    highest
+        Highest order, cycles per 2 pi of the angle.
+    lowest
+        Lowest order.
+
+    Returns
+    -------
+    list of tuple
+        Orders (cycles per 2 pi), and power over the median of the neighbourhood; at most `PEAKS`.
+    """
+    low = min(float(a.min()) for a in angle)
+    span = max(float(a.max()) for a in angle) - low
+    if span <= 0.0 or highest <= lowest:
+        return []
+    bins = int(np.ceil(2 * OVERSAMPLING * highest * span / (2 * np.pi))) + 1
+    width = span / bins
+    size = 1 << int(np.ceil(np.log2(PADDING * bins)))
+    power = np.zeros(size // 2 + 1)
+    for a, e in zip(angle, residual, strict=True):
+        number = np.minimum(((a - low) / width).astype(np.int64), bins - 1)
+        power += np.abs(np.fft.rfft(np.bincount(number, e, minlength=bins), size)) ** 2
+    orders = np.arange(power.size) * (2 * np.pi / (size * width))
+    apart = 2 * np.pi / span
+    inside = np.flatnonzero((orders >= max(lowest, 2 * apart)) & (orders <= highest))
+    if inside.size < 3:
+        return []
+    own = power[inside]
+    reach = max(int(NEIGHBOURS * apart / (orders[1] - orders[0])), 3)
+    found: list[tuple[float, float]] = []
+    blocked = np.zeros(own.size, bool)
+    for _ in range(PEAKS):
+        k = int(np.argmax(np.where(blocked, 0.0, own)))
+        if blocked[k]:
+            break
+        around = own[max(k - reach, 0) : k + reach + 1]
+        found.append((float(orders[inside[k]]), float(own[k] / max(float(np.median(around)), 1e-300))))
+        blocked |= np.abs(orders[inside] - orders[inside[k]]) < 1.5 * apart
+    return found

@@ -1,0 +1,179 @@
+"""Predictive score of a model: cross-validated log-likelihood of the torques with serially correlated noise.
+
+The one criterion by which models are ranked, admitted, exchanged and reduced. Errors are those of torques that the
+parameters did not see: the training data are cut into `BLOCKS` blocks of equal length, every `FOLDS`-th block is left
+out in turn, and the instrumental-variable estimate of the other blocks predicts it. The autoregressive noise model
+turns these errors into innovations, which carry all the information about the model that serially correlated errors
+have (Box, Jenkins 1976, chapter 7).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.diagnosis.regression import Fit
+from armident.identify.effects.terms import effect_terms
+from armident.identify.regression.ar_noise import ArModel
+
+Array = NDArray[np.float64]
+
+BLOCKS = 10
+"""Blocks of the training data: each much longer than the memory of the noise."""
+SUMS = 20
+"""Blocks of the block sums: long beside the memory of the noise, and enough for a variance with 19 degrees of freedom."""
+FOLDS = 10
+"""Folds of the cross-validation (Hastie, Tibshirani, Friedman 2009, section 7.10)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PredictiveScore:
+    """Cross-validated errors of a fitted model.
+
+    Parameters
+    ----------
+    fit
+        The fit of all training data, with its noise models.
+    """
+
+    fit: Fit
+
+    @cached_property
+    def folds(self) -> Array:
+        """Parameters estimated without each fold, (`FOLDS`, b)."""
+        equations, products = self.fit.equations, self.fit.products
+        b = self.fit.theta.size
+        zx, zy = np.zeros((FOLDS, b, b)), np.zeros((FOLDS, b))
+        for block, rows in zip(equations.blocks, products.rows, strict=True):
+            width, fold = block.x.size, fold_of(rows.shape[0])
+            for k in range(FOLDS):
+                own = rows[fold == k]
+                through = own[:, width:-1].T @ own
+                zx[k][np.ix_(block.z, block.x)] += through[:, :width]
+                zy[k][block.z] += through[:, -1]
+        scale, weak = products.scale, np.diag(self._prior)
+        found = [
+            np.linalg.lstsq(
+                (zx.sum(0) - zx[k] + weak) / np.outer(scale, scale), (zy.sum(0) - zy[k]) / scale, rcond=1e-12
+            )[0]
+            / scale
+            for k in range(FOLDS)
+        ]
+        return np.array(found)
+
+    @cached_property
+    def _prior(self) -> Array:
+        """Inverse prior variances of the parameters, (b,): zero except for those of free shapes.
+
+        The values of a free shape are torques of the size of its joint's torque error. Without this, a fold that does
+        not visit a part of the range leaves them undetermined there.
+        """
+        study = self.fit.study
+        inverse = np.zeros(self.fit.theta.size)
+        errors = np.concatenate(self.fit.left)
+        at = inverse.size - study.model.e
+        for term in effect_terms(study.model):
+            if term.effect.free:
+                size = float(np.mean(errors[:, term.place.joint] ** 2))
+                inverse[at : at + len(term.names)] = 1.0 / max(size, 1e-300)
+            at += len(term.names)
+        return inverse
+
+    @cached_property
+    def errors(self) -> tuple[Array, ...]:
+        """Predicted errors of each joint before whitening, stretch after stretch, N m or N, (M,) each."""
+        return tuple(np.concatenate(parts) for parts in self._parts)
+
+    @cached_property
+    def _parts(self) -> tuple[tuple[Array, ...], ...]:
+        found = []
+        for block in self.fit.equations.blocks:
+            width = block.x.size
+            total = sum(part.shape[0] for part in block.parts)
+            fold, begin, parts = fold_of(total), 0, []
+            for part in block.parts:
+                own = self.folds[fold[begin : begin + part.shape[0]]][:, block.x]
+                parts.append(part[:, -1] - np.einsum("mi,mi->m", part[:, :width], own))
+                begin += part.shape[0]
+            found.append(tuple(parts))
+        return tuple(found)
+
+    def innovations(self, noise: Sequence[ArModel]) -> Array:
+        """Mean squares of the innovations of each joint under noise models, (N m)^2 or N^2, (n,).
+
+        Parameters
+        ----------
+        noise
+            Noise model of each joint.
+        """
+        return np.array(
+            [
+                ar.variance * float(np.mean(np.concatenate([ar.whiten(part) for part in parts]) ** 2))
+                for ar, parts in zip(noise, self._parts, strict=True)
+            ]
+        )
+
+    @cached_property
+    def rms(self) -> Array:
+        """Root mean square of the predicted errors of each joint, N m or N, (n,)."""
+        return np.array([float(np.sqrt(np.mean(errors**2))) for errors in self.errors])
+
+    @cached_property
+    def log_likelihood(self) -> float:
+        """Log-likelihood of the data under the model's own noise models, less one for each of their coefficients.
+
+        The coefficients are not cross-validated; the subtraction is that of Akaike's criterion. Constants that all
+        models of the same data share are omitted.
+        """
+        own = self.innovations(self.fit.noise)
+        rows = np.array([errors.size for errors in self.errors])
+        orders = sum(ar.order for ar in self.fit.noise)
+        return float(-0.5 * np.sum(rows * np.log(np.maximum(own, 1e-300))) - orders)
+
+    def inflation_over(self, other: "PredictiveScore") -> Array:
+        """Variance of the score along the change of prediction over that of white innovations, of each joint, (n,).
+
+        Noise that changes slowly leaves correlation in the innovations which an autoregressive model of limited order
+        does not take. Block sums contain it, whatever its form (Kuensch 1989, Annals of Statistics 17(3)). At least 1.
+
+        Parameters
+        ----------
+        other
+            Score of the model without the effect in question.
+        """
+        found = []
+        for ar, own, less in zip(self.fit.noise, self._parts, other._parts, strict=True):
+            e1 = np.concatenate([ar.whiten(part) for part in own])
+            change = np.concatenate([ar.whiten(part) for part in less]) - e1
+            sums = np.array([part.sum() for part in np.array_split(change * e1, SUMS)])
+            naive = float(np.mean(e1**2) * (change @ change))
+            found.append(max(1.0, float(np.sum((sums - sums.mean()) ** 2)) * SUMS / (SUMS - 1) / max(naive, 1e-300)))
+        return np.array(found)
+
+    def gain_over(self, other: "PredictiveScore") -> float:
+        """Gain of log-likelihood over another model, both under the noise models of this one.
+
+        Noise models of the other one would take what it lacks for noise.
+
+        Parameters
+        ----------
+        other
+            Score of the model without the effect in question.
+        """
+        own, less = self.innovations(self.fit.noise), other.innovations(self.fit.noise)
+        rows = np.array([errors.size for errors in self.errors])
+        each = 0.5 * rows * np.log(np.maximum(less, 1e-300) / np.maximum(own, 1e-300))
+        return float(np.sum(each / self.inflation_over(other)))
+
+
+def fold_of(rows: int) -> NDArray[np.int64]:
+    """Return the fold of each row, (R,).
+
+    Parameters
+    ----------
+    rows
+        Number of rows, R.
+    """
+    return np.arange(rows) * BLOCKS // max(rows, 1) % FOLDS
