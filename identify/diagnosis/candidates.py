@@ -211,26 +211,30 @@ class Workshop:
             return (effect.key, place.joint, place.other, shapes, part, kind)
 
         missing = [shapes for shapes in grid if key(shapes) not in self.kept]
-        stretches = [self._filtered(effect, place, missing, self.motion(s, kind)) for s in getattr(self.study, part)]
+        stretches = [self._filtered(effect, place, missing, s, kind) for s in getattr(self.study, part)]
         made = {key(shapes): tuple(own[g] for own in stretches) for g, shapes in enumerate(missing)}
         if keep:
             self.kept.update(made)
         return [made[key(shapes)] if key(shapes) in made else self.kept[key(shapes)] for shapes in grid]
 
-    def _filtered(self, effect: Effect, place: Place, grid: Sequence[Shapes], motion: Motion) -> list[Kept]:
+    def _filtered(self, effect: Effect, place: Place, grid: Sequence[Shapes], stretch: Stretch, kind: str) -> list[Kept]:
         """Columns of one stretch in the band of the comparison, of every shape."""
+        motion, moving = self.motion(stretch, kind), stretch.moving
         narrow: list[Array] = []
         out: list[Kept] = []
         for shapes in grid:
             columns = effect.columns(motion, place, **dict(shapes))[motion.lead :]
             if columns.ndim == 3:
-                out.append((self._decimated(columns), False))
+                wide = self._decimated(columns)
+                out.append((wide if moving is None else wide * moving[:, :, None], False))
             else:
                 narrow.append(columns)
         if narrow:
             # A filter is hardly slower for many columns than for one.
             sizes = np.cumsum([columns.shape[1] for columns in narrow])[:-1]
             band = self.study.decimation(np.concatenate(narrow, axis=1))
+            if moving is not None:
+                band = band * moving[:, place.joint, None]
             out += [(columns, True) for columns in np.split(band, sizes, axis=1)]
         return out
 

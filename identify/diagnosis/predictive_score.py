@@ -116,6 +116,11 @@ class PredictiveScore:
         )
 
     @cached_property
+    def rows(self) -> Array:
+        """Number of rows of each joint while it moves, (n,)."""
+        return np.array([float(np.count_nonzero(errors)) for errors in self.errors])
+
+    @cached_property
     def rms(self) -> Array:
         """Root mean square of the predicted errors of each joint, N m or N, (n,)."""
         return np.array([float(np.sqrt(np.mean(errors**2))) for errors in self.errors])
@@ -128,7 +133,7 @@ class PredictiveScore:
         models of the same data share are omitted.
         """
         own = self.innovations(self.fit.noise)
-        rows = np.array([errors.size for errors in self.errors])
+        rows = self.rows
         orders = sum(ar.order for ar in self.fit.noise)
         return float(-0.5 * np.sum(rows * np.log(np.maximum(own, 1e-300))) - orders)
 
@@ -163,7 +168,7 @@ class PredictiveScore:
             Score of the model without the effect in question.
         """
         own, less = self.innovations(self.fit.noise), other.innovations(self.fit.noise)
-        rows = np.array([errors.size for errors in self.errors])
+        rows = self.rows
         each = 0.5 * rows * np.log(np.maximum(less, 1e-300) / np.maximum(own, 1e-300))
         return float(np.sum(each / self.inflation_over(other)))
 

@@ -442,7 +442,7 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
                 sudden = np.flatnonzero([t.effect.sudden for t in effect_terms(study.model) for _ in t.names])
                 terms[:, :, sudden] = out[0][:, :, first + sudden]
             rigid = np.concatenate([rigid, terms], axis=2)
-        out.append(rigid)
+        out.append(rigid if stretch.moving is None else rigid * stretch.moving[:, :, None])
     return out[0], out[1]
 
 

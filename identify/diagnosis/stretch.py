@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from armident.identify.signals.differentiate import Derivatives
 
@@ -39,6 +40,8 @@ class Stretch:
     before
         Measured and simulated motion before the stretch, where the experiment starts earlier. Effects with internal
         states start there.
+    moving
+        False where a joint stands still at an instant of ``y``, (M, n); ``None``: it never does.
     """
 
     measured: Derivatives
@@ -50,6 +53,7 @@ class Stretch:
     rows: NDArray[np.int64]
     span: slice
     before: tuple[Derivatives, Derivatives] | None = None
+    moving: NDArray[np.bool_] | None = None
 
     def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "Stretch":
         """Stretch with another simulation of the whole experiment.
@@ -116,3 +120,25 @@ def distances(stretches: Sequence[Stretch]) -> Array:
     apart = sum(np.sum((s.simulated.qd - s.measured.qd) ** 2, axis=0) for s in stretches)
     size = sum(np.sum(s.measured.qd**2, axis=0) for s in stretches)
     return np.asarray(apart / np.maximum(size, 1e-300))
+
+
+def moving_rows(qd: Array, slowest: Array, width: int, instants: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return false where a joint stands still, (M, n): its dry friction is undetermined there.
+
+    A joint stands still where it is slower than the width of its smoothed sign throughout a window. Reversals are
+    shorter and stay. Filters spread standstill by their length, so that its neighbours are left out too.
+
+    Parameters
+    ----------
+    qd
+        Velocities at the working rate, (N, n), rad/s or m/s.
+    slowest
+        Width of the smoothed sign of each joint, rad/s or m/s, (n,).
+    width
+        Half the length of the window, samples: the decimation factor of the comparison.
+    instants
+        Samples of the comparison, (M,).
+    """
+    still = minimum_filter1d((np.abs(qd) < slowest).astype(np.int8), 2 * width + 1, axis=0, mode="nearest")
+    spread = maximum_filter1d(still, 8 * width + 1, axis=0, mode="nearest")
+    return np.asarray(spread[instants] == 0)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Stanza
-from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distances, rows_before
+from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distances, moving_rows, rows_before
 from armident.identify.effects.recorded import of_recording, put_right
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model
@@ -289,6 +289,7 @@ def build_study(
     ]
     simulated, loop, auxiliary, warnings = _simulated(model, experiments, signals, bandwidth)
     warnings += unsaturated_joints(given, robot, experiments, bandwidth)
+    slowest = 1.0 / np.asarray(robot.sign_smoothing)
     train: list[Stretch] = []
     held: list[Stretch] = []
     for k, (e, s, z) in enumerate(zip(experiments, signals, simulated, strict=True)):
@@ -305,7 +306,10 @@ def build_study(
             earlier = rows_before(kept, rows)
             before = None if earlier.size == 0 else (at_rows(s, earlier, dt, factor), at_rows(z, earlier, dt, factor))
             measured, noiseless = at_rows(s, rows, dt, factor), at_rows(z, rows, dt, factor)
-            into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span, before))
+            at = second.instants(rows.size)
+            moving = moving_rows(measured.qd, slowest, second.factor, at)
+            y = np.where(moving, y, 0.0)
+            into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span, before, moving))
     duration = max(e.start + dt * e.q.shape[0] for e in experiments)
     return Study(
         robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first,

@@ -98,7 +98,7 @@ def tops(motion: Motion, joint: int) -> Sequence[float]:
     return [float(motion.top_speed[joint])]
 
 
-def _higher_at_rest(values: Array, shapes: Mapping[str, float]) -> bool:
+def _higher_at_rest(values: Array, shapes: Mapping[str, float], largest: Mapping[str, float]) -> bool:
     """Return True if friction is highest at the lowest speeds."""
     return bool(values[0] > 0.0 and values[0] >= values[-1])
 
