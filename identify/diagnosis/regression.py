@@ -429,7 +429,7 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
     out: list[Array] = []
     for kind in ("measured", "simulated"):
         signals = getattr(stretch, kind)
-        key = (id(signals), study.model.base.names[: -study.model.e or None])
+        key = (id(signals), study.model.base.names[: -study.model.e or None], tuple(study.robot.sign_smoothing))
         if key not in study.rigid:
             made = study.decimation(study.model.rigid_regressor(signals.q, signals.qd, signals.qdd))
             # Kept with the signals: their identity is the key only while they exist.

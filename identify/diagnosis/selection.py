@@ -37,6 +37,11 @@ from armident.identify.effects.registry import known
 from armident.identify.effects.terms import Term, effect_terms, stanza_of
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
+WIDTHS = (3.0, 1.5)
+"""Factors by which the width of the smoothed sign is changed, a coarse and a fine step."""
+WIDEST = (0.02, 20.0)
+"""Range of the sharpness of the sign, over that of the joint's top speed (`SATURATION`)."""
+
 Array = NDArray[np.float64]
 Key = tuple[str, int, int | None]
 
@@ -154,6 +159,23 @@ class StepwiseSelection:
         """Model as configured."""
         state = self._state(self.study.robot, None)
         assert state is not None
+        return state if self.study.sign_given else self._with_sign_widths(state)
+
+    def _with_sign_widths(self, state: ModelState) -> ModelState:
+        """Model with the width of each joint's sign at which it predicts best: friction near standstill is unknown."""
+        for j in range(state.robot.n):
+            for step in WIDTHS:
+                for factor in (step, 1.0 / step):
+                    while True:
+                        g = list(state.robot.sign_smoothing)
+                        g[j] *= factor
+                        if not WIDEST[0] <= g[j] / self.study.robot.sign_smoothing[j] <= WIDEST[1]:
+                            break
+                        other = self._state(_with_sign(state.robot, g), state)
+                        if other is None or other.score.log_likelihood <= state.score.log_likelihood + 1.0:
+                            break
+                        state = other
+        self.study = replace(self.study, robot=state.robot, sign_given=True)
         return state
 
     def run(self) -> ModelState:
@@ -276,7 +298,7 @@ class StepwiseSelection:
 
     def _state(self, robot: RobotConfig, before: ModelState | None) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""
-        key = "\n".join(entry.model_dump_json() for entry in robot.effects)
+        key = "\n".join([str(robot.sign_smoothing), *(entry.model_dump_json() for entry in robot.effects)])
         if key not in self._states:
             try:
                 self._states[key] = ModelState(*refit(self.study, robot, None if before is None else before.fit))
@@ -301,6 +323,12 @@ class StepwiseSelection:
                 return state
             state = weakest[1]
         return state
+
+
+def _with_sign(robot: RobotConfig, smoothing: Sequence[float]) -> RobotConfig:
+    """Return the configuration with another smoothing of the sign of each joint."""
+    friction = robot.friction.model_copy(update={"sign_smoothing": tuple(float(g) for g in smoothing)})
+    return robot.model_copy(update={"friction": friction})
 
 
 def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]:

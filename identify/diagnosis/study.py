@@ -92,7 +92,8 @@ class Study:
     sources: tuple[Sequence[Experiment], Sequence[Experiment]]
     signals: tuple[Derivatives, ...]
     warnings: tuple[str, ...] = ()
-    rigid: dict[tuple[int, tuple[str, ...]], tuple[Derivatives, Array]] = field(
+    sign_given: bool = True
+    rigid: dict[tuple[int, tuple[str, ...], tuple[float, ...]], tuple[Derivatives, Array]] = field(
         default_factory=dict, repr=False, compare=False
     )
 
@@ -313,7 +314,7 @@ def build_study(
     duration = max(e.start + dt * e.q.shape[0] for e in experiments)
     return Study(
         robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first,
-        (training, validation), tuple(signals), tuple(warnings),
+        (training, validation), tuple(signals), tuple(warnings), given.friction.sign_smoothing is not None,
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from armident.identify.experiment import Experiment
 from armident.identify.signals.bandpass import butterworth, central_difference
 from armident.identify.signals.bandwidth import position_noise
 
-SATURATION = 3000.0
+SATURATION = 450.0
 """``g`` times the top speed of the joint.
 
 Source: the thesis finds 150 s/rad sufficient for all joints of the TX40 (appendix B.2), so also for the slowest one,
