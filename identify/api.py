@@ -269,7 +269,7 @@ def identify(
     read = _read(recordings)
     config = _robot(robot, read)
     outcome = identify_recording(read, config, options, progress)
-    return Identification(outcome.document, config, read, outcome.result)
+    return Identification(outcome.document, outcome.robot, read, outcome.result)
 
 
 @dataclass(frozen=True, repr=False)

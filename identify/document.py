@@ -80,6 +80,7 @@ class IdentificationDocument(Document):
 
     ``torque_delay_samples`` has two numbers per joint: the number of samples by which the torque leads the position,
     and its standard deviation. A drive that reports the torque that it holds until the next sample has a lead of 0.5.
+    ``sign_smoothing`` is ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
     """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
@@ -105,6 +106,7 @@ class IdentificationDocument(Document):
     physical: dict[str, Any] | None = None
     torque_delay_samples: dict[str, list[float]] | None = None
     further_recordings: list[RecordingReference] | None = None
+    sign_smoothing: dict[str, float] | None = None
 
 
 class Alternative(Document):
@@ -206,6 +208,7 @@ class DiagnosisDocument(Document):
     """``diagnosis.json``: effects that the model lacks, their share of the torque error, and the unexplained rest.
 
     ``considered`` are effects that passed the tests but have a confidence below 0.5; they are not in the model.
+    ``sign_smoothing`` is ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
     """
 
     schema_: Literal["armident/diagnosis/2"] = Field("armident/diagnosis/2", alias="schema")
@@ -225,6 +228,7 @@ class DiagnosisDocument(Document):
     detection_limits: list[DetectionLimit] = []
     simulated: dict[str, dict[str, float]] | None = None
     considered: list[Finding] = []
+    sign_smoothing: dict[str, float] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -361,6 +365,7 @@ def identification_document(
             for name, samples, std in zip(joints, result.delay.samples, result.delay.std, strict=True)
         },
         further_recordings=[reference(recording) for recording in recordings[1:]] or None,
+        sign_smoothing=dict(zip(joints, (float(g) for g in result.sign_smoothing), strict=True)),
     )
 
 

@@ -37,7 +37,7 @@ def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, o
     friction
         fv, fc, offset and viscous coefficient of the brake by joint, shape (n, 4).
     smoothing
-        ``g`` in ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
+        ``g`` in ``sign(qd) -> (2/pi) atan(g qd)`` of each joint, s/rad or s/m, shape (n,).
     pairs
         The two joints, fv and fc of the couplings, shape (C, 4).
     ratio
@@ -53,16 +53,17 @@ def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, o
     slope[:, :] = 0.0
     out[n:] = 0.0
     for i in range(n):
-        x = smoothing * qd[i]
+        x = smoothing[i] * qd[i]
         out[i] = (
             (friction[i, 0] + friction[i, 3]) * qd[i] + friction[i, 1] * 2.0 / math.pi * math.atan(x) + friction[i, 2]
         )
-        slope[i, i] = friction[i, 0] + friction[i, 3] + friction[i, 1] * 2.0 / math.pi * smoothing / (1.0 + x * x)
+        slope[i, i] = friction[i, 0] + friction[i, 3] + friction[i, 1] * 2.0 / math.pi * smoothing[i] / (1.0 + x * x)
     for c in range(pairs.shape[0]):
         i, j = int(pairs[c, 0]), int(pairs[c, 1])
-        x = smoothing * (qd[i] + qd[j])
+        g = min(smoothing[i], smoothing[j])
+        x = g * (qd[i] + qd[j])
         dry = pairs[c, 3] * 2.0 / math.pi * math.atan(x)
-        dry_slope = pairs[c, 3] * 2.0 / math.pi * smoothing / (1.0 + x * x)
+        dry_slope = pairs[c, 3] * 2.0 / math.pi * g / (1.0 + x * x)
         out[i] += pairs[c, 2] * qd[j] + dry
         out[j] += pairs[c, 2] * qd[i] + dry
         slope[i, i] += dry_slope
@@ -75,7 +76,7 @@ def friction_torques(q, qd, t, friction, smoothing, pairs, ratio, table, load, o
         for i in range(n):
             motor += ratio[j, i] * q[i]
         beside = 0.0 if other < 0 else qd[other]
-        torque, steep = effect_torque(code, table[e, 3:], q[j], qd[j], motor, beside, load[j], t, smoothing)
+        torque, steep = effect_torque(code, table[e, 3:], q[j], qd[j], motor, beside, load[j], t, smoothing[j])
         out[j] += torque
         # Negative slopes are limited, because the matrix must remain positive definite.
         slope[j, j] += max(steep, 0.0) if steep > 0.0 else max(steep, -0.9 * slope[j, j])

@@ -105,7 +105,7 @@ class Plant:
         self._rows = bristles
         self._gears = gears
         self._resisting: tuple[Any, ...] = (
-            friction, robot.friction.sign_smoothing, np.array(pairs).reshape(-1, 4), robot.transmission_matrix, table,
+            friction, robot.sign_smoothing, np.array(pairs).reshape(-1, 4), robot.transmission_matrix, table,
             self._load,
         )  # fmt: skip
         self._rigid, self._fine = total == n, bool(gears.size or bristles.size)

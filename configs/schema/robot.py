@@ -11,6 +11,12 @@ from armident.configs.schema.base import FrozenModel
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=64)]
 Positive = Annotated[float, Field(gt=0)]
 
+NOMINAL_SIGN_SMOOTHING = {"revolute": 150.0, "prismatic": 5000.0}
+"""``g`` of the smoothed sign by type of joint where neither a value nor a motion is known, s/rad and s/m.
+
+150 s/rad is that of the TX40 (thesis appendix B.2); 5000 s/m is the same for the EMPS, ``configs/robots/emps.yaml``.
+"""
+
 
 class Mdh(FrozenModel):
     """Modified Denavit-Hartenberg parameters, frame j-1 to j (thesis section 2.1.1, table B.1).
@@ -149,13 +155,15 @@ class Friction(FrozenModel):
     Parameters
     ----------
     sign_smoothing
-        ``g`` (s/rad or s/m) in ``sign(qd) -> (2/pi) atan(g qd)``, used in simulation (thesis appendix B.2).
+        ``g`` (s/rad or s/m) in ``sign(qd) -> (2/pi) atan(g qd)`` (thesis appendix B.2): one value for all joints, or
+        one per joint. ``None``: each joint has its own, chosen from its recorded velocities
+        (`armident.identify.identification.sign_smoothing`).
     velocity_threshold
         Per joint (rad/s or m/s): samples of a joint slower than this are left out of that joint's equations, because
         its friction is undefined there. ``None``: chosen from the data.
     """
 
-    sign_smoothing: Positive = 150.0
+    sign_smoothing: Positive | tuple[Positive, ...] | None = None
     velocity_threshold: tuple[Annotated[float, Field(ge=0)], ...] | None = None
 
 
@@ -270,6 +278,9 @@ class RobotConfig(FrozenModel):
         threshold = self.friction.velocity_threshold
         if threshold is not None and len(threshold) != n:
             raise ValueError(f"friction.velocity_threshold: expected {n} numbers")
+        smoothing = self.friction.sign_smoothing
+        if isinstance(smoothing, tuple) and len(smoothing) != n:
+            raise ValueError(f"friction.sign_smoothing: expected one number or {n}")
         if self.controller is not None and not len(self.controller.kp) == len(self.controller.kv) == n:
             raise ValueError(f"controller: expected {n} numbers in kp and in kv")
         return self
@@ -278,6 +289,17 @@ class RobotConfig(FrozenModel):
     def n(self) -> int:
         """Number of joints."""
         return len(self.joints)
+
+    @property
+    def sign_smoothing(self) -> NDArray[np.float64]:
+        """``g`` (n,) of the smoothed sign of each joint, s/rad or s/m; nominal values where the configuration has none.
+
+        A coupling of two joints has the smaller of their two values.
+        """
+        given = self.friction.sign_smoothing
+        if given is None:
+            given = tuple(NOMINAL_SIGN_SMOOTHING[joint.type] for joint in self.joints)
+        return np.broadcast_to(np.asarray(given, dtype=np.float64), (self.n,)).copy()
 
     @property
     def transmission_matrix(self) -> NDArray[np.float64]:

@@ -223,6 +223,7 @@ def _diagnose(
         not_visible=undetectable(first),
         detection_limits=limits,
         simulated=simulated.document(),
+        sign_smoothing=dict(zip(study.joints, map(float, study.robot.sign_smoothing), strict=True)),
     )
     held = final.study.held
     return Diagnosis(

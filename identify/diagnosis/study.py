@@ -18,6 +18,7 @@ from armident.identify.experiment import Experiment
 from armident.identify.identification.auxiliary_loop import closed_loop
 from armident.identify.identification.equations import Prepared, aligned_torque, equations, least_rows
 from armident.identify.identification.options import CONTROLLERS, Options
+from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.motion import Motion
@@ -276,8 +277,9 @@ def build_study(
     if any(abs(e.dt - dt) > 1e-9 * dt for e in experiments):
         raise DataError("the recordings have different sampling rates; diagnose them separately")
     experiments = _continued(experiments)
-    model = arm_model(robot)
     bandwidth = robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
+    given, robot = robot, with_sign_smoothing(robot, experiments, bandwidth)
+    model = arm_model(robot)
     cutoff = min(BAND * bandwidth, 0.25 / dt)
     factor = max(1, int(1.0 / (dt * WORKING_RATE * cutoff)))
     first = design(dt, 0.4 / (dt * factor), factor) if factor > 1 else design(dt, 0.5 / dt, 1)
@@ -286,6 +288,7 @@ def build_study(
         replace(differentiate(e.q, dt, bandwidth_hz=bandwidth), start=e.start) for e in experiments
     ]
     simulated, loop, auxiliary, warnings = _simulated(model, experiments, signals, bandwidth)
+    warnings += unsaturated_joints(given, robot, experiments, bandwidth)
     train: list[Stretch] = []
     held: list[Stretch] = []
     for k, (e, s, z) in enumerate(zip(experiments, signals, simulated, strict=True)):

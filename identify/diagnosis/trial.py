@@ -89,7 +89,10 @@ class Trial:
     @property
     def forbidden(self) -> bool:
         """True if a linear parameter has a sign or a size that physics does not allow."""
-        return not self.candidate.effect.allows(self.values, self.std, dict(self.shapes))
+        largest: dict[str, float] = {}
+        for name, value in (pair for shapes in self.candidate.grid for pair in shapes):
+            largest[name] = max(value, largest.get(name, value))
+        return not self.candidate.effect.allows(self.values, self.std, dict(self.shapes), largest)
 
     @property
     def p_value(self) -> float:

@@ -21,6 +21,7 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.effects.wiring import SIGNALS, exchanges
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import aligned_torque, least_rows
+from armident.identify.identification.sign_smoothing import with_sign_smoothing
 from armident.identify.identification.solvers import decimation_of
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandwidth import motion_bandwidth
@@ -276,8 +277,8 @@ def _bench(experiments: Sequence[Experiment], robot: RobotConfig) -> _Bench:
     dt = experiments[0].dt
     if any(abs(e.dt - dt) > 1e-9 * dt for e in experiments):
         raise DataError("the recordings have different sampling rates; check their wiring separately")
-    model = arm_model(robot).without_terms()
     bandwidth = robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
+    model = arm_model(with_sign_smoothing(robot, experiments, bandwidth)).without_terms()
     wanted = decimation_of(
         "idim-ls", dt, bandwidth, None, samples=[e.q.shape[0] for e in experiments], rows=least_rows(model)
     )

@@ -164,8 +164,8 @@ class Effect:
         True if the arm's motion has jumps at instants that a simulation does not reproduce to the sample. The columns
         at measured signals are then their own instruments, and a higher threshold accounts for the feedback bias.
     physical
-        ``(values, shapes)`` to True if linear parameters (k,) are physically possible at given nonlinear ones, beyond
-        signs and bounds.
+        ``(values, shapes, largest)`` to True if linear parameters (k,) are physically possible at given nonlinear ones,
+        beyond signs and bounds; ``largest`` has the largest values of the nonlinear ones in the grid of the motion.
     negligible
         ``(values, dt)`` to True if linear parameters (k,) are within the sampling convention at the sampling period
         ``dt``, s; ``None``: never.
@@ -189,10 +189,12 @@ class Effect:
     share: bool = False
     undo: Callable[[Array, Recorded, float], Array] | None = None
     sudden: bool = False
-    physical: Callable[[Array, Mapping[str, float]], bool] | None = None
+    physical: Callable[[Array, Mapping[str, float], Mapping[str, float]], bool] | None = None
     negligible: Callable[[Array, float], bool] | None = None
 
-    def allows(self, values: Array, std: Array, shapes: Mapping[str, float]) -> bool:
+    def allows(
+        self, values: Array, std: Array, shapes: Mapping[str, float], largest: Mapping[str, float] | None = None
+    ) -> bool:
         """Return True if linear parameters (k,) with standard deviations (k,) are physically possible.
 
         Signs and bounds may be violated by `SIGN_TOLERANCE` standard deviations: single parameters may be zero.
@@ -203,8 +205,10 @@ class Effect:
             Linear parameters and their standard deviations, (k,) each.
         shapes
             Nonlinear parameters by name.
+        largest
+            Largest value of each nonlinear parameter in the grid of the motion; ``None``: as ``shapes``.
         """
-        if self.physical is not None and not self.physical(values, shapes):
+        if self.physical is not None and not self.physical(values, shapes, largest or shapes):
             return False
         return all(
             p.sign * value >= -SIGN_TOLERANCE * deviation

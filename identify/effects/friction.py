@@ -13,8 +13,11 @@ from armident.identify.robot.motion import Motion
 Array = NDArray[np.float64]
 
 TORQUE = ("N m", "N")
-LATE = 0.1
-"""Lowest knee, over the speed limit, at which nonlinear viscous friction may be negative (shear thickening)."""
+LATE = 0.3
+"""Lowest speed, over the largest one tried, at which nonlinear viscous friction may be negative (shear thickening).
+
+The largest one tried is a third of the joint's top speed.
+"""
 VISCOUS = ("N m s/rad", "N s/m")
 
 
@@ -44,7 +47,7 @@ def _asymmetric_coulomb(motion: Motion, place: Place, *, velocity: float = 0.0) 
 
 
 def films(motion: Motion, joint: int) -> Sequence[float]:
-    """Return speeds from that of the model's smoothed sign to a twentieth of the joint's top speed, rad/s or m/s.
+    """Return speeds from that of the joint's smoothed sign to a twentieth of the joint's top speed, rad/s or m/s.
 
     Parameters
     ----------
@@ -53,7 +56,7 @@ def films(motion: Motion, joint: int) -> Sequence[float]:
     joint
         Index of the joint, from 0.
     """
-    least, most = 1 / motion.model.smoothing, 0.05 * float(motion.top_speed[joint])
+    least, most = 1 / float(motion.model.smoothing[joint]), 0.05 * float(motion.top_speed[joint])
     return [float(v) for v in np.geomspace(least, most, 5)] if most > least else [least]
 
 
@@ -78,31 +81,15 @@ def bristles(motion: Motion, joint: int) -> Sequence[float]:
     return [float(d) for d in motion.span[joint] * np.geomspace(3e-6, 3e-4, 4)]
 
 
-def _nonlinear_viscous(motion: Motion, place: Place, *, knee: float) -> Array:
-    j = place.joint
-    # Normalised by the speed limit, so that the parameter is a torque for any knee.
-    share = motion.qd[:, j] / motion.model.robot.joints[j].limits.velocity
-    curved: Array = np.arcsinh(share / knee) / np.arcsinh(1.0 / knee)
+def _nonlinear_viscous(motion: Motion, place: Place, *, velocity: float) -> Array:
+    """Return Eyring's law, ``asinh(qd / velocity)``; linear up to ``velocity``, logarithmic above."""
+    curved: Array = np.arcsinh(motion.qd[:, place.joint] / velocity)
     return curved[:, None]
 
 
-def knees(motion: Motion, joint: int) -> Sequence[float]:
-    """Return knees from a hundredth of the joint's top speed to a third of it, as shares of its speed limit.
-
-    Parameters
-    ----------
-    motion
-        Motion of the arm.
-    joint
-        Index of the joint, from 0.
-    """
-    limit = motion.model.robot.joints[joint].limits.velocity
-    return [speed / limit for speed in speeds(motion, joint)]
-
-
-def _rises_from_rest(values: Array, shapes: Mapping[str, float]) -> bool:
-    """Return False for a negative value with a low knee: that shape is additional friction at low speed (Stribeck)."""
-    return bool(shapes["knee"] >= LATE or values[0] >= 0.0)
+def _rises_from_rest(values: Array, shapes: Mapping[str, float], largest: Mapping[str, float]) -> bool:
+    """Return False for a negative value with a low speed: that shape is additional friction at low speed (Stribeck)."""
+    return bool(shapes["velocity"] >= LATE * largest["velocity"] or values[0] >= 0.0)
 
 
 def _load_dependent(motion: Motion, place: Place, *, rotor: float = 0.0) -> Array:
@@ -148,7 +135,7 @@ def _position_dependent(motion: Motion, place: Place, *, period: float) -> Array
 def turns(motion: Motion, joint: int) -> Sequence[float]:
     """Return periods in the joint's position, rad or m: fractions of a turn, or of the travel of a prismatic axis.
 
-    The fractions are 1, 1/2, 1/3 and 1/4.
+    The fractions are 1, 1/2, 1/3 and 1/4. The travel is that of the motion.
 
     Parameters
     ----------
@@ -159,8 +146,7 @@ def turns(motion: Motion, joint: int) -> Sequence[float]:
     """
     if motion.model.robot.joints[joint].type == "revolute":
         return [2 * np.pi / k for k in (4, 3, 2, 1)]
-    low, high = motion.model.robot.joints[joint].limits.position
-    return [(high - low) / k for k in (4, 3, 2, 1)]
+    return [float(motion.span[joint]) / k for k in (4, 3, 2, 1)]
 
 
 def _drift(motion: Motion, place: Place, *, time_constant: float) -> Array:
@@ -187,12 +173,12 @@ def warming(motion: Motion, joint: int) -> Sequence[float]:
 def _coupling(motion: Motion, place: Place) -> Array:
     first, second = place.joint, place.other
     assert second is not None
-    dry = np.sign if motion.sharp else motion.model.smooth_sign
     columns = np.zeros((motion.samples, motion.n, 3))
     for one, two in ((first, second), (second, first)):
         columns[:, one, 0] = motion.qdd[:, two]
         columns[:, one, 1] = motion.qd[:, two]
-        columns[:, one, 2] = dry(motion.qd[:, one] + motion.qd[:, two])
+        both = motion.qd[:, one] + motion.qd[:, two]
+        columns[:, one, 2] = np.sign(both) if motion.sharp else motion.model.smooth_sign(both, (one, two))
     return columns
 
 
@@ -238,7 +224,7 @@ EFFECTS = (
         says="friction is not proportional to speed: shear thinning or churning of the lubricant",
         reference="Ree, Ree, Eyring 1958, Ind. Eng. Chem. 50(7)",
         linear=(Linear("fvn", TORQUE),),
-        shapes=(Shape("knee", ("", ""), knees),),
+        shapes=(Shape("velocity", ("rad/s", "m/s"), speeds),),
         columns=_nonlinear_viscous,
         physical=_rises_from_rest,
         needs="slow and fast motion",

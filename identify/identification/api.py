@@ -11,6 +11,7 @@ from armident.identify.identification.from_recording import experiments_from_rec
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
+from armident.identify.identification.sign_smoothing import with_numbers
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class IdentificationOutcome:
     recordings
         Identified recordings.
     robot
-        Configuration of the robot.
+        Configuration of the robot, with the smoothing of the sign that was used.
     result
         The estimate with its curves.
     document
@@ -65,7 +66,8 @@ def identify_recording(
     robot = robot or recordings[0].robot
     experiments, notes = experiments_of(recordings, robot, name_files=len(recordings) > 1)
     result = identify_experiment(experiments, robot, options or Options(), progress)
-    return IdentificationOutcome(recordings, robot, result, identification_document(result, recordings, robot, notes))
+    document = identification_document(result, recordings, robot, notes)
+    return IdentificationOutcome(recordings, with_numbers(robot, result.sign_smoothing), result, document)
 
 
 def experiments_of(

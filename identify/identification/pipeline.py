@@ -32,6 +32,7 @@ from armident.identify.identification.result import (
     Statistics,
     make_result,
 )
+from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
 from armident.identify.identification.solvers import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
 from armident.identify.identification.torque_delay import HELD, TorqueDelay
 from armident.identify.regression.equations import Estimate, ExperimentEquations
@@ -101,10 +102,12 @@ def _identify(
 
     clock.enter("model", 0.0)
     experiments = put_right(experiments, robot)
-    model = arm_model(robot)
     bandwidth = (
         options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], experiments[0].dt)
     )
+    given, robot = robot, with_sign_smoothing(robot, experiments, bandwidth)
+    warnings += unsaturated_joints(given, robot, experiments, bandwidth)
+    model = arm_model(robot)
 
     clock.enter("derivatives", 0.05)
     signals = _derivatives(experiments, robot, options, bandwidth)

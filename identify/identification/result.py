@@ -56,6 +56,8 @@ class Identification:
         The nearest physically consistent arm; ``None`` if not requested.
     delay
         Delay of the recorded torques against the positions; ``None`` without a reference trajectory.
+    sign_smoothing
+        ``g`` (n,) of each joint's smoothed sign, s/rad or s/m.
     relative_error_pct, relative_error_pct_by_joint
         ``|y - X theta| / |y|`` on the torques decimated to twice the bandwidth, overall and (n,), percent.
     iterations, converged, stop_reason
@@ -89,6 +91,7 @@ class Identification:
     diagnostics: Diagnostics
     physical: ConsistentParameters | None
     delay: TorqueDelay | None
+    sign_smoothing: Array
     relative_error_pct: float
     relative_error_pct_by_joint: Array
     iterations: int
@@ -211,6 +214,7 @@ def make_result(
         diagnostics=statistics.diagnostics,
         physical=statistics.physical,
         delay=statistics.delay,
+        sign_smoothing=model.smoothing,
         relative_error_pct=overall,
         relative_error_pct_by_joint=by_joint,
         iterations=estimate.iterations,

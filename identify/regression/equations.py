@@ -145,7 +145,7 @@ def filtered_regressor(
         motion = model.motion(signals.q, signals.qd, signals.qdd, signals.dt, signals.start, sharp_sign=sharp_sign)
         filtered[:, :, rigid:] = decimation(model.term_regressor(motion))
 
-    smoothing = 0.0 if sharp_sign else model.smoothing
+    smoothing = np.zeros(model.n) if sharp_sign else model.smoothing
     q, qd, qdd = (np.ascontiguousarray(x, dtype=np.float64) for x in (signals.q, signals.qd, signals.qdd))
 
     def fill(first: int) -> None:

@@ -73,8 +73,8 @@ EFFECT_PARAMETERS: dict[str, dict[str, str]] = {
         "displacement": "Characteristic displacement of the bristle (Dahl); 0: no bristle.",
     },
     "nonlinear_viscous_friction": {
-        "fvn": "Nonlinear part of the viscous friction at the speed limit of the joint.",
-        "knee": "Speed at which the curve bends, as a share of the speed limit.",
+        "fvn": "Nonlinear part of the viscous friction: `fvn asinh(qd / velocity)` (Eyring).",
+        "velocity": "Velocity at which the curve bends: linear below, logarithmic above.",
     },
     "load_dependent_friction": {
         "fcl": "Coulomb friction per transmitted torque.",

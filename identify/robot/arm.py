@@ -39,7 +39,8 @@ class ArmModel:
     """Inverse dynamic model ``tau = phi(q, qd, qdd) theta`` of a serial arm (thesis equations 2.3, 2.8).
 
     All quantities are joint side and SI. Friction is ``fv qd + fc sign(qd) + off`` (2.7). Unless ``sharp_sign`` is
-    true, the sign is ``(2/pi) atan(g qd)`` with the ``sign_smoothing`` g of the robot configuration (section B.2).
+    true, the sign is ``(2/pi) atan(g qd)`` with the ``sign_smoothing`` g of each joint in the robot configuration
+    (section B.2).
 
     Terms add torques that are linear in e further parameters: the last ones of ``names`` and of ``base.names``.
     The mass matrix, the Newton-Euler recursion and the simulation step omit these terms.
@@ -105,9 +106,9 @@ class ArmModel:
         return self.robot.n
 
     @property
-    def smoothing(self) -> float:
-        """``g`` of the smoothed sign, s/rad or s/m."""
-        return self.robot.friction.sign_smoothing
+    def smoothing(self) -> Floats:
+        """``g`` of each joint's smoothed sign, s/rad or s/m, (n,)."""
+        return self.robot.sign_smoothing
 
     @property
     def e(self) -> int:
@@ -136,9 +137,19 @@ class ArmModel:
         """Return the model under another gravity vector (3,) in the base frame, m/s^2."""
         return replace(self, chain=self.chain._replace(gravity=np.asarray(gravity, dtype=np.float64)))
 
-    def smooth_sign(self, qd: Floats) -> Floats:
-        """``(2/pi) atan(g qd)`` of joint velocities in rad/s or m/s, any shape (thesis appendix B.2)."""
-        smooth: Floats = 2 / np.pi * np.arctan(self.smoothing * qd)
+    def smooth_sign(self, qd: Floats, joints: tuple[int, ...] | None = None) -> Floats:
+        """``(2/pi) atan(g qd)`` of velocities (thesis appendix B.2).
+
+        Parameters
+        ----------
+        qd
+            Velocities, rad/s or m/s: of all joints, (..., n), or, with ``joints``, one series of any shape.
+        joints
+            Joints, from 0, to whose friction the series belongs: one, or the two of a coupling, which has the smaller
+            ``g`` of both.
+        """
+        g = self.smoothing if joints is None else self.smoothing[list(joints)].min()
+        smooth: Floats = 2 / np.pi * np.arctan(g * qd)
         return smooth
 
     def motion(
@@ -258,7 +269,7 @@ class ArmModel:
         """
         q, qd, qdd = self._motion(q, qd, qdd)
         out = np.empty_like(q)
-        smoothing = 0.0 if sharp_sign else self.smoothing
+        smoothing = np.zeros(self.n) if sharp_sign else self.smoothing
         fill_inverse_dynamics(self.chain, self.values(theta), smoothing, q, qd, qdd, out)
         return out
 
@@ -348,7 +359,7 @@ class ArmModel:
         if given is not None and given.shape != shape:
             raise ValueError(f"out has shape {given.shape}; expected {shape}")
         out = np.zeros(shape) if given is None else given
-        smoothing = 0.0 if sharp_sign else self.smoothing
+        smoothing = np.zeros(self.n) if sharp_sign else self.smoothing
 
         def fill(first: int) -> None:
             rows = slice(first, first + PIECE)

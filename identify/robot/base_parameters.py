@@ -185,7 +185,7 @@ def independent_columns(
     samples = 20 + 3 * p // n
     q, qd, qdd = (rng.uniform(-scale, scale, (samples, n)) for scale in (np.pi, 2.0, 4.0))
     regressor = np.zeros((samples, n, p))
-    fill_regressor(chain, columns, 0.0, q, qd, qdd, regressor)
+    fill_regressor(chain, columns, np.zeros(robot.n), q, qd, qdd, regressor)
     x = regressor.reshape(samples * n, p)[:, candidates]
     scale = np.linalg.norm(x, axis=0)
     alive = scale > RANK_TOLERANCE * scale.max()

@@ -78,7 +78,7 @@ class Values(NamedTuple):
     coupling
         Inertia, viscous and Coulomb friction of each coupling, (c, 3).
     smoothing
-        ``g`` of the smoothed sign, s/rad or s/m.
+        ``g`` of each joint's smoothed sign, s/rad or s/m, (n,); a coupling has the smaller one of its two joints.
     """
 
     inertial: Floats
@@ -88,7 +88,7 @@ class Values(NamedTuple):
     off: Floats
     coupling_joints: Ints
     coupling: Floats
-    smoothing: float
+    smoothing: Floats
 
 
 def cos_sin(angle: float) -> tuple[float, float]:
@@ -160,7 +160,7 @@ def columns_of(robot: RobotConfig, names: tuple[str, ...]) -> Columns:
     )
 
 
-def values_of(columns: Columns, theta: Floats, smoothing: float) -> Values:
+def values_of(columns: Columns, theta: Floats, smoothing: Floats) -> Values:
     """Parameter values by kind, from a parameter vector; parameters without a column are zero.
 
     Parameters
@@ -170,7 +170,7 @@ def values_of(columns: Columns, theta: Floats, smoothing: float) -> Values:
     theta
         Parameters in SI units; further elements, for instance those of terms, are not used.
     smoothing
-        ``g`` of the smoothed sign, s/rad or s/m.
+        ``g`` of each joint's smoothed sign, s/rad or s/m, (n,).
     """
     padded = np.append(np.asarray(theta, dtype=np.float64), 0.0)
     return Values(

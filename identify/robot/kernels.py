@@ -94,7 +94,7 @@ def turn(n: int, chain: Chain, q: Floats, angle: Floats, sine: Floats, cosine: F
 
 @compiled
 def fill_regressor(
-    chain: Chain, columns: Columns, smoothing: float, q: Floats, qd: Floats, qdd: Floats, out: Floats
+    chain: Chain, columns: Columns, smoothing: Floats, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
     """Compute the regressor of the inverse dynamic model (thesis equation 2.8).
 
@@ -105,7 +105,7 @@ def fill_regressor(
     columns
         Regressor column of each parameter; -1: the parameter is left out.
     smoothing
-        ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
+        ``g`` (n,) of each joint's smoothed sign, s/rad or s/m; 0: the sharp sign.
     q, qd, qdd
         Positions, velocities, accelerations, each (N, n); rad or m, s.
     out
@@ -191,7 +191,7 @@ def fill_regressor(
             if columns.fv[j] >= 0:
                 row[columns.fv[j]] = v
             if columns.fc[j] >= 0:
-                row[columns.fc[j]] = smooth_sign(v, smoothing)
+                row[columns.fc[j]] = smooth_sign(v, smoothing[j])
             if columns.off[j] >= 0:
                 row[columns.off[j]] = 1.0
         for m in range(columns.coupling_joints.shape[0]):
@@ -204,11 +204,12 @@ def fill_regressor(
                 out[k, i, viscous] = qd[k, j]
                 out[k, j, viscous] = qd[k, i]
             if coulomb >= 0:
-                out[k, i, coulomb] = out[k, j, coulomb] = smooth_sign(qd[k, i] + qd[k, j], smoothing)
+                g = min(smoothing[i], smoothing[j])
+                out[k, i, coulomb] = out[k, j, coulomb] = smooth_sign(qd[k, i] + qd[k, j], g)
 
 
 @inlined
-def add_friction(values: Values, smoothing: float, qd: Floats, tau: Floats) -> None:
+def add_friction(values: Values, smoothing: Floats, qd: Floats, tau: Floats) -> None:
     """Add friction, offsets and coupled friction of one sample to its torques (thesis equations 2.7, B.1).
 
     Parameters
@@ -216,7 +217,7 @@ def add_friction(values: Values, smoothing: float, qd: Floats, tau: Floats) -> N
     values
         Parameter values by kind, SI.
     smoothing
-        ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
+        ``g`` (n,) of each joint's smoothed sign, s/rad or s/m; 0: the sharp sign.
     qd
         Joint velocities (n,), rad/s or m/s.
     tau
@@ -225,10 +226,10 @@ def add_friction(values: Values, smoothing: float, qd: Floats, tau: Floats) -> N
     for j in range(qd.size):
         tau[j] += values.fv[j] * qd[j] + values.off[j]
         if values.fc[j] != 0.0:
-            tau[j] += values.fc[j] * smooth_sign(qd[j], smoothing)
+            tau[j] += values.fc[j] * smooth_sign(qd[j], smoothing[j])
     for m in range(values.coupling_joints.shape[0]):
         i, j = values.coupling_joints[m]
-        sign = values.coupling[m, 2] * smooth_sign(qd[i] + qd[j], smoothing)
+        sign = values.coupling[m, 2] * smooth_sign(qd[i] + qd[j], min(smoothing[i], smoothing[j]))
         tau[i] += values.coupling[m, 1] * qd[j] + sign
         tau[j] += values.coupling[m, 1] * qd[i] + sign
 
@@ -420,7 +421,7 @@ def fill_mass_matrix(
 
 @compiled
 def fill_inverse_dynamics(
-    chain: Chain, values: Values, smoothing: float, q: Floats, qd: Floats, qdd: Floats, out: Floats
+    chain: Chain, values: Values, smoothing: Floats, q: Floats, qd: Floats, qdd: Floats, out: Floats
 ) -> None:
     """Compute the joint torques along a motion, with friction, rotors and couplings.
 
@@ -431,7 +432,7 @@ def fill_inverse_dynamics(
     values
         Parameter values by kind, SI.
     smoothing
-        ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
+        ``g`` (n,) of each joint's smoothed sign, s/rad or s/m; 0: the sharp sign.
     q, qd, qdd
         Positions, velocities, accelerations, each (N, n); rad or m, s.
     out
@@ -537,7 +538,7 @@ def solve_factored(factor: Floats, n: int, x: Floats) -> None:
 
 @compiled
 def fill_forward_dynamics(
-    chain: Chain, values: Values, smoothing: float, q: Floats, qd: Floats, tau: Floats, out: Floats
+    chain: Chain, values: Values, smoothing: Floats, q: Floats, qd: Floats, tau: Floats, out: Floats
 ) -> int:
     """Compute the joint accelerations of the direct dynamic model (thesis equation 2.9).
 
@@ -548,7 +549,7 @@ def fill_forward_dynamics(
     values
         Parameter values by kind, SI.
     smoothing
-        ``g`` of the smoothed sign, s/rad or s/m; 0: the sharp sign.
+        ``g`` (n,) of each joint's smoothed sign, s/rad or s/m; 0: the sharp sign.
     q, qd
         Positions and velocities, each (N, n); rad or m, s.
     tau

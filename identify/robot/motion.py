@@ -24,11 +24,10 @@ POSTURES = 64
 
 
 @cache
-def _spread(limits: tuple[tuple[float, float], ...]) -> Array:
-    """Points (P, n) of the Halton sequence between the limits of each joint, rad or m."""
-    points = qmc.Halton(len(limits), scramble=False).random(POSTURES)
-    low, high = np.array(limits).T
-    return np.ascontiguousarray(low + points * (high - low))
+def _spread(revolute: tuple[bool, ...]) -> Array:
+    """Points (P, n) of the Halton sequence over a turn of each revolute joint, rad; prismatic joints are at zero."""
+    points = qmc.Halton(len(revolute), scramble=False).random(POSTURES)
+    return np.ascontiguousarray(np.where(revolute, np.pi * (2.0 * points - 1.0), 0.0))
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class Motion:
     Parameters
     ----------
     model
-        Arm model; effects use its geometry, transmission, limits and smoothing of the sign.
+        Arm model; effects use its geometry, transmission and smoothing of the sign.
     q, qd, qdd
         Positions, velocities, accelerations, (N, n) each; rad or m, s.
     dt
@@ -109,8 +108,11 @@ class Motion:
 
     @property
     def postures(self) -> Array:
-        """Postures spread evenly over the ranges of the joints, independent of the motion, rad or m, (P, n)."""
-        return _spread(tuple(joint.limits.position for joint in self.model.robot.joints))
+        """Postures spread evenly over a turn of every revolute joint, the same for every motion, rad or m, (P, n).
+
+        They do not depend on the configured limits either; prismatic joints are at zero.
+        """
+        return _spread(tuple(joint.type == "revolute" for joint in self.model.robot.joints))
 
     @cached_property
     def span(self) -> Array:

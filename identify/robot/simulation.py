@@ -191,19 +191,20 @@ def friction(
     """
     g = values.smoothing
     for j in range(n):
-        x[j] = g * v[j]
+        x[j] = g[j] * v[j]
     for m in range(pairs):
-        x[n + m] = g * (v[values.coupling_joints[m, 0]] + v[values.coupling_joints[m, 1]])
+        i, j = values.coupling_joints[m, 0], values.coupling_joints[m, 1]
+        x[n + m] = min(g[i], g[j]) * (v[i] + v[j])
     arctangents(x, bend, steep)
     for j in range(n):
         coulomb = TWO_OVER_PI * values.fc[j]
         force[j] = values.off[j] + values.fv[j] * v[j] + coulomb * bend[j]
-        slope[j] = values.fv[j] + coulomb * g * steep[j]
+        slope[j] = values.fv[j] + coulomb * g[j] * steep[j]
     for m in range(pairs):
         i, j = values.coupling_joints[m, 0], values.coupling_joints[m, 1]
         coulomb = TWO_OVER_PI * values.coupling[m, 2]
         common = coulomb * bend[n + m]
-        pair = coulomb * g * steep[n + m]
+        pair = coulomb * min(g[i], g[j]) * steep[n + m]
         force[i] += values.coupling[m, 1] * v[j] + common
         force[j] += values.coupling[m, 1] * v[i] + common
         slope[i] += pair
@@ -228,12 +229,13 @@ def divisions(n: int, pairs: int, values: Values, v: Floats, a: Floats, dt: floa
     """
     most = 1
     for j in range(n):
-        x, dx = values.smoothing * v[j], values.smoothing * a[j] * dt
+        x, dx = values.smoothing[j] * v[j], values.smoothing[j] * a[j] * dt
         if values.fc[j] != 0.0 and abs(x) < abs(dx) + NEAR_STANDSTILL:
             most = max(most, 1 + int(STEPS_PER_UNIT * abs(dx)))
     for m in range(pairs):
         i, j = values.coupling_joints[m]
-        x, dx = values.smoothing * (v[i] + v[j]), values.smoothing * (a[i] + a[j]) * dt
+        g = min(values.smoothing[i], values.smoothing[j])
+        x, dx = g * (v[i] + v[j]), g * (a[i] + a[j]) * dt
         if values.coupling[m, 2] != 0.0 and abs(x) < abs(dx) + NEAR_STANDSTILL:
             most = max(most, 1 + int(STEPS_PER_UNIT * abs(dx)))
     return min(most, MOST_STEPS)

@@ -53,11 +53,8 @@ def _highest(dt: float) -> float:
 
 def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
     """Frequency (Hz) below which ``POWER_SHARE`` of the fastest joint's velocity power lies; 0 if no joint moves."""
-    frequency, power = signal.periodogram(np.diff(q, axis=0) / dt, 1 / dt, window="hann", axis=0)
-    frequency, power = frequency[1:], power[1:]
-    position = power / (2 - 2 * np.cos(2 * np.pi * frequency * dt))[:, None]
-    # The power of white noise at one frequency is exponentially distributed: its median is log(2) times its mean.
-    floor = np.median(position[frequency >= 0.25 / dt], axis=0) / np.log(2)
+    frequency, power, position = _spectra(q, dt)
+    floor = _noise_floor(frequency, position, dt)
     moving = (position > SIGNIFICANT * floor) & (frequency <= _highest(dt))[:, None]
     cumulative = np.cumsum(np.where(moving, power, 0.0), axis=0)
     highest = 0.0
@@ -65,3 +62,34 @@ def _velocity_bandwidth(q: NDArray[np.float64], dt: float) -> float:
         reached = np.searchsorted(cumulative[:, j], POWER_SHARE * cumulative[-1, j])
         highest = max(highest, float(frequency[reached]))
     return highest
+
+
+def position_noise(q: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+    """Standard deviation of the white noise of measured positions, rad or m, (n,).
+
+    Parameters
+    ----------
+    q
+        Measured positions, (N, n), rad or m.
+    dt
+        Sampling period, s.
+    """
+    frequency, _, position = _spectra(q, dt)
+    noise: NDArray[np.float64] = np.sqrt(_noise_floor(frequency, position, dt) * 0.5 * dt)
+    return noise
+
+
+def _spectra(q: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Frequencies (F,), Hz, above 0, and spectral densities (F, n) of differences and positions over ``dt``."""
+    frequency, power = signal.periodogram(np.diff(q, axis=0) / dt, 1 / dt, window="hann", axis=0)
+    frequency, power = frequency[1:], power[1:]
+    return frequency, power, power / (2 - 2 * np.cos(2 * np.pi * frequency * dt))[:, None]
+
+
+def _noise_floor(frequency: NDArray[np.float64], position: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
+    """Density (n,) of white noise, from the upper half of the spectrum of positions over ``dt``.
+
+    The power of white noise at one frequency is exponentially distributed: its median is log(2) times its mean.
+    """
+    floor: NDArray[np.float64] = np.median(position[frequency >= 0.25 / dt], axis=0) / np.log(2)
+    return floor

@@ -79,7 +79,7 @@ def _python_loop(
 
     def acceleration(q: Floats, qd: Floats, tau: Floats) -> Any:
         friction = values.fv * qd + values.fc * (2 / np.pi) * np.arctan(g * qd)
-        common = coulomb * (2 / np.pi) * np.arctan(g * (qd[i] + qd[j]))
+        common = coulomb * (2 / np.pi) * np.arctan(min(g[i], g[j]) * (qd[i] + qd[j]))
         friction[i] += viscous * qd[j] + common
         friction[j] += viscous * qd[i] + common
         return pin.aba(oracle, data, q, qd, tau - friction).copy()

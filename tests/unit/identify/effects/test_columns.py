@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 
 from armident.configs import load_robot
 from armident.configs.schema.robot import Effect as Stanza
+from armident.configs.schema.robot import Limits
 from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import dahl
 from armident.identify.effects.recorded import put_right
@@ -60,12 +61,12 @@ def columns(name: str, motion: Motion, joint: int = 0, other: int | None = None,
 
 
 def sign(motion: Motion, joint: int = 0) -> Any:
-    return 2 / np.pi * np.arctan(motion.model.smoothing * motion.qd[:, joint])
+    return 2 / np.pi * np.arctan(motion.model.smoothing[joint] * motion.qd[:, joint])
 
 
 def test_viscous_friction_differs_between_the_directions(axis: Motion) -> None:
     found = columns("asymmetric_viscous_friction", axis)[:, 0, 0]
-    np.testing.assert_allclose(found, np.abs(axis.qd[:, 0]), atol=2 / (np.pi * axis.model.smoothing))
+    np.testing.assert_allclose(found, np.abs(axis.qd[:, 0]), atol=2 / (np.pi * axis.model.smoothing[0]))
 
 
 def test_dry_friction_that_differs_between_the_directions_is_constant_but_at_standstill(axis: Motion) -> None:
@@ -98,17 +99,23 @@ def test_a_bristle_of_stribeck_friction_carries_the_dry_friction_of_the_model(ax
     assert not columns("stribeck_friction", axis, velocity=0.03)[:, 0, 1].any()
 
 
-@pytest.mark.parametrize("knee", [0.02, 0.2])
-def test_curved_viscous_friction_is_the_parameter_at_top_speed(axis: Motion, knee: float) -> None:
-    top = axis.model.robot.joints[0].limits.velocity
-    steady = Motion(axis.model, axis.q, np.full_like(axis.qd, -top), axis.qdd, DT, 0.0, axis.theta, 5.0)
-    found = columns("nonlinear_viscous_friction", steady, knee=knee)[:, 0, 0]
-    np.testing.assert_allclose(found, -1.0)
-    half = Motion(axis.model, axis.q, np.full_like(axis.qd, top / 2), axis.qdd, DT, 0.0, axis.theta, 5.0)
-    found = columns("nonlinear_viscous_friction", half, knee=knee)[:, 0, 0]
-    # asinh(x) = log(x + sqrt(x^2 + 1))
-    x, one = 0.5 / knee, 1.0 / knee
-    np.testing.assert_allclose(found, np.log(x + np.sqrt(x**2 + 1)) / np.log(one + np.sqrt(one**2 + 1)))
+def test_curved_viscous_friction_is_eyrings_law(axis: Motion) -> None:
+    found = columns("nonlinear_viscous_friction", axis, velocity=0.02)[:, 0, 0]
+    # asinh(x) = log(x + sqrt(x^2 + 1)), an odd function.
+    x = np.abs(axis.qd[:, 0]) / 0.02
+    np.testing.assert_allclose(found, np.sign(axis.qd[:, 0]) * np.log(x + np.sqrt(x**2 + 1)), atol=1e-12)
+
+
+def test_no_nonlinear_parameter_depends_on_the_configured_limits(axis: Motion) -> None:
+    robot = axis.model.robot
+    limits = Limits(position=(-9.0, 5.0), velocity=7.0, acceleration=300.0, torque=4000.0)
+    wider = arm_model(robot.model_copy(update={"joints": (robot.joints[0].model_copy(update={"limits": limits}),)}))
+    other = replace(axis, model=wider)
+    for name, effect in catalogue().items():
+        if effect.scope == "pair" or effect.rewires:
+            continue
+        for shape in effect.shapes:
+            assert list(shape.grid(axis, 0)) == list(shape.grid(other, 0)), (name, shape.name)
 
 
 def test_load_dependent_friction_goes_with_what_the_link_takes(axis: Motion) -> None:
@@ -166,7 +173,7 @@ def test_drift_changes_friction_once_over_the_recording(axis: Motion, time_const
 def test_coupled_joints_feel_each_other(arm: Motion) -> None:
     found = columns("coupling_friction", arm, 1, 3)
     assert not found[:, [0, 2, 4, 5]].any()
-    shaft = 2 / np.pi * np.arctan(arm.model.smoothing * (arm.qd[:, 1] + arm.qd[:, 3]))
+    shaft = 2 / np.pi * np.arctan(arm.model.smoothing[[1, 3]].min() * (arm.qd[:, 1] + arm.qd[:, 3]))
     for one, two in ((1, 3), (3, 1)):
         np.testing.assert_allclose(found[:, one], np.stack([arm.qdd[:, two], arm.qd[:, two], shaft], axis=1))
 

@@ -6,10 +6,10 @@ import pytest
 from armident.identify.effects.registry import known
 
 
-@pytest.mark.parametrize(("value", "knee", "allowed"), [(-5.0, 0.02, False), (5.0, 0.02, True), (-5.0, 0.3, True)])
-def test_friction_does_not_fall_from_standstill(value: float, knee: float, allowed: bool) -> None:
+@pytest.mark.parametrize(("value", "velocity", "allowed"), [(-5.0, 0.02, False), (5.0, 0.02, True), (-5.0, 0.3, True)])
+def test_friction_does_not_fall_from_standstill(value: float, velocity: float, allowed: bool) -> None:
     effect = known("nonlinear_viscous_friction")
-    assert effect.allows(np.array([value]), np.array([0.1]), {"knee": knee}) is allowed
+    assert effect.allows(np.array([value]), np.array([0.1]), {"velocity": velocity}, {"velocity": 0.35}) is allowed
 
 
 @pytest.mark.parametrize(("inertia", "allowed"), [(-0.0028, True), (-0.055, False), (0.055, True)])

@@ -1,0 +1,162 @@
+"""Smoothing of the sign of each joint's velocity, chosen from the recorded motion (thesis appendix B.2).
+
+``sign(qd)`` is ``(2/pi) atan(g qd)`` in regressors and simulations. The width ``1/g`` is a velocity and belongs to the
+speeds of the joint: 150 s/rad saturates on a wrist of some rad/s, but not on a lift of some centimetres per second.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import RobotConfig
+from armident.identify.experiment import Experiment
+from armident.identify.signals.bandpass import butterworth, central_difference
+from armident.identify.signals.bandwidth import position_noise
+
+SATURATION = 450.0
+"""``g`` times the top speed of the joint.
+
+Source: the thesis finds 150 s/rad sufficient for all joints of the TX40 (appendix B.2), so also for the slowest one,
+whose top speed is 3.1 rad/s (joint 5 of `tx40_4.yaml`, 99 % quantile; all joints of its four trajectories: 3.1 to
+9.3 rad/s). "The value depends especially on the velocity range of the trajectory" (below equation 2.7). The smoothed
+sign reaches 0.99 at 14 % of the top speed.
+"""
+
+TOP_QUANTILE = 0.99
+"""Quantile of the absolute velocity that counts as the top speed."""
+
+SATURATED = 0.98
+"""Least smoothed sign at the root mean square velocity of a joint; below it a warning names the joint.
+
+The missing part of Coulomb friction, ``2 / (pi g qd)``, varies with the velocity, and viscous friction absorbs it: a
+lift at 150 s/m and 0.1 m/s rms misses 4 %, and its viscous friction comes out at 45 instead of 60 N s/m.
+"""
+
+LARGEST_CUTOFF = 0.45
+"""Highest cut-off of the velocity filter, over the sampling rate."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """Velocities of each joint in the recordings, rad/s or m/s, shape (n,) each.
+
+    Parameters
+    ----------
+    top
+        99 % quantile of the absolute velocity.
+    rms
+        Root mean square velocity.
+    noise
+        Standard deviation of the velocity that the noise of the encoder causes after the same filter.
+    """
+
+    top: Array
+    rms: Array
+    noise: Array
+
+
+def recorded_speeds(experiments: Sequence[Experiment], bandwidth_hz: float) -> Speeds:
+    """Velocities of each joint, after a zero-phase low-pass at the closed-loop bandwidth.
+
+    Parameters
+    ----------
+    experiments
+        Recordings.
+    bandwidth_hz
+        Closed-loop bandwidth, Hz.
+    """
+    speeds, noise = [], []
+    for e in experiments:
+        cutoff = min(bandwidth_hz, LARGEST_CUTOFF / e.dt)
+        speeds.append(np.abs(central_difference(butterworth(e.q, e.dt, cutoff), e.dt)))
+        # White noise has the density 2 var dt per Hz; differentiated up to the cut-off, its variance is this integral.
+        noise.append(position_noise(e.q, e.dt) * np.sqrt(8 / 3 * e.dt * np.pi**2 * cutoff**3))
+    together = np.concatenate(speeds)
+    return Speeds(
+        np.quantile(together, TOP_QUANTILE, axis=0), np.sqrt(np.mean(together**2, axis=0)), np.max(noise, axis=0)
+    )
+
+
+def with_sign_smoothing(robot: RobotConfig, experiments: Sequence[Experiment], bandwidth_hz: float) -> RobotConfig:
+    """Return the configuration with a number for each joint's ``friction.sign_smoothing``.
+
+    The width ``1/g`` is ``1 / SATURATION`` of the joint's top speed. It is not below the noise of the measured
+    velocity: the sign of a narrower one would be that of the noise. A joint without any motion keeps the nominal value.
+
+    Parameters
+    ----------
+    robot
+        Configuration; it is returned as it is where it gives the smoothing.
+    experiments
+        Recordings, corrected for wiring errors.
+    bandwidth_hz
+        Closed-loop bandwidth, Hz.
+    """
+    if robot.friction.sign_smoothing is not None:
+        return robot
+    speeds = recorded_speeds(experiments, bandwidth_hz)
+    width = np.maximum(speeds.top / SATURATION, speeds.noise)
+    # Four digits: the choice is one of scale, and the document shows the number that was used.
+    chosen = [
+        float(f"{1 / w:.4g}") if w > 0 else float(nominal)
+        for w, nominal in zip(width, robot.sign_smoothing, strict=True)
+    ]
+    return with_numbers(robot, chosen)
+
+
+def with_numbers(robot: RobotConfig, smoothing: Sequence[float] | Array) -> RobotConfig:
+    """Return the configuration with numbers for ``friction.sign_smoothing`` where it gives none.
+
+    Parameters
+    ----------
+    robot
+        Configuration; it is returned as it is where it gives the smoothing.
+    smoothing
+        ``g`` of each joint, s/rad or s/m, (n,).
+    """
+    if robot.friction.sign_smoothing is not None:
+        return robot
+    numbers = tuple(float(g) for g in smoothing)
+    return robot.model_copy(update={"friction": robot.friction.model_copy(update={"sign_smoothing": numbers})})
+
+
+def unsaturated_joints(
+    given: RobotConfig, robot: RobotConfig, experiments: Sequence[Experiment], bandwidth_hz: float
+) -> list[str]:
+    """Warnings for joints that move so slowly that the smoothing of the sign biases their friction.
+
+    Parameters
+    ----------
+    given
+        Configuration of the user.
+    robot
+        Configuration with numbers, from `with_sign_smoothing`.
+    experiments
+        Recordings.
+    bandwidth_hz
+        Closed-loop bandwidth, Hz.
+    """
+    speeds = recorded_speeds(experiments, bandwidth_hz)
+    reached = 2 / np.pi * np.arctan(robot.sign_smoothing * speeds.rms)
+    warnings = []
+    for j, joint in enumerate(robot.joints):
+        if reached[j] >= SATURATED or speeds.rms[j] == 0.0:
+            continue
+        unit = "s/rad" if joint.type == "revolute" else "s/m"
+        wanted = SATURATION / max(float(speeds.top[j]), 1e-300)
+        change = given.friction.sign_smoothing is not None and speeds.top[j] / SATURATION > speeds.noise[j]
+        remedy = (
+            f"leave friction.sign_smoothing out, or set {wanted:.3g} {unit} for this joint"
+            if change
+            else "record faster motion of this joint"
+        )
+        warnings.append(
+            f"{joint.name}: the smoothed sign (g = {robot.sign_smoothing[j]:.4g} {unit}) reaches only "
+            f"{100 * reached[j]:.0f} % at the joint's rms velocity: Coulomb and viscous friction are biased. "
+            f"Next: {remedy}."
+        )
+    return warnings
