@@ -23,7 +23,7 @@ from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
-from armident.identify.signals.differentiate import Derivatives
+from armident.identify.signals.differentiate import Derivatives, differentiate
 
 RUNAWAY = 3.0
 """Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged."""
@@ -123,6 +123,7 @@ def closed_loop(
                 # Methods without a measured regressor have the torque's band in both their sides.
                 band_hz=PIV_CUTOFF * bandwidth if options.method in MEASURED else np.inf,
                 starts=[e.start for e in experiments],
+                measured=_bandpassed(options, bandwidth, dt),
             )
             runs = auxiliary.simulate(start)
             if runs is None:
@@ -142,6 +143,17 @@ def closed_loop(
         return ClosedLoop(instruments, ls, {"kind": "followed", "reason": reason}, (reason,))
     loop = closest[1]
     return loop._replace(warnings=(loop.controller["reason"],)) if loop.controller["kind"] == "nominal" else loop
+
+
+def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Array, int], Derivatives] | None:
+    """The bandpass of the measured positions, for the instruments; ``None`` where another filter was chosen.
+
+    Without it the instruments of IDIM-PIV hold frequencies that the measured regressor lacks, and the prefilter takes
+    them for information.
+    """
+    if options.derivatives != "bandpass" or options.method not in MEASURED:
+        return None
+    return lambda q, _: differentiate(q, dt, "bandpass", bandwidth_hz=bandwidth)
 
 
 def velocity_error(runs: Sequence[Simulation], signals: Sequence[Derivatives]) -> float:
