@@ -80,7 +80,8 @@ class IdentificationDocument(Document):
 
     ``torque_delay_samples`` has two numbers per joint: the number of samples by which the torque leads the position,
     and its standard deviation. A drive that reports the torque that it holds until the next sample has a lead of 0.5.
-    ``sign_smoothing`` is ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
+    ``sign_smoothing`` is ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m. ``bias`` is the bias by
+    derivatives, encoder noise and sampling that was subtracted from the parameters, null where it is irrelevant.
     """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
@@ -106,6 +107,7 @@ class IdentificationDocument(Document):
     physical: dict[str, Any] | None = None
     torque_delay_samples: dict[str, list[float]] | None = None
     further_recordings: list[RecordingReference] | None = None
+    bias: dict[str, float] | None = None
     sign_smoothing: dict[str, float] | None = None
 
 
@@ -365,6 +367,7 @@ def identification_document(
             for name, samples, std in zip(joints, result.delay.samples, result.delay.std, strict=True)
         },
         further_recordings=[reference(recording) for recording in recordings[1:]] or None,
+        bias=None if result.bias is None else dict(zip(result.names, map(float, result.bias), strict=True)),
         sign_smoothing=dict(zip(joints, (float(g) for g in result.sign_smoothing), strict=True)),
     )
 

@@ -86,6 +86,8 @@ class AuxiliaryModel:
     measured
         ``measured(positions, k)``: derivatives of simulated positions (N, n) of experiment k by the filter of the
         measured ones. ``None``: simulated velocities and accelerations.
+    feedback
+        True if the controller is that of the drives, through which the noise of their encoders passes.
     """
 
     model: ArmModel
@@ -99,6 +101,7 @@ class AuxiliaryModel:
     band_hz: float = np.inf
     starts: Sequence[float] | None = None
     measured: Callable[[NDArray[np.float64], int], Derivatives] | None = None
+    feedback: bool = True
     _last: NDArray[np.float64] | None = None
     _warnings: list[str] = field(default_factory=list)
 
@@ -147,8 +150,18 @@ class AuxiliaryModel:
             max_velocity=self.max_velocity / share,
         )
 
-    def simulate(self, theta: NDArray[np.float64]) -> list[Simulation] | None:
-        """All experiments with these base parameters, or ``None`` if one diverges or theta is not finite."""
+    def simulate(
+        self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
+    ) -> list[Simulation] | None:
+        """All experiments with these base parameters, or ``None`` if one diverges or theta is not finite.
+
+        Parameters
+        ----------
+        theta
+            Base parameters (b,), SI.
+        disturbances
+            Additional motor torques, N m or N, one (N, n) array per experiment.
+        """
         if not np.isfinite(theta).all():
             return None
         runs = []
@@ -160,6 +173,7 @@ class AuxiliaryModel:
                 q_ref,
                 self.dt,
                 start=self._start(k),
+                disturbance=None if disturbances is None else disturbances[k],
                 band_hz=FELT * self.band_hz,
                 q0=q0,
                 qd0=qd0,
@@ -203,9 +217,8 @@ class AuxiliaryModel:
 
     def regressors(self, motions: Sequence[Derivatives]) -> list[NDArray[np.float64]]:
         """Filtered regressor at noise-free motions, one (M, n, b) per experiment."""
-        return [
-            filtered_regressor(self.model, self._in_band(motion, k), self.decimation) for k, motion in enumerate(motions)
-        ]
+        seen = [self._in_band(motion, k) for k, motion in enumerate(motions)]
+        return [filtered_regressor(self.model, motion, self.decimation) for motion in seen]
 
     def equations(self, blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ExperimentEquations]:
         """Equations with the simulated regressor in place of the measured one (2.32).

@@ -16,7 +16,7 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.measured_instruments import MotionInstruments
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import PIV_CUTOFF, Prepared
-from armident.identify.identification.options import Options
+from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.solvers import MEASURED
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
@@ -124,6 +124,7 @@ def closed_loop(
                 band_hz=PIV_CUTOFF * bandwidth if options.method in MEASURED else np.inf,
                 starts=[e.start for e in experiments],
                 measured=_bandpassed(options, bandwidth, dt),
+                feedback=description["kind"] in CONTROLLERS,
             )
             runs = auxiliary.simulate(start)
             if runs is None:

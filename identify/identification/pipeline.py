@@ -33,6 +33,7 @@ from armident.identify.identification.result import (
     make_result,
 )
 from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
+from armident.identify.identification.simulated_bias import RELEVANT, least_squares_bias
 from armident.identify.identification.solvers import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
 from armident.identify.identification.torque_delay import HELD, TorqueDelay
 from armident.identify.regression.equations import Estimate, ExperimentEquations
@@ -118,14 +119,18 @@ def _identify(
     prepared = Prepared(model, experiments, signals)
     ls = _least_squares(prepared, options, bandwidth, warnings)
 
+    doubts: tuple[str, ...] = ()
     if options.method == "idim-ls":
         solution, found = None, MethodResult(ls.estimate, ls.blocks, {"kind": "none"})
+        doubts = _doubts_of_least_squares(prepared, options, ls, bandwidth)
+        warnings += doubts
     else:
         clock.enter("controller", 0.35)
         solution, found = _solve_in_closed_loop(prepared, options, ls, bandwidth, clock, warnings)
 
     clock.enter("statistics", 0.85)
     statistics = _statistics(prepared, found, solution, warnings)
+    statistics = replace(statistics, interval_warnings=(*statistics.interval_warnings, *doubts))
     if options.physical:
         clock.enter("physical", 0.95)
         physical = nearest_consistent(model, found.estimate.theta, found.estimate.covariance)
@@ -146,13 +151,15 @@ def _least_squares(prepared: Prepared, options: Options, bandwidth: float, warni
         return decimation_of("idim-ls", dt, bandwidth, factor, samples=lengths, rows=rows, warnings=warnings)
 
     def estimate(blocks: Sequence[ExperimentEquations]) -> Estimate:
-        return idim_ls(blocks, model.base.names, weighted=options.weighted)
+        order = options.max_ar_order
+        return idim_ls(blocks, model.base.names, weighted=options.weighted, serial_order=order)
 
     # A factor chosen by the user is that of the method; a method with a noise model keeps its own for the comparison.
     factor = options.decimation if isinstance(options.decimation, int) else None
     plain = decimation(None if options.method in PREFILTERED else factor)
     published = model.robot.preprocessing
-    if options.derivatives is None and options.decimation is None and published is not None:
+    as_published = options.derivatives is None and options.decimation is None and published is not None
+    if as_published and published is not None:
         blocks = published_equations(model, experiments, published)
     else:
         blocks = prepared.equations(plain)
@@ -163,7 +170,29 @@ def _least_squares(prepared: Prepared, options: Options, bandwidth: float, warni
             plain = decimation(factor)
             blocks = prepared.equations(plain)
             ls = estimate(blocks)
-    return LeastSquares(ls, blocks, plain, factor)
+    return LeastSquares(ls, blocks, plain, factor, as_published)
+
+
+def _doubts_of_least_squares(
+    prepared: Prepared, options: Options, ls: LeastSquares, bandwidth: float
+) -> tuple[str, ...]:
+    """Warning if derivatives and encoder noise bias IDIM-LS by a relevant share of its standard deviations."""
+    if ls.published:
+        return ()
+    name = options.derivatives or "irwsm"
+
+    def smooth(q: Array, k: int) -> Derivatives:
+        used, e = prepared.signals[k].nvr, prepared.experiments[k]
+        return differentiate(q, e.dt, name, None if used is None else used[:, 0], bandwidth)
+
+    found = least_squares_bias(prepared, ls.decimation, ls.blocks, ls.estimate, smooth)
+    worst, share = found.largest(ls.estimate)
+    if share <= RELEVANT:
+        return ()
+    return (
+        f"Derivatives and encoder noise bias IDIM-LS ({prepared.model.base.names[worst]} by about {share:.1f} std): "
+        "its intervals are doubtful. Next: IDIM-IV or IDIM-PIV.",
+    )
 
 
 def _solve_in_closed_loop(
@@ -220,10 +249,10 @@ def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | No
         )
     diagnostics = solution.diagnostics(essential)
     if found.controller["kind"] not in CONTROLLERS:
-        return Statistics(essential, diagnostics)
+        return Statistics(essential, diagnostics, interval_warnings=solution.interval_warnings, bias=solution.bias)
     delay = solution.delay()
     warnings += _delay_warnings(delay, model.robot)
-    return Statistics(essential, diagnostics, delay)
+    return Statistics(essential, diagnostics, delay, interval_warnings=solution.interval_warnings, bias=solution.bias)
 
 
 def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:

@@ -58,6 +58,10 @@ class Identification:
         Delay of the recorded torques against the positions; ``None`` without a reference trajectory.
     sign_smoothing
         ``g`` (n,) of each joint's smoothed sign, s/rad or s/m.
+    interval_warnings
+        Reasons why the standard deviations are doubtful; they are among the warnings, too.
+    bias
+        Bias (b,) by derivatives, encoder noise and sampling that was subtracted, SI; ``None``: irrelevant.
     relative_error_pct, relative_error_pct_by_joint
         ``|y - X theta| / |y|`` on the torques decimated to twice the bandwidth, overall and (n,), percent.
     iterations, converged, stop_reason
@@ -92,6 +96,8 @@ class Identification:
     physical: ConsistentParameters | None
     delay: TorqueDelay | None
     sign_smoothing: Array
+    interval_warnings: tuple[str, ...]
+    bias: Array | None
     relative_error_pct: float
     relative_error_pct_by_joint: Array
     iterations: int
@@ -124,12 +130,15 @@ class LeastSquares:
         Parallel filter of the methods without a noise model.
     factor
         Decimation factor chosen by the user or from the noise; ``None``: from the bandwidth.
+    published
+        True for the filters of a published fit.
     """
 
     estimate: Estimate
     blocks: Sequence[ExperimentEquations]
     decimation: Decimation
     factor: int | None
+    published: bool = False
 
 
 @dataclass(frozen=True)
@@ -166,12 +175,18 @@ class Statistics:
         Delay of the recorded torques; ``None`` without a reference trajectory.
     physical
         Nearest physically consistent parameters; ``None`` if not requested.
+    interval_warnings
+        Reasons why the standard deviations are doubtful.
+    bias
+        Bias (b,) that was subtracted from the estimate, SI; ``None``: irrelevant.
     """
 
     essential: NDArray[np.bool_]
     diagnostics: Diagnostics
     delay: TorqueDelay | None = None
     physical: ConsistentParameters | None = None
+    interval_warnings: tuple[str, ...] = ()
+    bias: Array | None = None
 
 
 def make_result(
@@ -215,6 +230,8 @@ def make_result(
         physical=statistics.physical,
         delay=statistics.delay,
         sign_smoothing=model.smoothing,
+        interval_warnings=statistics.interval_warnings,
+        bias=statistics.bias,
         relative_error_pct=overall,
         relative_error_pct_by_joint=by_joint,
         iterations=estimate.iterations,

@@ -379,7 +379,7 @@ JUDGEMENTS = (
         "those of the bandpass",
         ("5.2",),
         derivatives,
-        "the printed errors differ by one to two orders of magnitude: the bandpass here has no delay; the published errors of 0.55 % and 1.15 % have the ratio 1 to 2.1 of forward "
+        "the bandpass here has no delay; the published errors of 0.55 % and 1.15 % have the ratio 1 to 2.1 of forward "
         "differences, half a sample late (velocity) and one sample late (acceleration); with such differences the "
         "protocol inferred from table 5.2 has errors one to two orders of magnitude above those of IRWSM 1",
     ),
