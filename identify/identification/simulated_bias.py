@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
+from scipy import signal, stats
 
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.experiment import Experiment
@@ -35,7 +35,7 @@ from armident.identify.signals.bandwidth import position_noise
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
 
-RELEVANT = 0.5
+RELEVANT_BIAS = 0.5
 """Bias in standard deviations above which an estimate is corrected: a 2-sigma interval with this bias holds the truth
 in 92.7 % of the cases instead of 95.4 %."""
 
@@ -49,7 +49,10 @@ DOMINANT = 1.0 / SIMULATION_ERROR
 """Bias in standard deviations above which intervals are doubtful although it was subtracted: what is left of it is
 then as large as everything else."""
 
-FEW, MANY = 2, 8
+SIGNIFICANCE = 0.05
+"""Probability that the scatter of simulated recordings counts as wider than the standard deviations by chance."""
+
+FEW, MANY = 2, 12
 """Simulated recordings to see that the bias is irrelevant, and to measure a relevant one."""
 
 Array = NDArray[np.float64]
@@ -159,7 +162,9 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
         Equations of the estimate.
     """
     theta = estimate.theta - found.bias
-    wider = np.maximum(found.scatter / estimate.std, 1.0)
+    ratio = found.scatter / estimate.std
+    least = np.sqrt(stats.chi2.ppf(1.0 - SIGNIFICANCE, found.runs - 1) / (found.runs - 1))
+    wider = np.where(ratio > least, ratio, 1.0)
     covariance = estimate.covariance * np.outer(wider, wider) + np.diag(
         found.scatter**2 / found.runs + (SIMULATION_ERROR * found.bias) ** 2
     )
@@ -168,7 +173,7 @@ def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[Experim
 
 
 def _relevant(errors: Sequence[Array], estimate: Estimate) -> bool:
-    return bool(np.any(np.abs(np.mean(errors, axis=0)) > RELEVANT * estimate.std))
+    return bool(np.any(np.abs(np.mean(errors, axis=0)) > RELEVANT_BIAS * estimate.std))
 
 
 def _recorded(

@@ -20,7 +20,7 @@ from armident.identify.identification.options import Method, Options
 from armident.identify.identification.simulated_bias import (
     DOMINANT,
     FEW,
-    RELEVANT,
+    RELEVANT_BIAS,
     SimulatedBias,
     corrected,
     simulated_bias,
@@ -300,7 +300,7 @@ def _without_bias(solution: Solution) -> Solution:
     if found is None:
         return solution
     worst, share = found.largest(estimate)
-    if share <= RELEVANT:
+    if share <= RELEVANT_BIAS:
         return solution
     name = problem.auxiliary.model.base.names[worst]
     line = (
