@@ -22,6 +22,7 @@ from armident.identify.identification.equations import (
     least_rows,
     published_equations,
 )
+from armident.identify.identification.least_squares_doubts import doubts_of_least_squares
 from armident.identify.identification.noise_decimation import decimation_from_noise
 from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.result import (
@@ -33,7 +34,6 @@ from armident.identify.identification.result import (
     make_result,
 )
 from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
-from armident.identify.identification.simulated_bias import RELEVANT_BIAS, least_squares_bias
 from armident.identify.identification.solvers import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
 from armident.identify.identification.torque_delay import HELD, TorqueDelay
 from armident.identify.regression.equations import Estimate, ExperimentEquations
@@ -45,10 +45,6 @@ from armident.identify.signals.differentiate import Derivatives, differentiate, 
 
 TOLERATED_DELAY = 1.0
 """Deviation of the torque delay from the expected one that gives no warning, samples."""
-
-UNDERSTATED = 1.25
-"""Ratio of standard deviations with and without serial correlation above which intervals are doubtful: a 2-sigma
-interval that is too narrow by this factor holds the truth in 89 % of the cases."""
 
 TORQUE_PREDICTIONS = 2
 """Largest number of predictions of the torques on which terms depend."""
@@ -126,7 +122,7 @@ def _identify(
     doubts: tuple[str, ...] = ()
     if options.method == "idim-ls":
         solution, found = None, MethodResult(ls.estimate, ls.blocks, {"kind": "none"})
-        doubts = _doubts_of_least_squares(prepared, options, ls, bandwidth)
+        doubts = doubts_of_least_squares(prepared, options, ls, bandwidth)
         warnings += doubts
     else:
         clock.enter("controller", 0.35)
@@ -174,37 +170,6 @@ def _least_squares(prepared: Prepared, options: Options, bandwidth: float, warni
             blocks = prepared.equations(plain)
             ls = estimate(blocks)
     return LeastSquares(ls, blocks, plain, factor, as_published)
-
-
-def _doubts_of_least_squares(
-    prepared: Prepared, options: Options, ls: LeastSquares, bandwidth: float
-) -> tuple[str, ...]:
-    """Warnings if derivatives and encoder noise bias IDIM-LS, or if serial correlation understates its intervals."""
-    if ls.published:
-        return ()
-    name = options.derivatives or "irwsm"
-
-    def smooth(q: Array, k: int) -> Derivatives:
-        used, e = prepared.signals[k].nvr, prepared.experiments[k]
-        return differentiate(q, e.dt, name, None if used is None else used[:, 0], bandwidth)
-
-    names, doubts = prepared.model.base.names, []
-    found = least_squares_bias(prepared, ls.decimation, ls.blocks, ls.estimate, smooth)
-    worst, share = found.largest(ls.estimate)
-    if share > RELEVANT_BIAS:
-        doubts.append(
-            f"Derivatives and encoder noise bias IDIM-LS ({names[worst]} by about {share:.1f} std): its intervals are "
-            "doubtful. Next: IDIM-IV or IDIM-PIV."
-        )
-    serial = idim_ls(ls.blocks, names, weighted=options.weighted, serial_order=options.max_ar_order)
-    ratio = serial.std / ls.estimate.std
-    if ratio.max() > UNDERSTATED:
-        doubts.append(
-            f"The residuals of IDIM-LS are serially correlated, which 2.27 neglects (the std of "
-            f"{names[int(np.argmax(ratio))]} would be {ratio.max():.1f} times as large): its intervals are doubtful. "
-            "Next: IDIM-IV or IDIM-PIV."
-        )
-    return tuple(doubts)
 
 
 def _solve_in_closed_loop(

@@ -3,6 +3,8 @@
 The axis is integrated apart from the package: 20 steps per sample of the method ``ode23s`` for one mass.
 """
 
+from itertools import pairwise
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +89,7 @@ def _reference(moves: int) -> Floats:
     rng = np.random.default_rng(7)
     points = np.concatenate([[0.0], rng.uniform(-STROKE, STROKE, moves)])
     parts = []
-    for a, b in zip(points, points[1:], strict=False):
+    for a, b in pairwise(points):
         distance = abs(b - a)
         speed = min(rng.uniform(*SPEEDS), np.sqrt(distance * ACCELERATION))
         ramp = speed / ACCELERATION
