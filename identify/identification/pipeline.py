@@ -22,7 +22,7 @@ from armident.identify.identification.equations import (
     least_rows,
     published_equations,
 )
-from armident.identify.identification.least_squares_doubts import doubts_of_least_squares
+from armident.identify.identification.interval_doubts import doubts_of_least_squares
 from armident.identify.identification.noise_decimation import decimation_from_noise
 from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.result import (

@@ -16,6 +16,7 @@ from armident.identify.estimators.idim_iv import idim_iv
 from armident.identify.estimators.idim_piv import idim_piv
 from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.identification.equations import LS_CUTOFF, PIV_CUTOFF, Prepared, decimated_rows, sufficient
+from armident.identify.identification.interval_doubts import doubts_of_serial_correlation
 from armident.identify.identification.options import Method, Options
 from armident.identify.identification.simulated_bias import (
     DOMINANT,
@@ -26,7 +27,13 @@ from armident.identify.identification.simulated_bias import (
     simulated_bias,
 )
 from armident.identify.identification.torque_delay import TorqueDelay, torque_delay
-from armident.identify.regression.equations import Estimate, ExperimentEquations, joint_variances
+from armident.identify.regression.equations import (
+    Estimate,
+    ExperimentEquations,
+    joint_variances,
+    noise_models,
+    serial_covariance,
+)
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
 
@@ -318,12 +325,28 @@ def _without_bias(solution: Solution) -> Solution:
     )
 
 
+def _doubted(method: str, solution: Solution) -> Solution:
+    """The solution with a warning where serial correlation, which 2.37 neglects, makes its intervals too narrow."""
+    problem, estimate = solution.problem, solution.estimate
+    simulated = problem.auxiliary.fresh().equations(problem.blocks, estimate.theta)
+    noise = noise_models(simulated, estimate.theta, estimate.covariance, problem.options.max_ar_order)
+    zeta, keep = [b.x for b in simulated], [b.keep for b in simulated]
+    covariance = serial_covariance(zeta, zeta, keep, joint_variances(simulated, estimate.theta), noise)
+    names = problem.auxiliary.model.base.names
+    doubts = doubts_of_serial_correlation(method, names, estimate, np.sqrt(np.diag(covariance)))
+    return replace(
+        solution,
+        warnings=(*solution.warnings, *doubts),
+        interval_warnings=(*solution.interval_warnings, *doubts),
+    )
+
+
 def _didim(problem: Problem) -> Solution:
-    return Solution(didim(problem.blocks, problem.auxiliary, problem.start), problem)
+    return _doubted("DIDIM", Solution(didim(problem.blocks, problem.auxiliary, problem.start), problem))
 
 
 def _clie(problem: Problem) -> Solution:
-    return Solution(clie(problem.blocks, problem.auxiliary, problem.start), problem)
+    return _doubted("CLIE", Solution(clie(problem.blocks, problem.auxiliary, problem.start), problem))
 
 
 def _cloe(problem: Problem) -> Solution:

@@ -43,8 +43,10 @@ def test_least_squares_says_that_a_noisy_encoder_makes_its_intervals_doubtful() 
     assert abs(found.theta[0] - axis.MASS) > 2 * found.std[0]
 
 
-def test_least_squares_says_that_coloured_noise_makes_its_intervals_doubtful() -> None:
-    found = identify_experiment(axis.recorded(0, torque=2.0, pole=0.99), axis.robot(), Options(method="idim-ls"))
+@pytest.mark.parametrize("method", ["idim-ls", "didim"])
+def test_methods_without_noise_model_say_that_coloured_noise_makes_their_intervals_doubtful(method: Method) -> None:
+    experiment = axis.recorded(0, torque=2.0, pole=0.99)
+    found = identify_experiment(experiment, axis.robot(), Options(method=method, controller="parametric"))
     assert any("serially correlated" in warning for warning in found.interval_warnings)
 
 

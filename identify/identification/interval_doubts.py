@@ -1,4 +1,6 @@
-"""Reasons why the intervals of IDIM-LS are doubtful: it has neither instruments nor a noise model."""
+"""Reasons why intervals are doubtful: of IDIM-LS, without instruments, and of methods without a noise model."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -8,6 +10,7 @@ from armident.identify.identification.equations import Prepared
 from armident.identify.identification.options import Options
 from armident.identify.identification.result import Array, LeastSquares
 from armident.identify.identification.simulated_bias import RELEVANT_BIAS, least_squares_bias
+from armident.identify.regression.equations import Estimate
 from armident.identify.signals.differentiate import Derivatives, differentiate
 
 UNDERSTATED = 1.25
@@ -52,16 +55,30 @@ def doubts_of_least_squares(
             "doubtful. Next: IDIM-IV or IDIM-PIV."
         )
     serial = idim_ls(ls.blocks, names, weighted=options.weighted, serial_order=options.max_ar_order)
-    ratio = serial.std / ls.estimate.std
-    if ratio.max() > UNDERSTATED and _serially_correlated(ls):
-        doubts.append(
-            f"The residuals of IDIM-LS are serially correlated, which 2.27 neglects (the std of "
-            f"{names[int(np.argmax(ratio))]} would be {ratio.max():.1f} times as large): its intervals are doubtful. "
-            "Next: IDIM-IV or IDIM-PIV."
-        )
+    doubts += doubts_of_serial_correlation("IDIM-LS", names, ls.estimate, serial.std)
     return tuple(doubts)
 
 
-def _serially_correlated(ls: LeastSquares) -> bool:
-    """True if the residuals of a joint are not white (Ljung and Box 1978)."""
-    return any(ljung_box(series, FEW_LAGS)[2] < CORRELATED for series in ls.estimate.residuals)
+def doubts_of_serial_correlation(method: str, names: Sequence[str], estimate: Estimate, std: Array) -> tuple[str, ...]:
+    """Warning if the residuals of a joint are not white (Ljung and Box 1978) and intervals are too narrow for it.
+
+    Parameters
+    ----------
+    method
+        Name of the method.
+    names
+        Base parameters (b,).
+    estimate
+        Estimate whose covariance takes the residuals for white.
+    std
+        Standard deviations (b,) that allow for serial correlation, SI.
+    """
+    ratio = std / estimate.std
+    worst = int(np.argmax(ratio))
+    white = all(ljung_box(series, FEW_LAGS)[2] >= CORRELATED for series in estimate.residuals)
+    if white or ratio[worst] <= UNDERSTATED:
+        return ()
+    return (
+        f"The residuals of {method} are serially correlated, which its covariance neglects (the std of {names[worst]} "
+        f"would be {ratio[worst]:.1f} times as large): its intervals are doubtful. Next: IDIM-IV or IDIM-PIV.",
+    )
