@@ -121,7 +121,7 @@ def simulated_bias(
     Returns
     -------
     SimulatedBias or None
-        ``None`` if the loop with this estimate cannot be simulated.
+        ``None`` if the loop with this estimate cannot be simulated, or its recordings do not determine the parameters.
     """
     auxiliary, theta = auxiliary.fresh(), estimate.theta
     clean = auxiliary.simulate(theta)
@@ -139,7 +139,13 @@ def simulated_bias(
         if recorded is None:
             return None
         kept = [replace(new, keep=block.keep, t=block.t) for new, block in zip(recorded, blocks, strict=True)]
-        errors.append(iv_products(instruments, kept, weights).theta - theta)
+        try:
+            found = iv_products(instruments, kept, weights).theta
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(found).all():
+            return None
+        errors.append(found - theta)
         if runs is None and len(errors) == FEW and not _relevant(errors, estimate):
             break
     return SimulatedBias(np.mean(errors, axis=0), np.std(errors, axis=0, ddof=1), len(errors))
