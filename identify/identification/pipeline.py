@@ -1,10 +1,12 @@
 """Identification pipeline in the steps of the thesis, for `armident identify` and the worker."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
@@ -15,6 +17,7 @@ from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.experiment import Experiment
 from armident.identify.identification.auxiliary_loop import RELEVANT, ClosedLoop, closed_loop, velocity_error
+from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import (
     Prepared,
     aligned_torque,
@@ -22,8 +25,16 @@ from armident.identify.identification.equations import (
     least_rows,
     published_equations,
 )
+from armident.identify.identification.excitation_check import (
+    MOVE,
+    Support,
+    examine_support,
+    moving_joints,
+    require_motion,
+)
+from armident.identify.identification.judgement import Judged, judgement, require_finite
 from armident.identify.identification.noise_decimation import decimation_from_noise
-from armident.identify.identification.options import CONTROLLERS, Options
+from armident.identify.identification.options import CONTROLLERS, Method, Options
 from armident.identify.identification.result import (
     Array,
     Identification,
@@ -33,7 +44,7 @@ from armident.identify.identification.result import (
     make_result,
 )
 from armident.identify.identification.solvers import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
-from armident.identify.identification.torque_delay import HELD, TorqueDelay
+from armident.identify.identification.verdict import Reason, SetupCheck, judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_consistent
@@ -41,8 +52,8 @@ from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
 
-TOLERATED_DELAY = 1.0
-"""Deviation of the torque delay from the expected one that gives no warning, samples."""
+NOT_FINITE = "infs or NaNs"
+"""Text of scipy's ``ValueError`` for arrays that are not finite."""
 
 TORQUE_PREDICTIONS = 2
 """Largest number of predictions of the torques on which terms depend."""
@@ -61,8 +72,9 @@ def identify_experiment(
     robot: RobotConfig,
     options: Options | None = None,
     progress: Progress | None = None,
+    setup: SetupCheck | None = None,
 ) -> Identification:
-    """Identify the base parameters of a robot.
+    """Identify the base parameters of a robot, and judge the result.
 
     The steps are those of the thesis: derivatives (5.1), IDIM-LS (2.3.2), controller (5.2), auxiliary closed loop,
     IDIM-IV (2.3.3) or IDIM-PIV (6.2.2). IDIM-LS is always computed: it starts the iterations and is reported beside
@@ -78,6 +90,8 @@ def identify_experiment(
         Options; ``None``: the defaults.
     progress
         Called with a stage and the share done, 0 to 1.
+    setup
+        Check of the set-up of these recordings, which enters the verdict; ``None``: not made.
 
     Raises
     ------
@@ -90,16 +104,25 @@ def identify_experiment(
     _check(experiments, robot)
     # The matrices are tall and narrow: threads gain little, delay each other on a busy machine, and round differently.
     with threadpool_limits(1):  # type: ignore[no-untyped-call]
-        return _identify(experiments, robot, options or Options(), _Clock(progress or (lambda stage, share: None)))
+        return _identify(
+            experiments, robot, options or Options(), _Clock(progress or (lambda stage, share: None)), setup
+        )
 
 
 def _identify(
-    experiments: Sequence[Experiment], robot: RobotConfig, options: Options, clock: "_Clock"
+    experiments: Sequence[Experiment],
+    robot: RobotConfig,
+    options: Options,
+    clock: "_Clock",
+    setup: SetupCheck | None,
 ) -> Identification:
     """Carry out the steps of the thesis in their order."""
-    warnings: list[str] = []
+    notes = _Notes()
+    criteria = IdentificationCriteria()
 
     clock.enter("model", 0.0)
+    moving = moving_joints(experiments, robot, criteria)
+    require_motion(experiments, robot, moving)
     experiments = put_right(experiments, robot)
     model = arm_model(robot)
     bandwidth = (
@@ -113,37 +136,63 @@ def _identify(
     if any(term.depends_on_torque for term in model.terms):
         model = _with_predicted_torques(model, experiments, signals, bandwidth)
     prepared = Prepared(model, experiments, signals)
-    ls = _least_squares(prepared, options, bandwidth, warnings)
+    ls = _least_squares(prepared, options, bandwidth, moving, criteria, notes)
+    support = examine_support(prepared, ls.blocks, ls.decimation, moving, criteria, ls.estimate.noise)
 
-    if options.method == "idim-ls":
-        solution, found = None, MethodResult(ls.estimate, ls.blocks, {"kind": "none"})
-    else:
-        clock.enter("controller", 0.35)
-        solution, found = _solve_in_closed_loop(prepared, options, ls, bandwidth, clock, warnings)
+    with _refusing_singular(options.method, model, support, criteria):
+        if options.method == "idim-ls":
+            solution, found = None, MethodResult(ls.estimate, ls.blocks, {"kind": "none"})
+        else:
+            clock.enter("controller", 0.35)
+            solution, found = _solve_in_closed_loop(prepared, options, ls, bandwidth, clock, notes)
+        require_finite(found.estimate)
+        clock.enter("statistics", 0.85)
+        statistics = _statistics(prepared, found, solution)
+        if options.physical:
+            clock.enter("physical", 0.95)
+            physical = nearest_consistent(model, found.estimate.theta, found.estimate.covariance)
+            statistics = replace(statistics, physical=physical)
 
-    clock.enter("statistics", 0.85)
-    statistics = _statistics(prepared, found, solution, warnings)
-    if options.physical:
-        clock.enter("physical", 0.95)
-        physical = nearest_consistent(model, found.estimate.theta, found.estimate.covariance)
-        statistics = replace(statistics, physical=physical)
-        if not physical.compatible:
-            warnings.append(physical.verdict)
+    clock.enter("verdict", 0.97)
+    reasons = judgement(Judged(prepared, options, ls, found, solution, statistics, support), criteria)
+    verdict = judge([*notes.reasons, *reasons], setup)
+    if verdict.of_kind("excitation"):
+        statistics = replace(statistics, essential=statistics.essential & support.supported)
     clock.done()
-    return make_result(options, model, found, ls, statistics, warnings, clock.spent)
+    return make_result(options, model, found, ls, statistics, (verdict, criteria), notes.warnings, clock.spent)
 
 
-def _least_squares(prepared: Prepared, options: Options, bandwidth: float, warnings: list[str]) -> LeastSquares:
+def _least_squares(
+    prepared: Prepared,
+    options: Options,
+    bandwidth: float,
+    moving: NDArray[np.bool_],
+    criteria: IdentificationCriteria,
+    notes: "_Notes",
+) -> LeastSquares:
     """IDIM-LS (2.3.2); its equations are decimated by the bandwidth, the user's factor, or the noise (6.2.3)."""
     model, experiments = prepared.model, prepared.experiments
     lengths = [e.q.shape[0] for e in experiments]
 
     def decimation(factor: int | None) -> Decimation:
         dt, rows = experiments[0].dt, least_rows(model)
-        return decimation_of("idim-ls", dt, bandwidth, factor, samples=lengths, rows=rows, warnings=warnings)
+        return decimation_of(
+            "idim-ls",
+            dt,
+            bandwidth,
+            factor,
+            samples=lengths,
+            rows=rows,
+            warnings=notes.warnings,
+            reasons=notes.reasons,
+        )
 
     def estimate(blocks: Sequence[ExperimentEquations]) -> Estimate:
-        return idim_ls(blocks, model.base.names, weighted=options.weighted)
+        try:
+            return idim_ls(blocks, model.base.names, weighted=options.weighted)
+        except DataError as error:
+            support = examine_support(prepared, blocks, plain, moving, criteria)
+            raise DataError(f"{error}; {support.sentence(model, criteria)}. Next: {MOVE}") from error
 
     # A factor chosen by the user is that of the method; a method with a noise model keeps its own for the comparison.
     factor = options.decimation if isinstance(options.decimation, int) else None
@@ -155,7 +204,7 @@ def _least_squares(prepared: Prepared, options: Options, bandwidth: float, warni
         blocks = prepared.equations(plain)
     ls = estimate(blocks)
     if options.decimation == "noise":
-        factor = _memory_of_noise(prepared, ls.theta, warnings)
+        factor = _memory_of_noise(prepared, ls.theta, notes.reasons)
         if options.method not in PREFILTERED:
             plain = decimation(factor)
             blocks = prepared.equations(plain)
@@ -169,7 +218,7 @@ def _solve_in_closed_loop(
     ls: LeastSquares,
     bandwidth: float,
     clock: "_Clock",
-    warnings: list[str],
+    notes: "_Notes",
 ) -> tuple[Solution, MethodResult]:
     """Controller (5.2), auxiliary closed loop, and the method; a second time if the controller proves unsuitable."""
     experiments, rows = prepared.experiments, least_rows(prepared.model)
@@ -180,7 +229,8 @@ def _solve_in_closed_loop(
         ls.factor,
         samples=[e.q.shape[0] for e in experiments],
         rows=rows,
-        warnings=warnings,
+        warnings=notes.warnings,
+        reasons=notes.reasons,
     )
 
     def in_loop(loop: ClosedLoop) -> Solution:
@@ -198,14 +248,19 @@ def _solve_in_closed_loop(
             if not _defect_of_loop(second, prepared.signals):
                 solution = second
                 loop = other._replace(controller=other.controller | {"reason": defect}, warnings=(defect,))
-    estimate = solution.estimate
-    warnings += [*loop.warnings, *solution.warnings, *estimate.warnings]
-    if not estimate.converged:
-        warnings.append(f"{options.method} did not converge: {estimate.stop_reason}")
-    return solution, MethodResult(estimate, solution.problem.blocks, loop.controller, solution.noise_of)
+    notes.warnings += [*loop.warnings, *_iterates(solution.estimate.warnings)]
+    notes.reasons += [reason for reason in solution.reasons if reason.kind != "residual"]
+    return solution, MethodResult(solution.estimate, solution.problem.blocks, loop.controller, solution.noise_of)
 
 
-def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | None, warnings: list[str]) -> Statistics:
+def _iterates(warnings: Sequence[str]) -> list[str]:
+    """Warnings of an estimator, those of its iterates in one line."""
+    if len(warnings) < 2:
+        return list(warnings)
+    return [f"{len(warnings)} iterates needed correction; the first: {warnings[0]}"]
+
+
+def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | None) -> Statistics:
     """Essential parameters, tests of the estimate, and the delay of the torques where a reference was recorded."""
     model, estimate = prepared.model, found.estimate
     used = sum(r.size for series in estimate.residuals for r in series)
@@ -218,9 +273,29 @@ def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | No
     diagnostics = solution.diagnostics(essential)
     if found.controller["kind"] not in CONTROLLERS:
         return Statistics(essential, diagnostics)
-    delay = solution.delay()
-    warnings += _delay_warnings(delay, model.robot)
-    return Statistics(essential, diagnostics, delay)
+    return Statistics(essential, diagnostics, solution.delay())
+
+
+@contextmanager
+def _refusing_singular(
+    method: Method, model: ArmModel, support: Support, criteria: IdentificationCriteria
+) -> Iterator[None]:
+    """Turn equations without a finite solution into a `DataError` that lists what the motion supports.
+
+    Raises
+    ------
+    DataError
+        If numpy finds a singular matrix, or scipy a number that is not finite (which it reports as ``ValueError``).
+    """
+    try:
+        yield
+    except (np.linalg.LinAlgError, ValueError) as error:
+        if not isinstance(error, np.linalg.LinAlgError) and NOT_FINITE not in str(error):
+            raise
+        raise DataError(
+            f"the equations of {method} have no finite solution. Of the motion: "
+            f"{support.sentence(model, criteria)}. Next: {MOVE}"
+        ) from error
 
 
 def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
@@ -229,7 +304,7 @@ def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
     A controller can move the arm with the first estimate and, at the edge of stability, not with a later one. Then the
     iterates do not settle, or settle where the instruments have little to do with the motion.
     """
-    runs = solution.problem.auxiliary.simulate(solution.estimate.theta)
+    runs = solution.runs
     if runs is None:
         defect = "diverges with"
     elif (error := velocity_error(runs, signals)) >= RELEVANT:
@@ -261,7 +336,7 @@ def _with_predicted_torques(
     return model
 
 
-def _memory_of_noise(prepared: Prepared, theta: Array, warnings: list[str]) -> int:
+def _memory_of_noise(prepared: Prepared, theta: Array, reasons: list[Reason]) -> int:
     """Decimation factor after which the residuals of IDIM-LS at the full rate are hardly correlated (6.2.3)."""
     model = prepared.model
     errors = [
@@ -272,21 +347,12 @@ def _memory_of_noise(prepared: Prepared, theta: Array, warnings: list[str]) -> i
     ]
     found = decimation_from_noise(errors)
     if found.bounded:
-        warnings.append(
-            f"The noise is correlated over more than {found.factor} samples, the limit of the decimation: "
-            "standard deviations may be too small."
+        message = (
+            f"The noise is correlated over more than {found.factor} samples, the limit of the decimation: standard "
+            "deviations may be too small"
         )
+        reasons.append(Reason("doubtful", message, "use --method idim-piv", kind="uncertainty"))
     return found.factor
-
-
-def _delay_warnings(delay: TorqueDelay, robot: RobotConfig) -> list[str]:
-    """A warning for every joint whose torque is recorded more than a sample away from its expected position."""
-    off = delay.contradicts() & (np.abs(delay.samples - HELD) > TOLERATED_DELAY)
-    return [
-        f"{joint.name}: the torque belongs to the position {samples:.1f} +- {std:.1f} samples later, expected is {HELD}"
-        for joint, samples, std, wrong in zip(robot.joints, delay.samples, delay.std, off, strict=True)
-        if wrong
-    ]
 
 
 def _derivatives(
@@ -303,6 +369,14 @@ def _derivatives(
         )
         for e in experiments
     ]
+
+
+@dataclass
+class _Notes:
+    """Lines for the user, and defects for the verdict, as the steps find them."""
+
+    warnings: list[str] = field(default_factory=list)
+    reasons: list[Reason] = field(default_factory=list)
 
 
 @dataclass

@@ -18,12 +18,21 @@ from armident.identify.estimators.sep_pem import sep_pem
 from armident.identify.identification.equations import LS_CUTOFF, PIV_CUTOFF, Prepared, decimated_rows, sufficient
 from armident.identify.identification.options import Method, Options
 from armident.identify.identification.torque_delay import TorqueDelay, torque_delay
+from armident.identify.identification.verdict import Reason
 from armident.identify.regression.equations import Estimate, ExperimentEquations, joint_variances
+from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
 
 CONTRADICTION = 5.0
 """Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before IDIM-IV replaces it."""
+
+MISSING = "the model misses an effect"
+SHARED_NOISE = (
+    "the model misses an effect, or the instruments, which come from the measured motion without a reference, share "
+    "its noise"
+)
+"""Causes of a contradiction between IDIM-PIV and IDIM-IV, with and without a recorded reference."""
 
 PREFILTERED: tuple[Method, ...] = ("idim-piv", "sep-pem")
 """Methods with a noise model: their equations are decimated only roughly (thesis section 7.2)."""
@@ -43,6 +52,7 @@ def decimation_of(
     samples: Sequence[int] = (),
     rows: int = 0,
     warnings: list[str] | None = None,
+    reasons: list[Reason] | None = None,
 ) -> Decimation:
     """Return low-pass and decimation for a method; enough equations are left unless the user chose the factor.
 
@@ -61,21 +71,24 @@ def decimation_of(
     rows
         Least number of instants of all experiments together, see `least_rows`.
     warnings
-        List to which a line is added if the cut-off was raised, or if too few equations are left.
+        List to which a line is added if the cut-off was raised.
+    reasons
+        List to which a reason of the verdict is added if too few equations are left.
     """
     share = PIV_CUTOFF if method in PREFILTERED else LS_CUTOFF
     cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)
     wanted = design(dt, cutoff, factor)
     chosen = wanted if factor is not None else sufficient(wanted, dt, samples, rows)
-    left, lines = decimated_rows(chosen, samples), [] if warnings is None else warnings
-    if left < rows:
-        lines.append(
+    left = decimated_rows(chosen, samples)
+    if left < rows and reasons is not None:
+        message = (
             f"The decimation by {chosen.factor} leaves {left} equations per joint, fewer than {rows}: estimate and "
-            "standard deviations are uncertain. Next: record longer"
-            + (" or decimate less." if chosen.factor > 1 else ".")
+            "standard deviations are uncertain"
         )
-    elif chosen is not wanted:
-        lines.append(
+        step = "record longer or decimate less" if chosen.factor > 1 else "record longer"
+        reasons.append(Reason("doubtful", message, step, kind="uncertainty"))
+    elif chosen is not wanted and warnings is not None:
+        warnings.append(
             f"A cut-off of {cutoff:.3g} Hz leaves {decimated_rows(wanted, samples)} equations per joint, fewer than "
             f"{rows}: raised to {0.5 / (dt * chosen.factor):.3g} Hz, which leaves {left}."
         )
@@ -140,15 +153,20 @@ class Solution:
         True if the noise models weighted the rows; false if they only entered the covariance.
     noise_of
         Quantity to which noise models and residuals belong.
-    warnings
-        Lines for the result document.
+    reasons
+        Defects for the verdict.
     """
 
     estimate: Estimate
     problem: Problem
     prefiltered: bool = False
     noise_of: str = "joint torque"
-    warnings: tuple[str, ...] = ()
+    reasons: tuple[Reason, ...] = ()
+
+    @cached_property
+    def runs(self) -> list[Simulation] | None:
+        """Simulated closed loop with the estimate, one run per experiment; ``None`` if it diverges."""
+        return self.problem.auxiliary.simulate(self.estimate.theta)
 
     @cached_property
     def motions(self) -> list[Derivatives]:
@@ -222,22 +240,31 @@ def _idim_piv(problem: Problem) -> Solution:
         max_order=options.max_ar_order,
         grey_box=options.noise_model == "grey-box",
     )
-    shift = np.abs(estimate.theta - without.theta) / without.std
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shift = np.nan_to_num(np.abs(estimate.theta - without.theta) / without.std, nan=np.inf)
     worst = int(np.argmax(shift))
+    referenced = all(e.q_ref is not None for e in problem.prepared.experiments)
     if shift[worst] > CONTRADICTION:
         name = problem.auxiliary.model.base.names[worst]
-        reason = (
-            f"The noise model cannot explain the residuals ({name} would move by {shift[worst]:.0f} std): "
-            "the model misses an effect"
+        reason = Reason(
+            "doubtful",
+            f"a noise model would move {name} by {shift[worst]:.0f} standard deviations (result: idim-iv), so "
+            + (MISSING if referenced else SHARED_NOISE),
+            "armident diagnose RECORDING",
+            kind="residual",
         )
     elif without.converged and not estimate.converged:
-        reason = f"IDIM-PIV did not converge ({estimate.stop_reason})"
+        reason = Reason(
+            "doubtful",
+            f"idim-piv did not converge ({estimate.stop_reason}); the result is that of idim-iv",
+            "armident diagnose RECORDING",
+            kind="convergence",
+        )
     else:
         if options.noise_model == "grey-box":
             return Solution(estimate, problem, noise_of="motor position")
         return Solution(estimate, problem, prefiltered=True)
-    warning = f"{reason}. Result: IDIM-IV. Next: armident diagnose."
-    return Solution(without, plain, warnings=(warning,))
+    return Solution(without, plain, reasons=(reason,))
 
 
 def _idim_iv(problem: Problem) -> Solution:
