@@ -25,6 +25,7 @@ from armident.identify.effects.effect import Effect as Effect
 from armident.identify.effects.registry import catalogue
 from armident.identify.experiment import Experiment
 from armident.identify.identification.api import experiments_of, identify_recording
+from armident.identify.identification.from_recording import rest_notes
 from armident.identify.identification.options import (
     ControllerName,
     DerivativesName,
@@ -434,6 +435,7 @@ def diagnose(
         read = (*read, *_read(validate))
         held_out, more = experiments_of(read[-1:], config, name_files=True)
         notes += more
+    notes += rest_notes(training, config)
     settings = Settings(false_alarms=false_alarm_rate, material=material)
     references = [reference(recording) for recording in read]
     found = run(training, held_out, config, references, numbers, list(dict.fromkeys(notes)), progress, settings)

@@ -88,12 +88,12 @@ def judgement(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     model, experiments, method = prepared.model, prepared.experiments, judged.options.method
     theta, covariance, blocks = estimate.theta, estimate.covariance, judged.ls.blocks
     moving, diagnostics = judged.support.moving, judged.statistics.diagnostics
-    errors = relative_errors(blocks, theta)[1]
+    errors, ls_errors = (relative_errors(blocks, at)[1] for at in (theta, judged.ls.estimate.theta))
     excitation = excitation_reasons(model, experiments, judged.support, theta, covariance, criteria)
     step = MOVE if any(reason.level == "unusable" for reason in excitation) else CHECK
     reasons = [
         *excitation,
-        *error_reasons(model.robot, blocks, theta, errors, moving, criteria, step),
+        *error_reasons(model.robot, blocks, theta, errors, moving, criteria, step, ls_errors),
         *physics_reasons(model, experiments, blocks, theta, covariance, criteria, judged.statistics.physical),
         *convergence_reasons(method, estimate),
     ]

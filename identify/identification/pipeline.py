@@ -1,12 +1,14 @@
 """Identification pipeline in the steps of the thesis, for `armident identify` and the worker."""
 
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
@@ -282,13 +284,17 @@ def _refusing_singular(
 ) -> Iterator[None]:
     """Turn equations without a finite solution into a `DataError` that lists what the motion supports.
 
+    Floating-point warnings of such equations are suppressed: the verdict states the defect.
+
     Raises
     ------
     DataError
         If numpy finds a singular matrix, or scipy a number that is not finite (which it reports as ``ValueError``).
     """
     try:
-        yield
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", linalg.LinAlgWarning)
+            yield
     except (np.linalg.LinAlgError, ValueError) as error:
         if not isinstance(error, np.linalg.LinAlgError) and NOT_FINITE not in str(error):
             raise

@@ -34,10 +34,12 @@ def error_reasons(
     moving: NDArray[np.bool_],
     criteria: IdentificationCriteria,
     step: str,
+    ls_errors: Array,
 ) -> list[Reason]:
     """Return a reason if the model leaves more than a third of the torque of a joint.
 
-    It is unusable, unless the rest is white noise: then the torque of the joint itself is mostly noise.
+    It is unusable, unless least squares leaves as much and the rest is white noise: then the torque of the joint itself
+    is mostly noise.
 
     Parameters
     ----------
@@ -54,7 +56,9 @@ def error_reasons(
     criteria
         Limits.
     step
-        Next step where the rest is not noise.
+        Next step where the rest is not noise and least squares does no better.
+    ls_errors
+        Relative error of each joint (n,) with the estimate of IDIM-LS, percent.
     """
     rest = residuals(blocks, theta)
     limits = np.where(moving, criteria.max_joint_error_pct, criteria.max_rest_error_pct)
@@ -62,7 +66,7 @@ def error_reasons(
     noisy: list[int] = []
     for j in np.flatnonzero(errors > limits).tolist():
         test = whiteness([e[b.keep[:, j], j] for e, b in zip(rest, blocks, strict=True)])
-        white = test.fraction_outside <= criteria.white_fraction and errors[j] < criteria.max_rest_error_pct
+        white = test.fraction_outside <= criteria.white_fraction and ls_errors[j] > limits[j]
         (noisy if white else wrong).append(j)
 
     def reason(level: Level, joints: list[int], more: str, step: str = step) -> Reason:
@@ -71,7 +75,10 @@ def error_reasons(
         return Reason(level, message, step, robot.joints[joints[0]].name if len(joints) == 1 else None, "error")
 
     reasons = []
-    if wrong:
+    if wrong and (ls_errors[wrong] <= limits[wrong]).all():
+        better = f"; idim-ls leaves {ls_errors[wrong].max():.3g} % at most"
+        reasons.append(reason("unusable", wrong, better, "use --method idim-ls or idim-piv, or record the reference"))
+    elif wrong:
         reasons.append(reason("unusable", wrong, ""))
     if noisy:
         longer = "move with more torque at this joint, or record longer"
@@ -135,6 +142,8 @@ def residual_reasons(
 ) -> list[Reason]:
     """Return one reason for the residuals that are not noise, and one for standard deviations that are too small.
 
+    A variance that depends on speed or torque is reported by the tests, but is no defect: it biases nothing.
+
     Parameters
     ----------
     method
@@ -149,16 +158,13 @@ def residual_reasons(
         Reasons of the estimator, which may already contain the statement.
     """
     coloured = [j for j in diagnostics.joints if j.joint in judged and not j.white]
-    varying = [j for j in diagnostics.joints if j.joint in judged and not j.homoskedastic]
     parts = []
     if coloured:
         parts.append(f"serially correlated at {listed([j.joint for j in coloured])}")
-    if varying:
-        parts.append(f"of a variance that depends on speed or torque at {listed([j.joint for j in varying])}")
     parts += [reason.message for reason in known if reason.kind == "residual"]
     reasons = []
     if parts:
-        joints = {j.joint for j in (*coloured, *varying)}
+        joints = {j.joint for j in coloured}
         message = f"The residuals are not noise: {'; '.join(parts)}. Standard deviations may be too small"
         reasons.append(Reason("doubtful", message, DIAGNOSE, joints.pop() if len(joints) == 1 else None, "residual"))
     if method in WHITE_COVARIANCE and diagnostics.serial_std_ratio > criteria.max_std_ratio:

@@ -28,11 +28,8 @@ CONTRADICTION = 5.0
 """Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before IDIM-IV replaces it."""
 
 MISSING = "the model misses an effect"
-SHARED_NOISE = (
-    "the model misses an effect, or the instruments, which come from the measured motion without a reference, share "
-    "its noise"
-)
-"""Causes of a contradiction between IDIM-PIV and IDIM-IV, with and without a recorded reference."""
+SHARED_NOISE = "the model misses an effect, or the instruments, which follow the measured motion, share its noise"
+"""Causes of a contradiction between IDIM-PIV and IDIM-IV, with instruments from a recorded reference and without."""
 
 PREFILTERED: tuple[Method, ...] = ("idim-piv", "sep-pem")
 """Methods with a noise model: their equations are decimated only roughly (thesis section 7.2)."""
@@ -243,7 +240,8 @@ def _idim_piv(problem: Problem) -> Solution:
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = np.nan_to_num(np.abs(estimate.theta - without.theta) / without.std, nan=np.inf)
     worst = int(np.argmax(shift))
-    referenced = all(e.q_ref is not None for e in problem.prepared.experiments)
+    pairs = zip(problem.auxiliary.references, problem.prepared.experiments, strict=True)
+    referenced = all(reference is e.q_ref for reference, e in pairs)
     if shift[worst] > CONTRADICTION:
         name = problem.auxiliary.model.base.names[worst]
         reason = Reason(

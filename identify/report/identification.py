@@ -178,7 +178,7 @@ def _residual_words(document: IdentificationDocument) -> str:
         return " ".join(f"{message}." for message in reasons)
     if document.verdict == "unusable":
         return "They were not tested: the result is unusable."
-    return "No test finds anything but noise in them."
+    return "No test finds serial correlation or model error in them."
 
 
 def _continued(t: Array) -> Array:
