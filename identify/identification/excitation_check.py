@@ -32,6 +32,9 @@ POSTURES = 100
 NEGLIGIBLE = 1e-6
 """Torque per SI unit of a parameter, relative to the greatest of all, below which a motion does not show it."""
 
+NOISE_SAMPLES = 100_000
+"""Samples from which the position noise is estimated."""
+
 FARTHEST = 1e3
 """Position limit, rad or m, beyond which a joint counts as endless and its recorded range is used."""
 
@@ -52,9 +55,7 @@ def joint_ranges(experiments: Sequence[Experiment]) -> Array:
     experiments
         Recordings of one robot.
     """
-    low = np.min([e.q.min(axis=0) for e in experiments], axis=0)
-    high = np.max([e.q.max(axis=0) for e in experiments], axis=0)
-    return np.asarray(high - low, dtype=np.float64)
+    return _ranges([e.q for e in experiments])
 
 
 def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig, criteria: IdentificationCriteria) -> Mask:
@@ -82,7 +83,7 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig, criteri
     moving = ranges > np.maximum(least, counts)
     references = [e.q_ref for e in experiments if e.q_ref is not None]
     if len(references) == len(experiments):
-        moving &= np.ptp(np.concatenate(references), axis=0) > counts
+        moving &= _ranges(references) > counts
     kinds = np.array([joint.type for joint in robot.joints])
     for kind in set(kinds.tolist()):
         same = kinds == kind
@@ -264,7 +265,8 @@ def excitation_reasons(
     q = motion_postures(experiments)
     inertia, _ = joint_uncertainty(model, theta, covariance, q)
     anywhere, gravity = joint_uncertainty(model, theta, covariance, workspace_postures(model.robot, q))
-    torque = np.sqrt(np.mean(np.concatenate([e.tau for e in experiments]) ** 2, axis=0))
+    power = sum(np.einsum("kj,kj->j", e.tau, e.tau) for e in experiments)
+    torque = np.sqrt(power / sum(e.tau.shape[0] for e in experiments))
     gravity = gravity / np.maximum(torque, 1e-300)
     weak = support.moving & (
         (np.maximum(inertia, anywhere) > criteria.max_inertia_std) | (gravity > criteria.max_gravity_std)
@@ -297,8 +299,8 @@ def motion_postures(experiments: Sequence[Experiment], count: int = POSTURES) ->
     count
         Number of postures.
     """
-    q = np.concatenate([e.q for e in experiments])
-    return q[:: max(1, q.shape[0] // count)]
+    every = max(1, sum(e.q.shape[0] for e in experiments) // count)
+    return np.concatenate([e.q[::every] for e in experiments])
 
 
 def workspace_postures(robot: RobotConfig, recorded: Array, count: int = POSTURES) -> Array:
@@ -386,8 +388,16 @@ def _held(signals: Derivatives, moving: Mask) -> Derivatives:
     return replace(signals, q=q, qd=np.where(moving, signals.qd, 0.0), qdd=np.where(moving, signals.qdd, 0.0))
 
 
+def _ranges(signals: Sequence[Array]) -> Array:
+    """Range (n,) of signals (N, n) of several experiments."""
+    low = np.min([signal.min(axis=0) for signal in signals], axis=0)
+    high = np.max([signal.max(axis=0) for signal in signals], axis=0)
+    return np.asarray(high - low, dtype=np.float64)
+
+
 def _position_noise(q: Array) -> Array:
-    """Standard deviation (n,) of white position noise, from second differences by their median."""
+    """Standard deviation (n,) of white position noise, from second differences of the first samples by their median."""
+    q = q[:NOISE_SAMPLES]
     if q.shape[0] < 3:
         return np.zeros(q.shape[1])
     return np.asarray(np.median(np.abs(np.diff(q, 2, axis=0)), axis=0) / (0.6745 * np.sqrt(6.0)), dtype=np.float64)
