@@ -1,14 +1,20 @@
 """Reasons of the verdict of an identification, collected from all checks."""
 
-from dataclasses import dataclass
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import linalg
 
+from armident.configs import DataError
 from armident.identify.identification.auxiliary_loop import velocity_error
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared
-from armident.identify.identification.excitation_check import MOVE, Support, excitation_reasons
-from armident.identify.identification.options import Options
+from armident.identify.identification.excitation_check import Support, excitation_reasons
+from armident.identify.identification.moving_joints import MOVE
+from armident.identify.identification.options import Method, Options
 from armident.identify.identification.physics_check import physics_reasons
 from armident.identify.identification.result import LeastSquares, MethodResult, Statistics, relative_errors
 from armident.identify.identification.result_check import (
@@ -23,6 +29,18 @@ from armident.identify.identification.result_check import (
 from armident.identify.identification.solvers import Solution
 from armident.identify.identification.verdict import Reason
 from armident.identify.regression.equations import Estimate
+from armident.identify.robot.arm import ArmModel
+
+NOT_FINITE = "infs or NaNs"
+"""Text of scipy's ``ValueError`` for arrays that are not finite."""
+
+
+@dataclass
+class Notes:
+    """Lines for the user, and defects for the verdict, as the steps of an identification find them."""
+
+    warnings: list[str] = field(default_factory=list)
+    reasons: list[Reason] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -70,6 +88,43 @@ def require_finite(estimate: Estimate) -> None:
     finite = np.isfinite(estimate.theta).all() and np.isfinite(estimate.covariance).all()
     if not finite or (np.diag(estimate.covariance) < 0.0).any():
         raise np.linalg.LinAlgError("the estimate or its covariance is not finite")
+
+
+@contextmanager
+def refusing_singular(
+    method: Method, model: ArmModel, support: Support, criteria: IdentificationCriteria
+) -> Iterator[None]:
+    """Turn equations without a finite solution into a `DataError` that lists what the motion supports.
+
+    Floating-point warnings of such equations are suppressed: the verdict states the defect.
+
+    Parameters
+    ----------
+    method
+        Name of the method.
+    model
+        The arm.
+    support
+        Parameters that the motion supports.
+    criteria
+        Limits.
+
+    Raises
+    ------
+    DataError
+        If numpy finds a singular matrix, or scipy a number that is not finite (which it reports as ``ValueError``).
+    """
+    try:
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", linalg.LinAlgWarning)
+            yield
+    except (np.linalg.LinAlgError, ValueError) as error:
+        if not isinstance(error, np.linalg.LinAlgError) and NOT_FINITE not in str(error):
+            raise
+        raise DataError(
+            f"the equations of {method} have no finite solution. Of the motion: "
+            f"{support.sentence(model, criteria)}. Next: {MOVE}"
+        ) from error
 
 
 def judgement(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:

@@ -1,14 +1,11 @@
 """Identification pipeline in the steps of the thesis, for `armident identify` and the worker."""
 
 import time
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
@@ -27,16 +24,11 @@ from armident.identify.identification.equations import (
     least_rows,
     published_equations,
 )
-from armident.identify.identification.excitation_check import (
-    MOVE,
-    Support,
-    examine_support,
-    moving_joints,
-    require_motion,
-)
-from armident.identify.identification.judgement import Judged, judgement, require_finite
+from armident.identify.identification.excitation_check import examine_support
+from armident.identify.identification.judgement import Judged, Notes, judgement, refusing_singular, require_finite
+from armident.identify.identification.moving_joints import MOVE, moving_joints, require_motion
 from armident.identify.identification.noise_decimation import decimation_from_noise
-from armident.identify.identification.options import CONTROLLERS, Method, Options
+from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.result import (
     Array,
     Identification,
@@ -53,9 +45,6 @@ from armident.identify.robot.consistent import nearest_consistent
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
-
-NOT_FINITE = "infs or NaNs"
-"""Text of scipy's ``ValueError`` for arrays that are not finite."""
 
 TORQUE_PREDICTIONS = 2
 """Largest number of predictions of the torques on which terms depend."""
@@ -119,7 +108,7 @@ def _identify(
     setup: SetupCheck | None,
 ) -> Identification:
     """Carry out the steps of the thesis in their order."""
-    notes = _Notes()
+    notes = Notes()
     criteria = IdentificationCriteria()
 
     clock.enter("model", 0.0)
@@ -141,7 +130,7 @@ def _identify(
     ls = _least_squares(prepared, options, bandwidth, moving, criteria, notes)
     support = examine_support(prepared, ls.blocks, ls.decimation, moving, criteria, ls.estimate.noise)
 
-    with _refusing_singular(options.method, model, support, criteria):
+    with refusing_singular(options.method, model, support, criteria):
         if options.method == "idim-ls":
             solution, found = None, MethodResult(ls.estimate, ls.blocks, {"kind": "none"})
         else:
@@ -170,7 +159,7 @@ def _least_squares(
     bandwidth: float,
     moving: NDArray[np.bool_],
     criteria: IdentificationCriteria,
-    notes: "_Notes",
+    notes: Notes,
 ) -> LeastSquares:
     """IDIM-LS (2.3.2); its equations are decimated by the bandwidth, the user's factor, or the noise (6.2.3)."""
     model, experiments = prepared.model, prepared.experiments
@@ -220,7 +209,7 @@ def _solve_in_closed_loop(
     ls: LeastSquares,
     bandwidth: float,
     clock: "_Clock",
-    notes: "_Notes",
+    notes: Notes,
 ) -> tuple[Solution, MethodResult]:
     """Controller (5.2), auxiliary closed loop, and the method; a second time if the controller proves unsuitable."""
     experiments, rows = prepared.experiments, least_rows(prepared.model)
@@ -275,33 +264,9 @@ def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | No
     diagnostics = solution.diagnostics(essential)
     if found.controller["kind"] not in CONTROLLERS:
         return Statistics(essential, diagnostics)
-    return Statistics(essential, diagnostics, solution.delay())
-
-
-@contextmanager
-def _refusing_singular(
-    method: Method, model: ArmModel, support: Support, criteria: IdentificationCriteria
-) -> Iterator[None]:
-    """Turn equations without a finite solution into a `DataError` that lists what the motion supports.
-
-    Floating-point warnings of such equations are suppressed: the verdict states the defect.
-
-    Raises
-    ------
-    DataError
-        If numpy finds a singular matrix, or scipy a number that is not finite (which it reports as ``ValueError``).
-    """
-    try:
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore", linalg.LinAlgWarning)
-            yield
-    except (np.linalg.LinAlgError, ValueError) as error:
-        if not isinstance(error, np.linalg.LinAlgError) and NOT_FINITE not in str(error):
-            raise
-        raise DataError(
-            f"the equations of {method} have no finite solution. Of the motion: "
-            f"{support.sentence(model, criteria)}. Next: {MOVE}"
-        ) from error
+    delay = solution.delay()
+    finite = np.isfinite(delay.samples).all() and np.isfinite(delay.std).all()
+    return Statistics(essential, diagnostics, delay if finite else None)
 
 
 def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
@@ -375,14 +340,6 @@ def _derivatives(
         )
         for e in experiments
     ]
-
-
-@dataclass
-class _Notes:
-    """Lines for the user, and defects for the verdict, as the steps find them."""
-
-    warnings: list[str] = field(default_factory=list)
-    reasons: list[Reason] = field(default_factory=list)
 
 
 @dataclass

@@ -75,9 +75,9 @@ def error_reasons(
         return Reason(level, message, step, robot.joints[joints[0]].name if len(joints) == 1 else None, "error")
 
     reasons = []
-    if wrong and (ls_errors[wrong] <= limits[wrong]).all():
+    if wrong and step == CHECK and (ls_errors[wrong] <= limits[wrong]).all():
         better = f"; idim-ls leaves {ls_errors[wrong].max():.3g} % at most"
-        reasons.append(reason("unusable", wrong, better, "use --method idim-ls or idim-piv, or record the reference"))
+        reasons.append(reason("unusable", wrong, better, "use --method idim-ls, or record the reference"))
     elif wrong:
         reasons.append(reason("unusable", wrong, ""))
     if noisy:

@@ -13,12 +13,14 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import Diagnostics
 from armident.identify.experiment import Experiment
 from armident.identify.identification.criteria import IdentificationCriteria
-from armident.identify.identification.excitation_check import joint_ranges, moving_joints, workspace_postures
+from armident.identify.identification.excitation_check import workspace_postures
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.moving_joints import joint_ranges, moving_joints
 from armident.identify.identification.options import METHODS, Method, Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
 from armident.identify.identification.result_check import (
+    CHECK,
     convergence_reasons,
     delay_reasons,
     error_reasons,
@@ -294,7 +296,7 @@ def errors_of(rest: np.ndarray, error: float, ls_error: float) -> list[Reason]:
     one = load_robot("emps")
     block = ExperimentEquations(rest[:, None], np.zeros((rest.size, 1, 4)), np.ones((rest.size, 1), bool), rest)
     given = np.array([error]), np.array([True])
-    return error_reasons(one, [block], np.zeros(4), *given, CRITERIA, "check", np.array([ls_error]))
+    return error_reasons(one, [block], np.zeros(4), *given, CRITERIA, CHECK, np.array([ls_error]))
 
 
 def test_a_torque_that_is_white_noise_is_doubtful_and_a_model_error_unusable() -> None:
