@@ -1,11 +1,14 @@
 """Verdict of an identification: trustworthy, doubtful or unusable, with reasons and the next step in words."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 Level = Literal["trustworthy", "doubtful", "unusable"]
 LEVELS: tuple[Level, ...] = ("trustworthy", "doubtful", "unusable")
+
+AT_REST = ("standstill", "joint_at_rest")
+"""Findings of the set-up that are a matter of the excitation."""
 
 Kind = Literal[
     "setup", "error", "physics", "excitation", "convergence", "loop", "residual", "uncertainty", "instruments", "delay"
@@ -86,6 +89,10 @@ class SetupFinding(Protocol):
     """Finding of the check of the set-up, as far as the verdict uses it."""
 
     @property
+    def kind(self) -> str:
+        """Kind of the mistake, for example ``time_shift`` or ``joint_at_rest``."""
+
+    @property
     def joints(self) -> tuple[str, ...]:
         """Joints concerned."""
 
@@ -135,44 +142,58 @@ def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict
     setup
         Check of the set-up; ``None``: not made.
     """
-    every = [*setup_reasons(setup), *reasons]
+    every = _merged(reasons, setup)
     once = {reason.message: reason for reason in reversed(every)}
     found = sorted(reversed(once.values()), key=lambda reason: -LEVELS.index(reason.level))
     return Verdict(found[0].level if found else "trustworthy", tuple(found))
 
 
-def setup_reasons(setup: SetupCheck | None) -> list[Reason]:
-    """Return a reason for every finding of the set-up, and one for joints that no hypothesis explains.
+def _merged(reasons: Sequence[Reason], setup: SetupCheck | None) -> list[Reason]:
+    """Reasons of the set-up and of the result, each defect once.
 
-    Parameters
-    ----------
-    setup
-        Check of the set-up; ``None``: not made.
+    Joints at rest are a matter of the excitation, and a common delay one of the set-up. Joints that no hypothesis
+    explains are named in the reason that gives their error.
     """
     if setup is None:
-        return []
-    reasons = [
+        return list(reasons)
+    kinds = {reason.kind for reason in reasons}
+    findings = [f for f in setup.findings if f.kind not in AT_REST or "excitation" not in kinds]
+    shifted = any(finding.kind == "time_shift" for finding in findings)
+    rest = [reason for reason in reasons if not (shifted and reason.kind == "delay")]
+    lost = [k for k, reason in enumerate(rest) if reason.kind == "error" and reason.level == "unusable"]
+    if setup.joints_not_understood and not lost:
+        return [*_setup_reasons(findings), _not_understood(setup), *rest]
+    if setup.joints_not_understood:
+        first = rest[lost[0]]
+        rest[lost[0]] = replace(
+            first, message=f"{first.message}; no hypothesis of the set-up explains it{_tried(setup)}"
+        )
+    return [*_setup_reasons(findings), *rest]
+
+
+def _setup_reasons(findings: Sequence[SetupFinding]) -> list[Reason]:
+    """Return a reason for every finding of the set-up."""
+    return [
         Reason(
             "unusable" if finding.decisive else "doubtful",
             f"{finding.message.rstrip('.')} (probability {finding.probability:.2f})",
-            finding.remedy,
+            finding.remedy.rstrip("."),
             finding.joints[0] if len(finding.joints) == 1 else None,
             "setup",
         )
-        for finding in setup.findings
+        for finding in findings
     ]
-    if setup.joints_not_understood:
-        tried = f"; tried: {', '.join(setup.tried)}" if setup.tried else ""
-        reasons.append(
-            Reason(
-                "unusable",
-                f"The rigid model leaves more than a third of the torque of {listed(setup.joints_not_understood)}"
-                f"{tried}",
-                "check signs, order, units and gear ratios of the recording: armident check RECORDING",
-                kind="setup",
-            )
-        )
-    return reasons
+
+
+def _not_understood(setup: SetupCheck) -> Reason:
+    """Reason for joints that the rigid model does not explain with any hypothesis."""
+    message = f"The rigid model leaves more than a third of the torque of {listed(setup.joints_not_understood)}{_tried(setup)}"
+    step = "check signs, order, units and gear ratios of the recording: armident check RECORDING"
+    return Reason("unusable", message, step, kind="setup")
+
+
+def _tried(setup: SetupCheck) -> str:
+    return f" (tried: {', '.join(setup.tried)})" if setup.tried else ""
 
 
 def listed(names: Sequence[str], most: int = 12) -> str:

@@ -63,6 +63,7 @@ def motion(*targets: list[float]) -> Trajectory:
 
 @dataclass(frozen=True)
 class Finding:
+    kind: str = "torque_unit"
     joints: tuple[str, ...] = ("joint_1",)
     probability: float = 0.999
     message: str = "The torques are in kN m."
@@ -234,8 +235,20 @@ def test_other_findings_are_doubtful_and_joints_not_understood_unusable() -> Non
     assert judge([], Setup((replace(Finding(), decisive=False),))).level == "doubtful"
     verdict = judge([], Setup(joints_not_understood=("joint_4", "joint_5")))
     assert verdict.level == "unusable"
-    assert "joint_4 and joint_5; tried: signs, order" in verdict.reasons[0].message
+    assert "joint_4 and joint_5 (tried: signs, order)" in verdict.reasons[0].message
     assert judge([], Setup()).level == "trustworthy"
+
+
+def test_set_up_and_result_state_each_defect_once() -> None:
+    error = Reason("unusable", "The model leaves more than 33 % of the torque of joint_4 (69 %)", "check", "joint_4")
+    (reason,) = judge([error], Setup(joints_not_understood=("joint_4",))).reasons
+    assert reason.message == f"{error.message}; no hypothesis of the set-up explains it (tried: signs, order)"
+    rest = Reason("doubtful", "joint_4 does not move", "move it", kind="excitation")
+    still = replace(Finding(), kind="joint_at_rest", decisive=False)
+    assert judge([rest], Setup((still,))).reasons == (rest,)
+    late = Reason("doubtful", "The torque belongs to the position some samples later", "clocks", kind="delay")
+    (reason,) = judge([late], Setup((replace(Finding(), kind="time_shift"),))).reasons
+    assert reason.kind == "setup"
 
 
 def test_each_line_stands_once_and_the_worst_comes_first() -> None:
