@@ -13,6 +13,7 @@ from armident.identify.identification.auxiliary_loop import velocity_error
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import Prepared
 from armident.identify.identification.excitation_check import Support, excitation_reasons
+from armident.identify.identification.motion_dependence import motion_dependence
 from armident.identify.identification.moving_joints import MOVE
 from armident.identify.identification.options import Method, Options
 from armident.identify.identification.physics_check import physics_reasons
@@ -157,7 +158,9 @@ def judgement(judged: Judged, criteria: IdentificationCriteria) -> list[Reason]:
     if not any(reason.level == "unusable" for reason in reasons):
         known = () if judged.solution is None else judged.solution.reasons
         names = [joint.name for joint, moves in zip(model.robot.joints, moving, strict=True) if moves]
-        reasons += residual_reasons(method, diagnostics, names, criteria, known)
+        finest = judged.found.blocks if method == "idim-piv" else blocks
+        dependences = motion_dependence(prepared, finest, theta)
+        reasons += residual_reasons(method, diagnostics, names, criteria, known, dependences)
         reasons += instrument_reasons(diagnostics, theta.size, criteria)
         reasons += delay_reasons(judged.statistics.delay, model.robot, criteria)
     return reasons

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from armident.configs import RobotConfig
 from armident.identify.estimators.diagnostics import Diagnostics
 from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.motion_dependence import Dependence
 from armident.identify.identification.options import Method
 from armident.identify.identification.torque_delay import HELD, TorqueDelay
 from armident.identify.identification.verdict import Level, Reason, listed
@@ -139,6 +140,7 @@ def residual_reasons(
     judged: Sequence[str],
     criteria: IdentificationCriteria,
     known: Sequence[Reason] = (),
+    dependences: Sequence[Dependence] = (),
 ) -> list[Reason]:
     """Return one reason for the residuals that are not noise, and one for standard deviations that are too small.
 
@@ -156,15 +158,27 @@ def residual_reasons(
         Limits.
     known
         Reasons of the estimator, which may already contain the statement.
+    dependences
+        Dependence of the residuals on the motion.
     """
     coloured = [j for j in diagnostics.joints if j.joint in judged and not j.white]
     parts = []
     if coloured:
         parts.append(f"serially correlated at {listed([j.joint for j in coloured])}")
+    dependent = [
+        d
+        for d in dependences
+        if diagnostics.joints[d.joint].joint in judged
+        and d.share > criteria.max_motion_share
+        and d.deviation >= criteria.min_motion_deviation
+    ]
+    if dependent:
+        shares = [f"{d.variable} of {diagnostics.joints[d.joint].joint} ({100 * d.share:.0f} %)" for d in dependent]
+        parts.append(f"they depend on {listed(shares)}, so the model misses an effect there")
     parts += [reason.message for reason in known if reason.kind == "residual"]
     reasons = []
     if parts:
-        joints = {j.joint for j in coloured}
+        joints = {j.joint for j in coloured} | {diagnostics.joints[d.joint].joint for d in dependent}
         message = f"The residuals are not noise: {'; '.join(parts)}. Standard deviations may be too small"
         reasons.append(Reason("doubtful", message, DIAGNOSE, joints.pop() if len(joints) == 1 else None, "residual"))
     if method in WHITE_COVARIANCE and diagnostics.serial_std_ratio > criteria.max_std_ratio:

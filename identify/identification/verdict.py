@@ -187,7 +187,8 @@ def _setup_reasons(findings: Sequence[SetupFinding]) -> list[Reason]:
 
 def _not_understood(setup: SetupCheck) -> Reason:
     """Reason for joints that the rigid model does not explain with any hypothesis."""
-    message = f"The rigid model leaves more than a third of the torque of {listed(setup.joints_not_understood)}{_tried(setup)}"
+    joints, tried = listed(setup.joints_not_understood), _tried(setup)
+    message = f"The rigid model leaves more than a third of the torque of {joints}{tried}"
     step = "check signs, order, units and gear ratios of the recording: armident check RECORDING"
     return Reason("unusable", message, step, kind="setup")
 

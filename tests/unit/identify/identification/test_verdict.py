@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from armident.configs import DataError, Trajectory, load_robot
 from armident.configs.schema.robot import RobotConfig
@@ -13,8 +14,10 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import Diagnostics
 from armident.identify.experiment import Experiment
 from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.equations import Prepared
 from armident.identify.identification.excitation_check import workspace_postures
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.motion_dependence import motion_dependence
 from armident.identify.identification.moving_joints import joint_ranges, moving_joints
 from armident.identify.identification.options import METHODS, Method, Options
 from armident.identify.identification.pipeline import identify_experiment
@@ -31,6 +34,8 @@ from armident.identify.identification.result_check import (
 from armident.identify.identification.torque_delay import TorqueDelay
 from armident.identify.identification.verdict import Reason, judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations
+from armident.identify.signals.decimate import design
+from armident.identify.signals.differentiate import differentiate
 from armident.virtual_robot.offline import simulate_recording
 from tests.fixtures.arms import FAST, identified, recording, trajectory
 
@@ -78,6 +83,7 @@ class Setup:
     tried: tuple[str, ...] = ("signs", "order")
 
 
+@pytest.mark.slow
 def test_a_healthy_arm_is_trustworthy_by_every_line() -> None:
     for robot, seed in (("tx40", 1), ("emps", 1)):
         outcome = identified(robot, f"{robot}_excitation", seed)
@@ -156,6 +162,7 @@ def test_an_arm_at_rest_is_refused_in_one_line(arm: RobotConfig) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_one_moving_joint_gives_its_few_parameters(arm: RobotConfig, method: Method) -> None:
     single = recorded(arm, motion(*([0.0, angle, 0.0, 0.0, 0.0, 0.0] for angle in (0.8, -0.8, 0.4, 0.0))))
@@ -288,6 +295,37 @@ def test_coloured_residuals_have_one_line_for_all_joints() -> None:
     assert reason.message.startswith("The residuals are not noise: serially correlated at joint_1 and joint_2")
     (reason,) = residual_reasons("idim-piv", coloured, ["joint_2"], CRITERIA)
     assert reason.joint == "joint_2"
+
+
+def test_a_ripple_that_a_noise_model_could_absorb_is_named(arm: RobotConfig) -> None:
+    """Seven periods per turn of joint 1; the parameters stay possible."""
+    (clean,) = experiments_from_recording(recording("tx40", "tx40_excitation", 1, repeats=1, period=FAST), arm)[0]
+    tau = clean.tau.copy()
+    tau[:, 0] += 3.0 * np.sin(7 * clean.q[:, 0])
+    found = identify_experiment(replace(clean, tau=tau), arm, LEAST_SQUARES)
+    (reason,) = found.verdict.of_kind("residual")
+    assert "position of joint_1" in reason.message
+    assert reason.joint == "joint_1"
+
+
+@pytest.mark.parametrize("noise", ["white", "coloured"])
+def test_noise_does_not_depend_on_the_motion(healthy: list[Experiment], arm: RobotConfig, noise: str) -> None:
+    """Residuals of 20 seeds, replaced by noise: at most one of 240 tests is positive at the limits of the verdict."""
+    model = arm_model(arm)
+    signals = [differentiate(e.q, e.dt) for e in healthy]
+    prepared = Prepared(model, healthy, signals)
+    blocks = prepared.equations(design(healthy[0].dt, 20.0))
+    theta, positive = np.zeros(model.base.b), 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        drawn = [rng.normal(size=b.y.shape) for b in blocks]
+        if noise == "coloured":
+            drawn = [lfilter([1.0], [1.0, -0.9], y, axis=0) for y in drawn]
+        found = motion_dependence(prepared, [replace(b, y=y) for b, y in zip(blocks, drawn, strict=True)], theta)
+        positive += sum(
+            d.share > CRITERIA.max_motion_share and d.deviation >= CRITERIA.min_motion_deviation for d in found
+        )
+    assert positive <= 1
 
 
 def test_standard_deviations_that_neglect_correlation_are_doubtful() -> None:
