@@ -162,7 +162,7 @@ def residual_reasons(
         Dependence of the residuals on the motion.
     """
     coloured = [j for j in diagnostics.joints if j.joint in judged and not j.white]
-    parts = []
+    parts, step = [], DIAGNOSE
     if coloured:
         parts.append(f"serially correlated at {listed([j.joint for j in coloured])}")
     dependent = [
@@ -174,13 +174,18 @@ def residual_reasons(
     ]
     if dependent:
         shares = [f"{d.variable} of {diagnostics.joints[d.joint].joint} ({100 * d.share:.0f} %)" for d in dependent]
-        parts.append(f"they depend on {listed(shares)}, so the model misses an effect there")
+        friction = any(d.variable == "velocity" for d in dependent)
+        cause = (
+            "friction, its smoothed sign or an effect is not as modelled" if friction else "the model misses an effect"
+        )
+        parts.append(f"they depend on {listed(shares)}, so {cause} there")
+        step = f"adjust friction.sign_smoothing, or {DIAGNOSE}" if friction else DIAGNOSE
     parts += [reason.message for reason in known if reason.kind == "residual"]
     reasons = []
     if parts:
         joints = {j.joint for j in coloured} | {diagnostics.joints[d.joint].joint for d in dependent}
         message = f"The residuals are not noise: {'; '.join(parts)}. Standard deviations may be too small"
-        reasons.append(Reason("doubtful", message, DIAGNOSE, joints.pop() if len(joints) == 1 else None, "residual"))
+        reasons.append(Reason("doubtful", message, step, joints.pop() if len(joints) == 1 else None, "residual"))
     if method in WHITE_COVARIANCE and diagnostics.serial_std_ratio > criteria.max_std_ratio:
         message = (
             f"Standard deviations are up to {diagnostics.serial_std_ratio:.1f} times too small: {method} takes the "

@@ -27,8 +27,8 @@ from armident.identify.signals.differentiate import Derivatives
 CONTRADICTION = 5.0
 """Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before IDIM-IV replaces it."""
 
-MISSING = "the model misses an effect"
-SHARED_NOISE = "the model misses an effect, or the instruments, which follow the measured motion, share its noise"
+CONTRADICTION_CAUSE = "they contain errors of the model or its derivatives"
+NO_REFERENCE_CAUSE = f"{CONTRADICTION_CAUSE}, or the instruments, which follow the measured motion, share their noise"
 """Causes of a contradiction between IDIM-PIV and IDIM-IV, with instruments from a recorded reference and without."""
 
 PREFILTERED: tuple[Method, ...] = ("idim-piv", "sep-pem")
@@ -247,7 +247,7 @@ def _idim_piv(problem: Problem) -> Solution:
         reason = Reason(
             "doubtful",
             f"a noise model would move {name} by {shift[worst]:.0f} standard deviations (result: idim-iv), so "
-            + (MISSING if referenced else SHARED_NOISE),
+            + (CONTRADICTION_CAUSE if referenced else NO_REFERENCE_CAUSE),
             "armident diagnose RECORDING",
             kind="residual",
         )
