@@ -27,13 +27,10 @@ from armident.identify.identification.result_check import (
     loop_reasons,
     residual_reasons,
 )
-from armident.identify.identification.solvers import Solution
+from armident.identify.identification.solvers import Solution, is_singular
 from armident.identify.identification.verdict import Reason
 from armident.identify.regression.equations import Estimate
 from armident.identify.robot.arm import ArmModel
-
-NOT_FINITE = "infs or NaNs"
-"""Text of scipy's ``ValueError`` for arrays that are not finite."""
 
 
 @dataclass
@@ -120,7 +117,7 @@ def refusing_singular(
             warnings.simplefilter("ignore", linalg.LinAlgWarning)
             yield
     except (np.linalg.LinAlgError, ValueError) as error:
-        if not isinstance(error, np.linalg.LinAlgError) and NOT_FINITE not in str(error):
+        if not is_singular(error):
             raise
         raise DataError(
             f"the equations of {method} have no finite solution. Of the motion: "

@@ -93,11 +93,17 @@ def identify_experiment(
     """
     experiments = [experiments] if isinstance(experiments, Experiment) else list(experiments)
     _check(experiments, robot)
-    # The matrices are tall and narrow: threads gain little, delay each other on a busy machine, and round differently.
-    with threadpool_limits(1):  # type: ignore[no-untyped-call]
-        return _identify(
-            experiments, robot, options or Options(), _Clock(progress or (lambda stage, share: None)), setup
-        )
+    clock = _Clock(progress or (lambda stage, share: None))
+    try:
+        # The matrices are tall and narrow: threads gain little, delay each other on a busy machine, round differently.
+        with threadpool_limits(1):  # type: ignore[no-untyped-call]
+            return _identify(experiments, robot, options or Options(), clock, setup)
+    except DataError as error:
+        known = judge([], setup).reasons
+        if not known:
+            raise
+        cause = f"{known[0].message}. Next: {known[0].next_step}"
+        raise DataError(f"{str(error).rstrip('.')}. Set-up: {cause}") from error
 
 
 def _identify(
@@ -264,9 +270,7 @@ def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | No
     diagnostics = solution.diagnostics(essential)
     if found.controller["kind"] not in CONTROLLERS:
         return Statistics(essential, diagnostics)
-    delay = solution.delay()
-    finite = np.isfinite(delay.samples).all() and np.isfinite(delay.std).all()
-    return Statistics(essential, diagnostics, delay if finite else None)
+    return Statistics(essential, diagnostics, solution.delay())
 
 
 def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:

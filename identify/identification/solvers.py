@@ -31,6 +31,9 @@ CONTRADICTION_CAUSE = "they contain errors of the model or its derivatives"
 NO_REFERENCE_CAUSE = f"{CONTRADICTION_CAUSE}, or the instruments, which follow the measured motion, share their noise"
 """Causes of a contradiction between IDIM-PIV and IDIM-IV, with instruments from a recorded reference and without."""
 
+NOT_FINITE = "infs or NaNs"
+"""Text of scipy's ``ValueError`` for arrays that are not finite."""
+
 PREFILTERED: tuple[Method, ...] = ("idim-piv", "sep-pem")
 """Methods with a noise model: their equations are decimated only roughly (thesis section 7.2)."""
 
@@ -200,13 +203,34 @@ class Solution:
             essential=essential,
         )
 
-    def delay(self) -> TorqueDelay:
-        """Delay of the recorded torques, with the motion simulated along the recorded reference as instruments."""
+    def delay(self) -> TorqueDelay | None:
+        """Delay of the recorded torques, with the motion simulated along the recorded reference as instruments.
+
+        ``None`` if its equations have no finite solution.
+        """
         problem, prepared = self.problem, self.problem.prepared
         x = [block.x for block in prepared.equations(problem.plain)]
         thinned = problem.in_band.auxiliary.decimation == problem.plain
         z = self.instruments if thinned else problem.plain_problem.auxiliary.regressors(self.motions)
-        return torque_delay(prepared.model, prepared.experiments, prepared.signals, problem.plain, self.motions, (x, z))
+        data = prepared.model, prepared.experiments, prepared.signals
+        try:
+            found = torque_delay(*data, problem.plain, self.motions, (x, z))
+        except (np.linalg.LinAlgError, ValueError) as error:
+            if not is_singular(error):
+                raise
+            return None
+        return found if np.isfinite(found.samples).all() and np.isfinite(found.std).all() else None
+
+
+def is_singular(error: Exception) -> bool:
+    """Return true for a singular matrix, and for scipy's ``ValueError`` about numbers that are not finite.
+
+    Parameters
+    ----------
+    error
+        Exception of numpy or scipy.
+    """
+    return isinstance(error, np.linalg.LinAlgError) or NOT_FINITE in str(error)
 
 
 def solve(problem: Problem) -> Solution:

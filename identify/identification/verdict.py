@@ -176,7 +176,7 @@ def _setup_reasons(findings: Sequence[SetupFinding]) -> list[Reason]:
     return [
         Reason(
             "unusable" if finding.decisive else "doubtful",
-            f"{finding.message.rstrip('.')} (probability {finding.probability:.2f})",
+            f"{finding.message[:1].upper()}{finding.message[1:].rstrip('.')} (probability {finding.probability:.2f})",
             finding.remedy.rstrip("."),
             finding.joints[0] if len(finding.joints) == 1 else None,
             "setup",

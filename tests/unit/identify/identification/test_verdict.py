@@ -238,6 +238,13 @@ def test_a_decisive_finding_of_the_set_up_is_unusable_and_comes_first() -> None:
     assert verdict.reasons[0].joint == "joint_1"
 
 
+def test_a_refusal_states_the_finding_of_the_set_up_too(healthy: list[Experiment], arm: RobotConfig) -> None:
+    turned = changed(healthy, lambda e: replace(e, tau=-e.tau))
+    sign = replace(Finding(), kind="torque_sign", message="the torque of joint_1 has the wrong sign", remedy="turn it")
+    with pytest.raises(DataError, match=r"Set-up: The torque of joint_1 has the wrong sign .* Next: turn it"):
+        identify_experiment(turned, arm, Options(method="didim"), setup=Setup((sign,)))
+
+
 def test_other_findings_are_doubtful_and_joints_not_understood_unusable() -> None:
     assert judge([], Setup((replace(Finding(), decisive=False),))).level == "doubtful"
     verdict = judge([], Setup(joints_not_understood=("joint_4", "joint_5")))
