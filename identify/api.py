@@ -25,6 +25,7 @@ from armident.identify.effects.effect import Effect as Effect
 from armident.identify.effects.registry import catalogue
 from armident.identify.experiment import Experiment
 from armident.identify.identification.api import experiments_of, identify_recording
+from armident.identify.identification.from_recording import rest_notes
 from armident.identify.identification.options import (
     ControllerName,
     DerivativesName,
@@ -33,6 +34,7 @@ from armident.identify.identification.options import (
     Options,
 )
 from armident.identify.identification.result import Identification as Estimation
+from armident.identify.identification.verdict import Reason
 from armident.identify.monitoring.change_test import ParameterChangeTest
 from armident.identify.monitoring.change_test import compare as test_parameter_change
 from armident.identify.regression.equations import MAX_AR_ORDER
@@ -113,6 +115,16 @@ class Identification(_Result):
     result: Estimation
 
     @property
+    def verdict(self) -> str:
+        """``trustworthy``, ``doubtful`` or ``unusable``; an unusable result must not be used."""
+        return self.result.verdict.level
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Reasons of the verdict with the next step in words, the most severe first; empty if trustworthy."""
+        return self.result.verdict.reasons
+
+    @property
     def parameters(self) -> ParameterTable:
         """Table of the base parameters (b,): ``parameters["zz1r"].value``, ``parameters.to_pandas()``."""
         return ParameterTable(self.document.parameters, f"{self.document.robot}: {self.document.method}")
@@ -172,10 +184,9 @@ class Identification(_Result):
     def _summary(self) -> str:
         document = self.document
         essential = sum(p.essential for p in document.parameters)
-        state = "converged" if document.converged else f"not converged ({document.stop_reason})"
         return (
             f"{document.robot}, {document.method}: torque error {document.relative_error_pct:.2f} %, "
-            f"{essential} of {len(document.parameters)} base parameters essential, {state}"
+            f"{essential} of {len(document.parameters)} base parameters essential, {self.result.verdict.sentence}"
         )
 
     def _table(self) -> Table:
@@ -424,6 +435,7 @@ def diagnose(
         read = (*read, *_read(validate))
         held_out, more = experiments_of(read[-1:], config, name_files=True)
         notes += more
+    notes += rest_notes(training, config)
     settings = Settings(false_alarms=false_alarm_rate, material=material)
     references = [reference(recording) for recording in read]
     found = run(training, held_out, config, references, numbers, list(dict.fromkeys(notes)), progress, settings)

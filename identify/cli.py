@@ -44,7 +44,9 @@ def identify(
     out: OutDirectory = None,
     json: Json = False,
 ) -> None:
-    """Identify the dynamic model of a robot from a recording.
+    """Identify the dynamic model of a robot from a recording, and judge the result.
+
+    Exit code 3 if the verdict is unusable: the reasons stand in the result.
 
     Example: armident identify tx40.mcap --out results
     """
@@ -62,7 +64,9 @@ def identify(
         "weighted": weighted,
         "physical": physical,
     }
-    identify_command(recording, config, chosen, out, as_json=json)
+    code = identify_command(recording, config, chosen, out, as_json=json)
+    if code:
+        raise typer.Exit(code)
 
 
 def worker(

@@ -121,6 +121,22 @@ def wanted_table(std: Mapping[str, float]) -> None:
     Console().print(table)
 
 
+COLOURS = {"trustworthy": "green", "doubtful": "yellow", "unusable": "red"}
+"""Colours of the levels of a verdict."""
+
+
+def verdict_lines(document: IdentificationDocument) -> None:
+    """Print the verdict of an identification, its reasons, and the next step of each."""
+    level = document.verdict or "not judged"
+    console = Console()
+    console.print(f"verdict: {level}", style=f"bold {COLOURS.get(level, 'default')}", highlight=False)
+    for reason in document.reasons:
+        console.print(
+            f"- {reason.message}.", style=COLOURS[reason.level], highlight=False, soft_wrap=True, markup=False
+        )
+        console.print(f"  Next: {reason.next_step}.", highlight=False, soft_wrap=True, markup=False)
+
+
 def identification_table(document: IdentificationDocument) -> None:
     """Print the essential parameters with their standard deviations, beside the IDIM-LS estimate."""
     beside = {} if document.comparison is None else {p.name: p for p in document.comparison.parameters}
@@ -142,7 +158,9 @@ def identification_table(document: IdentificationDocument) -> None:
     console.print(table)
     essential = sum(p.essential for p in document.parameters)
     errors = ", ".join(f"{name} {value:.1f}" for name, value in document.relative_error_pct_by_joint.items())
-    outside = max((w.fraction_outside_2sigma for w in document.whiteness), default=0.0)
+    coloured = any(reason.kind in ("residual", "uncertainty") for reason in document.reasons)
+    tested = document.verdict in ("trustworthy", "doubtful")
+    residuals = f"; residuals are {'not ' if coloured else ''}noise" if tested else ""
     console.print(
         f"{essential} of {len(document.parameters)} base parameters are essential; "
         f"relative torque error {document.relative_error_pct:.4f} % ({errors})",
@@ -150,8 +168,7 @@ def identification_table(document: IdentificationDocument) -> None:
         soft_wrap=True,
     )
     console.print(
-        f"{document.iterations} iterations, {'converged' if document.converged else 'not converged'}; "
-        f"residual autocorrelation outside 2 sigma at most at {100 * outside:.0f} % of the lags (white: 5 %)",
+        f"{document.iterations} iterations{residuals}",
         highlight=False,
         soft_wrap=True,
     )

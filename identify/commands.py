@@ -5,8 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from armident.configs import DataError
 from armident.identify.document import to_json
 from armident.identify.identification.options import parse_decimation, parse_nvr
+
+UNUSABLE = DataError.exit_code
+"""Exit code: the data do not support an identification, and the result says why."""
 
 FOUND = 4
 """Exit code: done, with findings or an unexplained residual."""
@@ -14,7 +18,7 @@ FOUND = 4
 
 def identify_command(
     path: Path, config: Path | None, chosen: Mapping[str, Any], out: Path | None, *, as_json: bool
-) -> None:
+) -> int:
     """Carry out ``armident identify``.
 
     Parameters
@@ -30,13 +34,18 @@ def identify_command(
     as_json
         Print the document on stdout instead of a table.
 
+    Returns
+    -------
+    int
+        Exit code: `UNUSABLE` if the verdict says so, otherwise 0.
+
     Raises
     ------
     ConfigError, DataError
         If an option or a file is wrong, or the recording cannot be identified.
     """
     from armident.identify.api import identify
-    from armident.identify.cli_tables import identification_table, progress, warn
+    from armident.identify.cli_tables import identification_table, progress, verdict_lines, warn
 
     as_written = {"nvr": parse_nvr(chosen.get("nvr")), "decimation": parse_decimation(chosen.get("decimation"))}
     with progress(f"identify {path.name}") as report:
@@ -44,10 +53,12 @@ def identify_command(
     document, html = result.save(out or _beside(path, "identification"))
     if as_json:
         sys.stdout.write(to_json(result.document))
-        return
-    warn(result.document.warnings)
-    identification_table(result.document)
-    print(f"result: {document}\nreport: {html}")
+    else:
+        verdict_lines(result.document)
+        warn(result.document.warnings)
+        identification_table(result.document)
+        print(f"result: {document}\nreport: {html}")
+    return UNUSABLE if result.verdict == "unusable" else 0
 
 
 def diagnose_command(

@@ -138,10 +138,13 @@ def closed_loop(
             break
     if closest is None:
         if options.method not in MEASURED or options.noise_model == "grey-box":
-            raise DataError("no closed loop could be simulated: it diverges with every controller and start tried")
+            raise DataError(
+                f"{options.method} needs a simulated closed loop, which diverges with every controller and start "
+                "tried. Next: judge the recording by --method idim-ls, or armident check RECORDING"
+            )
         reason = "No closed loop can be simulated with this estimate. Instruments: the smoothed measured motion."
         instruments = MotionInstruments.of(model, smoothed_motion(), dt, decimation)
-        return ClosedLoop(instruments, ls, {"kind": "followed", "reason": reason}, (reason,))
+        return ClosedLoop(instruments, ls, {"kind": "followed", "reason": reason})
     loop = closest[1]
     return loop._replace(warnings=(loop.controller["reason"],)) if loop.controller["kind"] == "nominal" else loop
 

@@ -27,6 +27,7 @@ from armident.identify.identification.simulated_bias import (
     simulated_bias,
 )
 from armident.identify.identification.torque_delay import TorqueDelay, torque_delay
+from armident.identify.identification.verdict import Reason
 from armident.identify.regression.equations import (
     Estimate,
     ExperimentEquations,
@@ -34,11 +35,19 @@ from armident.identify.regression.equations import (
     noise_models,
     serial_covariance,
 )
+from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives
 
 CONTRADICTION = 5.0
 """Standard deviations by which IDIM-PIV may differ from IDIM-IV in any parameter before IDIM-IV replaces it."""
+
+CONTRADICTION_CAUSE = "they contain errors of the model or its derivatives"
+NO_REFERENCE_CAUSE = f"{CONTRADICTION_CAUSE}, or the instruments, which follow the measured motion, share their noise"
+"""Causes of a contradiction between IDIM-PIV and IDIM-IV, with instruments from a recorded reference and without."""
+
+NOT_FINITE = "infs or NaNs"
+"""Text of scipy's ``ValueError`` for arrays that are not finite."""
 
 PREFILTERED: tuple[Method, ...] = ("idim-piv", "sep-pem")
 """Methods with a noise model: their equations are decimated only roughly (thesis section 7.2)."""
@@ -58,6 +67,7 @@ def decimation_of(
     samples: Sequence[int] = (),
     rows: int = 0,
     warnings: list[str] | None = None,
+    reasons: list[Reason] | None = None,
 ) -> Decimation:
     """Return low-pass and decimation for a method; enough equations are left unless the user chose the factor.
 
@@ -76,21 +86,24 @@ def decimation_of(
     rows
         Least number of instants of all experiments together, see `least_rows`.
     warnings
-        List to which a line is added if the cut-off was raised, or if too few equations are left.
+        List to which a line is added if the cut-off was raised.
+    reasons
+        List to which a reason of the verdict is added if too few equations are left.
     """
     share = PIV_CUTOFF if method in PREFILTERED else LS_CUTOFF
     cutoff = share * bandwidth_hz if factor is None else 0.5 / (dt * factor)
     wanted = design(dt, cutoff, factor)
     chosen = wanted if factor is not None else sufficient(wanted, dt, samples, rows)
-    left, lines = decimated_rows(chosen, samples), [] if warnings is None else warnings
-    if left < rows:
-        lines.append(
+    left = decimated_rows(chosen, samples)
+    if left < rows and reasons is not None:
+        message = (
             f"The decimation by {chosen.factor} leaves {left} equations per joint, fewer than {rows}: estimate and "
-            "standard deviations are uncertain. Next: record longer"
-            + (" or decimate less." if chosen.factor > 1 else ".")
+            "standard deviations are uncertain"
         )
-    elif chosen is not wanted:
-        lines.append(
+        step = "record longer or decimate less" if chosen.factor > 1 else "record longer"
+        reasons.append(Reason("doubtful", message, step, kind="uncertainty"))
+    elif chosen is not wanted and warnings is not None:
+        warnings.append(
             f"A cut-off of {cutoff:.3g} Hz leaves {decimated_rows(wanted, samples)} equations per joint, fewer than "
             f"{rows}: raised to {0.5 / (dt * chosen.factor):.3g} Hz, which leaves {left}."
         )
@@ -155,8 +168,8 @@ class Solution:
         True if the noise models weighted the rows; false if they only entered the covariance.
     noise_of
         Quantity to which noise models and residuals belong.
-    warnings
-        Lines for the result document.
+    reasons
+        Defects for the verdict.
     interval_warnings
         Reasons why the standard deviations are doubtful.
     bias
@@ -167,9 +180,14 @@ class Solution:
     problem: Problem
     prefiltered: bool = False
     noise_of: str = "joint torque"
-    warnings: tuple[str, ...] = ()
+    reasons: tuple[Reason, ...] = ()
     interval_warnings: tuple[str, ...] = ()
     bias: Array | None = None
+
+    @cached_property
+    def runs(self) -> list[Simulation] | None:
+        """Simulated closed loop with the estimate, one run per experiment; ``None`` if it diverges."""
+        return self.problem.auxiliary.simulate(self.estimate.theta)
 
     @cached_property
     def motions(self) -> list[Derivatives]:
@@ -206,13 +224,34 @@ class Solution:
             essential=essential,
         )
 
-    def delay(self) -> TorqueDelay:
-        """Delay of the recorded torques, with the motion simulated along the recorded reference as instruments."""
+    def delay(self) -> TorqueDelay | None:
+        """Delay of the recorded torques, with the motion simulated along the recorded reference as instruments.
+
+        ``None`` if its equations have no finite solution.
+        """
         problem, prepared = self.problem, self.problem.prepared
         x = [block.x for block in prepared.equations(problem.plain)]
         thinned = problem.in_band.auxiliary.decimation == problem.plain
         z = self.instruments if thinned else problem.plain_problem.auxiliary.regressors(self.motions)
-        return torque_delay(prepared.model, prepared.experiments, prepared.signals, problem.plain, self.motions, (x, z))
+        data = prepared.model, prepared.experiments, prepared.signals
+        try:
+            found = torque_delay(*data, problem.plain, self.motions, (x, z))
+        except (np.linalg.LinAlgError, ValueError) as error:
+            if not is_singular(error):
+                raise
+            return None
+        return found if np.isfinite(found.samples).all() and np.isfinite(found.std).all() else None
+
+
+def is_singular(error: Exception) -> bool:
+    """Return true for a singular matrix, and for scipy's ``ValueError`` about numbers that are not finite.
+
+    Parameters
+    ----------
+    error
+        Exception of numpy or scipy.
+    """
+    return isinstance(error, np.linalg.LinAlgError) or NOT_FINITE in str(error)
 
 
 def solve(problem: Problem) -> Solution:
@@ -244,24 +283,34 @@ def _idim_piv(problem: Problem) -> Solution:
         grey_box=options.noise_model == "grey-box",
     )
     difference, black_box = estimate.theta - without.theta, options.noise_model == "black-box"
-    if black_box and np.any(np.abs(difference) > CONTRADICTION * without.std):
-        difference = difference - _difference_without_model_error(problem, estimate, without)
-    shift = np.abs(difference) / without.std
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if black_box and np.any(np.abs(difference) > CONTRADICTION * without.std):
+            difference = difference - _difference_without_model_error(problem, estimate, without)
+        shift = np.nan_to_num(np.abs(difference) / without.std, nan=np.inf)
     worst = int(np.argmax(shift))
+    pairs = zip(problem.auxiliary.references, problem.prepared.experiments, strict=True)
+    referenced = all(reference is e.q_ref for reference, e in pairs)
     if shift[worst] > CONTRADICTION:
         name = problem.auxiliary.model.base.names[worst]
-        reason = (
-            f"The noise model cannot explain the residuals ({name} would move by {shift[worst]:.0f} std): "
-            "the model misses an effect"
+        reason = Reason(
+            "doubtful",
+            f"a noise model would move {name} by {shift[worst]:.0f} standard deviations (result: idim-iv), so "
+            + (CONTRADICTION_CAUSE if referenced else NO_REFERENCE_CAUSE),
+            "armident diagnose RECORDING",
+            kind="residual",
         )
     elif without.converged and not estimate.converged:
-        reason = f"IDIM-PIV did not converge ({estimate.stop_reason})"
+        reason = Reason(
+            "doubtful",
+            f"idim-piv did not converge ({estimate.stop_reason}); the result is that of idim-iv",
+            "armident diagnose RECORDING",
+            kind="convergence",
+        )
     else:
         if not black_box:
             return Solution(estimate, problem, noise_of="motor position")
         return _without_bias(Solution(estimate, problem, prefiltered=True))
-    warning = f"{reason}. Result: IDIM-IV. Next: armident diagnose."
-    return _without_bias(Solution(without, plain, warnings=(warning,)))
+    return _without_bias(Solution(without, plain, reasons=(reason,)))
 
 
 def _idim_iv(problem: Problem) -> Solution:
@@ -319,7 +368,6 @@ def _without_bias(solution: Solution) -> Solution:
     return replace(
         solution,
         estimate=corrected(estimate, found, problem.blocks),
-        warnings=(*solution.warnings, *doubtful),
         interval_warnings=(*solution.interval_warnings, *doubtful),
         bias=found.bias,
     )
@@ -336,7 +384,6 @@ def _doubted(method: str, solution: Solution) -> Solution:
     doubts = doubts_of_serial_correlation(method, names, estimate, np.sqrt(np.diag(covariance)))
     return replace(
         solution,
-        warnings=(*solution.warnings, *doubts),
         interval_warnings=(*solution.interval_warnings, *doubts),
     )
 
