@@ -1,0 +1,170 @@
+"""Single mistakes of a set-up, each as the correction that it needs."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import RobotConfig
+from armident.identify.effects.wiring import raw_scales
+from armident.identify.setup.fit import Hypothesis
+
+Array = NDArray[np.float64]
+
+DEGREES = np.pi / 180.0
+THOUSANDTH = 1e-3
+
+
+@dataclass(frozen=True)
+class Move:
+    """One mistake: what to do to the corrections found so far.
+
+    Parameters
+    ----------
+    family
+        Kind of the mistake, for the prior: all members of a family share its probability.
+    words
+        Description.
+    position, torque
+        Matrices (n, n) that multiply the corrections; ``None``: no change.
+    drives
+        True if raw numbers of two drives are exchanged, with the scales of both.
+    """
+
+    family: str
+    words: str
+    position: Array | None = None
+    torque: Array | None = None
+    drives: bool = False
+
+    def __call__(self, h: Hypothesis) -> Hypothesis:
+        """Return the hypothesis with this mistake corrected, too."""
+        position = h.position if self.position is None else self.position @ h.position
+        torque = h.torque if self.torque is None else self.torque @ h.torque
+        return replace(h, position=position, torque=torque)
+
+
+def sign_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
+    """Signals with the wrong sign: of one joint, and of all.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    joints
+        Indices of the joints that move.
+    """
+    names = [joint.name for joint in robot.joints]
+    groups: list[tuple[str, list[int]]] = [(names[j], [j]) for j in joints]
+    if len(joints) > 1:
+        groups.append(("all joints", list(range(robot.n))))
+    for where, chosen in groups:
+        turned = np.eye(robot.n)
+        turned[chosen, chosen] = -1.0
+        yield Move("position_sign", f"position of {where} with the wrong sign", turned, None)
+        yield Move("torque_sign", f"torque of {where} with the wrong sign", None, turned)
+        yield Move("position_sign", f"position and torque of {where} with the wrong sign", turned, turned)
+
+
+def exchange_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
+    """Two joints exchanged: as columns in SI units, and as raw numbers of the drives where that differs.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    joints
+        Indices of the joints that move.
+    """
+    names = [joint.name for joint in robot.joints]
+    ratios = robot.transmission_matrix
+    counts, rated = raw_scales(robot)
+    for i, k in combinations(joints, 2):
+        swap = np.eye(robot.n)
+        swap[[i, k]] = swap[[k, i]]
+        pairs = [("columns", swap, swap)]
+        at_drives = np.linalg.solve(ratios, (swap * counts[:, None] / counts) @ ratios)
+        of_drives = ratios.T @ (swap * rated[:, None] / rated) @ np.linalg.inv(ratios.T)
+        if not (np.allclose(at_drives, swap, rtol=1e-3) and np.allclose(of_drives, swap, rtol=1e-3)):
+            pairs.append(("drives", at_drives, of_drives))
+        for what, position, torque in pairs:
+            where = f"{names[i]} and {names[k]}" + (" (raw numbers of the drives)" if what == "drives" else "")
+            raw = what == "drives"
+            yield Move("exchange", f"torques of {where} exchanged", None, torque, raw)
+            yield Move("exchange", f"positions of {where} exchanged", position, None, raw)
+            yield Move("exchange", f"positions and torques of {where} exchanged", position, torque, raw)
+
+
+def unit_moves(robot: RobotConfig) -> Iterator[Move]:
+    """Units and sides of a whole signal.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    """
+    n, ratios = robot.n, robot.transmission_matrix
+    revolute = np.array([joint.type == "revolute" for joint in robot.joints])
+    small = np.diag(np.where(revolute, DEGREES, THOUSANDTH))
+    yield Move("position_unit", f"positions in {' and '.join(sorted({_unit(joint.type) for joint in robot.joints}))}", small, None)
+    if np.abs(ratios - np.eye(n)).max() > 1e-9:
+        inverse = np.linalg.inv(ratios)
+        yield Move("side", "torques of the motors", None, ratios.T)
+        yield Move("side", "positions of the motors", inverse, None)
+        yield Move("side", "positions and torques of the motors", inverse, ratios.T)
+        yield Move("side", "torques of the joints taken as those of the motors", None, inverse.T)
+        yield Move("side", "positions of the joints taken as those of the motors", ratios, None)
+        yield Move("side", "positions and torques of the joints taken as those of the motors", ratios, inverse.T)
+    yield Move("torque_unit", "torques in thousands of their unit", None, 1e3 * np.eye(n))
+    yield Move("torque_unit", "torques in thousandths of their unit", None, 1e-3 * np.eye(n))
+    _, rated = raw_scales(robot)
+    if np.ptp(np.log(rated)) > 0.01:
+        share = ratios.T @ np.diag(rated / 1000.0) @ np.linalg.inv(ratios.T)
+        yield Move("torque_unit", "torques in per mille of the rated torque", None, share)
+        at_motors = ratios.T @ np.diag(rated / 1000.0)
+        yield Move("torque_unit", "motor torques in per mille of the rated torque", None, at_motors)
+
+
+def single_unit_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
+    """Unit or side of one joint's signal.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    joints
+        Indices of the joints that move.
+    """
+    for j in joints:
+        joint = robot.joints[j]
+        ratio = float(robot.transmission_matrix[j, j])
+        unit = DEGREES if joint.type == "revolute" else THOUSANDTH
+        yield Move("position_unit", f"position of {joint.name} in {_unit(joint.type)}", scaled(robot.n, j, unit), None)
+        yield Move("torque_unit", f"torque of {joint.name} in thousandths", None, scaled(robot.n, j, 1e-3))
+        yield Move("torque_unit", f"torque of {joint.name} in thousands", None, scaled(robot.n, j, 1e3))
+        if ratio != 0.0 and abs(abs(ratio) - 1.0) > 1e-9:
+            yield Move("side", f"torque of {joint.name} is that of its motor", None, scaled(robot.n, j, ratio))
+            yield Move("side", f"torque of {joint.name} was converted twice", None, scaled(robot.n, j, 1.0 / ratio))
+
+
+def scaled(n: int, joint: int, factor: float) -> Array:
+    """Identity (n, n) with a factor at one joint.
+
+    Parameters
+    ----------
+    n
+        Number of joints.
+    joint
+        Index of the joint.
+    factor
+        The factor.
+    """
+    matrix = np.eye(n)
+    matrix[joint, joint] = factor
+    return matrix
+
+
+def _unit(kind: str) -> str:
+    return "degrees" if kind == "revolute" else "mm"

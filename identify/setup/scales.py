@@ -1,0 +1,82 @@
+"""Scales of single joints that may have any value: gear ratio, torque constant, encoder resolution."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from armident.configs import RobotConfig
+from armident.identify.setup.fit import Hypothesis
+from armident.identify.setup.moves import Move, scaled
+
+Array = NDArray[np.float64]
+Criterion = Callable[[Hypothesis], float]
+
+FACTORS = tuple(float(f) for f in np.geomspace(0.2, 5.0, 15) if abs(f - 1.0) > 1e-6)
+"""True over configured values that are tried before the refinement."""
+
+LEAST_GEAR = 0.05
+"""Least relative error of a gear ratio or a resolution: below it other effects of drives and links resemble it."""
+
+LEAST_TORQUE = 2.5
+"""Least factor of a single torque: up to it, a torque constant may differ from its data sheet (`drive_gain_error`)."""
+
+
+def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criterion) -> Iterator[Move]:
+    """Best factor of one joint for its gear ratio, its torque alone and its position alone.
+
+    A wrong gear ratio scales the position by ``f`` and the torque by ``1 / f``: their power stays.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    joint
+        Index of the joint.
+    h
+        Corrections so far.
+    criterion
+        Misfit to minimise.
+    """
+    n, name = robot.n, robot.joints[joint].name
+
+    def gear(f: float) -> Move:
+        return Move("gear_ratio", f"gear ratio of {name}", scaled(n, joint, f), scaled(n, joint, 1.0 / f))
+
+    def torque(f: float) -> Move:
+        return Move("torque_scale", f"scale of the torque of {name}", None, scaled(n, joint, f))
+
+    def position(f: float) -> Move:
+        return Move("position_scale", f"scale of the position of {name}", scaled(n, joint, f), None)
+
+    for made, least in ((gear, 1.0 + LEAST_GEAR), (torque, LEAST_TORQUE), (position, 1.0 + LEAST_GEAR)):
+        factor = _best(lambda f, made=made: criterion(made(f)(h)))
+        if abs(np.log(factor)) >= np.log(least):
+            yield made(factor)
+
+
+def _best(criterion: Callable[[float], float]) -> float:
+    """Factor with the least misfit: the best of `FACTORS`, refined between its neighbours."""
+    grid = sorted((*FACTORS, 1.0))
+    values = [criterion(f) for f in grid]
+    k = int(np.argmin(values))
+    low, high = np.log(grid[max(k - 1, 0)]), np.log(grid[min(k + 1, len(grid) - 1)])
+    found = optimize.minimize_scalar(
+        lambda v: criterion(float(np.exp(v))), bounds=(low, high), method="bounded", options={"xatol": 2e-3, "maxiter": 15}
+    )
+    return float(np.exp(found.x)) if found.fun < values[k] else grid[k]
+
+
+def with_clock(h: Hypothesis, factor: float) -> Hypothesis:
+    """Return the hypothesis with another unit of time.
+
+    Parameters
+    ----------
+    h
+        Corrections so far.
+    factor
+        True over recorded duration.
+    """
+    return replace(h, clock=h.clock * factor)

@@ -1,0 +1,263 @@
+"""Search for the corrections of a set-up: best-first over single mistakes, and over whole permutations."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.setup import assignment, gravity, moves, scales
+from armident.identify.setup.bench import Bench
+from armident.identify.setup.fit import Hypothesis, fit, held_out, joint_errors
+from armident.identify.setup.plausible import log_plausibility
+
+Array = NDArray[np.float64]
+
+MOST_MISTAKES = 6
+"""Largest number of mistakes that are corrected one after the other."""
+
+PRIOR = float(np.log(100.0))
+"""Cost of each mistake, nats: one set-up of a hundred has a mistake of a given kind."""
+
+LEAST_ODDS = float(np.log(99.0))
+"""Least gain of the score for a finding, nats: posterior odds of 99 to 1, a false alarm in less than 1 %."""
+
+LEAST_DROP = float(np.log(2.0))
+"""Least drop of the held-out residual power for a finding, summed over the joints, nats: half the power of one joint."""
+
+NOT_UNDERSTOOD = 1.0 / 3.0
+"""Largest relative error of a joint that the rigid model explains (DIAGNOSIS.md, principle 1)."""
+
+RANKED_ROWS = 100.0
+"""Independent rows that weigh the fit against the plausibility of units in the ranking."""
+
+EXHAUSTIVE = 6
+"""Largest number of joints of which all orders are tried; with more, a search by exchanges starts from several."""
+
+ORDERS_KEPT = 3
+"""Number of best orders from which the search continues."""
+
+CLOCKS = (1e-3, 1e-6, 1e-9, 1e3)
+"""Units of time that are tried: ms, us and ns taken for s, and s taken for ms."""
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A hypothesis with the mistakes that lead to it.
+
+    Parameters
+    ----------
+    h
+        The hypothesis.
+    families, words
+        Kind and description of each mistake.
+    made
+        Changes of each mistake: matrices of positions and torques (n, n), and True for an exchange of raw numbers.
+    rank
+        Criterion of the ranking, in sample, nats per row: lower is better.
+    rivals
+        Families and descriptions of other single mistakes that explain the recordings equally well as the last one.
+    probability
+        Posterior share of each mistake.
+    """
+
+    h: Hypothesis
+    families: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
+    made: tuple[tuple[Array, Array, bool], ...] = ()
+    rank: float = np.inf
+    rivals: tuple[str, ...] = ()
+    probability: tuple[float, ...] = ()
+
+
+@dataclass(eq=False)
+class Search:
+    """Search over the hypotheses of one set of recordings.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    tried
+        Families of hypotheses that were tried, in words, filled by the search.
+    """
+
+    bench: Bench
+    tried: dict[str, int] = field(default_factory=dict)
+
+    def rank(self, h: Hypothesis) -> float:
+        """Criterion of the ranking: misfit in sample minus plausibility of the units, nats per row."""
+        try:
+            shares = fit(self.bench, h).shares
+        except np.linalg.LinAlgError:
+            return np.inf
+        misfit = float(np.log(shares[self.bench.moving]).sum())
+        return misfit - 2.0 * log_plausibility(self.bench, h) / RANKED_ROWS
+
+    def run(self, start: Hypothesis) -> Step:
+        """Return the corrected set-up.
+
+        Parameters
+        ----------
+        start
+            The set-up as configured.
+        """
+        first = Step(start, rank=self.rank(start))
+        best = self._greedy(first)
+        if self._understood(best.h):
+            return best
+        for step in self._orders(start):
+            other = self._greedy(step)
+            if self._gain(best, other)[0] > 0:
+                best = other
+            if self._understood(best.h):
+                break
+        return best
+
+    def _understood(self, h: Hypothesis) -> bool:
+        errors, _ = joint_errors(self.bench, h)
+        return bool(np.all(errors[self.bench.moving] <= NOT_UNDERSTOOD))
+
+    def _greedy(self, step: Step) -> Step:
+        while len(step.families) < MOST_MISTAKES:
+            found = sorted(self._neighbours(step), key=lambda s: s.rank)
+            taken = self._taken(step, found)
+            if taken is None:
+                return step
+            step = taken
+        return step
+
+    def _taken(self, step: Step, found: list[Step]) -> Step | None:
+        """Best neighbour, if it is a mistake of the set-up that is certain and material."""
+        best = found[0]
+        if best.families[-1] == "one_late":
+            # The delay of a single drive is an effect of its own, and no clock of the set-up.
+            return None
+        gain, drop, plausible = self._gain(step, best)
+        if gain < LEAST_ODDS or (drop < LEAST_DROP and plausible < LEAST_ODDS):
+            return None
+        equal = [s for s in found[1:8] if s.families[-1] != "one_late" and self._gain(s, best)[0] < LEAST_ODDS]
+        odds = [np.exp(min(-self._gain(s, best)[0], 0.0)) for s in equal if _differs(s.h, best.h)]
+        share = 1.0 / (1.0 + sum(odds) + np.exp(-gain))
+        rivals = tuple(s.words[-1] for s in equal)
+        return replace(best, rivals=rivals, probability=(*step.probability, share))
+
+    def _gain(self, old: Step, new: Step) -> tuple[float, float, float]:
+        """Gain of the score, drop of the held-out residual power, and gain of plausibility, nats each."""
+        moving = self.bench.moving
+        try:
+            before, after = held_out(self.bench, old.h)[moving], held_out(self.bench, new.h)[moving]
+        except np.linalg.LinAlgError:
+            return -np.inf, 0.0, 0.0
+        rows = independent_rows(fit(self.bench, new.h).residual)[moving]
+        drops = np.log(before / after)
+        plausible = log_plausibility(self.bench, new.h) - log_plausibility(self.bench, old.h)
+        cost = PRIOR * (len(new.families) - len(old.families))
+        return float(0.5 * rows @ drops + plausible - cost), float(drops.sum()), plausible
+
+    def _neighbours(self, step: Step) -> Iterator[Step]:
+        bench, h = self.bench, step.h
+        robot, n = bench.robot, bench.n
+        joints = [int(j) for j in np.flatnonzero(bench.moving)]
+        singles: Iterable[moves.Move] = (
+            *moves.sign_moves(robot, joints),
+            *moves.exchange_moves(robot, joints),
+            *moves.unit_moves(robot),
+            *moves.single_unit_moves(robot, joints),
+            *(move for j in joints if n > 1 for move in scales.scale_moves(robot, j, h, self.rank)),
+        )
+        for move in singles:
+            yield self._made(step, move.family, move.words, move(h), move.drives)
+        if n > 1:
+            yield self._made(step, "assignment", "torques in another order", assignment.by_rows(bench, h))
+        if h.gravity.any():
+            yield self._made(step, "gravity_missing", "torques without gravity", gravity.without_gravity(h))
+        turned = gravity.best_direction(h, self.rank)
+        yield self._made(step, "gravity_direction", "another direction of gravity", turned)
+        for clock in CLOCKS:
+            yield self._made(step, "time_unit", f"time in units of {clock:g} s", scales.with_clock(h, clock))
+        late = gravity.best_shift(h, self.rank, bench.period, bench.moving)
+        yield self._made(step, "time_shift", "all torques late by the same time", late)
+        for j in joints if n > 1 else []:
+            one = gravity.best_shift(h, self.rank, bench.period, np.arange(n) == j)
+            yield self._made(step, "one_late", f"torque of {robot.joints[j].name} late", one)
+
+    def _made(self, step: Step, family: str, words: str, h: Hypothesis, raw: bool = False) -> Step:
+        self.tried[family] = self.tried.get(family, 0) + 1
+        # What this mistake adds to the corrections before it.
+        change = (
+            h.position @ np.linalg.inv(step.h.position),
+            h.torque @ np.linalg.inv(step.h.torque),
+            raw,
+        )
+        return replace(
+            step,
+            h=h,
+            families=(*step.families, family),
+            words=(*step.words, words),
+            made=(*step.made, change),
+            rank=self.rank(h),
+        )
+
+    def _orders(self, start: Hypothesis) -> list[Step]:
+        """Best orders of all joints, with torques in the order of positions, or as their friction assigns them."""
+        n = self.bench.n
+        relative = [np.eye(n)]
+        by_friction = assignment.by_friction(self.bench, start)
+        if not np.array_equal(by_friction, np.eye(n)):
+            relative.append(by_friction)
+        seen: dict[bytes, tuple[float, Hypothesis]] = {}
+
+        def at(order: Array, own: Array) -> float:
+            h = replace(start, position=order @ start.position, torque=order @ own @ start.torque)
+            key = np.concatenate([order, own]).tobytes()
+            if key not in seen:
+                self.tried["order"] = self.tried.get("order", 0) + 1
+                seen[key] = self.rank(h), h
+            return seen[key][0]
+
+        for own in relative:
+            if n <= EXHAUSTIVE:
+                for order in assignment.orders(n):
+                    at(order, own)
+            else:
+                for first in assignment.usual_orders(n):
+                    _climb(first, lambda order, own=own: at(order, own))
+        best = sorted(seen.values(), key=lambda pair: pair[0])[:ORDERS_KEPT]
+        first = Step(start, rank=self.rank(start))
+        return [
+            replace(self._made(first, "order", "joints in another order", h), probability=(1.0,)) for _, h in best
+        ]
+
+
+def _climb(order: Array, criterion: "assignment.OrderCriterion") -> None:
+    """Exchange two joints as long as the criterion falls."""
+    least = criterion(order)
+    while True:
+        swapped = [assignment.exchanged(order, i, k) for i in range(len(order)) for k in range(i)]
+        values = [criterion(other) for other in swapped]
+        k = int(np.argmin(values))
+        if values[k] >= least:
+            return
+        order, least = swapped[k], values[k]
+
+
+def _differs(a: Hypothesis, b: Hypothesis) -> bool:
+    """True if two hypotheses correct the signals differently."""
+    same = np.allclose(a.position, b.position, rtol=0.05) and np.allclose(a.torque, b.torque, rtol=0.05)
+    return not (same and np.allclose(a.gravity, b.gravity, atol=0.5) and a.clock == b.clock)
+
+
+def independent_rows(residual: Array) -> Array:
+    """Number of independent rows with the serial correlation of the residuals, (n,).
+
+    ``M (1 - r) / (1 + r)`` for the correlation r of neighbouring rows (Bartlett 1946), at least 4.
+
+    Parameters
+    ----------
+    residual
+        Residuals (M, n).
+    """
+    power = np.maximum((residual**2).sum(axis=0), 1e-300)
+    r = np.clip((residual[1:] * residual[:-1]).sum(axis=0) / power, 0.0, 0.99)
+    return np.maximum(residual.shape[0] * (1 - r) / (1 + r), 4.0)
