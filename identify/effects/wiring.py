@@ -101,8 +101,9 @@ def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
 
     Raw values (counts, shares of the rated signal) are exchanged, while the scaling belongs to the drive. So these are
     signed permutations, scaled where two drives differ in resolution, gain or rating. With ``joint_side: 1`` columns in
-    SI units on the joint side are concerned, as they are after an import; `signal_scale` always acts on these. Several
-    entries act one after the other, so that exchanges express any permutation.
+    SI units on the joint side are concerned, as they are after an import; `signal_scale` always acts on these, and with an
+    ``other`` joint adds a multiple of its signal. Several entries act one after the other: exchanges express any
+    permutation.
 
     Raises
     ------
@@ -127,7 +128,8 @@ def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
             if stanza.effect == "sign_error":
                 change[first, first] = -1.0
             elif stanza.effect == "signal_scale":
-                change[first, first] = stanza.parameters[signal]
+                second = first if stanza.other is None else names.index(stanza.other)
+                change[first, second] = stanza.parameters[signal]
             else:
                 if stanza.other is None:
                     raise ConfigError(f"effects[{k}]: joint_order of {stanza.joint} needs the other joint")

@@ -101,6 +101,8 @@ class Bench:
         Mask (n,) of the joints that move.
     period
         Sampling period of the recordings, s.
+    rows_kept
+        Largest number of instants.
     """
 
     model: ArmModel
@@ -109,6 +111,7 @@ class Bench:
     decimation: Decimation
     moving: NDArray[np.bool_]
     period: float
+    rows_kept: int = MOST_ROWS
     _rows: dict[bytes, Rows] = field(default_factory=dict, repr=False)
     _torques: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
@@ -121,7 +124,7 @@ class Bench:
     def stride(self) -> int:
         """Kept are one of so many instants."""
         count = sum(self.decimation.count(s.q.shape[0]) for s in self.segments)
-        return max(1, -(-count // MOST_ROWS))
+        return max(1, -(-count // self.rows_kept))
 
     @property
     def rigid(self) -> int:

@@ -1,6 +1,7 @@
 """Check of the set-up: wiring, units, transmission, gravity and clocks, before anything else."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,21 +78,39 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         nothing = (100.0,) * robot.n
         return SetupCheck(tuple(findings), nothing, nothing, (), ("standstill",), None)
     findings += signals.clipped_findings(experiments, robot, moving)
-    bench = make_bench(experiments, robot, moving)
-    n = robot.n
-    start = Hypothesis(np.eye(n), np.eye(n), np.array(robot.gravity), np.zeros(n))
-    search = Search(bench)
-    best = search.run(start)
-    found = described(best, robot)
-    findings += signals.rate_findings(experiments, robot, best.h.clock)
+    bench, search, best = _searched(experiments, robot, moving)
+    found = described(best, robot, bench)
+    tried, before = search.tried, _errors(bench, _as_configured(robot))
+    setup_findings, corrected = found.findings, found.robot
+    if best.h.clock != 1.0:
+        # Velocities enter friction and limits: everything else is judged with the right clock.
+        experiments = [replace(e, dt=e.dt * best.h.clock) for e in experiments]
+        bench, again, best = _searched(experiments, robot, moving)
+        found = described(best, robot, bench)
+        clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
+        setup_findings, corrected = (*clock, *found.findings), found.robot
+        tried = tried | again.tried
+    findings += signals.rate_findings(experiments, robot)
     return SetupCheck(
-        findings=tuple([*found.findings, *findings]),
-        relative_error_pct=_errors(bench, start),
+        findings=(*setup_findings, *findings),
+        relative_error_pct=before,
         corrected_error_pct=_errors(bench, best.h),
         joints_not_understood=_not_understood(bench, best),
-        tried=tuple(words for family, words in TRIED.items() if family in search.tried),
-        corrected_robot=found.robot,
+        tried=tuple(words for family, words in TRIED.items() if family in tried),
+        corrected_robot=corrected,
     )
+
+
+def _searched(
+    experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]
+) -> tuple[Bench, Search, Step]:
+    bench = make_bench(experiments, robot, moving)
+    search = Search(bench)
+    return bench, search, search.run(_as_configured(robot))
+
+
+def _as_configured(robot: RobotConfig) -> Hypothesis:
+    return Hypothesis(np.eye(robot.n), np.eye(robot.n), np.array(robot.gravity), np.zeros(robot.n))
 
 
 def _errors(bench: Bench, h: Hypothesis) -> tuple[float, ...]:

@@ -5,18 +5,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect
+from armident.identify.setup.bench import Bench
+from armident.identify.setup.fit import Hypothesis
+from armident.identify.setup.plausible import position_ratio, torque_ratio, velocity_ratio
+from armident.identify.setup.prior import WIRING
 from armident.identify.setup.result import SetupFinding
 from armident.identify.setup.search import Step
 
 Array = NDArray[np.float64]
 
-WIRING = ("position_sign", "torque_sign", "exchange", "assignment", "order")
-"""Families that only permute signals or change their signs."""
-
-RECORDED_AGAIN = "armident import FILE --motor-side"
+SCALES = ("position_unit", "torque_unit", "side", "gear_ratio", "torque_scale", "position_scale")
+"""Families that scale signals."""
 
 CLOCK_WORDS = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "ks"}
 
@@ -37,7 +40,7 @@ class Described:
     robot: RobotConfig | None
 
 
-def described(step: Step, robot: RobotConfig) -> Described:
+def described(step: Step, robot: RobotConfig, bench: Bench) -> Described:
     """Return the findings of a search.
 
     Parameters
@@ -46,56 +49,76 @@ def described(step: Step, robot: RobotConfig) -> Described:
         Its result.
     robot
         The configuration.
+    bench
+        Signals, for the figures of the messages.
     """
     findings: list[SetupFinding] = []
     entries: list[Effect] = []
-    update: dict[str, object] = {}
-    for finding, made in (*_wiring(step, robot), *_scales(step, robot), *_late(step, robot)):
-        findings.append(finding)
-        entries += made
+    for first, last in _groups(step):
+        if step.families[first] in WIRING and not step.made[first][2]:
+            made = _wiring(step, first, last, robot)
+        elif step.families[first] in WIRING:
+            made = [_raw_exchange(step, first, robot)]
+        elif step.families[first] == "time_shift":
+            made = [_late(step, first, robot)]
+        elif step.families[first] in SCALES:
+            made = [_scale(step, first, robot, bench)]
+        else:
+            continue
+        for finding, stanzas in made:
+            findings.append(finding)
+            entries += stanzas
+    update: dict[str, object] = {"effects": (*robot.effects, *entries)} if entries else {}
     share = dict(zip(step.families, step.probability, strict=True))
     for family in ("gravity_missing", "gravity_direction"):
         if family in step.families:
             findings.append(_gravity(family, step, robot, share[family]))
             update["gravity"] = tuple(float(round(g, 4)) for g in step.h.gravity)
     if "time_unit" in step.families:
-        findings.append(_clock(step, robot, share["time_unit"]))
-    if entries:
-        update["effects"] = (*robot.effects, *entries)
+        findings.append(_clock(step, robot, bench, share["time_unit"]))
     return Described(tuple(findings), robot.model_copy(update=update) if update else None)
 
 
-def _wiring(step: Step, robot: RobotConfig) -> Iterator[tuple[SetupFinding, list[Effect]]]:
-    """Signs and orders: of all such mistakes together, in as few words as possible."""
+def _groups(step: Step) -> Iterator[tuple[int, int]]:
+    """First mistake and the one after the last of each group: consecutive mistakes of the wiring make one."""
+    first = 0
+    while first < len(step.families):
+        last = first + 1
+        while last < len(step.families) and _mergeable(step, first) and _mergeable(step, last):
+            last += 1
+        yield first, last
+        first = last
+
+
+def _mergeable(step: Step, k: int) -> bool:
+    return step.families[k] in WIRING and not step.made[k][2]
+
+
+def _wiring(step: Step, first: int, last: int, robot: RobotConfig) -> list[tuple[SetupFinding, list[Effect]]]:
+    """Signs and orders of some mistakes together, in as few words as possible."""
     n, names = robot.n, [joint.name for joint in robot.joints]
-    position, torque, share = np.eye(n), np.eye(n), 1.0
-    for family, (of_position, of_torque, raw), p, words in zip(
-        step.families, step.made, step.probability, step.words, strict=True
-    ):
-        if family not in WIRING:
-            continue
-        if raw:
-            yield _raw_exchange(of_position, of_torque, p, words, robot)
-            continue
-        share = min(share, p)
+    position, torque = np.eye(n), np.eye(n)
+    for of_position, of_torque, _ in step.made[first:last]:
         position, torque = of_position @ position, of_torque @ torque
+    share = min(step.probability[first:last])
+    rivals = [words for some in step.rivals[first:last] for words in some]
     orders = [np.abs(m).argmax(axis=1) for m in (position, torque)]
-    signs = [np.sign(m[np.arange(n), order]) for m, order in zip((position, torque), orders, strict=True)]
+    turned = [np.sign(m[np.arange(n), order]) < 0 for m, order in zip((position, torque), orders, strict=True)]
     if np.array_equal(orders[0], orders[1]):
-        groups = [(orders[0], ("position", "torque"))]
+        groups: list[tuple[NDArray[np.int64], tuple[str, ...]]] = [(orders[0], ("position", "torque"))]
     else:
         groups = [(orders[0], ("position",)), (orders[1], ("torque",))]
-    for order, signals in groups:
-        if not np.array_equal(order, np.arange(n)):
-            yield _order(order, signals, share, names)
-    turned = [signs[0] < 0, signs[1] < 0]
+    found = [
+        _order(order, signals, share, names) for order, signals in groups if not np.array_equal(order, np.arange(n))
+    ]
     for mask, signals in (
         (turned[0] & turned[1], ("position", "torque")),
         (turned[0] & ~turned[1], ("position",)),
         (~turned[0] & turned[1], ("torque",)),
     ):
         if mask.any():
-            yield _sign([names[j] for j in np.flatnonzero(mask)], signals, share, step)
+            found.append(_sign([names[j] for j in np.flatnonzero(mask)], signals, share, rivals))
+    return found
 
 
 def _order(
@@ -132,85 +155,95 @@ def transpositions(order: NDArray[np.int64]) -> list[tuple[int, int]]:
     return pairs
 
 
-def _raw_exchange(
-    position: Array, torque: Array, share: float, words: str, robot: RobotConfig
-) -> tuple[SetupFinding, list[Effect]]:
+def _raw_exchange(step: Step, k: int, robot: RobotConfig) -> tuple[SetupFinding, list[Effect]]:
+    position, torque, _ = step.made[k]
     ratios = robot.transmission_matrix
-    at_motors = {"position": ratios @ position @ np.linalg.inv(ratios)}
-    at_motors["torque"] = np.linalg.inv(ratios.T) @ torque @ ratios.T
+    at_motors = {
+        "position": ratios @ position @ np.linalg.inv(ratios),
+        "torque": np.linalg.inv(ratios.T) @ torque @ ratios.T,
+    }
     signals = [name for name, m in at_motors.items() if not np.allclose(m, np.eye(robot.n))]
     pair = np.flatnonzero(np.abs(np.diag(at_motors[signals[0]])) < 1e-9)
     names = [robot.joints[j].name for j in pair]
     stanza = Effect(effect="joint_order", joint=names[0], other=names[1], parameters={s: 1.0 for s in signals})
-    message = f"{words}: swapped node numbers or plugs of two drives"
-    return SetupFinding("joint_order", tuple(names), share, message, _lines([stanza]), True), [stanza]
+    message = f"{step.words[k]}: swapped node numbers or plugs of two drives"
+    return SetupFinding("joint_order", tuple(names), step.probability[k], message, _lines([stanza]), True), [stanza]
 
 
 def _sign(
-    joints: Sequence[str], signals: Sequence[str], share: float, step: Step
+    joints: Sequence[str], signals: Sequence[str], share: float, rivals: Sequence[str]
 ) -> tuple[SetupFinding, list[Effect]]:
     entries = [_entry("sign_error", name, signals) for name in joints]
     verb = "have" if len(joints) > 1 or len(signals) > 1 else "has"
     message = f"{' and '.join(signals)} of {', '.join(joints)} {verb} the wrong sign"
     if len(signals) == 2:
         message += ": the joint turns opposite to its configured direction"
+    if rivals:
+        message += f" (equally well explained by: {'; '.join(rivals)})"
     kind = "torque_sign" if tuple(signals) == ("torque",) else "position_sign"
     return SetupFinding(kind, tuple(joints), share, message, _lines(entries), True), entries
 
 
-def _scales(step: Step, robot: RobotConfig) -> Iterator[tuple[SetupFinding, list[Effect]]]:
-    """Units, sides and gear ratios, one finding each."""
-    for family, (position, torque, _), share, words in zip(
-        step.families, step.made, step.probability, step.words, strict=True
-    ):
-        if family in ("position_unit", "torque_unit", "side", "gear_ratio", "torque_scale", "position_scale"):
-            yield _scale(family, position, torque, share, words, robot)
-
-
-def _scale(
-    family: str, position: Array, torque: Array, share: float, words: str, robot: RobotConfig
-) -> tuple[SetupFinding, list[Effect]]:
-    eye = np.eye(robot.n)
-    diagonal = all(np.allclose(m, np.diag(np.diag(m))) for m in (position, torque))
-    changed = np.abs(position - eye).max(axis=1) + np.abs(torque - eye).max(axis=1) > 1e-12
-    joints = [j for j in range(robot.n) if changed[j]]
+def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFinding, list[Effect]]:
+    """A unit, a side or a gear ratio."""
+    family, (position, torque, _) = step.families[k], step.made[k]
+    changed = sum(np.abs(m - np.eye(robot.n)).max(axis=1) for m in (position, torque)) > 1e-12
+    joints = [int(j) for j in np.flatnonzero(changed)]
     names = tuple(robot.joints[j].name for j in joints)
-    entries = []
-    for j in joints if diagonal else []:
-        values = {"position": float(position[j, j]), "torque": float(torque[j, j])}
-        given = {signal: _rounded(v) for signal, v in values.items() if abs(v - 1.0) > 1e-12}
-        entries.append(Effect(effect="signal_scale", joint=robot.joints[j].name, parameters=given))
-    kind = {"torque_scale": "torque_unit", "position_scale": "position_unit"}.get(family, family)
-    remedy = _lines(entries) if entries else RECORDED_AGAIN
-    message = words
+    entries = [*_linear_map(position, "position", robot), *_linear_map(torque, "torque", robot)]
+    remedy, message = _lines(entries), step.words[k]
+    j = joints[0]
     if family == "gear_ratio":
-        j = joints[0]
-        configured = robot.transmission_matrix[j, j]
-        true = configured / position[j, j]
-        message = f"the gear ratio of {names[0]} is {true:.4g} by its motion, not {configured:.4g} as configured"
+        configured, true = robot.transmission_matrix[j, j], robot.transmission_matrix[j, j] / position[j, j]
+        message = f"the gear ratio of {names[0]} is {true:.4g} by its motion and torque, not {configured:.4g}"
         remedy = f"transmission: row of {names[0]}: {true:.4g} in place of {configured:.4g}; or {remedy}"
     elif family == "torque_scale":
-        factor = torque[joints[0], joints[0]]
-        message = f"the torque of {names[0]} is {factor:.3g} times the recorded one, by the torques of the other joints"
-        remedy = f"joints: {names[0]}: drive: gain: {factor:.3g} times the present one; or {remedy}"
+        message = f"the torque of {names[0]} is {torque[j, j]:.3g} times the recorded one by those of the other joints"
+        remedy = f"joints: {names[0]}: drive: gain: {torque[j, j]:.3g} times the present one; or {remedy}"
     elif family == "position_scale":
-        factor = position[joints[0], joints[0]]
-        message = f"the position of {names[0]} is {factor:.3g} times the recorded one, by the geometry of the arm"
-        remedy = f"joints: {names[0]}: drive: counts_per_unit: {1 / factor:.3g} times the present one; or {remedy}"
-    return SetupFinding(kind, names, share, message, remedy, True), entries
+        message = f"the position of {names[0]} is {position[j, j]:.3g} times the recorded one by the geometry of the arm"
+        resolution = f"counts_per_unit: {1 / position[j, j]:.3g} times the present one"
+        remedy = f"joints: {names[0]}: drive: {resolution}; or {remedy}"
+    elif len(joints) > 1:
+        message += (
+            f": the largest positions are on average {position_ratio(bench, _as_configured(robot)):.3g} of their limits, "
+            f"the largest torques {torque_ratio(bench, _as_configured(robot)):.3g}"
+        )
+        if family == "side":
+            remedy = f"armident import FILE --motor-side where positions and torques are the motors'; or {remedy}"
+    kind = {"torque_scale": "torque_unit", "position_scale": "position_unit"}.get(family, family)
+    return SetupFinding(kind, names, step.probability[k], message, remedy, True), entries
 
 
-def _late(step: Step, robot: RobotConfig) -> Iterator[tuple[SetupFinding, list[Effect]]]:
-    if "time_shift" not in step.families:
-        return
-    share = step.probability[step.families.index("time_shift")]
+def _linear_map(matrix: Array, signal: str, robot: RobotConfig) -> list[Effect]:
+    """Entries of `signal_scale` for a matrix (n, n): factors of an upper, a diagonal and a lower triangular matrix."""
+    n, names = robot.n, [joint.name for joint in robot.joints]
+    _, lower, upper = linalg.lu(matrix) if not _diagonal(matrix) else (None, np.eye(n), matrix)
+    pivots = np.diag(upper)
+    upper = upper / pivots[:, None]
+
+    def entry(i: int, k: int, factor: float) -> Effect:
+        other = None if k == i else names[k]
+        return Effect(effect="signal_scale", joint=names[i], other=other, parameters={signal: _rounded(factor)})
+
+    made = [entry(i, k, upper[i, k]) for i in range(n) for k in range(i + 1, n) if abs(upper[i, k]) > 1e-12]
+    made += [entry(i, i, pivots[i]) for i in range(n) if abs(pivots[i] - 1.0) > 1e-12]
+    made += [entry(i, k, lower[i, k]) for i in reversed(range(n)) for k in range(i) if abs(lower[i, k]) > 1e-12]
+    return made
+
+
+def _diagonal(matrix: Array) -> bool:
+    return bool(np.allclose(matrix, np.diag(np.diag(matrix))))
+
+
+def _late(step: Step, k: int, robot: RobotConfig) -> tuple[SetupFinding, list[Effect]]:
     shift = float(step.h.shift[np.argmax(np.abs(step.h.shift))])
     delay = float(f"{shift:.3g}")
     names = tuple(joint.name for joint in robot.joints)
     entries = [Effect(effect="time_delay", joint=name, parameters={"delay": delay}) for name in names]
     direction = "late" if shift > 0 else "early"
     message = f"all torques are {1000 * abs(shift):.3g} ms {direction} against the positions"
-    yield SetupFinding("time_shift", names, share, message, _lines(entries), True), entries
+    return SetupFinding("time_shift", names, step.probability[k], message, _lines(entries), True), entries
 
 
 def _gravity(family: str, step: Step, robot: RobotConfig, share: float) -> SetupFinding:
@@ -229,11 +262,19 @@ def _gravity(family: str, step: Step, robot: RobotConfig, share: float) -> Setup
     return SetupFinding(family, names, share, message, f"gravity: [{vector}]", True)
 
 
-def _clock(step: Step, robot: RobotConfig, share: float) -> SetupFinding:
+def _clock(step: Step, robot: RobotConfig, bench: Bench, share: float) -> SetupFinding:
     names = tuple(joint.name for joint in robot.joints)
     unit = CLOCK_WORDS.get(step.h.clock, f"{step.h.clock:g} s")
-    message = f"the time column is in {unit}, not in s: velocities and accelerations are far from the configured limits"
-    return SetupFinding("time_unit", names, share, message, "armident import FILE --rate RATE, with the rate in Hz", True)
+    rate = 1.0 / (bench.period * step.h.clock)
+    message = (
+        f"the time column is in {unit}, not in s: at {1 / bench.period:.4g} Hz the largest velocities are on average "
+        f"{100 * velocity_ratio(bench, _as_configured(robot)):.2g} % of their limits"
+    )
+    return SetupFinding("time_unit", names, share, message, f"armident import FILE --rate {rate:.6g}", True)
+
+
+def _as_configured(robot: RobotConfig) -> Hypothesis:
+    return Hypothesis(np.eye(robot.n), np.eye(robot.n), np.array(robot.gravity), np.zeros(robot.n))
 
 
 def _entry(effect: str, joint: str, signals: Sequence[str], other: str | None = None) -> Effect:

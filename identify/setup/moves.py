@@ -108,23 +108,23 @@ def unit_moves(robot: RobotConfig) -> Iterator[Move]:
     n, ratios = robot.n, robot.transmission_matrix
     revolute = np.array([joint.type == "revolute" for joint in robot.joints])
     small = np.diag(np.where(revolute, DEGREES, THOUSANDTH))
-    yield Move("position_unit", f"positions in {' and '.join(sorted({_unit(joint.type) for joint in robot.joints}))}", small, None)
+    yield Move("position_unit", f"the positions are in {' and '.join(sorted({_unit(joint.type) for joint in robot.joints}))}", small, None)
     if np.abs(ratios - np.eye(n)).max() > 1e-9:
         inverse = np.linalg.inv(ratios)
-        yield Move("side", "torques of the motors", None, ratios.T)
-        yield Move("side", "positions of the motors", inverse, None)
-        yield Move("side", "positions and torques of the motors", inverse, ratios.T)
-        yield Move("side", "torques of the joints taken as those of the motors", None, inverse.T)
-        yield Move("side", "positions of the joints taken as those of the motors", ratios, None)
-        yield Move("side", "positions and torques of the joints taken as those of the motors", ratios, inverse.T)
-    yield Move("torque_unit", "torques in thousands of their unit", None, 1e3 * np.eye(n))
-    yield Move("torque_unit", "torques in thousandths of their unit", None, 1e-3 * np.eye(n))
+        yield Move("side", "the torques are those of the motors, not of the joints", None, ratios.T)
+        yield Move("side", "the positions are those of the motors, not of the joints", inverse, None)
+        yield Move("side", "the positions and torques are those of the motors, not of the joints", inverse, ratios.T)
+        yield Move("side", "the torques are those of the joints, and were converted as those of the motors", None, inverse.T)
+        yield Move("side", "the positions are those of the joints, and were converted as those of the motors", ratios, None)
+        yield Move("side", "the positions and torques are those of the joints, and were converted as those of the motors", ratios, inverse.T)
+    yield Move("torque_unit", "the torques are 1000 times too small (kN m for N m, or A for mA)", None, 1e3 * np.eye(n))
+    yield Move("torque_unit", "the torques are 1000 times too large (mN m for N m, or mA for A)", None, 1e-3 * np.eye(n))
     _, rated = raw_scales(robot)
     if np.ptp(np.log(rated)) > 0.01:
         share = ratios.T @ np.diag(rated / 1000.0) @ np.linalg.inv(ratios.T)
-        yield Move("torque_unit", "torques in per mille of the rated torque", None, share)
+        yield Move("torque_unit", "the torques are in per mille of the rated torque", None, share)
         at_motors = ratios.T @ np.diag(rated / 1000.0)
-        yield Move("torque_unit", "motor torques in per mille of the rated torque", None, at_motors)
+        yield Move("torque_unit", "the torques are those of the motors in per mille of the rated torque", None, at_motors)
 
 
 def single_unit_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
@@ -141,12 +141,12 @@ def single_unit_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Mov
         joint = robot.joints[j]
         ratio = float(robot.transmission_matrix[j, j])
         unit = DEGREES if joint.type == "revolute" else THOUSANDTH
-        yield Move("position_unit", f"position of {joint.name} in {_unit(joint.type)}", scaled(robot.n, j, unit), None)
-        yield Move("torque_unit", f"torque of {joint.name} in thousandths", None, scaled(robot.n, j, 1e-3))
-        yield Move("torque_unit", f"torque of {joint.name} in thousands", None, scaled(robot.n, j, 1e3))
+        yield Move("position_unit", f"the position of {joint.name} is in {_unit(joint.type)}", scaled(robot.n, j, unit), None)
+        yield Move("torque_unit", f"the torque of {joint.name} is 1000 times too large", None, scaled(robot.n, j, 1e-3))
+        yield Move("torque_unit", f"the torque of {joint.name} is 1000 times too small", None, scaled(robot.n, j, 1e3))
         if ratio != 0.0 and abs(abs(ratio) - 1.0) > 1e-9:
-            yield Move("side", f"torque of {joint.name} is that of its motor", None, scaled(robot.n, j, ratio))
-            yield Move("side", f"torque of {joint.name} was converted twice", None, scaled(robot.n, j, 1.0 / ratio))
+            yield Move("side", f"the torque of {joint.name} is that of its motor", None, scaled(robot.n, j, ratio))
+            yield Move("side", f"the torque of {joint.name} is that of the joint, and was converted as that of the motor", None, scaled(robot.n, j, 1.0 / ratio))
 
 
 def scaled(n: int, joint: int, factor: float) -> Array:

@@ -14,8 +14,11 @@ from armident.identify.setup.moves import Move, scaled
 Array = NDArray[np.float64]
 Criterion = Callable[[Hypothesis], float]
 
-FACTORS = tuple(float(f) for f in np.geomspace(0.2, 5.0, 15) if abs(f - 1.0) > 1e-6)
+FACTORS = (0.2, 0.32, 0.5, 0.7, 0.85, 1.0, 1.18, 1.4, 2.0, 3.1, 5.0)
 """True over configured values that are tried before the refinement."""
+
+WORTH_REFINING = 0.02
+"""Least drop of the criterion at the tried values for a refinement, nats per row."""
 
 LEAST_GEAR = 0.05
 """Least relative error of a gear ratio or a resolution: below it other effects of drives and links resemble it."""
@@ -59,14 +62,18 @@ def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criter
 
 def _best(criterion: Callable[[float], float]) -> float:
     """Factor with the least misfit: the best of `FACTORS`, refined between its neighbours."""
-    grid = sorted((*FACTORS, 1.0))
-    values = [criterion(f) for f in grid]
+    values = [criterion(f) for f in FACTORS]
     k = int(np.argmin(values))
-    low, high = np.log(grid[max(k - 1, 0)]), np.log(grid[min(k + 1, len(grid) - 1)])
+    if values[k] > values[FACTORS.index(1.0)] - WORTH_REFINING:
+        return 1.0
+    low, high = np.log(FACTORS[max(k - 1, 0)]), np.log(FACTORS[min(k + 1, len(FACTORS) - 1)])
     found = optimize.minimize_scalar(
-        lambda v: criterion(float(np.exp(v))), bounds=(low, high), method="bounded", options={"xatol": 2e-3, "maxiter": 15}
+        lambda v: criterion(float(np.exp(v))),
+        bounds=(low, high),
+        method="bounded",
+        options={"xatol": 2e-3, "maxiter": 15},
     )
-    return float(np.exp(found.x)) if found.fun < values[k] else grid[k]
+    return float(np.exp(found.x)) if found.fun < values[k] else FACTORS[k]
 
 
 def with_clock(h: Hypothesis, factor: float) -> Hypothesis:

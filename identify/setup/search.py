@@ -10,14 +10,12 @@ from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, fit, held_out, joint_errors
 from armident.identify.setup.plausible import log_plausibility
+from armident.identify.setup.prior import WIRING, cost, wiring_cost
 
 Array = NDArray[np.float64]
 
 MOST_MISTAKES = 6
 """Largest number of mistakes that are corrected one after the other."""
-
-PRIOR = float(np.log(100.0))
-"""Cost of each mistake, nats: one set-up of a hundred has a mistake of a given kind."""
 
 LEAST_ODDS = float(np.log(99.0))
 """Least gain of the score for a finding, nats: posterior odds of 99 to 1, a false alarm in less than 1 %."""
@@ -40,8 +38,14 @@ RANKED_ROWS = 100.0
 EXHAUSTIVE = 6
 """Largest number of joints of which all orders are tried; with more, a search by exchanges starts from several."""
 
-ORDERS_KEPT = 3
+EQUAL = 0.1
+"""Odds to the best hypothesis from which on another one is named beside it."""
+
+ORDERS_KEPT = 2
 """Number of best orders from which the search continues."""
+
+ORDER_ROWS = 150
+"""Instants with which orders are ranked: enough for residuals that differ by tens of percent."""
 
 CLOCKS = (1e-3, 1e-6, 1e-9, 1e3)
 """Units of time that are tried: ms, us and ns taken for s, and s taken for ms."""
@@ -62,7 +66,7 @@ class Step:
     rank
         Criterion of the ranking, in sample, nats per row: lower is better.
     rivals
-        Families and descriptions of other single mistakes that explain the recordings equally well as the last one.
+        For each mistake, others of the same kind that explain the recordings equally well.
     probability
         Posterior share of each mistake.
     """
@@ -72,7 +76,7 @@ class Step:
     words: tuple[str, ...] = ()
     made: tuple[tuple[Array, Array, bool], ...] = ()
     rank: float = np.inf
-    rivals: tuple[str, ...] = ()
+    rivals: tuple[tuple[str, ...], ...] = ()
     probability: tuple[float, ...] = ()
 
 
@@ -93,12 +97,7 @@ class Search:
 
     def rank(self, h: Hypothesis) -> float:
         """Criterion of the ranking: misfit in sample minus plausibility of the units, nats per row."""
-        try:
-            shares = fit(self.bench, h).shares
-        except np.linalg.LinAlgError:
-            return np.inf
-        misfit = float(np.log(shares[self.bench.moving]).sum())
-        return misfit - 2.0 * log_plausibility(self.bench, h) / RANKED_ROWS
+        return _rank(self.bench, h)
 
     def run(self, start: Hypothesis) -> Step:
         """Return the corrected set-up.
@@ -110,14 +109,13 @@ class Search:
         """
         first = Step(start, rank=self.rank(start))
         best = self._greedy(first)
-        if self._understood(best.h):
+        simple = len(best.families) < 2 or not any(family in WIRING for family in best.families)
+        if self.bench.n < 3 or (simple and self._understood(best.h)):
             return best
-        for step in self._orders(start):
+        for step in self._orders(first):
             other = self._greedy(step)
             if self._gain(best, other)[0] > 0:
                 best = other
-            if self._understood(best.h):
-                break
         return best
 
     def _understood(self, h: Hypothesis) -> bool:
@@ -144,10 +142,12 @@ class Search:
         least = LEAST_DROP_LATE if late else LEAST_DROP
         if gain < LEAST_ODDS or (drop < least and plausible < LEAST_ODDS):
             return None
-        equal = [s for s in found[1:8] if s.families[-1] != "one_late" and self._gain(s, best)[0] < LEAST_ODDS]
-        odds = [np.exp(min(-self._gain(s, best)[0], 0.0)) for s in equal if _differs(s.h, best.h)]
-        share = 1.0 / (1.0 + sum(odds) + np.exp(-gain))
-        rivals = tuple(s.words[-1] for s in equal)
+        others = [s for s in found[1:8] if s.families[-1] != "one_late" and _differs(s.h, best.h)]
+        odds = {s.words[-1]: float(np.exp(min(-self._gain(s, best)[0], 0.0))) for s in others}
+        # A symmetry of the arm makes some signs equal: that one of them is wrong is certain all the same.
+        equal = {w: p for s in others if (p := odds[w := s.words[-1]]) > EQUAL and _same_kind(s, best)}
+        share = (1.0 + sum(equal.values())) / (1.0 + sum(odds.values()) + float(np.exp(-gain)))
+        rivals = (*step.rivals, tuple(equal))
         return replace(best, rivals=rivals, probability=(*step.probability, share))
 
     def _gain(self, old: Step, new: Step) -> tuple[float, float, float]:
@@ -160,8 +160,9 @@ class Search:
         rows = independent_rows(fit(self.bench, new.h).residual)[moving]
         drops = np.log(before / after)
         plausible = log_plausibility(self.bench, new.h) - log_plausibility(self.bench, old.h)
-        cost = PRIOR * (len(new.families) - len(old.families))
-        return float(0.5 * rows @ drops + plausible - cost), float(drops.sum()), plausible
+        n = self.bench.n
+        dearer = cost(new.families, new.made, n) - cost(old.families, old.made, n)
+        return float(0.5 * rows @ drops + plausible - dearer), float(drops.sum()), plausible
 
     def _neighbours(self, step: Step) -> Iterator[Step]:
         bench, h = self.bench, step.h
@@ -198,18 +199,14 @@ class Search:
             h.torque @ np.linalg.inv(step.h.torque),
             raw,
         )
-        return replace(
-            step,
-            h=h,
-            families=(*step.families, family),
-            words=(*step.words, words),
-            made=(*step.made, change),
-            rank=self.rank(h),
-        )
+        families, made = (*step.families, family), (*step.made, change)
+        rank = self.rank(h) + 2.0 * cost(families, made, self.bench.n) / RANKED_ROWS
+        return replace(step, h=h, families=families, words=(*step.words, words), made=made, rank=rank)
 
-    def _orders(self, start: Hypothesis) -> list[Step]:
+    def _orders(self, first: Step) -> list[Step]:
         """Best orders of all joints, with torques in the order of positions, or as their friction assigns them."""
-        n = self.bench.n
+        n, start = self.bench.n, first.h
+        coarse = replace(self.bench, rows_kept=ORDER_ROWS, _rows={}, _torques={})
         relative = [np.eye(n)]
         by_friction = assignment.by_friction(self.bench, start)
         if not np.array_equal(by_friction, np.eye(n)):
@@ -217,11 +214,11 @@ class Search:
         seen: dict[bytes, tuple[float, Hypothesis]] = {}
 
         def at(order: Array, own: Array) -> float:
-            h = replace(start, position=order @ start.position, torque=order @ own @ start.torque)
             key = np.concatenate([order, own]).tobytes()
             if key not in seen:
                 self.tried["order"] = self.tried.get("order", 0) + 1
-                seen[key] = self.rank(h), h
+                h = replace(start, position=order @ start.position, torque=order @ own @ start.torque)
+                seen[key] = _rank(coarse, h) + 2.0 * wiring_cost(order, order @ own) / RANKED_ROWS, h
             return seen[key][0]
 
         for own in relative:
@@ -229,13 +226,19 @@ class Search:
                 for order in assignment.orders(n):
                     at(order, own)
             else:
-                for first in assignment.usual_orders(n):
-                    _climb(first, lambda order, own=own: at(order, own))
-        best = sorted(seen.values(), key=lambda pair: pair[0])[:ORDERS_KEPT]
-        first = Step(start, rank=self.rank(start))
-        return [
-            replace(self._made(first, "order", "joints in another order", h), probability=(1.0,)) for _, h in best
-        ]
+                for begin in assignment.usual_orders(n):
+                    _climb(begin, lambda order, own=own: at(order, own))
+        best = sorted(seen.values(), key=lambda pair: pair[0])[: 4 * ORDERS_KEPT]
+        steps = [self._made(first, "order", "joints in another order", h) for _, h in best]
+        return [replace(s, probability=(1.0,), rivals=((),)) for s in sorted(steps, key=lambda s: s.rank)[:ORDERS_KEPT]]
+
+
+def _rank(bench: Bench, h: Hypothesis) -> float:
+    try:
+        shares = fit(bench, h).shares
+    except np.linalg.LinAlgError:
+        return np.inf
+    return float(np.log(shares[bench.moving]).sum()) - 2.0 * log_plausibility(bench, h) / RANKED_ROWS
 
 
 def _climb(order: Array, criterion: "assignment.OrderCriterion") -> None:
@@ -254,6 +257,11 @@ def _differs(a: Hypothesis, b: Hypothesis) -> bool:
     """True if two hypotheses correct the signals differently."""
     same = np.allclose(a.position, b.position, rtol=0.05) and np.allclose(a.torque, b.torque, rtol=0.05)
     return not (same and np.allclose(a.gravity, b.gravity, atol=0.5) and a.clock == b.clock)
+
+
+def _same_kind(a: Step, b: Step) -> bool:
+    """True if both last mistakes are mistakes of the wiring, or both of the units."""
+    return (a.families[-1] in WIRING) == (b.families[-1] in WIRING)
 
 
 def independent_rows(residual: Array) -> Array:

@@ -151,7 +151,7 @@ def _runs(x: Array, tolerance: float) -> list[tuple[float, int, int]]:
     return [(float(x[b]), int(b), int(e)) for b, e in zip(begins[long], ends[long], strict=True)]
 
 
-def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig, clock: float) -> list[SetupFinding]:
+def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig) -> list[SetupFinding]:
     """Return a finding if the motion has fewer than ten samples per period.
 
     Parameters
@@ -160,10 +160,8 @@ def rate_findings(experiments: Sequence[Experiment], robot: RobotConfig, clock: 
         SI, joint side.
     robot
         The configuration.
-    clock
-        True over recorded duration.
     """
-    dt = experiments[0].dt * clock
+    dt = experiments[0].dt
     highest = np.max([velocity_frequency(e.q, dt) for e in experiments], axis=0)
     slow = np.flatnonzero(highest * dt * LEAST_SAMPLES > 1.0)
     if not slow.size:
