@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.identify.setup.bench import Bench
-from armident.identify.setup.fit import FLOOR, Hypothesis, physical_least_squares
+from armident.identify.setup.fit import FLOOR, Hypothesis, normal, physical_least_squares
 
 Array = NDArray[np.float64]
 OrderCriterion = Callable[[Array], float]
@@ -29,16 +29,15 @@ def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
         Start.
     """
     n = bench.n
-    rows = bench.rows(h.position)
-    x = rows.x.copy()
-    x[:, :, : bench.rigid] += np.tensordot(h.gravity, rows.gravity, 1)
+    found = normal(bench, h)
+    x = found.x
     y = bench.torque(h.shift) @ h.torque.T
     power = np.maximum((y**2).sum(axis=0), 1e-300)
     cost, sign = np.zeros((n, n)), np.ones((n, n))
     for m in range(n):
         used = np.flatnonzero(np.abs(x[:, m]).max(axis=0) > 0)
         own = np.ascontiguousarray(x[:, m, used])
-        gram, physical = own.T @ own, rows.physical[[m, n + m]][:, used]
+        gram, physical = own.T @ own, found.physical[[m, n + m]][:, used]
         for k in range(n):
             right = own.T @ y[:, k]
             shares = []
@@ -66,11 +65,10 @@ def by_friction(bench: Bench, h: Hypothesis) -> Array:
     h
         Start; its assignments are not used.
     """
-    n, b = bench.n, bench.rigid
+    n = bench.n
     x = bench.rows(np.eye(n)).x
-    names = bench.model.base.names
-    dry = np.stack([x[:, j, names.index(f"fc{j + 1}")] for j in range(n)], axis=1)
-    slow = np.stack([x[:, j, names.index(f"fv{j + 1}")] for j in range(n)], axis=1)
+    dry = np.stack([x[:, j, bench.column(f"fc{j + 1}")] for j in range(n)], axis=1)
+    slow = np.stack([x[:, j, bench.column(f"fv{j + 1}")] for j in range(n)], axis=1)
     fast = np.concatenate([bench._kept(s.qdd) for s in bench.segments])
     q = np.concatenate([bench._kept(s.q) for s in bench.segments])
     smooth = np.concatenate([np.ones((q.shape[0], 1)), q, np.sin(q), np.cos(q), fast, slow], axis=1)

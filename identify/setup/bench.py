@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +85,7 @@ class Rows:
     physical: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Bench:
     """Signals of a set of recordings, and a cache of their equations.
 
@@ -103,6 +105,8 @@ class Bench:
         Sampling period of the recordings, s.
     rows_kept
         Largest number of instants.
+    normals
+        Cache of `armident.identify.setup.fit.normal`.
     """
 
     model: ArmModel
@@ -112,6 +116,7 @@ class Bench:
     moving: NDArray[np.bool_]
     period: float
     rows_kept: int = MOST_ROWS
+    normals: dict[bytes, Any] = field(default_factory=dict, repr=False)
     _rows: dict[bytes, Rows] = field(default_factory=dict, repr=False)
     _torques: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
@@ -130,6 +135,32 @@ class Bench:
     def rigid(self) -> int:
         """Number of base parameters: the first columns of the regressors."""
         return self.model.base.b
+
+    @cached_property
+    def recorded(self) -> tuple[Array, Array, Array]:
+        """Recorded positions, velocities and torques at the instants of the rows, (M, n) each."""
+        q, qd, tau = (np.concatenate([self._kept(getattr(s, x)) for s in self.segments]) for x in ("q", "qd", "tau"))
+        return q, qd, tau
+
+    def coarse(self, rows: int) -> "Bench":
+        """Return the same signals with fewer instants.
+
+        Parameters
+        ----------
+        rows
+            Largest number of instants.
+        """
+        return Bench(self.model, self.robot, self.segments, self.decimation, self.moving, self.period, rows)
+
+    def column(self, name: str) -> int:
+        """Column of a standard parameter that is a base parameter, possibly with others regrouped into it.
+
+        Parameters
+        ----------
+        name
+            Standard parameter.
+        """
+        return list(self.model.base.independent).index(self.model.names.index(name))
 
     def torque(self, shift: Array) -> Array:
         """Recorded torques at the instants of the rows, moved to earlier times, (M, n), N m or N.
@@ -170,7 +201,6 @@ class Bench:
 
     def _make(self, position: Array) -> Rows:
         n, b = self.n, self.rigid
-        names = self.model.base.names
         q, qd, qdd = (
             np.concatenate([self._kept(getattr(s, name)) for s in self.segments]) @ position.T
             for name in ("q", "qd", "qdd")
@@ -187,7 +217,7 @@ class Bench:
         physical = np.zeros((2, n, x.shape[2]))
         spring = q - q.mean(axis=0)
         for j in range(n):
-            dry = names.index(f"fc{j + 1}")
+            dry = self.column(f"fc{j + 1}")
             x[:, :, dry] = 0.0
             x[:, j, dry] = free[:, j, 0]
             own = b + FRICTION_TERMS * j + np.arange(FRICTION_TERMS)
@@ -195,10 +225,12 @@ class Bench:
             x[:, j, own[1:]] = free[:, j, 1:]
             push = np.zeros_like(postures)
             push[:, j] = 1.0
-            unit = weightless.rigid_regressor(postures, np.zeros_like(postures), push)
+            motionless = np.zeros_like(postures)
+            unit = weightless.rigid_regressor(postures, motionless, push) - weightless.rigid_regressor(
+                postures, motionless, motionless
+            )
             physical[0, j, :b] = unit[:, j].mean(axis=0)
-            physical[0, j, names.index(f"off{j + 1}")] = 0.0
-            columns = [names.index(f"fv{j + 1}"), dry, *own[1:]]
+            columns = [self.column(f"fv{j + 1}"), dry, *own[1:]]
             physical[1, j, columns] = (x[:, j, columns] * qd[:, j, None]).mean(axis=0)
         return Rows(x, gravity, physical.reshape(2 * n, -1))
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize
 
-from armident.identify.setup.bench import FRICTION_TERMS, Bench, Rows
+from armident.identify.setup.bench import Bench
 
 Array = NDArray[np.float64]
 
@@ -21,6 +21,9 @@ RIDGE = 1e-6
 
 PARTS = 4
 """Parts of the cross-validation; each consists of several blocks of time."""
+
+KEPT = 32
+"""Largest number of normal equations that are kept for repeated use."""
 
 BLOCKS = 24
 """Contiguous blocks of time per experiment set: long against the memory of the residual."""
@@ -68,8 +71,86 @@ class Fit:
     theta: Array
 
 
-def equations(bench: Bench, h: Hypothesis, *, free: bool = True) -> tuple[Array, Array, Rows]:
-    """Regressors of the recorded torques (M, n, c), the torques (M, n), and the rows.
+@dataclass(eq=False)
+class Normal:
+    """Normal equations of all rows of the model, for one assignment of positions and one gravity.
+
+    Parameters
+    ----------
+    x
+        Regressors of the joint torques, (M, n, c).
+    grams
+        ``X_m' X_m`` of every row, (n, c, c).
+    physical
+        Constraints, (k, c).
+    products
+        ``X_m' y_k`` of row m and recorded torque k, (n, n, c), by the shifts of the torques.
+    """
+
+    x: Array
+    grams: Array
+    physical: Array
+    products: dict[bytes, Array]
+
+
+def normal(bench: Bench, h: Hypothesis) -> Normal:
+    """Return the normal equations of a hypothesis; repeated calls return the same object.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        The hypothesis; its torques are not used.
+    """
+    # Accelerations scale with the clock squared; only their proportion to gravity matters to the fit.
+    gravity = h.gravity * h.clock**2
+    key = np.round(np.concatenate([h.position.ravel(), gravity]), 12).tobytes()
+    if key not in bench.normals:
+        rows = bench.rows(h.position)
+        x = rows.x.copy()
+        x[:, :, : bench.rigid] += np.einsum("a,amnb->mnb", gravity, rows.gravity)
+        each = np.ascontiguousarray(x.transpose(1, 0, 2))
+        if len(bench.normals) > KEPT:
+            bench.normals.clear()
+        bench.normals[key] = Normal(x, each.transpose(0, 2, 1) @ each, rows.physical, {})
+    found: Normal = bench.normals[key]
+    return found
+
+
+def _products(bench: Bench, found: Normal, shift: Array) -> Array:
+    key = np.round(shift, 9).tobytes()
+    if key not in found.products:
+        y = bench.torque(shift)
+        found.products[key] = np.einsum("mic,mk->ikc", found.x, y, optimize=True)
+    return found.products[key]
+
+
+def fit_shares(bench: Bench, h: Hypothesis) -> Array:
+    """Residual share of the power of every recorded torque, in sample, (n,); see `fit`.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        The hypothesis.
+    """
+    owner = np.abs(h.torque).argmax(axis=0)
+    scale = h.torque[owner, np.arange(bench.n)]
+    single = np.zeros_like(h.torque)
+    single[owner, np.arange(bench.n)] = scale
+    if not np.array_equal(single, h.torque):
+        return fit(bench, h).shares
+    found = normal(bench, h)
+    grams = found.grams[owner] / (scale**2)[:, None, None]
+    products = _products(bench, found, h.shift)[owner, np.arange(bench.n)] / scale[:, None]
+    power = np.maximum((bench.torque(h.shift) ** 2).sum(axis=0), 1e-300)
+    return _solve(grams, products, power, found.physical, bench.moving)[1]
+
+
+def equations(bench: Bench, h: Hypothesis, *, free: bool = True) -> tuple[Array, Array, Array]:
+    """Regressors of the recorded torques (M, n, c), the torques (M, n), and the constraints (k, c).
 
     Parameters
     ----------
@@ -80,15 +161,11 @@ def equations(bench: Bench, h: Hypothesis, *, free: bool = True) -> tuple[Array,
     free
         True to include the free friction terms and springs.
     """
-    rows = bench.rows(h.position)
-    x = rows.x.copy()
-    # Accelerations scale with the clock squared; only their proportion to gravity matters to the fit.
-    x[:, :, : bench.rigid] += np.tensordot(h.gravity * h.clock**2, rows.gravity, 1)
-    if not free:
-        x = x[:, :, : bench.rigid]
+    found = normal(bench, h)
+    x, physical = (found.x, found.physical) if free else (found.x[..., : bench.rigid], found.physical[:, : bench.rigid])
     if not np.array_equal(h.torque, np.eye(bench.n)):
         x = np.linalg.inv(h.torque) @ x
-    return x, bench.torque(h.shift), rows
+    return x, bench.torque(h.shift), physical
 
 
 def fit(bench: Bench, h: Hypothesis, *, free: bool = True) -> Fit:
@@ -103,8 +180,7 @@ def fit(bench: Bench, h: Hypothesis, *, free: bool = True) -> Fit:
     free
         True to include the free friction terms and springs.
     """
-    x, y, rows = equations(bench, h, free=free)
-    physical = rows.physical[:, : x.shape[2]]
+    x, y, physical = equations(bench, h, free=free)
     grams, products, power = _normal(x, y)
     theta, shares = _solve(grams, products, power, physical, bench.moving)
     return Fit(shares, y - x @ theta, theta)
@@ -137,13 +213,13 @@ def held_out(bench: Bench, h: Hypothesis) -> Array:
     h
         The hypothesis.
     """
-    x, y, rows = equations(bench, h)
+    x, y, physical = equations(bench, h)
     block = (np.arange(y.shape[0]) * BLOCKS // y.shape[0]) % PARTS
     parts = [_normal(x[block == k], y[block == k]) for k in range(PARTS)]
     total = [sum(part[i] for part in parts) for i in range(3)]
     left = np.zeros(bench.n)
     for grams, products, power in parts:
-        theta, _ = _solve(total[0] - grams, total[1] - products, total[2] - power, rows.physical, bench.moving)
+        theta, _ = _solve(total[0] - grams, total[1] - products, total[2] - power, physical, bench.moving)
         left += power - 2 * products @ theta + grams @ theta @ theta
     return np.maximum(left / total[2], FLOOR)
 

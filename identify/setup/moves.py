@@ -146,6 +146,10 @@ def single_unit_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Mov
         yield Move("torque_unit", f"the torque of {joint.name} is 1000 times too small", None, scaled(robot.n, j, 1e3))
         if ratio != 0.0 and abs(abs(ratio) - 1.0) > 1e-9:
             yield Move("side", f"the torque of {joint.name} is that of its motor", None, scaled(robot.n, j, ratio))
+            place = scaled(robot.n, j, 1.0 / ratio)
+            yield Move("side", f"the position of {joint.name} is that of its motor", place, None)
+            place = scaled(robot.n, j, ratio)
+            yield Move("side", f"the position of {joint.name} was converted as that of its motor", place, None)
             yield Move("side", f"the torque of {joint.name} is that of the joint, and was converted as that of the motor", None, scaled(robot.n, j, 1.0 / ratio))
 
 

@@ -38,7 +38,7 @@ def position_ratio(bench: Bench, h: Hypothesis) -> float:
         Corrections.
     """
     limits = np.array([max(abs(end) for end in joint.limits.position) for joint in bench.robot.joints])
-    peaks = np.max([np.abs(s.q @ h.position.T).max(axis=0) for s in bench.segments], axis=0)
+    peaks = np.abs(bench.recorded[0] @ h.position.T).max(axis=0)
     return _mean(peaks / limits, limits, bench.moving)
 
 
@@ -53,7 +53,7 @@ def velocity_ratio(bench: Bench, h: Hypothesis) -> float:
         Corrections.
     """
     limits = np.array([joint.limits.velocity for joint in bench.robot.joints])
-    peaks = np.max([np.abs(s.qd @ h.position.T).max(axis=0) for s in bench.segments], axis=0)
+    peaks = np.abs(bench.recorded[1] @ h.position.T).max(axis=0)
     return _mean(peaks / h.clock / limits, limits, bench.moving)
 
 
@@ -68,7 +68,7 @@ def torque_ratio(bench: Bench, h: Hypothesis) -> float:
         Corrections.
     """
     limits = np.array([joint.limits.torque for joint in bench.robot.joints])
-    peaks = np.max([np.abs(s.tau @ h.torque.T).max(axis=0) for s in bench.segments], axis=0)
+    peaks = np.abs(bench.recorded[2] @ h.torque.T).max(axis=0)
     return _mean(peaks / limits, limits, bench.moving)
 
 

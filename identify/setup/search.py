@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
-from armident.identify.setup.fit import Hypothesis, fit, held_out, joint_errors
+from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors
 from armident.identify.setup.plausible import log_plausibility
 from armident.identify.setup.prior import WIRING, cost, wiring_cost
 
@@ -109,7 +109,7 @@ class Search:
         """
         first = Step(start, rank=self.rank(start))
         best = self._greedy(first)
-        simple = len(best.families) < 2 or not any(family in WIRING for family in best.families)
+        simple = sum(family in WIRING for family in best.families) < 2
         if self.bench.n < 3 or (simple and self._understood(best.h)):
             return best
         for step in self._orders(first):
@@ -134,21 +134,31 @@ class Search:
     def _taken(self, step: Step, found: list[Step]) -> Step | None:
         """Best neighbour, if it is a mistake of the set-up that is certain and material."""
         best = found[0]
-        if best.families[-1] == "one_late":
-            # The delay of a single drive is an effect of its own, and no clock of the set-up.
-            return None
         gain, drop, plausible = self._gain(step, best)
-        late = best.families[-1] == "time_shift" and float(np.sum(best.h.shift - step.h.shift)) > 0.0
-        least = LEAST_DROP_LATE if late else LEAST_DROP
+        least = LEAST_DROP
+        if best.families[-1] == "time_shift":
+            shift = float(np.max(best.h.shift - step.h.shift))
+            if abs(shift) < self.bench.period or self._one_is_late(step, best):
+                return None
+            least = LEAST_DROP_LATE if shift > 0.0 else LEAST_DROP
         if gain < LEAST_ODDS or (drop < least and plausible < LEAST_ODDS):
             return None
-        others = [s for s in found[1:8] if s.families[-1] != "one_late" and _differs(s.h, best.h)]
+        others = [s for s in found[1:8] if _differs(s.h, best.h)]
         odds = {s.words[-1]: float(np.exp(min(-self._gain(s, best)[0], 0.0))) for s in others}
         # A symmetry of the arm makes some signs equal: that one of them is wrong is certain all the same.
         equal = {w: p for s in others if (p := odds[w := s.words[-1]]) > EQUAL and _same_kind(s, best)}
         share = (1.0 + sum(equal.values())) / (1.0 + sum(odds.values()) + float(np.exp(-gain)))
         rivals = (*step.rivals, tuple(equal))
         return replace(best, rivals=rivals, probability=(*step.probability, share))
+
+    def _one_is_late(self, step: Step, best: Step) -> bool:
+        """True if a delay of one drive alone explains more: an effect of its own, and no clock of the set-up."""
+        n = self.bench.n
+        alone = [
+            self.rank(gravity.best_shift(step.h, self.rank, self.bench.period, np.arange(n) == j))
+            for j in np.flatnonzero(self.bench.moving)
+        ]
+        return n > 1 and min(alone) < self.rank(best.h)
 
     def _gain(self, old: Step, new: Step) -> tuple[float, float, float]:
         """Gain of the score, drop of the held-out residual power, and gain of plausibility, nats each."""
@@ -187,9 +197,6 @@ class Search:
             yield self._made(step, "time_unit", f"time in units of {clock:g} s", scales.with_clock(h, clock))
         late = gravity.best_shift(h, self.rank, bench.period, bench.moving)
         yield self._made(step, "time_shift", "all torques late by the same time", late)
-        for j in joints if n > 1 else []:
-            one = gravity.best_shift(h, self.rank, bench.period, np.arange(n) == j)
-            yield self._made(step, "one_late", f"torque of {robot.joints[j].name} late", one)
 
     def _made(self, step: Step, family: str, words: str, h: Hypothesis, raw: bool = False) -> Step:
         self.tried[family] = self.tried.get(family, 0) + 1
@@ -206,7 +213,7 @@ class Search:
     def _orders(self, first: Step) -> list[Step]:
         """Best orders of all joints, with torques in the order of positions, or as their friction assigns them."""
         n, start = self.bench.n, first.h
-        coarse = replace(self.bench, rows_kept=ORDER_ROWS, _rows={}, _torques={})
+        coarse = self.bench.coarse(ORDER_ROWS)
         relative = [np.eye(n)]
         by_friction = assignment.by_friction(self.bench, start)
         if not np.array_equal(by_friction, np.eye(n)):
@@ -235,7 +242,7 @@ class Search:
 
 def _rank(bench: Bench, h: Hypothesis) -> float:
     try:
-        shares = fit(bench, h).shares
+        shares = fit_shares(bench, h)
     except np.linalg.LinAlgError:
         return np.inf
     return float(np.log(shares[bench.moving]).sum()) - 2.0 * log_plausibility(bench, h) / RANKED_ROWS
