@@ -1,4 +1,4 @@
-"""Commands of this package: identify, diagnose, effects, history, trajectory, worker, reproduce, diagnose-suite."""
+"""Commands of this package: identify, check, diagnose, effects, history, trajectory, worker, reproduce, diagnose-suite."""
 
 from pathlib import Path
 from typing import Annotated
@@ -63,6 +63,25 @@ def identify(
         "physical": physical,
     }
     identify_command(recording, config, chosen, out, as_json=json)
+
+
+def check(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings (.mcap) of one robot at one sampling rate.")],
+    config: Robot = None,
+    json: Json = False,
+) -> None:
+    """Check the set-up in seconds: signs, order of joints, units, gear ratios, gravity, clocks, clipping, standstill.
+
+    Prints what is wrong, how sure that is, and the line of configuration that corrects it. Exit code 0 if the set-up
+    is right, 3 if results would be unusable.
+
+    Example: armident check tx40.mcap --config configs/tx40.yaml
+    """
+    from armident.identify.commands import check_command
+
+    code = check_command(recordings, config, as_json=json)
+    if code:
+        raise typer.Exit(code)
 
 
 def worker(
