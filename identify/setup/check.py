@@ -12,9 +12,10 @@ from armident.identify.effects.recorded import put_right
 from armident.identify.experiment import Experiment
 from armident.identify.setup import signals
 from armident.identify.setup.bench import Bench, make_bench
+from armident.identify.setup.clipping import clipped_torques
 from armident.identify.setup.describe import described
 from armident.identify.setup.fit import Hypothesis, joint_errors
-from armident.identify.setup.result import SetupCheck
+from armident.identify.setup.result import SetupCheck, SetupFinding
 from armident.identify.setup.search import NOT_UNDERSTOOD, Search, Step
 
 Array = NDArray[np.float64]
@@ -32,6 +33,7 @@ TRIED = {
     "torque_unit": "torques in thousands, thousandths or per mille of their unit",
     "position_scale": "another encoder resolution of each joint",
     "torque_scale": "another torque constant of each joint",
+    "torque_scales": "every torque in a unit of its own drive",
     "gear_ratio": "another gear ratio of each joint",
     "side": "motor side taken for joint side, and the reverse",
     "gravity_direction": "any direction of gravity",
@@ -91,6 +93,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         setup_findings, corrected = (*clock, *found.findings), found.robot
         tried = tried | again.tried
     findings += signals.rate_findings(experiments, robot)
+    findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
     return SetupCheck(
         findings=(*setup_findings, *findings),
         relative_error_pct=before,
@@ -107,6 +110,23 @@ def _searched(
     bench = make_bench(experiments, robot, moving)
     search = Search(bench)
     return bench, search, search.run(_as_configured(robot))
+
+
+def _clipped(bench: Bench, best: Step, robot: RobotConfig, known: set[str]) -> list[SetupFinding]:
+    """Return the torques that are clipped behind noise, and were not found by equal values."""
+    findings = []
+    for clip in clipped_torques(bench, best.h):
+        name = robot.joints[clip.joint].name
+        if name in known:
+            continue
+        unit = "N m" if robot.joints[clip.joint].type == "revolute" else "N"
+        message = (
+            f"the torque of {name} is clipped at {clip.level:.4g} {unit} in {100 * clip.share:.0f} % of the time: the "
+            f"model needs {clip.needed:.2g} times as much there"
+        )
+        unusable = clip.share >= signals.CLIPPED_UNUSABLE
+        findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, signals.CLIPPED_REMEDY, unusable))
+    return findings
 
 
 def _as_configured(robot: RobotConfig) -> Hypothesis:

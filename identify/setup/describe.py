@@ -18,7 +18,7 @@ from armident.identify.setup.search import Step
 
 Array = NDArray[np.float64]
 
-SCALES = ("position_unit", "torque_unit", "side", "gear_ratio", "torque_scale", "position_scale")
+SCALES = ("position_unit", "torque_unit", "side", "gear_ratio", "torque_scale", "torque_scales", "position_scale")
 """Families that scale signals."""
 
 CLOCK_WORDS = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "ks"}
@@ -204,6 +204,10 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
         message = f"the position of {names[0]} is {position[j, j]:.3g} times the recorded one by the geometry of the arm"
         resolution = f"counts_per_unit: {1 / position[j, j]:.3g} times the present one"
         remedy = f"joints: {names[0]}: drive: {resolution}; or {remedy}"
+    elif family == "torque_scales":
+        factors = ", ".join(f"{torque[i, i]:.3g}" for i in range(robot.n))
+        message += f" (per mille, or currents): by the links that they share, true over recorded is as {factors}"
+        remedy = f"joints: drive: gain or rated of each drive by its data sheet; or {remedy}"
     elif len(joints) > 1:
         message += (
             f": the largest positions are on average {position_ratio(bench, _as_configured(robot)):.3g} of their limits, "
@@ -211,7 +215,7 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
         )
         if family == "side":
             remedy = f"armident import FILE --motor-side where positions and torques are the motors'; or {remedy}"
-    kind = {"torque_scale": "torque_unit", "position_scale": "position_unit"}.get(family, family)
+    kind = {"torque_scale": "torque_unit", "torque_scales": "torque_unit", "position_scale": "position_unit"}.get(family, family)
     return SetupFinding(kind, names, step.probability[k], message, remedy, True), entries
 
 

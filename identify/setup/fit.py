@@ -186,6 +186,24 @@ def fit(bench: Bench, h: Hypothesis, *, free: bool = True) -> Fit:
     return Fit(shares, y - x @ theta, theta)
 
 
+def fit_rows(x: Array, y: Array, used: NDArray[np.bool_], physical: Array, moving: NDArray[np.bool_]) -> Array:
+    """Return the parameters (c,) of a fit to some of the equations.
+
+    Parameters
+    ----------
+    x, y
+        Regressors (M, n, c) and torques (M, n).
+    used
+        Mask (M, n) of the equations.
+    physical
+        Constraints, (k, c).
+    moving
+        Mask (n,) of the joints that move.
+    """
+    theta, _ = _solve(*_normal(x * used[:, :, None], y * used), physical, moving)
+    return theta
+
+
 def joint_errors(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
     """Relative error of the rigid model at every joint, and the correlation of neighbouring residuals, (n,) each.
 

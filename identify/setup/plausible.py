@@ -72,6 +72,20 @@ def torque_ratio(bench: Bench, h: Hypothesis) -> float:
     return _mean(peaks / limits, limits, bench.moving)
 
 
+def plausible_factor(bench: Bench, h: Hypothesis) -> float:
+    """Common factor that brings the torques to the middle of their plausible range, 1 inside of it.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        Corrections.
+    """
+    ratio = torque_ratio(bench, h)
+    return 1.0 if TORQUE[0] <= ratio <= TORQUE[1] else float(np.sqrt(TORQUE[0] * TORQUE[1])) / ratio
+
+
 def log_plausibility(bench: Bench, h: Hypothesis) -> float:
     """Logarithm of the plausibility of the corrected signals against the limits, 0 or less.
 

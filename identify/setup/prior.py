@@ -10,6 +10,12 @@ Array = NDArray[np.float64]
 MISTAKE = math.log(100.0)
 """Cost of each mistake, nats: one set-up of a hundred has a mistake of a given kind."""
 
+RAW = 1.0
+"""Further cost of an exchange of raw numbers, nats: where columns explain the recordings equally well, they are meant."""
+
+FACTOR = math.log(10.0)
+"""Cost of each free factor of all torques, nats: it lies in one of ten intervals that the data tell apart."""
+
 PREFERENCE = {"torque": 0.0, "both": 0.2, "position": 0.4}
 """Further cost, nats, among hypotheses that a symmetry of the arm makes equal: signs of torques are a convention."""
 
@@ -36,7 +42,9 @@ def cost(families: tuple[str, ...], made: tuple[tuple[Array, Array, bool], ...],
         if family in WIRING and not raw:
             position, torque = of_position @ position, of_torque @ torque
         else:
-            total += MISTAKE + math.log(n)
+            total += MISTAKE + math.log(n) + (RAW if raw else 0.0)
+            if family == "torque_scales":
+                total += n * FACTOR
     return total + wiring_cost(position, torque)
 
 

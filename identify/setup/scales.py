@@ -1,6 +1,6 @@
 """Scales of single joints that may have any value: gear ratio, torque constant, encoder resolution."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +23,7 @@ WORTH_REFINING = 0.02
 LEAST_GEAR = 0.05
 """Least relative error of a gear ratio or a resolution: below it other effects of drives and links resemble it."""
 
-LEAST_TORQUE = 2.5
+LEAST_TORQUE = 3.0
 """Least factor of a single torque: up to it, a torque constant may differ from its data sheet (`drive_gain_error`)."""
 
 
@@ -58,6 +58,36 @@ def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criter
         factor = _best(lambda f, made=made: criterion(made(f)(h)))
         if abs(np.log(factor)) >= np.log(least):
             yield made(factor)
+
+
+def torque_scales(h: Hypothesis, criterion: Criterion, starts: Sequence[Array]) -> Array | None:
+    """Best factors (n,) of all torques together, or ``None`` if none of them is far from the others.
+
+    The torques of joints that carry the same links determine the proportions; the common factor is free.
+
+    Parameters
+    ----------
+    h
+        Corrections so far.
+    criterion
+        Misfit to minimise.
+    starts
+        Factors (n,) from which the search starts.
+    """
+
+    def misfit(logs: Array) -> float:
+        return criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque))
+
+    found = [
+        optimize.minimize(misfit, np.log(np.abs(start)), method="L-BFGS-B", options={"maxiter": 12, "eps": 1e-3})
+        for start in starts
+    ]
+    best = min(found, key=lambda f: float(f.fun))
+    logs = np.asarray(best.x)
+    if np.max(np.abs(logs - np.median(logs))) < np.log(LEAST_TORQUE):
+        return None
+    factors: Array = np.exp(logs)
+    return factors
 
 
 def _best(criterion: Callable[[float], float]) -> float:

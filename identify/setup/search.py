@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from armident.identify.setup import assignment, gravity, moves, scales
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors
-from armident.identify.setup.plausible import log_plausibility
+from armident.identify.setup.plausible import log_plausibility, plausible_factor
 from armident.identify.setup.prior import WIRING, cost, wiring_cost
 
 Array = NDArray[np.float64]
@@ -37,6 +37,9 @@ RANKED_ROWS = 100.0
 
 EXHAUSTIVE = 6
 """Largest number of joints of which all orders are tried; with more, a search by exchanges starts from several."""
+
+CANDIDATES = 4
+"""Number of best-ranked mistakes whose held-out score is computed."""
 
 EQUAL = 0.1
 """Odds to the best hypothesis from which on another one is named beside it."""
@@ -132,8 +135,14 @@ class Search:
         return step
 
     def _taken(self, step: Step, found: list[Step]) -> Step | None:
-        """Best neighbour, if it is a mistake of the set-up that is certain and material."""
-        best = found[0]
+        """Best neighbour that is a mistake of the set-up, certain and material."""
+        for best in found[:CANDIDATES]:
+            taken = self._accepted(step, best, [s for s in found[: 2 * CANDIDATES] if s is not best])
+            if taken is not None:
+                return taken
+        return None
+
+    def _accepted(self, step: Step, best: Step, found: list[Step]) -> Step | None:
         gain, drop, plausible = self._gain(step, best)
         least = LEAST_DROP
         if best.families[-1] == "time_shift":
@@ -143,7 +152,7 @@ class Search:
             least = LEAST_DROP_LATE if shift > 0.0 else LEAST_DROP
         if gain < LEAST_ODDS or (drop < least and plausible < LEAST_ODDS):
             return None
-        others = [s for s in found[1:8] if _differs(s.h, best.h)]
+        others = [s for s in found if _differs(s.h, best.h)]
         odds = {s.words[-1]: float(np.exp(min(-self._gain(s, best)[0], 0.0))) for s in others}
         # A symmetry of the arm makes some signs equal: that one of them is wrong is certain all the same.
         equal = {w: p for s in others if (p := odds[w := s.words[-1]]) > EQUAL and _same_kind(s, best)}
@@ -191,12 +200,27 @@ class Search:
             yield self._made(step, "assignment", "torques in another order", assignment.by_rows(bench, h))
         if h.gravity.any():
             yield self._made(step, "gravity_missing", "torques without gravity", gravity.without_gravity(h))
+        if n > 1:
+            yield from self._torque_scales(step)
         turned = gravity.best_direction(h, self.rank)
         yield self._made(step, "gravity_direction", "another direction of gravity", turned)
         for clock in CLOCKS:
             yield self._made(step, "time_unit", f"time in units of {clock:g} s", scales.with_clock(h, clock))
         late = gravity.best_shift(h, self.rank, bench.period, bench.moving)
         yield self._made(step, "time_shift", "all torques late by the same time", late)
+
+    def _torque_scales(self, step: Step) -> Iterator[Step]:
+        """All torques in a unit of each drive's own: per mille of unknown rated torques, currents of the motors."""
+        bench, h = self.bench, step.h
+        ratios = np.abs(np.diag(bench.robot.transmission_matrix))
+        starts = [np.ones(bench.n), *([ratios] if np.all(ratios > 0) and np.ptp(ratios) > 0 else [])]
+        factors = scales.torque_scales(h, self.rank, starts)
+        if factors is None:
+            return
+        scaled = replace(h, torque=factors[:, None] * h.torque)
+        factors = factors * plausible_factor(bench, scaled)
+        words = "every torque is in a unit of its own drive"
+        yield self._made(step, "torque_scales", words, replace(h, torque=factors[:, None] * h.torque))
 
     def _made(self, step: Step, family: str, words: str, h: Hypothesis, raw: bool = False) -> Step:
         self.tried[family] = self.tried.get(family, 0) + 1

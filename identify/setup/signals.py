@@ -31,6 +31,8 @@ CLIPPED_SHARE = 2e-3
 CLIPPED_UNUSABLE = 0.05
 """Share of clipped samples from which on results are unusable."""
 
+CLIPPED_REMEDY = "record a gentler motion, or with a wider range of the torque signal"
+
 POWER_SHARE = 0.95
 """Share of the velocity's power below the frequency of a motion."""
 
@@ -114,9 +116,8 @@ def clipped_findings(
             if share >= CLIPPED_SHARE:
                 unit = "N m" if robot.joints[j].type == "revolute" else "N"
                 message = f"the torque of {name} is clipped at {level:.4g} {unit} in {100 * share:.1f} % of the samples"
-                remedy = "record a gentler motion, or with a wider range of the torque signal"
                 unusable = share >= CLIPPED_UNUSABLE
-                findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, remedy, unusable))
+                findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, CLIPPED_REMEDY, unusable))
                 break
     return findings
 
