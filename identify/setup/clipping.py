@@ -19,10 +19,10 @@ LEAST_ROWS = 0.03
 LEAST_FREE = 0.1
 """Least share of rows below the level that must be left for the fit."""
 
-LEAST_EXCESS = 1.08
+LEAST_EXCESS = 1.04
 """Median of the predicted torque over the level from which on it counts as clipped."""
 
-LEAST_IMPROVEMENT = 4.0
+LEAST_IMPROVEMENT = 1.5
 """Factor by which the residual power of the rows below the level must fall without the rows near it."""
 
 LEVEL_QUANTILE = 0.98

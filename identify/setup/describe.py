@@ -1,7 +1,8 @@
 """Findings of a set-up check in words, with the lines of configuration that correct them."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,11 @@ from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis
-from armident.identify.setup.plausible import position_ratio, torque_ratio, velocity_ratio
+from armident.identify.setup.plausible import plausible_factor, position_ratio, torque_ratio, velocity_ratio
 from armident.identify.setup.prior import WIRING
 from armident.identify.setup.result import SetupFinding
-from armident.identify.setup.search import Step
+from armident.identify.setup.scales import LEAST_TORQUE
+from armident.identify.setup.search import EACH_OWN, Step
 
 Array = NDArray[np.float64]
 
@@ -54,6 +56,7 @@ def described(step: Step, robot: RobotConfig, bench: Bench) -> Described:
     """
     findings: list[SetupFinding] = []
     entries: list[Effect] = []
+    step = _scales_merged(step, bench)
     for first, last in _groups(step):
         if step.families[first] in WIRING and not step.made[first][2]:
             made = _wiring(step, first, last, robot)
@@ -61,7 +64,7 @@ def described(step: Step, robot: RobotConfig, bench: Bench) -> Described:
             made = [_raw_exchange(step, first, robot)]
         elif step.families[first] == "time_shift":
             made = [_late(step, first, robot)]
-        elif step.families[first] in SCALES:
+        elif step.families[first] in SCALES and not _of_a_drive(step, first):
             made = [_scale(step, first, robot, bench)]
         else:
             continue
@@ -79,6 +82,40 @@ def described(step: Step, robot: RobotConfig, bench: Bench) -> Described:
     return Described(tuple(findings), robot.model_copy(update=update) if update else None)
 
 
+def _scales_merged(step: Step, bench: Bench) -> Step:
+    """Make one mistake of all scales of torques where every torque is in a unit of its own drive."""
+    single = step.families.count("torque_scale")
+    if "torque_scales" not in step.families and single < 2:
+        return step
+    n = bench.n
+    scales = [
+        k
+        for k, (family, (position, torque, _)) in enumerate(zip(step.families, step.made, strict=True))
+        if family in SCALES and np.array_equal(position, np.eye(n)) and _diagonal(torque)
+    ]
+    whole = np.eye(n)
+    for k in scales:
+        whole = step.made[k][1] @ whole
+    logs = np.log(np.abs(np.diag(whole)))
+    if np.max(np.abs(logs - np.median(logs))) < np.log(LEAST_TORQUE):
+        return step
+    whole = whole * plausible_factor(bench, step.h)
+    last = scales[-1]
+    kept = [k for k in range(len(step.families)) if k == last or k not in scales]
+
+    def of(values: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(values[k] for k in kept)
+
+    return replace(
+        step,
+        families=of(tuple("torque_scales" if k == last else f for k, f in enumerate(step.families))),
+        words=of(tuple(EACH_OWN if k == last else words for k, words in enumerate(step.words))),
+        made=of(tuple((np.eye(n), whole, False) if k == last else m for k, m in enumerate(step.made))),
+        probability=of(step.probability),
+        rivals=of(step.rivals),
+    )
+
+
 def _groups(step: Step) -> Iterator[tuple[int, int]]:
     """First mistake and the one after the last of each group: consecutive mistakes of the wiring make one."""
     first = 0
@@ -88,6 +125,14 @@ def _groups(step: Step) -> Iterator[tuple[int, int]]:
             last += 1
         yield first, last
         first = last
+
+
+def _of_a_drive(step: Step, k: int) -> bool:
+    """True for a torque constant that differs moderately: an effect of the drive (`drive_gain_error`)."""
+    if step.families[k] != "torque_scale":
+        return False
+    factors = np.diag(step.made[k][1])
+    return bool(np.all(np.abs(np.log(factors)) < np.log(LEAST_TORQUE)))
 
 
 def _mergeable(step: Step, k: int) -> bool:

@@ -23,8 +23,14 @@ WORTH_REFINING = 0.02
 LEAST_GEAR = 0.05
 """Least relative error of a gear ratio or a resolution: below it other effects of drives and links resemble it."""
 
+LEAST_GAIN = 1.3
+"""Least factor of a single torque that is corrected for the search."""
+
 LEAST_TORQUE = 3.0
-"""Least factor of a single torque: up to it, a torque constant may differ from its data sheet (`drive_gain_error`)."""
+"""Least factor of a single torque for a finding: up to it, a torque constant may differ from its data sheet.
+
+Below, the factor is an effect of the drive (`drive_gain_error`): corrected for the search, and not reported.
+"""
 
 
 def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criterion) -> Iterator[Move]:
@@ -54,7 +60,7 @@ def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criter
     def position(f: float) -> Move:
         return Move("position_scale", f"scale of the position of {name}", scaled(n, joint, f), None)
 
-    for made, least in ((gear, 1.0 + LEAST_GEAR), (torque, LEAST_TORQUE), (position, 1.0 + LEAST_GEAR)):
+    for made, least in ((gear, 1.0 + LEAST_GEAR), (torque, LEAST_GAIN), (position, 1.0 + LEAST_GEAR)):
         factor = _best(lambda f, made=made: criterion(made(f)(h)))
         if abs(np.log(factor)) >= np.log(least):
             yield made(factor)

@@ -26,8 +26,10 @@ LEAST_DROP = float(np.log(2.0))
 LEAST_DROP_LATE = 0.2
 """The same for torques that are late by one time: the phase of a few milliseconds is small in the band of a motion.
 
-In a closed loop noise makes torques seem early, never late; torques that seem early need the full `LEAST_DROP`.
 """
+
+LEAST_DROP_EARLY = 2.0
+"""The same for torques that are early: noise in a closed loop, and current loops that lag, resemble it."""
 
 NOT_UNDERSTOOD = 1.0 / 3.0
 """Largest relative error of a joint that the rigid model explains (DIAGNOSIS.md, principle 1)."""
@@ -37,6 +39,8 @@ RANKED_ROWS = 100.0
 
 EXHAUSTIVE = 6
 """Largest number of joints of which all orders are tried; with more, a search by exchanges starts from several."""
+
+EACH_OWN = "every torque is in a unit of its own drive"
 
 CANDIDATES = 4
 """Number of best-ranked mistakes whose held-out score is computed."""
@@ -146,10 +150,15 @@ class Search:
         gain, drop, plausible = self._gain(step, best)
         least = LEAST_DROP
         if best.families[-1] == "time_shift":
-            shift = float(np.max(best.h.shift - step.h.shift))
-            if abs(shift) < self.bench.period or self._one_is_late(step, best):
+            shift = float(best.h.shift[self.bench.moving][0] - step.h.shift[self.bench.moving][0])
+            least = LEAST_DROP_LATE if shift > 0.0 else LEAST_DROP_EARLY
+            if abs(shift) < self.bench.period:
                 return None
-            least = LEAST_DROP_LATE if shift > 0.0 else LEAST_DROP
+            one = self._one_late(step)
+            if one is not None and one.rank < best.rank:
+                # The delay of one drive alone is an effect of its own, and no clock of the set-up.
+                best, least = one, LEAST_DROP
+                gain, drop, plausible = self._gain(step, best)
         if gain < LEAST_ODDS or (drop < least and plausible < LEAST_ODDS):
             return None
         others = [s for s in found if _differs(s.h, best.h)]
@@ -160,14 +169,21 @@ class Search:
         rivals = (*step.rivals, tuple(equal))
         return replace(best, rivals=rivals, probability=(*step.probability, share))
 
-    def _one_is_late(self, step: Step, best: Step) -> bool:
-        """True if a delay of one drive alone explains more: an effect of its own, and no clock of the set-up."""
-        n = self.bench.n
+    def _one_late(self, step: Step) -> Step | None:
+        """Best delay of one drive alone; ``None`` for a single joint."""
+        n, names = self.bench.n, [joint.name for joint in self.bench.robot.joints]
+        if n < 2:
+            return None
         alone = [
-            self.rank(gravity.best_shift(step.h, self.rank, self.bench.period, np.arange(n) == j))
+            self._made(
+                step,
+                "one_late",
+                f"torque of {names[j]} late",
+                gravity.best_shift(step.h, self.rank, self.bench.period, np.arange(n) == j),
+            )
             for j in np.flatnonzero(self.bench.moving)
         ]
-        return n > 1 and min(alone) < self.rank(best.h)
+        return min(alone, key=lambda s: s.rank)
 
     def _gain(self, old: Step, new: Step) -> tuple[float, float, float]:
         """Gain of the score, drop of the held-out residual power, and gain of plausibility, nats each."""
@@ -219,8 +235,7 @@ class Search:
             return
         scaled = replace(h, torque=factors[:, None] * h.torque)
         factors = factors * plausible_factor(bench, scaled)
-        words = "every torque is in a unit of its own drive"
-        yield self._made(step, "torque_scales", words, replace(h, torque=factors[:, None] * h.torque))
+        yield self._made(step, "torque_scales", EACH_OWN, replace(h, torque=factors[:, None] * h.torque))
 
     def _made(self, step: Step, family: str, words: str, h: Hypothesis, raw: bool = False) -> Step:
         self.tried[family] = self.tried.get(family, 0) + 1
