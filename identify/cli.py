@@ -1,4 +1,4 @@
-"""Commands of this package: identify, check, diagnose, effects, history, trajectory, worker, reproduce, diagnose-suite."""
+"""Commands of this package: identify, check, diagnose, effects, history, trajectory, worker, reproduce, suite."""
 
 from pathlib import Path
 from typing import Annotated

@@ -50,8 +50,8 @@ EFFECTS = (
     Effect(
         name="signal_scale",
         title="a signal with the wrong scale",
-        says="position or torque of a joint is recorded in another unit, on the other side of the gear, or with another "
-        "gear ratio: true over recorded value",
+        says="position or torque of a joint is recorded in another unit, on the other side of the gear, or with "
+        "another gear ratio; the value is true over recorded",
         reference="Brunot 2017, equation 2.14",
         linear=(),
         columns=_none,
@@ -101,9 +101,9 @@ def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
 
     Raw values (counts, shares of the rated signal) are exchanged, while the scaling belongs to the drive. So these are
     signed permutations, scaled where two drives differ in resolution, gain or rating. With ``joint_side: 1`` columns in
-    SI units on the joint side are concerned, as they are after an import; `signal_scale` always acts on these, and with an
-    ``other`` joint adds a multiple of its signal. Several entries act one after the other: exchanges express any
-    permutation.
+    SI units on the joint side are concerned, as they are after an import; `signal_scale` always acts on these, and
+    with an ``other`` joint adds a multiple of its signal. Several entries act one after the other: exchanges express
+    any permutation.
 
     Raises
     ------

@@ -213,7 +213,8 @@ class Bench:
         x = np.zeros((q.shape[0], n, b + FRICTION_TERMS * n))
         x[:, :, :b] = weightless.rigid_regressor(q, qd, qdd)
         at_rest = weightless.rigid_regressor(q, still, still)
-        gravity = np.stack([self.model.with_gravity(axis).rigid_regressor(q, still, still) - at_rest for axis in np.eye(3)])
+        along = [self.model.with_gravity(axis).rigid_regressor(q, still, still) for axis in np.eye(3)]
+        gravity = np.stack(along) - at_rest
         physical = np.zeros((2, n, x.shape[2]))
         spring = q - q.mean(axis=0)
         for j in range(n):

@@ -70,7 +70,8 @@ def check_setup(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupC
         try:
             return _check(put_right(experiments, robot), robot)
         except np.linalg.LinAlgError as error:
-            raise DataError(f"the set-up cannot be checked: the equations of the motion are singular ({error})") from error
+            message = f"the set-up cannot be checked: the equations of the motion are singular ({error})"
+            raise DataError(message) from error
 
 
 def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
@@ -84,13 +85,14 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
     found = described(best, robot, bench)
     tried, before = search.tried, _errors(bench, _as_configured(robot))
     setup_findings, corrected = found.findings, found.robot
-    if best.h.clock != 1.0:
+    clock = best.h.clock
+    if clock != 1.0:
         # Velocities enter friction and limits: everything else is judged with the right clock.
-        experiments = [replace(e, dt=e.dt * best.h.clock) for e in experiments]
+        experiments = [replace(e, dt=e.dt * clock) for e in experiments]
         bench, again, best = _searched(experiments, robot, moving)
         found = described(best, robot, bench)
-        clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
-        setup_findings, corrected = (*clock, *found.findings), found.robot
+        of_clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
+        setup_findings, corrected = (*of_clock, *found.findings), found.robot
         tried = tried | again.tried
     findings += signals.rate_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
@@ -101,6 +103,7 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         joints_not_understood=_not_understood(bench, best),
         tried=tuple(words for family, words in TRIED.items() if family in tried),
         corrected_robot=corrected,
+        clock=clock,
     )
 
 

@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 SCALES = ("position_unit", "torque_unit", "side", "gear_ratio", "torque_scale", "torque_scales", "position_scale")
 """Families that scale signals."""
 
+KINDS = {"torque_scale": "torque_unit", "torque_scales": "torque_unit", "position_scale": "position_unit"}
+"""Kind of the finding where it is not the family."""
+
 CLOCK_WORDS = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "ks"}
 
 
@@ -246,7 +249,7 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
         message = f"the torque of {names[0]} is {torque[j, j]:.3g} times the recorded one by those of the other joints"
         remedy = f"joints: {names[0]}: drive: gain: {torque[j, j]:.3g} times the present one; or {remedy}"
     elif family == "position_scale":
-        message = f"the position of {names[0]} is {position[j, j]:.3g} times the recorded one by the geometry of the arm"
+        message = f"the position of {names[0]} is {position[j, j]:.3g} times the recorded one by the arm's geometry"
         resolution = f"counts_per_unit: {1 / position[j, j]:.3g} times the present one"
         remedy = f"joints: {names[0]}: drive: {resolution}; or {remedy}"
     elif family == "torque_scales":
@@ -254,14 +257,14 @@ def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupF
         message += f" (per mille, or currents): by the links that they share, true over recorded is as {factors}"
         remedy = f"joints: drive: gain or rated of each drive by its data sheet; or {remedy}"
     elif len(joints) > 1:
+        h = _as_configured(robot)
         message += (
-            f": the largest positions are on average {position_ratio(bench, _as_configured(robot)):.3g} of their limits, "
-            f"the largest torques {torque_ratio(bench, _as_configured(robot)):.3g}"
+            f": the largest positions are on average {position_ratio(bench, h):.3g} of their limits, "
+            f"the largest torques {torque_ratio(bench, h):.3g}"
         )
         if family == "side":
             remedy = f"armident import FILE --motor-side where positions and torques are the motors'; or {remedy}"
-    kind = {"torque_scale": "torque_unit", "torque_scales": "torque_unit", "position_scale": "position_unit"}.get(family, family)
-    return SetupFinding(kind, names, step.probability[k], message, remedy, True), entries
+    return SetupFinding(KINDS.get(family, family), names, step.probability[k], message, remedy, True), entries
 
 
 def _linear_map(matrix: Array, signal: str, robot: RobotConfig) -> list[Effect]:

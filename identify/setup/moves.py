@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 DEGREES = np.pi / 180.0
 THOUSANDTH = 1e-3
 
+LEAST_SPREAD = 0.01
+"""Least spread of the logarithms of rated torques: equal ones make per mille a common factor."""
+
 
 @dataclass(frozen=True)
 class Move:
@@ -106,25 +109,29 @@ def unit_moves(robot: RobotConfig) -> Iterator[Move]:
         The configuration.
     """
     n, ratios = robot.n, robot.transmission_matrix
+    inverse = np.linalg.inv(ratios)
     revolute = np.array([joint.type == "revolute" for joint in robot.joints])
+    units = " and ".join(sorted({_unit(joint.type) for joint in robot.joints}))
     small = np.diag(np.where(revolute, DEGREES, THOUSANDTH))
-    yield Move("position_unit", f"the positions are in {' and '.join(sorted({_unit(joint.type) for joint in robot.joints}))}", small, None)
-    if np.abs(ratios - np.eye(n)).max() > 1e-9:
-        inverse = np.linalg.inv(ratios)
-        yield Move("side", "the torques are those of the motors, not of the joints", None, ratios.T)
-        yield Move("side", "the positions are those of the motors, not of the joints", inverse, None)
-        yield Move("side", "the positions and torques are those of the motors, not of the joints", inverse, ratios.T)
-        yield Move("side", "the torques are those of the joints, and were converted as those of the motors", None, inverse.T)
-        yield Move("side", "the positions are those of the joints, and were converted as those of the motors", ratios, None)
-        yield Move("side", "the positions and torques are those of the joints, and were converted as those of the motors", ratios, inverse.T)
+    yield Move("position_unit", f"the positions are in {units}", small, None)
     yield Move("torque_unit", "the torques are 1000 times too small (kN m for N m, or A for mA)", None, 1e3 * np.eye(n))
-    yield Move("torque_unit", "the torques are 1000 times too large (mN m for N m, or mA for A)", None, 1e-3 * np.eye(n))
+    yield Move("torque_unit", "the torques are 1000 times too large (mN m for N m, mA for A)", None, 1e-3 * np.eye(n))
+    if np.abs(ratios - np.eye(n)).max() > 1e-9:
+        for what, places in (("torques", (False, True)), ("positions", (True, False)), ("signals", (True, True))):
+            yield Move(
+                "side", f"the {what} are those of the motors, not of the joints", *_where(places, inverse, ratios.T)
+            )
+            words = f"the {what} are those of the joints, and were converted as those of the motors"
+            yield Move("side", words, *_where(places, ratios, inverse.T))
     _, rated = raw_scales(robot)
-    if np.ptp(np.log(rated)) > 0.01:
-        share = ratios.T @ np.diag(rated / 1000.0) @ np.linalg.inv(ratios.T)
-        yield Move("torque_unit", "the torques are in per mille of the rated torque", None, share)
-        at_motors = ratios.T @ np.diag(rated / 1000.0)
-        yield Move("torque_unit", "the torques are those of the motors in per mille of the rated torque", None, at_motors)
+    if np.ptp(np.log(rated)) > LEAST_SPREAD:
+        share = ratios.T @ np.diag(rated / 1000.0)
+        yield Move("torque_unit", "the torques are in per mille of the rated torque", None, share @ inverse.T)
+        yield Move("torque_unit", "the torques are the motors', in per mille of the rated torque", None, share)
+
+
+def _where(places: tuple[bool, bool], position: Array, torque: Array) -> tuple[Array | None, Array | None]:
+    return position if places[0] else None, torque if places[1] else None
 
 
 def single_unit_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
@@ -138,19 +145,22 @@ def single_unit_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Mov
         Indices of the joints that move.
     """
     for j in joints:
-        joint = robot.joints[j]
-        ratio = float(robot.transmission_matrix[j, j])
-        unit = DEGREES if joint.type == "revolute" else THOUSANDTH
-        yield Move("position_unit", f"the position of {joint.name} is in {_unit(joint.type)}", scaled(robot.n, j, unit), None)
-        yield Move("torque_unit", f"the torque of {joint.name} is 1000 times too large", None, scaled(robot.n, j, 1e-3))
-        yield Move("torque_unit", f"the torque of {joint.name} is 1000 times too small", None, scaled(robot.n, j, 1e3))
-        if ratio != 0.0 and abs(abs(ratio) - 1.0) > 1e-9:
-            yield Move("side", f"the torque of {joint.name} is that of its motor", None, scaled(robot.n, j, ratio))
-            place = scaled(robot.n, j, 1.0 / ratio)
-            yield Move("side", f"the position of {joint.name} is that of its motor", place, None)
-            place = scaled(robot.n, j, ratio)
-            yield Move("side", f"the position of {joint.name} was converted as that of its motor", place, None)
-            yield Move("side", f"the torque of {joint.name} is that of the joint, and was converted as that of the motor", None, scaled(robot.n, j, 1.0 / ratio))
+        name, ratio = robot.joints[j].name, float(robot.transmission_matrix[j, j])
+
+        def at(factor: float, j: int = j) -> Array:
+            return scaled(robot.n, j, factor)
+
+        unit, word = (DEGREES, "degrees") if robot.joints[j].type == "revolute" else (THOUSANDTH, "mm")
+        yield Move("position_unit", f"the position of {name} is in {word}", at(unit), None)
+        yield Move("torque_unit", f"the torque of {name} is 1000 times too large", None, at(1e-3))
+        yield Move("torque_unit", f"the torque of {name} is 1000 times too small", None, at(1e3))
+        if ratio == 0.0 or abs(abs(ratio) - 1.0) < 1e-9:
+            continue
+        of_motor, of_joint = "is that of its motor", "is that of the joint, and was converted as that of the motor"
+        yield Move("side", f"the torque of {name} {of_motor}", None, at(ratio))
+        yield Move("side", f"the position of {name} {of_motor}", at(1.0 / ratio), None)
+        yield Move("side", f"the position of {name} {of_joint}", at(ratio), None)
+        yield Move("side", f"the torque of {name} {of_joint}", None, at(1.0 / ratio))
 
 
 def scaled(n: int, joint: int, factor: float) -> Array:

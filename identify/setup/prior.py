@@ -11,7 +11,7 @@ MISTAKE = math.log(100.0)
 """Cost of each mistake, nats: one set-up of a hundred has a mistake of a given kind."""
 
 RAW = 1.0
-"""Further cost of an exchange of raw numbers, nats: where columns explain the recordings equally well, they are meant."""
+"""Further cost of an exchange of raw numbers, nats: columns are meant where both explain the recordings equally."""
 
 FACTOR = math.log(10.0)
 """Cost of each free factor of all torques, nats: it lies in one of ten intervals that the data tell apart."""

@@ -53,6 +53,8 @@ class SetupCheck:
         Hypotheses tried, in words.
     corrected_robot
         Configuration with the corrections that a configuration can express; ``None`` if there are none.
+    clock
+        True over recorded duration: the sampling period has to be multiplied by it.
     """
 
     findings: tuple[SetupFinding, ...]
@@ -61,3 +63,4 @@ class SetupCheck:
     joints_not_understood: tuple[str, ...]
     tried: tuple[str, ...]
     corrected_robot: RobotConfig | None
+    clock: float = 1.0

@@ -21,7 +21,7 @@ LEAST_ODDS = float(np.log(99.0))
 """Least gain of the score for a finding, nats: posterior odds of 99 to 1, a false alarm in less than 1 %."""
 
 LEAST_DROP = float(np.log(2.0))
-"""Least drop of the held-out residual power for a finding, summed over the joints, nats: half the power of one joint."""
+"""Least drop of the held-out residual power for a finding, nats, summed over the joints: half of one joint's."""
 
 LEAST_DROP_LATE = 0.2
 """The same for torques that are late by one time: the phase of a few milliseconds is small in the band of a motion.

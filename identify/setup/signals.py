@@ -31,6 +31,8 @@ CLIPPED_SHARE = 2e-3
 CLIPPED_UNUSABLE = 0.05
 """Share of clipped samples from which on results are unusable."""
 
+REST_REMEDY = "record a motion of all joints: armident trajectory designs one"
+
 CLIPPED_REMEDY = "record a gentler motion, or with a wider range of the torque signal"
 
 POWER_SHARE = 0.95
@@ -78,14 +80,13 @@ def rest_findings(moving: NDArray[np.bool_], robot: RobotConfig) -> list[SetupFi
     names = tuple(joint.name for joint in robot.joints)
     if not moving.any():
         message = "standstill: no joint moves in these recordings, so that they determine no parameter"
-        return [SetupFinding("standstill", names, 1.0, message, "record a motion: armident trajectory designs one", True)]
+        return [SetupFinding("standstill", names, 1.0, message, REST_REMEDY, True)]
     still = tuple(name for name, moves in zip(names, moving, strict=True) if not moves)
     if not still:
         return []
     verb = "does" if len(still) == 1 else "do"
     message = f"{', '.join(still)} {verb} not move: the recordings do not determine their inertia and friction"
-    remedy = "record a motion of all joints: armident trajectory designs one"
-    return [SetupFinding("joint_at_rest", still, 1.0, message, remedy, False)]
+    return [SetupFinding("joint_at_rest", still, 1.0, message, REST_REMEDY, False)]
 
 
 def clipped_findings(
@@ -110,7 +111,8 @@ def clipped_findings(
         for torques in ([e.tau[:, j] for e in experiments], [tau[:, j] for tau in at_motors]):
             if max(float(np.ptp(tau)) for tau in torques) == 0.0:
                 message = f"the torque of {name} never changes although the joint moves: its drive does not report it"
-                findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, "check the mapping of the torque", True))
+                remedy = "check the mapping of the torque in session and drive"
+                findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, remedy, True))
                 break
             share, level = _clipped(torques, [e.q[:, j] for e in experiments])
             if share >= CLIPPED_SHARE:
