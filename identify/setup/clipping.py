@@ -25,6 +25,9 @@ LEAST_EXCESS = 1.04
 LEAST_IMPROVEMENT = 1.5
 """Factor by which the residual power of the rows below the level must fall without the rows near it."""
 
+MOST_SLOPE = 0.3
+"""Largest slope of recorded over predicted torques near the level: 0 where they are clipped, near 1 elsewhere."""
+
 LEVEL_QUANTILE = 0.98
 """Quantile of the magnitude of the torques that stands for the level: single peaks of noise lie above it."""
 
@@ -77,6 +80,14 @@ def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
         below = fit_rows(x, y, used, physical, bench.moving)
         residual = [np.mean((y[~near, k] - x[~near, k] @ theta) ** 2) for theta in (whole, below)]
         needed = float(np.median((x[near, k] @ below) * np.sign(y[near, k]))) / level
-        if needed > LEAST_EXCESS and residual[0] > LEAST_IMPROVEMENT * residual[1]:
+        flat = _slope(np.abs(x[near, k] @ below), np.abs(y[near, k])) < MOST_SLOPE
+        if flat and needed > LEAST_EXCESS and residual[0] > LEAST_IMPROVEMENT * residual[1]:
             found.append(Clip(int(k), level, share, needed))
     return found
+
+
+def _slope(x: Array, y: Array) -> float:
+    """Slope of the regression line of y on x; 1 if x does not vary."""
+    spread = x - x.mean()
+    power = float(spread @ spread)
+    return float(spread @ y) / power if power > 0 else 1.0

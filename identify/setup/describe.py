@@ -99,10 +99,10 @@ def _scales_merged(step: Step, bench: Bench) -> Step:
     whole = np.eye(n)
     for k in scales:
         whole = step.made[k][1] @ whole
-    logs = np.log(np.abs(np.diag(whole)))
-    if np.max(np.abs(logs - np.median(logs))) < np.log(LEAST_TORQUE):
+    logs, common = np.log(np.abs(np.diag(whole))), plausible_factor(bench, step.h)
+    if common == 1.0 and np.max(np.abs(logs - np.median(logs))) < np.log(LEAST_TORQUE):
         return step
-    whole = whole * plausible_factor(bench, step.h)
+    whole = whole * common
     last = scales[-1]
     kept = [k for k in range(len(step.families)) if k == last or k not in scales]
 

@@ -116,7 +116,7 @@ class Search:
         """
         first = Step(start, rank=self.rank(start))
         best = self._greedy(first)
-        simple = sum(family in WIRING for family in best.families) < 2
+        simple = sum(family in ("exchange", "assignment") for family in best.families) < 2
         if self.bench.n < 3 or (simple and self._understood(best.h)):
             return best
         for step in self._orders(first):
