@@ -204,7 +204,7 @@ def fit_rows(x: Array, y: Array, used: NDArray[np.bool_], physical: Array, movin
     return theta
 
 
-def joint_errors(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
+def joint_errors(bench: Bench, h: Hypothesis, *, free: bool = False) -> tuple[Array, Array]:
     """Relative error of the rigid model at every joint, and the correlation of neighbouring residuals, (n,) each.
 
     Parameters
@@ -213,8 +213,10 @@ def joint_errors(bench: Bench, h: Hypothesis) -> tuple[Array, Array]:
         Signals.
     h
         Corrections of the signals.
+    free
+        True to include the free friction terms and springs.
     """
-    residual = fit(bench, h, free=False).residual @ h.torque.T
+    residual = fit(bench, h, free=free).residual @ h.torque.T
     torque = bench.torque(h.shift) @ h.torque.T
     power = np.maximum((residual**2).sum(axis=0), 1e-300)
     errors = np.sqrt(power / np.maximum((torque**2).sum(axis=0), 1e-300))

@@ -48,7 +48,8 @@ class SetupCheck:
     corrected_error_pct
         The same with the corrections, (n,).
     joints_not_understood
-        Joints of which the rigid model leaves more than a third of the torque, although no hypothesis explains it.
+        Joints of which the rigid model, even with a spring and free friction, leaves more than a third of the torque,
+        and no hypothesis explains it.
     tried
         Hypotheses tried, in words.
     corrected_robot

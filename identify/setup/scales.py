@@ -26,6 +26,9 @@ LEAST_GEAR = 0.05
 LEAST_GAIN = 1.3
 """Least factor of a single torque that is corrected for the search."""
 
+WIDEST = float(np.log(1e3))
+"""Largest logarithm of a factor over its start: three decades."""
+
 LEAST_TORQUE = 3.0
 """Least factor of a single torque for a finding: up to it, a torque constant may differ from its data sheet.
 
@@ -85,7 +88,13 @@ def torque_scales(h: Hypothesis, criterion: Criterion, starts: Sequence[Array]) 
         return criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque))
 
     found = [
-        optimize.minimize(misfit, np.log(np.abs(start)), method="L-BFGS-B", options={"maxiter": 12, "eps": 1e-3})
+        optimize.minimize(
+            misfit,
+            np.log(np.abs(start)),
+            method="L-BFGS-B",
+            bounds=[(v - WIDEST, v + WIDEST) for v in np.log(np.abs(start))],
+            options={"maxiter": 12, "eps": 1e-3},
+        )
         for start in starts
     ]
     best = min(found, key=lambda f: float(f.fun))

@@ -126,7 +126,7 @@ class Search:
         return best
 
     def _understood(self, h: Hypothesis) -> bool:
-        errors, _ = joint_errors(self.bench, h)
+        errors, _ = joint_errors(self.bench, h, free=True)
         return bool(np.all(errors[self.bench.moving] <= NOT_UNDERSTOOD))
 
     def _greedy(self, step: Step) -> Step:

@@ -16,8 +16,11 @@ Array = NDArray[np.float64]
 STILL_SHARE = 1e-3
 """Share of its position range below which a joint counts as not moving."""
 
-STILL_NOISE = 10.0
-"""Range of a joint over the standard deviation of its encoder noise below which it counts as not moving."""
+STILL_RATIO = 0.7
+"""Power of the differences over twice that of the positions above which they are noise (von Neumann 1941): 1 if white.
+
+A sine with five samples per period has 0.69.
+"""
 
 LEAST_RUN = 5
 """Samples in a row at the extreme value that count as clipped: noise of one count keeps a value for fewer."""
@@ -62,8 +65,9 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig) -> NDAr
     limits = np.array([j.limits.position[1] - j.limits.position[0] for j in robot.joints])
     whole = np.where(limits < NO_LIMIT, np.minimum(limits, usual), usual)
     span = np.max([np.ptp(e.q, axis=0) for e in experiments], axis=0)
-    noise = np.max([np.std(np.diff(e.q, n=2, axis=0), axis=0) / np.sqrt(6.0) for e in experiments], axis=0)
-    moving: NDArray[np.bool_] = (span >= STILL_SHARE * whole) & (span > STILL_NOISE * noise)
+    power = np.sum([np.var(e.q, axis=0) for e in experiments], axis=0)
+    of_steps = np.sum([np.mean(np.diff(e.q, axis=0) ** 2, axis=0) for e in experiments], axis=0)
+    moving: NDArray[np.bool_] = (span >= STILL_SHARE * whole) & (of_steps < 2 * STILL_RATIO * power)
     return moving
 
 
