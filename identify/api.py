@@ -372,7 +372,7 @@ class Diagnosis(_Result):
             The document as written, with the path of the model.
         """
         place, document = Path(folder), self.document
-        if self.robot.effects != self.configured.effects:
+        if self.robot != self.configured:
             model = place / "model.yaml"
             write_atomically(model, robot_yaml(self.robot))
             document = document.model_copy(update={"model": str(model)})

@@ -198,8 +198,10 @@ def _diagnose(
         considered=list(outcome.considered),
         unexplained=left,
         gap=Gaps(
-            train=BeforeAfter(before=gap_of(first, held=False), after=gap_of(final, held=False)),
-            validation=BeforeAfter(before=gap_of(first, held=True), after=gap_of(final, held=True)),
+            train=BeforeAfter(before=stage.as_configured(gap_of(first, held=False)), after=gap_of(final, held=False)),
+            validation=BeforeAfter(
+                before=stage.as_configured(gap_of(first, held=True)), after=gap_of(final, held=True)
+            ),
         ),
         noise_floor=noise_floor(final, found.left),
         recommended_experiment=experiment_to_separate(findings),

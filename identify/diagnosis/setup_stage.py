@@ -3,8 +3,10 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from armident.configs import DataError, RobotConfig
-from armident.identify.document import Finding, Unexplained
+from armident.identify.document import Finding, Gap, Unexplained
 from armident.identify.experiment import Experiment
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck, SetupFinding
@@ -31,6 +33,8 @@ class SetupStage:
         Joints that the rigid model does not explain in any set-up.
     warnings
         Remarks on the recordings.
+    errors
+        Relative error of the rigid model in the set-up as configured by joint, percent, (n,).
     """
 
     training: tuple[Experiment, ...]
@@ -39,6 +43,28 @@ class SetupStage:
     findings: tuple[Finding, ...]
     unexplained: tuple[Unexplained, ...]
     warnings: tuple[str, ...]
+    errors: tuple[float, ...]
+
+    def as_configured(self, gap: Gap) -> Gap:
+        """Gap of the model in the set-up as configured, from that in the corrected one.
+
+        Parameters
+        ----------
+        gap
+            Relative errors of the model in the corrected set-up.
+        """
+        if not self.findings:
+            return gap
+        names = list(gap.by_joint)
+        after = np.maximum([gap.by_joint[name] for name in names], 1e-12)
+        torque = np.array([gap.rms[name] for name in names]) / after
+        each = np.maximum(self.errors, after)
+        whole = float(np.sqrt(np.sum((each * torque) ** 2) / np.sum(torque**2)))
+        return Gap(
+            all=whole,
+            by_joint=dict(zip(names, (float(v) for v in each), strict=True)),
+            rms=dict(zip(names, (float(v) for v in each * torque), strict=True)),
+        )
 
     def named(self, findings: Sequence[Finding]) -> list[Finding]:
         """Findings of the set-up, then those at joints that are understood.
@@ -95,6 +121,7 @@ def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], rob
             for name in check.joints_not_understood
         ),
         tuple(f"{finding.message}: {finding.remedy}" for finding in check.findings if finding.kind in REMARKS),
+        check.relative_error_pct,
     )
 
 

@@ -28,6 +28,9 @@ MOST_ROWS = 600
 LEAST_ROWS = 40
 """Least number of instants for any comparison."""
 
+LEAST_SAMPLES = 200
+"""Least number of samples: ten per period of twenty periods of a motion."""
+
 SLOW = 0.02
 """Share of a joint's largest velocity below which the sign of its velocity is smoothed."""
 
@@ -268,10 +271,11 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
         qdd = np.gradient(qd, working, axis=0)
         segments.append(Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, -0.5))), working))
     count = sum(second.count(s.q.shape[0]) for s in segments)
-    if count < LEAST_ROWS:
+    samples = sum(e.q.shape[0] for e in experiments)
+    if count < LEAST_ROWS or samples < LEAST_SAMPLES:
         raise DataError(
-            f"the recordings are too short for a check of the set-up: {count} independent instants of the motion, "
-            f"at least {LEAST_ROWS} are needed; record longer"
+            f"the recordings are too short for a check of the set-up: {samples} samples, {count} after filtering; "
+            f"at least {LEAST_SAMPLES} and {LEAST_ROWS} are needed: record longer"
         )
     generic = robot.model_copy(update={"gravity": tuple(GENERIC), "effects": ()})
     return Bench(ArmModel.from_config(generic), robot, tuple(segments), second, moving, dt)

@@ -66,7 +66,7 @@ def described(step: Step, robot: RobotConfig, bench: Bench) -> Described:
         elif step.families[first] in WIRING:
             made = [_raw_exchange(step, first, robot)]
         elif step.families[first] == "time_shift":
-            made = [_late(step, first, robot)]
+            made = [_late(step, first, robot, bench)] if "time_shift" not in step.families[last:] else []
         elif step.families[first] in SCALES and not _of_a_drive(step, first):
             made = [_scale(step, first, robot, bench)]
         else:
@@ -76,8 +76,8 @@ def described(step: Step, robot: RobotConfig, bench: Bench) -> Described:
             entries += stanzas
     update: dict[str, object] = {"effects": (*robot.effects, *entries)} if entries else {}
     share = dict(zip(step.families, step.probability, strict=True))
-    for family in ("gravity_missing", "gravity_direction"):
-        if family in step.families:
+    for family in [f for f in step.families if f.startswith("gravity")][-1:]:
+        if family != "gravity_missing" or not step.h.gravity.any():
             findings.append(_gravity(family, step, robot, share[family]))
             update["gravity"] = tuple(float(round(g, 4)) for g in step.h.gravity)
     if "time_unit" in step.families:
@@ -288,8 +288,9 @@ def _diagonal(matrix: Array) -> bool:
     return bool(np.allclose(matrix, np.diag(np.diag(matrix))))
 
 
-def _late(step: Step, k: int, robot: RobotConfig) -> tuple[SetupFinding, list[Effect]]:
-    shift = float(step.h.shift[np.argmax(np.abs(step.h.shift))])
+def _late(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFinding, list[Effect]]:
+    # One drive may be late by a time of its own.
+    shift = float(np.median(step.h.shift[bench.moving]))
     delay = float(f"{shift:.3g}")
     names = tuple(joint.name for joint in robot.joints)
     entries = [Effect(effect="time_delay", joint=name, parameters={"delay": delay}) for name in names]
