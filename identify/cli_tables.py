@@ -97,7 +97,8 @@ def setup_table(result: SetupCheck) -> None:
         print(f"{finding.kind}: {finding.message} (probability {finding.probability:.2f})")
         print(f"  correct it by: {finding.remedy}")
     corrected = f", corrected {after}" if any(f.decisive for f in result.findings) else ""
-    print(f"torque error of the rigid model by joint: {before} %{corrected}{' %' if corrected else ''}")
+    if any(error != 100.0 for error in result.relative_error_pct):
+        print(f"torque error of the rigid model by joint: {before} %{corrected}{' %' if corrected else ''}")
     if result.joints_not_understood:
         names = ", ".join(result.joints_not_understood)
         print(f"not understood: the rigid model leaves more than a third of the torque of {names}")

@@ -46,9 +46,11 @@ def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
                 shares.append(max((power[k] - 2 * s * right @ theta + theta @ gram @ theta) / power[k], FLOOR))
             cost[m, k] = np.log(min(shares))
             sign[m, k] = 1.0 if shares[0] <= shares[1] else -1.0
-    model, recorded = optimize.linear_sum_assignment(cost)
-    taken = np.zeros((n, n))
-    taken[model, recorded] = sign[model, recorded]
+    chosen = np.flatnonzero(bench.moving)
+    model, recorded = optimize.linear_sum_assignment(cost[np.ix_(chosen, chosen)])
+    taken = np.eye(n)
+    taken[chosen, chosen] = 0.0
+    taken[chosen[model], chosen[recorded]] = sign[chosen[model], chosen[recorded]]
     return replace(h, torque=taken @ h.torque)
 
 
@@ -80,34 +82,44 @@ def by_friction(bench: Bench, h: Hypothesis) -> Array:
     spread = np.sqrt(np.mean((y - own @ coefficients) ** 2, axis=0))
     inverse = np.sqrt(np.maximum(np.diag(np.linalg.pinv(own.T @ own)), 1e-300))
     t = coefficients / np.maximum(inverse[:, None] * spread, 1e-300)
-    joint, recorded = optimize.linear_sum_assignment(-np.abs(t))
-    taken = np.zeros((n, n))
-    taken[joint, recorded] = np.where(t[joint, recorded] >= 0, 1.0, -1.0)
+    chosen = np.flatnonzero(bench.moving)
+    joint, recorded = optimize.linear_sum_assignment(-np.abs(t[np.ix_(chosen, chosen)]))
+    taken = np.eye(n)
+    taken[chosen, chosen] = 0.0
+    taken[chosen[joint], chosen[recorded]] = np.where(t[chosen[joint], chosen[recorded]] >= 0, 1.0, -1.0)
     return taken
 
 
-def orders(n: int) -> Iterator[Array]:
-    """Permutation matrices (n, n) of n joints.
+def orders(moving: NDArray[np.bool_]) -> Iterator[Array]:
+    """Permutation matrices (n, n) of the joints that move.
 
     Parameters
     ----------
-    n
-        Number of joints.
+    moving
+        Mask (n,) of the joints that move.
     """
-    for order in permutations(range(n)):
-        yield np.eye(n)[list(order)]
+    chosen = np.flatnonzero(moving)
+    for order in permutations(chosen):
+        rows = np.arange(moving.size)
+        rows[chosen] = order
+        yield np.eye(moving.size)[rows]
 
 
-def usual_orders(n: int) -> list[Array]:
+def usual_orders(moving: NDArray[np.bool_]) -> list[Array]:
     """Orders from which a search by exchanges starts: as configured, reversed, and all rotations.
 
     Parameters
     ----------
-    n
-        Number of joints.
+    moving
+        Mask (n,) of the joints that move.
     """
-    own = np.eye(n)
-    return [own, own[::-1], *(np.roll(own, k, axis=0) for k in range(1, n))]
+    own, chosen = np.eye(moving.size), np.flatnonzero(moving)
+    made = []
+    for order in (chosen, chosen[::-1], *(np.roll(chosen, k) for k in range(1, chosen.size))):
+        rows = np.arange(moving.size)
+        rows[chosen] = order
+        made.append(own[rows])
+    return made
 
 
 def exchanged(order: Array, first: int, second: int) -> Array:

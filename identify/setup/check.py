@@ -137,8 +137,8 @@ def _as_configured(robot: RobotConfig) -> Hypothesis:
 
 
 def _errors(bench: Bench, h: Hypothesis) -> tuple[float, ...]:
-    """Relative error of every joint's corrected torque, percent, (n,)."""
-    return tuple(100 * float(e) for e in joint_errors(bench, h)[0])
+    """Relative error of every joint's corrected torque, percent, (n,); 100 at a joint at rest."""
+    return tuple(float(100 * e) for e in np.where(bench.moving, joint_errors(bench, h)[0], 1.0))
 
 
 def _not_understood(bench: Bench, best: Step) -> tuple[str, ...]:

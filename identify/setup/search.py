@@ -117,7 +117,7 @@ class Search:
         first = Step(start, rank=self.rank(start))
         best = self._greedy(first)
         simple = sum(family in ("exchange", "assignment") for family in best.families) < 2
-        if self.bench.n < 3 or (simple and self._understood(best.h)):
+        if self.bench.moving.sum() < 3 or (simple and self._understood(best.h)):
             return best
         for step in self._orders(first):
             other = self._greedy(step)
@@ -172,7 +172,7 @@ class Search:
     def _one_late(self, step: Step) -> Step | None:
         """Best delay of one drive alone; ``None`` for a single joint."""
         n, names = self.bench.n, [joint.name for joint in self.bench.robot.joints]
-        if n < 2:
+        if self.bench.moving.sum() < 2:
             return None
         alone = [
             self._made(
@@ -201,22 +201,22 @@ class Search:
 
     def _neighbours(self, step: Step) -> Iterator[Step]:
         bench, h = self.bench, step.h
-        robot, n = bench.robot, bench.n
+        robot = bench.robot
         joints = [int(j) for j in np.flatnonzero(bench.moving)]
         singles: Iterable[moves.Move] = (
             *moves.sign_moves(robot, joints),
             *moves.exchange_moves(robot, joints),
             *moves.unit_moves(robot),
             *moves.single_unit_moves(robot, joints),
-            *(move for j in joints if n > 1 for move in scales.scale_moves(robot, j, h, self.rank)),
+            *(move for j in joints if len(joints) > 1 for move in scales.scale_moves(robot, j, h, self.rank)),
         )
         for move in singles:
             yield self._made(step, move.family, move.words, move(h), move.drives)
-        if n > 1:
+        if len(joints) > 1:
             yield self._made(step, "assignment", "torques in another order", assignment.by_rows(bench, h))
         if h.gravity.any():
             yield self._made(step, "gravity_missing", "torques without gravity", gravity.without_gravity(h))
-        if n > 1:
+        if len(joints) > 1:
             yield from self._torque_scales(step)
         turned = gravity.best_direction(h, self.rank)
         yield self._made(step, "gravity_direction", "another direction of gravity", turned)
@@ -268,12 +268,12 @@ class Search:
             return seen[key][0]
 
         for own in relative:
-            if n <= EXHAUSTIVE:
-                for order in assignment.orders(n):
+            if self.bench.moving.sum() <= EXHAUSTIVE:
+                for order in assignment.orders(self.bench.moving):
                     at(order, own)
             else:
-                for begin in assignment.usual_orders(n):
-                    _climb(begin, lambda order, own=own: at(order, own))
+                for begin in assignment.usual_orders(self.bench.moving):
+                    _climb(begin, self.bench.moving, lambda order, own=own: at(order, own))
         best = sorted(seen.values(), key=lambda pair: pair[0])[: 4 * ORDERS_KEPT]
         steps = [self._made(first, "order", "joints in another order", h) for _, h in best]
         return [replace(s, probability=(1.0,), rivals=((),)) for s in sorted(steps, key=lambda s: s.rank)[:ORDERS_KEPT]]
@@ -287,11 +287,11 @@ def _rank(bench: Bench, h: Hypothesis) -> float:
     return float(np.log(shares[bench.moving]).sum()) - 2.0 * log_plausibility(bench, h) / RANKED_ROWS
 
 
-def _climb(order: Array, criterion: "assignment.OrderCriterion") -> None:
+def _climb(order: Array, moving: NDArray[np.bool_], criterion: "assignment.OrderCriterion") -> None:
     """Exchange two joints as long as the criterion falls."""
-    least = criterion(order)
+    least, chosen = criterion(order), np.flatnonzero(moving)
     while True:
-        swapped = [assignment.exchanged(order, i, k) for i in range(len(order)) for k in range(i)]
+        swapped = [assignment.exchanged(order, i, k) for i in chosen for k in chosen if k < i]
         values = [criterion(other) for other in swapped]
         k = int(np.argmin(values))
         if values[k] >= least:

@@ -16,6 +16,12 @@ Array = NDArray[np.float64]
 STILL_SHARE = 1e-3
 """Share of its position range below which a joint counts as not moving."""
 
+HELD_SHARE = 0.01
+"""Motion of a joint over that of the joint that moves most, in shares of their ranges, below which it is held.
+
+A held joint gives way to the torques of the others by less than a percent of their motion.
+"""
+
 STILL_RATIO = 0.7
 """Power of the differences over twice that of the positions above which they are noise (von Neumann 1941): 1 if white.
 
@@ -64,10 +70,14 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig) -> NDAr
     usual = np.array([2 * np.pi if joint.type == "revolute" else 1.0 for joint in robot.joints])
     limits = np.array([j.limits.position[1] - j.limits.position[0] for j in robot.joints])
     whole = np.where(limits < NO_LIMIT, np.minimum(limits, usual), usual)
-    span = np.max([np.ptp(e.q, axis=0) for e in experiments], axis=0)
+    share = np.max([np.ptp(e.q, axis=0) for e in experiments], axis=0) / whole
+    wanted = share
+    if all(e.q_ref is not None for e in experiments):
+        wanted = np.max([np.ptp(e.q_ref, axis=0) for e in experiments if e.q_ref is not None], axis=0) / whole
     power = np.sum([np.var(e.q, axis=0) for e in experiments], axis=0)
     of_steps = np.sum([np.mean(np.diff(e.q, axis=0) ** 2, axis=0) for e in experiments], axis=0)
-    moving: NDArray[np.bool_] = (span >= STILL_SHARE * whole) & (of_steps < 2 * STILL_RATIO * power)
+    moves = (share >= STILL_SHARE) & (wanted >= STILL_SHARE) & (share >= HELD_SHARE * share.max())
+    moving: NDArray[np.bool_] = moves & (of_steps < 2 * STILL_RATIO * power)
     return moving
 
 
@@ -83,7 +93,7 @@ def rest_findings(moving: NDArray[np.bool_], robot: RobotConfig) -> list[SetupFi
     """
     names = tuple(joint.name for joint in robot.joints)
     if not moving.any():
-        message = "standstill: no joint moves in these recordings, so that they determine no parameter"
+        message = "no joint moves in these recordings, so that they determine no parameter"
         return [SetupFinding("standstill", names, 1.0, message, REST_REMEDY, True)]
     still = tuple(name for name, moves in zip(names, moving, strict=True) if not moves)
     if not still:
