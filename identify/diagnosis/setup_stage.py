@@ -10,6 +10,7 @@ from armident.identify.document import Finding, Gap, Unexplained
 from armident.identify.experiment import Experiment
 from armident.identify.setup.check import check_setup
 from armident.identify.setup.result import SetupCheck, SetupFinding
+from armident.identify.setup.search import NOT_UNDERSTOOD
 
 SIGNALS = {"position_sign": "position", "torque_sign": "torque"}
 
@@ -66,27 +67,42 @@ class SetupStage:
             rms=dict(zip(names, (float(v) for v in each * torque), strict=True)),
         )
 
-    def named(self, findings: Sequence[Finding]) -> list[Finding]:
+    def doubtful(self, gap: Gap) -> list[Unexplained]:
+        """Entries of the joints that are not understood with the effects found, either.
+
+        Parameters
+        ----------
+        gap
+            Held-out errors of the model with the effects found.
+        """
+        return [entry for entry in self.unexplained if gap.by_joint[entry.joint] > 100 * NOT_UNDERSTOOD]
+
+    def named(self, findings: Sequence[Finding], gap: Gap) -> list[Finding]:
         """Findings of the set-up, then those at joints that are understood.
 
         Parameters
         ----------
         findings
             Effects found in the corrected set-up.
+        gap
+            Held-out errors of the model with them.
         """
-        doubtful = {entry.joint for entry in self.unexplained}
-        return [*self.findings, *(f for f in findings if f.joint not in doubtful)]
+        joints = {entry.joint for entry in self.doubtful(gap)}
+        return [*self.findings, *(f for f in findings if f.joint not in joints)]
 
-    def left(self, unexplained: Sequence[Unexplained]) -> list[Unexplained]:
+    def left(self, unexplained: Sequence[Unexplained], gap: Gap) -> list[Unexplained]:
         """Joints that are not understood, then the dependences at the others.
 
         Parameters
         ----------
         unexplained
             Remaining dependences of the residual.
+        gap
+            Held-out errors of the model with the effects found.
         """
-        doubtful = {entry.joint for entry in self.unexplained}
-        return [*self.unexplained, *(entry for entry in unexplained if entry.joint not in doubtful)]
+        doubtful = self.doubtful(gap)
+        joints = {entry.joint for entry in doubtful}
+        return [*doubtful, *(entry for entry in unexplained if entry.joint not in joints)]
 
 
 def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], robot: RobotConfig) -> SetupStage:

@@ -209,6 +209,8 @@ def velocity_frequency(q: Array, dt: float) -> Array:
     # A tenth of the spectrum is free of motion where the rate suffices; noise is white in the position.
     floor = np.quantile(position, 0.05, axis=0) / 0.0513
     cumulative = np.cumsum(np.where(position > SIGNIFICANT * floor, power, 0.0), axis=0)
+    # A constant velocity is motion, too: its power lies at zero.
+    cumulative += np.mean(np.diff(q, axis=0) / dt, axis=0) ** 2 / frequency[0]
     out = np.zeros(q.shape[1])
     for j in np.flatnonzero(cumulative[-1] > 0):
         out[j] = frequency[np.searchsorted(cumulative[:, j], POWER_SHARE * cumulative[-1, j])]
