@@ -174,14 +174,16 @@ def _diagnose(
     found = _searched(stage.training, stage.validation, stage.robot, steps, settings)
     study, first, outcome = found.study, found.first, found.outcome
     final = outcome.state
-    findings = stage.named(outcome.findings)
+    after = gap_of(final, held=True)
+    findings = stage.named(outcome.findings, after)
     places = {id(f): k for k, f in enumerate(outcome.findings)}
     lacking = [_beside(final, outcome.lacking[places[id(f)]]) if id(f) in places else None for f in findings]
     left = stage.left(
         [
             Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
             for d in found.left
-        ]
+        ],
+        after,
     )
     if baseline is not None:
         steps("changed parameters")
@@ -199,9 +201,7 @@ def _diagnose(
         unexplained=left,
         gap=Gaps(
             train=BeforeAfter(before=stage.as_configured(gap_of(first, held=False)), after=gap_of(final, held=False)),
-            validation=BeforeAfter(
-                before=stage.as_configured(gap_of(first, held=True)), after=gap_of(final, held=True)
-            ),
+            validation=BeforeAfter(before=stage.as_configured(gap_of(first, held=True)), after=after),
         ),
         noise_floor=noise_floor(final, found.left),
         recommended_experiment=experiment_to_separate(findings),

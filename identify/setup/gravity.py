@@ -16,7 +16,7 @@ Criterion = Callable[[Hypothesis], float]
 STANDARD = 9.81
 """Magnitude of gravity where the configuration has none, m/s^2."""
 
-DIRECTIONS = np.array([d / np.linalg.norm(d) for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
+DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 """Directions from which the search starts: faces, edges and corners of a cube, (26, 3)."""
 
 STARTS = 2
@@ -39,25 +39,30 @@ def best_direction(h: Hypothesis, criterion: Criterion) -> Hypothesis:
     size = float(np.linalg.norm(h.gravity)) or STANDARD
     tried = sorted(DIRECTIONS, key=lambda d: criterion(replace(h, gravity=size * d)))
     starts = [*tried[:STARTS], *([h.gravity / size] if h.gravity.any() else [])]
-    best, least = h, np.inf
-    for start in starts:
-        first, second = _across(start)
+    found = [_refined(h, size, start, criterion) for start in starts]
+    return min(found, key=lambda pair: pair[0])[1]
 
-        def turned(angles: Array, start: Array = start, first: Array = first, second: Array = second) -> Hypothesis:
-            angle = float(np.linalg.norm(angles))
-            side = (angles[0] * first + angles[1] * second) / max(angle, 1e-12)
-            return replace(h, gravity=size * (np.cos(angle) * start + np.sin(angle) * side))
 
-        simplex = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.2]])
-        found = optimize.minimize(
-            lambda angles, at=turned: criterion(at(angles)),
-            np.zeros(2),
-            method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-3, "maxfev": 80},
-        )
-        if found.fun < least:
-            best, least = turned(found.x), float(found.fun)
-    return best
+def _refined(h: Hypothesis, size: float, start: Array, criterion: Criterion) -> tuple[float, Hypothesis]:
+    """Least misfit near a direction, and its hypothesis."""
+    first, second = _across(start)
+
+    def turned(angles: Array) -> Hypothesis:
+        angle = float(np.linalg.norm(angles))
+        side = (angles[0] * first + angles[1] * second) / max(angle, 1e-12)
+        return replace(h, gravity=size * (np.cos(angle) * start + np.sin(angle) * side))
+
+    def misfit(angles: Array) -> float:
+        return criterion(turned(angles))
+
+    simplex = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.2]])
+    found = optimize.minimize(
+        misfit,
+        np.zeros(2),
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-3, "maxfev": 80},
+    )
+    return float(found.fun), turned(np.asarray(found.x))
 
 
 def without_gravity(h: Hypothesis) -> Hypothesis:

@@ -87,9 +87,9 @@ def exchange_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
     for i, k in combinations(joints, 2):
         swap = np.eye(robot.n)
         swap[[i, k]] = swap[[k, i]]
-        pairs = [("columns", swap, swap)]
-        at_drives = np.linalg.solve(ratios, (swap * counts[:, None] / counts) @ ratios)
-        of_drives = ratios.T @ (swap * rated[:, None] / rated) @ np.linalg.inv(ratios.T)
+        pairs: list[tuple[str, Array, Array]] = [("columns", swap, swap)]
+        at_drives = np.asarray(np.linalg.solve(ratios, (swap * counts[:, None] / counts) @ ratios), np.float64)
+        of_drives: Array = ratios.T @ (swap * rated[:, None] / rated) @ np.linalg.inv(ratios.T)
         if not (np.allclose(at_drives, swap, rtol=1e-3) and np.allclose(of_drives, swap, rtol=1e-3)):
             pairs.append(("drives", at_drives, of_drives))
         for what, position, torque in pairs:
@@ -109,7 +109,7 @@ def unit_moves(robot: RobotConfig) -> Iterator[Move]:
         The configuration.
     """
     n, ratios = robot.n, robot.transmission_matrix
-    inverse = np.linalg.inv(ratios)
+    inverse = np.asarray(np.linalg.inv(ratios), np.float64)
     revolute = np.array([joint.type == "revolute" for joint in robot.joints])
     units = " and ".join(sorted({_unit(joint.type) for joint in robot.joints}))
     small = np.diag(np.where(revolute, DEGREES, THOUSANDTH))

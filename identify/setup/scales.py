@@ -64,7 +64,7 @@ def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criter
         return Move("position_scale", f"scale of the position of {name}", scaled(n, joint, f), None)
 
     for made, least in ((gear, 1.0 + LEAST_GEAR), (torque, LEAST_GAIN), (position, 1.0 + LEAST_GEAR)):
-        factor = _best(lambda f, made=made: criterion(made(f)(h)))
+        factor = _best(made, h, criterion)
         if abs(np.log(factor)) >= np.log(least):
             yield made(factor)
 
@@ -105,15 +105,15 @@ def torque_scales(h: Hypothesis, criterion: Criterion, starts: Sequence[Array]) 
     return factors
 
 
-def _best(criterion: Callable[[float], float]) -> float:
+def _best(made: Callable[[float], Move], h: Hypothesis, criterion: Criterion) -> float:
     """Factor with the least misfit: the best of `FACTORS`, refined between its neighbours."""
-    values = [criterion(f) for f in FACTORS]
+    values = [criterion(made(f)(h)) for f in FACTORS]
     k = int(np.argmin(values))
     if values[k] > values[FACTORS.index(1.0)] - WORTH_REFINING:
         return 1.0
     low, high = np.log(FACTORS[max(k - 1, 0)]), np.log(FACTORS[min(k + 1, len(FACTORS) - 1)])
     found = optimize.minimize_scalar(
-        lambda v: criterion(float(np.exp(v))),
+        lambda v: criterion(made(float(np.exp(v)))(h)),
         bounds=(low, high),
         method="bounded",
         options={"xatol": 2e-3, "maxiter": 15},

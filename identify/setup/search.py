@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -309,7 +310,7 @@ class Search:
                     at(order, own)
             else:
                 for begin in assignment.usual_orders(self.bench.moving):
-                    _climb(begin, self.bench.moving, lambda order, own=own: at(order, own))
+                    _climb(begin, self.bench.moving, partial(at, own=own))
         best = sorted(seen.values(), key=lambda pair: pair[0])[: 4 * ORDERS_KEPT]
         steps = [self._made(first, "order", "joints in another order", h) for _, h in best]
         return [replace(s, probability=(1.0,), rivals=((),)) for s in sorted(steps, key=lambda s: s.rank)[:ORDERS_KEPT]]
@@ -327,7 +328,7 @@ def _climb(order: Array, moving: NDArray[np.bool_], criterion: "assignment.Order
     """Exchange two joints as long as the criterion falls."""
     least, chosen = criterion(order), np.flatnonzero(moving)
     while True:
-        swapped = [assignment.exchanged(order, i, k) for i in chosen for k in chosen if k < i]
+        swapped = [assignment.exchanged(order, i, k) for i in map(int, chosen) for k in map(int, chosen) if k < i]
         values = [criterion(other) for other in swapped]
         k = int(np.argmin(values))
         if values[k] >= least:
@@ -358,4 +359,5 @@ def independent_rows(residual: Array) -> Array:
     """
     power = np.maximum((residual**2).sum(axis=0), 1e-300)
     r = np.clip((residual[1:] * residual[:-1]).sum(axis=0) / power, 0.0, 0.99)
-    return np.maximum(residual.shape[0] * (1 - r) / (1 + r), 4.0)
+    rows: Array = np.maximum(residual.shape[0] * (1 - r) / (1 + r), 4.0)
+    return rows
