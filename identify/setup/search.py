@@ -133,7 +133,8 @@ class Search:
         """
         first = Step(start, rank=self.rank(start))
         best = self._greedy(first)
-        simple = sum(family in ("exchange", "assignment") for family in best.families) < 2
+        # An exchange that needs a second mistake beside it may be a part of another order.
+        simple = len(best.families) < 2 or not {"exchange", "assignment"} & set(best.families)
         if self.bench.moving.sum() < 3 or (simple and self._understood(best.h)):
             return best
         for step in self._orders(first):
