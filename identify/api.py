@@ -39,6 +39,8 @@ from armident.identify.monitoring.change_test import ParameterChangeTest
 from armident.identify.monitoring.change_test import compare as test_parameter_change
 from armident.identify.regression.equations import MAX_AR_ORDER
 from armident.identify.report.files import robot_yaml
+from armident.identify.setup.check import check_setup
+from armident.identify.setup.result import SetupCheck
 from armident.identify.signals.differentiate import NvrRule
 from armident.identify.tables import EffectTable, ParameterTable, Table
 
@@ -283,6 +285,41 @@ def identify(
     return Identification(outcome.document, outcome.robot, read, outcome.result)
 
 
+def check(recordings: Recorded | Sequence[Recorded], robot: Robot | None = None) -> SetupCheck:
+    """Check signs, order, units, gear ratios, gravity and clocks of recordings against the configuration; seconds.
+
+    Parameters
+    ----------
+    recordings
+        A recording, the path of one, or a sequence of them; all of one robot at one sampling rate.
+    robot
+        Configuration to check, or the path or shipped name of one; by default the one inside the first recording.
+
+    Returns
+    -------
+    SetupCheck
+        Mistakes with their probability and the line of configuration that corrects each.
+
+    Raises
+    ------
+    ConfigError
+        If a file does not exist or a configuration is wrong.
+    DataError
+        If the recordings are too short, or their sampling rates differ.
+
+    Examples
+    --------
+    >>> import armident
+    >>> recording = armident.simulate_recording("tx40", "tx40_excitation", seed=1)
+    >>> armident.check(recording).findings
+    ()
+    """
+    read = _read(recordings)
+    config = _robot(robot, read)
+    experiments, _ = experiments_of(read, config, name_files=True)
+    return check_setup(experiments, config)
+
+
 @dataclass(frozen=True, repr=False)
 class Diagnosis(_Result):
     """Disagreement of a model with recordings, and the effects that explain it.
@@ -346,7 +383,7 @@ class Diagnosis(_Result):
             The document as written, with the path of the model.
         """
         place, document = Path(folder), self.document
-        if self.robot.effects != self.configured.effects:
+        if self.robot != self.configured:
             model = place / "model.yaml"
             write_atomically(model, robot_yaml(self.robot))
             document = document.model_copy(update={"model": str(model)})

@@ -1,4 +1,4 @@
-"""Commands of this package: identify, diagnose, effects, history, trajectory, worker, reproduce, diagnose-suite."""
+"""Commands of this package: identify, check, diagnose, effects, history, trajectory, worker, reproduce, suite."""
 
 from pathlib import Path
 from typing import Annotated
@@ -65,6 +65,25 @@ def identify(
         "physical": physical,
     }
     code = identify_command(recording, config, chosen, out, as_json=json)
+    if code:
+        raise typer.Exit(code)
+
+
+def check(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings (.mcap) of one robot at one sampling rate.")],
+    config: Robot = None,
+    json: Json = False,
+) -> None:
+    """Check the set-up in seconds: signs, order of joints, units, gear ratios, gravity, clocks, clipping, standstill.
+
+    Prints what is wrong, how sure that is, and the line of configuration that corrects it. Exit code 0 if the set-up
+    is right, 3 if results would be unusable.
+
+    Example: armident check tx40.mcap --config configs/tx40.yaml
+    """
+    from armident.identify.commands import check_command
+
+    code = check_command(recordings, config, as_json=json)
     if code:
         raise typer.Exit(code)
 

@@ -15,6 +15,7 @@ from rich.table import Table
 from armident.configs import RobotConfig
 from armident.identify.document import DiagnosisDocument, IdentificationDocument
 from armident.identify.effects.terms import arm_model
+from armident.identify.setup.result import SetupCheck
 
 SHOW_AFTER_S = 2.0
 """Duration after which progress is shown, s."""
@@ -84,6 +85,24 @@ def warn(lines: list[str]) -> None:
     """Print one line per warning on stderr."""
     for line in lines:
         print(f"armident: warning: {line}", file=sys.stderr)
+
+
+def setup_table(result: SetupCheck) -> None:
+    """Print the findings of a set-up check, one below the other, and its hypotheses where a joint is not understood."""
+    before = ", ".join(f"{error:.1f}" for error in result.relative_error_pct)
+    after = ", ".join(f"{error:.1f}" for error in result.corrected_error_pct)
+    if not result.findings:
+        print("set-up: no mistake found")
+    for finding in result.findings:
+        print(f"{finding.kind}: {finding.message} (probability {finding.probability:.2f})")
+        print(f"  correct it by: {finding.remedy}")
+    corrected = f", corrected {after}" if any(f.decisive for f in result.findings) else ""
+    if any(error != 100.0 for error in result.relative_error_pct):
+        print(f"torque error of the rigid model by joint: {before} %{corrected}{' %' if corrected else ''}")
+    if result.joints_not_understood:
+        names = ", ".join(result.joints_not_understood)
+        print(f"not understood: the rigid model leaves more than a third of the torque of {names}")
+        print(f"  tried: {'; '.join(result.tried)}")
 
 
 def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:

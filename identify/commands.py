@@ -1,5 +1,6 @@
-"""Commands ``identify`` and ``diagnose``: read, compute, write, print."""
+"""Commands ``identify``, ``check`` and ``diagnose``: read, compute, write, print."""
 
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +15,9 @@ UNUSABLE = DataError.exit_code
 
 FOUND = 4
 """Exit code: done, with findings or an unexplained residual."""
+
+UNUSABLE = 3
+"""Exit code: the data cannot support the request as they are configured."""
 
 
 def identify_command(
@@ -59,6 +63,44 @@ def identify_command(
         identification_table(result.document)
         print(f"result: {document}\nreport: {html}")
     return UNUSABLE if result.verdict == "unusable" else 0
+
+
+def check_command(paths: Sequence[Path], config: Path | None, *, as_json: bool) -> int:
+    """Carry out ``armident check``.
+
+    Parameters
+    ----------
+    paths
+        Recordings.
+    config
+        Robot configuration; ``None``: that of the first recording.
+    as_json
+        Print the result as JSON on stdout instead of a table.
+
+    Returns
+    -------
+    int
+        Exit code: `UNUSABLE` with a decisive finding or a joint that is not understood, otherwise 0.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If a file is wrong, or the recordings cannot be checked.
+    """
+    from armident.identify.api import check
+    from armident.identify.cli_tables import progress, setup_table
+
+    with progress("check"):
+        result = check(list(paths), config)
+    if as_json:
+        content = {**vars(result), "findings": [vars(finding) for finding in result.findings]}
+        robot = result.corrected_robot
+        content["corrected_robot"] = None if robot is None else robot.model_dump(mode="json", by_alias=True)
+        sys.stdout.write(json.dumps(content, indent=2) + "\n")
+    else:
+        setup_table(result)
+    wrong = result.joints_not_understood or any(finding.decisive for finding in result.findings)
+    return UNUSABLE if wrong else 0
 
 
 def diagnose_command(

@@ -142,10 +142,16 @@ EFFECT_PARAMETERS: dict[str, dict[str, str]] = {
     "sign_error": {
         "position": "1: the position signal has the wrong sign.",
         "torque": "1: the torque signal has the wrong sign.",
+        "joint_side": "1: the signals of the joint, in SI units, not those of the drive.",
     },
     "joint_order": {
         "position": "1: the position signals are exchanged.",
         "torque": "1: the torque signals are exchanged.",
+        "joint_side": "1: columns of the joints, in SI units, not raw numbers of the drives.",
+    },
+    "signal_scale": {
+        "position": "True over recorded position; with another joint, the multiple of its position that is added.",
+        "torque": "True over recorded torque; with another joint, the multiple of its torque that is added.",
     },
 }
 """Meaning of every parameter of the effects of this package."""
