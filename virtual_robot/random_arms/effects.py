@@ -1,6 +1,6 @@
 """Hidden effects of random arms: physics and readings, with laws that are not the formulas of the catalogue."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,8 +35,48 @@ class Place:
     peak: Floats
 
 
-Apply = Callable[[Plant, Place, float, Generator], Plant]
-"""Plant with an effect of a strength; every call draws the same numbers from an equally seeded generator."""
+class Shapes:
+    """Draws the numbers that shape a law; two objects of one seed draw the same.
+
+    Parameters
+    ----------
+    seed
+        Seed.
+    wider
+        Factor by which the ranges of the laws are extended at both ends.
+    """
+
+    def __init__(self, seed: Sequence[int], wider: float) -> None:
+        self.generator, self._wider = np.random.default_rng(seed), wider
+
+    def between(self, low: float, high: float) -> float:
+        """Draw a number of the range, extended for this half of the suite.
+
+        Parameters
+        ----------
+        low, high
+            Ends of the range; a range about zero is extended in both directions.
+        """
+        wider = self._wider
+        return float(self.generator.uniform(low / wider if low > 0.0 else low * wider, high * wider))
+
+    def angle(self) -> float:
+        """Draw an angle of the full circle, rad."""
+        return float(self.generator.uniform(0.0, 2.0 * np.pi))
+
+    def one_of(self, values: Sequence[float]) -> float:
+        """Draw one of some values.
+
+        Parameters
+        ----------
+        values
+            The values.
+        """
+        return float(self.generator.choice(values))
+
+
+Apply = Callable[[Plant, Place, float, Shapes], Plant]
+"""Plant with an effect of a strength."""
 
 
 @dataclass(frozen=True)
@@ -65,23 +105,19 @@ def _metre(plant: Plant, j: int) -> float:
     return PRISMATIC_SCALE if plant.arm.prismatic[j] else 1.0
 
 
-def _sign(rng: Generator) -> float:
-    return float(rng.choice([-1.0, 1.0]))
-
-
-def _stribeck(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _stribeck(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
-    speed, law = rng.uniform(0.02, 0.12) * plant.arm.speed[j], rng.integers(2)
+    speed, law = draw.between(0.02, 0.12) * plant.arm.speed[j], draw.generator.integers(2)
     amount = s * 0.5 * max(plant.laws[j, COULOMB], 0.1 * plant.arm.scale[j])
     return with_law(plant, j, stribeck=amount, stribeck_velocity=speed, stribeck_law=float(law))
 
 
-def _tight_spot(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _tight_spot(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
     low, high = np.percentile(at.motion.position[:, j], [15.0, 85.0])
     amount = s * 0.8 * max(plant.laws[j, COULOMB], 0.1 * plant.arm.scale[j])
-    width = rng.uniform(0.06, 0.3) * _metre(plant, j)
-    return with_law(plant, j, tight=amount, tight_position=rng.uniform(low, high), tight_width=width)
+    width = draw.between(0.06, 0.3) * _metre(plant, j)
+    return with_law(plant, j, tight=amount, tight_position=float(draw.generator.uniform(low, high)), tight_width=width)
 
 
 def _fastest_order(plant: Plant, j: int) -> float:
@@ -90,33 +126,33 @@ def _fastest_order(plant: Plant, j: int) -> float:
     return 2.0 * np.pi * min(sampling / 6.0, 1.0 / (25.0 * plant.step)) / float(plant.arm.speed[j])
 
 
-def _ripple_joint(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _ripple_joint(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
     top = min(_fastest_order(plant, j), 60.0 / _metre(plant, j))
-    order = np.exp(rng.uniform(np.log(min(6.0 / _metre(plant, j), 0.5 * top)), np.log(top)))
+    order = np.exp(draw.generator.uniform(np.log(min(6.0 / _metre(plant, j), 0.5 * top)), np.log(top)))
     amount = s * 0.15 * plant.arm.scale[j]
-    return with_law(plant, j, ripple=amount, ripple_order=float(order), ripple_phase=rng.uniform(0.0, 2.0 * np.pi))
+    return with_law(plant, j, ripple=amount, ripple_order=float(order), ripple_phase=draw.angle())
 
 
-def _ripple_motor(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _ripple_motor(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
     ratio, top = float(plant.arm.ratio[j]), _fastest_order(plant, j)
     whole = [k for k in (1, 2, 3, 4, 6) if k * ratio <= top]
     # Too slow a rate for a turn of the motor: a stage of the gear before it.
-    order = ratio * (float(rng.choice(whole)) if whole else min(top / ratio, 1.0) * rng.uniform(0.4, 0.9))
+    order = ratio * (draw.one_of(whole) if whole else min(top / ratio, 1.0) * draw.between(0.4, 0.9))
     amount = s * 0.15 * plant.arm.scale[j]
-    return with_law(plant, j, ripple=amount, ripple_order=order, ripple_phase=rng.uniform(0.0, 2.0 * np.pi))
+    return with_law(plant, j, ripple=amount, ripple_order=order, ripple_phase=draw.angle())
 
 
-def _spring(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _spring(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j, metre = at.joint, _metre(plant, at.joint)
     stiffness = s * 0.25 * plant.arm.scale[j] / metre
-    centre = rng.uniform(-0.3, 0.3) * metre
-    cubic = stiffness * rng.uniform(0.5, 2.0) / metre**2
+    centre = draw.between(-0.3, 0.3) * metre
+    cubic = stiffness * draw.between(0.5, 2.0) / metre**2
     return with_law(plant, j, spring=stiffness, spring_cubic=cubic, spring_position=centre)
 
 
-def _one_sided_viscosity(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _one_sided_viscosity(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
     amount = s * 0.3 * plant.arm.scale[j] / plant.arm.speed[j]
     return with_law(plant, j, viscous_forward=amount)
@@ -129,43 +165,43 @@ def _more_friction(plant: Plant, j: int, least: float) -> Plant:
     return with_law(plant, j, coulomb=dry, viscous=viscous)
 
 
-def _warming_with_work(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _warming_with_work(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
     plant = _more_friction(plant, j, 0.2)
     rate = np.abs(at.motion.velocity[:, j])
     work = plant.step * float(np.sum(rate * (plant.laws[j, VISCOUS] * rate + plant.laws[j, COULOMB])))
-    return with_law(plant, j, work_drop=min(0.45 * s, 0.95), work_scale=work * rng.uniform(0.2, 0.8))
+    return with_law(plant, j, work_drop=min(0.45 * s, 0.95), work_scale=work * draw.between(0.2, 0.8))
 
 
-def _warming_with_time(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _warming_with_time(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
     plant = _more_friction(plant, j, 0.2)
     duration = plant.step * at.motion.position.shape[0]
-    return with_law(plant, j, time_drop=min(0.6 * s, 1.2), time_scale=duration * rng.uniform(0.2, 0.8))
+    return with_law(plant, j, time_drop=min(0.6 * s, 1.2), time_scale=duration * draw.between(0.2, 0.8))
 
 
-def _curved_viscosity(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _curved_viscosity(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
-    power = float(rng.choice([rng.uniform(0.35, 0.55), rng.uniform(1.7, 2.5)]))
+    power = draw.one_of([draw.between(0.35, 0.55), draw.between(1.7, 2.5)])
     return with_law(plant, j, curve=s * 0.6 * plant.arm.scale[j], curve_velocity=plant.arm.speed[j], curve_power=power)
 
 
-def _load_friction(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _load_friction(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
-    return with_law(plant, j, load=0.2 * s, load_knee=rng.uniform(0.05, 0.3) * plant.arm.scale[j])
+    return with_law(plant, j, load=0.2 * s, load_knee=draw.between(0.05, 0.3) * plant.arm.scale[j])
 
 
-def _presliding(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _presliding(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
     plant = with_law(plant, j, coulomb=max(plant.laws[j, COULOMB], 0.15 * plant.arm.scale[j]))
-    return with_law(plant, j, presliding=s * rng.uniform(0.01, 0.03) * _metre(plant, j))
+    return with_law(plant, j, presliding=s * draw.between(0.01, 0.03) * _metre(plant, j))
 
 
-def _pair_friction(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _pair_friction(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     i, j = at.joint, at.joint + 1
     scale = min(plant.arm.scale[i], plant.arm.scale[j])
-    viscous = s * rng.uniform(0.1, 0.3) * scale / max(plant.arm.speed[i], plant.arm.speed[j])
-    row = np.array([[i, j, viscous, s * rng.uniform(0.1, 0.3) * scale]])
+    viscous = s * draw.between(0.1, 0.3) * scale / max(plant.arm.speed[i], plant.arm.speed[j])
+    row = np.array([[i, j, viscous, s * draw.between(0.1, 0.3) * scale]])
     return replace(plant, pairs=np.vstack([plant.pairs, row]))
 
 
@@ -173,44 +209,44 @@ def _link_inertia(plant: Plant, j: int) -> float:
     return float(plant.arm.diagonal[j] - plant.arm.rotor[j])
 
 
-def _elastic_gear(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _elastic_gear(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j, inertia = at.joint, _link_inertia(plant, at.joint)
-    stiffness = inertia * (2.0 * np.pi * rng.uniform(18.0, 35.0)) ** 2 / s
+    stiffness = inertia * (2.0 * np.pi * draw.between(18.0, 35.0)) ** 2 / s
     twist = 3.0 * plant.arm.scale[j] / stiffness
-    damping = 2.0 * rng.uniform(0.03, 0.12) * np.sqrt(stiffness * inertia)
-    row = np.array([[j, stiffness, stiffness * rng.uniform(0.0, 0.8) / twist**2, damping, 0.0]])
+    damping = 2.0 * draw.between(0.03, 0.12) * np.sqrt(stiffness * inertia)
+    row = np.array([[j, stiffness, stiffness * draw.between(0.0, 0.8) / twist**2, damping, 0.0]])
     return replace(plant, gears=np.vstack([plant.gears, row]))
 
 
-def _play(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _play(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
     inertia = 1.0 / (1.0 / _link_inertia(plant, j) + 1.0 / plant.arm.rotor[j])
-    stiffness = inertia * (2.0 * np.pi * rng.uniform(80.0, 140.0)) ** 2
-    damping = 2.0 * rng.uniform(0.15, 0.4) * np.sqrt(stiffness * inertia)
+    stiffness = inertia * (2.0 * np.pi * draw.between(80.0, 140.0)) ** 2
+    damping = 2.0 * draw.between(0.15, 0.4) * np.sqrt(stiffness * inertia)
     row = np.array([[j, stiffness, 0.0, damping, 0.5 * s * 4e-3 * _metre(plant, j)]])
     return replace(plant, gears=np.vstack([plant.gears, row]))
 
 
-def _soft_saturation(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _soft_saturation(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     return with_entry(plant, "saturation", at.joint, float(at.peak[at.joint]) / s)
 
 
-def _gain_error(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
-    return with_entry(plant, "gain", at.joint, 1.0 + max(_sign(rng) * 0.15 * s, -0.6))
+def _gain_error(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
+    return with_entry(plant, "gain", at.joint, 1.0 + max(draw.one_of([-1.0, 1.0]) * 0.15 * s, -0.6))
 
 
-def _torque_delay(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _torque_delay(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     return with_entry(plant, "delay", at.joint, 5e-3 * s)
 
 
-def _slow_actuator(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _slow_actuator(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     return with_law(plant, at.joint, lag=3e-3 * s)
 
 
-def _eccentric_encoder(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _eccentric_encoder(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j, metre = at.joint, _metre(plant, at.joint)
-    order = float(rng.choice([1.0, 2.0, rng.uniform(2.0, 8.0)])) / metre
-    phase = rng.uniform(0.0, 2.0 * np.pi)
+    order = draw.one_of([1.0, 2.0, draw.between(2.0, 8.0)]) / metre
+    phase = draw.angle()
     return with_law(plant, j, eccentricity=6e-3 * s / order, eccentricity_order=order, eccentricity_phase=phase)
 
 
@@ -233,14 +269,14 @@ def rotated(gravity: Floats, axis: Floats, angle: float) -> Floats:
     )
 
 
-def _tilted_base(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
-    heading = rng.uniform(0.0, 2.0 * np.pi)
+def _tilted_base(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
+    heading = draw.angle()
     axis = np.array([np.cos(heading), np.sin(heading), 0.0])
     return replace(plant, arm=replace(plant.arm, gravity=rotated(plant.arm.gravity, axis, 0.1 * s)))
 
 
-def _bursts(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
-    amount, rate, width = s * 0.5 * plant.arm.scale[at.joint], rng.uniform(0.6, 2.0), rng.uniform(0.01, 0.06)
+def _bursts(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
+    amount, rate, width = s * 0.5 * plant.arm.scale[at.joint], draw.between(0.6, 2.0), draw.between(0.01, 0.06)
 
     def torque(own: Generator, t: Floats) -> Floats:
         out = np.zeros_like(t)
@@ -251,9 +287,9 @@ def _bursts(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
     return replace(plant, external=plant.external | {at.joint: torque})
 
 
-def _unrecorded(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _unrecorded(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     """Torque that follows a signal that no recording holds: slow random process with a cut-off."""
-    amount, cutoff = s * 0.2 * plant.arm.scale[at.joint], rng.uniform(0.3, 2.5)
+    amount, cutoff = s * 0.2 * plant.arm.scale[at.joint], draw.between(0.3, 2.5)
 
     def torque(own: Generator, t: Floats) -> Floats:
         rates = np.linspace(0.05, 1.0, 25) * cutoff
@@ -265,9 +301,9 @@ def _unrecorded(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
     return replace(plant, external=plant.external | {at.joint: torque})
 
 
-def _vibration(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _vibration(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     sampling = 1.0 / (plant.step * plant.every)
-    amount, frequency = s * 0.15 * plant.arm.scale[at.joint], rng.uniform(12.0, min(70.0, sampling / 6.0))
+    amount, frequency = s * 0.15 * plant.arm.scale[at.joint], draw.between(12.0, min(70.0, sampling / 6.0))
 
     def torque(own: Generator, t: Floats) -> Floats:
         swell = 1.0 + 0.4 * np.sin(2.0 * np.pi * own.uniform(0.2, 0.6) * t + own.uniform(0.0, 6.0))
@@ -276,8 +312,8 @@ def _vibration(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
     return replace(plant, external=plant.external | {at.joint: torque})
 
 
-def _offset_steps(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
-    amount, rate = s * 0.2 * plant.arm.scale[at.joint], rng.uniform(0.3, 1.0)
+def _offset_steps(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
+    amount, rate = s * 0.2 * plant.arm.scale[at.joint], draw.between(0.3, 1.0)
 
     def torque(own: Generator, t: Floats) -> Floats:
         out = np.zeros_like(t)
@@ -288,14 +324,14 @@ def _offset_steps(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
     return replace(plant, external=plant.external | {at.joint: torque})
 
 
-def _slosh(plant: Plant, at: Place, s: float, rng: Generator) -> Plant:
+def _slosh(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
     j = at.joint
     return with_law(
         plant,
         j,
         slosh=min(0.25 * s, 1.0) * _link_inertia(plant, j),
-        slosh_frequency=rng.uniform(0.7, 3.0),
-        slosh_damping=rng.uniform(0.02, 0.1),
+        slosh_frequency=draw.between(0.7, 3.0),
+        slosh_damping=draw.between(0.02, 0.1),
     )
 
 

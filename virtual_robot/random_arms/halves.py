@@ -49,6 +49,8 @@ class Ranges:
         Length of a recording, s.
     rates
         Sampling rates, Hz.
+    wider
+        Factor by which the ranges of the hidden laws are extended at both ends.
     visibility
         Visibility aimed at.
     """
@@ -72,6 +74,7 @@ class Ranges:
     bandwidth: Range
     duration: Range
     rates: tuple[int, ...]
+    wider: float
     visibility: Range
 
 
@@ -95,6 +98,7 @@ DEVELOPMENT = Ranges(
     bandwidth=(4.0, 10.0),
     duration=(8.0, 14.0),
     rates=(200, 250, 400, 500, 1000, 1000, 2000, 2000, 4000, 5000),
+    wider=1.0,
     visibility=(1.0, 10.0),
 )
 
@@ -118,6 +122,7 @@ RESERVE = Ranges(
     bandwidth=(3.5, 12.0),
     duration=(8.0, 15.0),
     rates=(200, 300, 500, 800, 1000, 1250, 2000, 2500, 4000, 5000),
+    wider=1.3,
     visibility=(1.0, 10.0),
 )
 

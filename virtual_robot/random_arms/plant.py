@@ -17,6 +17,7 @@ from armident.virtual_robot.random_arms.slots import (
     ECCENTRICITY_ORDER,
     ECCENTRICITY_PHASE,
     GEARS,
+    LAWS,
     PAIRS,
 )
 
@@ -125,7 +126,7 @@ def healthy_plant(arm: Arm, control: Floats, step: float, every: int) -> Plant:
     )  # fmt: skip
 
 
-def simulate(plant: Plant, motion: Motion, seed: NDArray[np.int64]) -> Run:
+def simulate(plant: Plant, motion: Motion, seed: tuple[int, ...]) -> Run:
     """Simulate a recording.
 
     Parameters
@@ -202,8 +203,6 @@ def with_law(plant: Plant, joint: int, **values: float) -> Plant:
     **values
         Values by name of the column.
     """
-    from armident.virtual_robot.random_arms.slots import LAWS
-
     laws = plant.laws.copy()
     for name, value in values.items():
         laws[joint, LAWS.index(name)] = value

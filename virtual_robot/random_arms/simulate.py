@@ -1,4 +1,4 @@
-"""Compiled closed loop of a random arm: rigid bodies, dry friction as impulses with bounds, controllers, encoders.
+"""Compiled closed loop of a random arm: rigid bodies, dry friction as bounded impulses, controllers, encoders.
 
 One step is linearly implicit in velocities: viscous friction, springs and contacts are stable at any stiffness. Dry
 friction is a box-constrained impulse by joint (projected Gauss-Seidel): a joint sticks where the bound suffices, and
@@ -11,104 +11,22 @@ import numpy as np
 from numba import njit
 
 from armident.virtual_robot.random_arms.bodies import mass_and_bias, place
+from armident.virtual_robot.random_arms.friction import dry_level, friction_impulses, smooth_torque, warmed
+from armident.virtual_robot.random_arms.loops import command, read_encoder
 from armident.virtual_robot.random_arms.slots import (
     COULOMB,
-    COULOMB_FORWARD,
-    CURVE,
-    CURVE_POWER,
-    CURVE_VELOCITY,
-    ECCENTRICITY,
-    ECCENTRICITY_ORDER,
-    ECCENTRICITY_PHASE,
-    FEEDFORWARD,
-    FILTER,
-    KI,
-    KP,
-    KV,
     LAG,
-    LIMIT,
-    LOAD,
-    LOAD_KNEE,
-    OFFSET,
-    ONE_LOOP,
     PRESLIDING,
-    RIPPLE,
-    RIPPLE_ORDER,
-    RIPPLE_PHASE,
     SLOSH,
     SLOSH_DAMPING,
     SLOSH_FREQUENCY,
-    SPRING,
-    SPRING_CUBIC,
-    SPRING_POSITION,
-    STRIBECK,
-    STRIBECK_LAW,
-    STRIBECK_VELOCITY,
-    TIGHT,
-    TIGHT_POSITION,
-    TIGHT_WIDTH,
-    TIME_DROP,
-    TIME_SCALE,
     VISCOUS,
-    VISCOUS_FORWARD,
-    WINDOW,
-    WORK_DROP,
-    WORK_SCALE,
 )
 
-SWEEPS = 25
-"""Largest number of Gauss-Seidel sweeps over the friction impulses of a step."""
-CONVERGED = 1e-9
-"""Change of a friction impulse, relative to its bound, below which the sweeps end."""
 ELEMENTS = np.array([[0.25, 0.3], [0.45, 1.0], [0.30, 2.0]])
 """Presliding by three Maxwell-slip elements: share of the dry friction, and breakaway relative to the nominal one."""
-
-
-@njit(cache=True, error_model="numpy")
-def dry_level(law, q, v, forward, faded, load):  # type: ignore[no-untyped-def]
-    """Dry friction of a joint in one direction, N m or N.
-
-    Parameters
-    ----------
-    law
-        Row of the law table.
-    q, v
-        Position and velocity before the step.
-    forward
-        1 for the bound in positive direction.
-    faded
-        Factor of warming.
-    load
-        Torque that the gear transmits.
-    """
-    level = law[COULOMB] * faded
-    if forward:
-        level += law[COULOMB_FORWARD]
-    if law[STRIBECK] != 0.0:
-        ratio = abs(v) / law[STRIBECK_VELOCITY]
-        level += law[STRIBECK] * (math.exp(-ratio) if law[STRIBECK_LAW] == 0.0 else 1.0 / (1.0 + ratio * ratio * ratio))
-    if law[TIGHT] != 0.0:
-        away = (q - law[TIGHT_POSITION]) / law[TIGHT_WIDTH]
-        level += law[TIGHT] * math.exp(-0.5 * away * away)
-    if law[LOAD] != 0.0:
-        level += law[LOAD] * (math.sqrt(load * load + law[LOAD_KNEE] * law[LOAD_KNEE]) - law[LOAD_KNEE])
-    return max(level, 0.0)
-
-
-@njit(cache=True, error_model="numpy")
-def smooth_torque(law, q, v):  # type: ignore[no-untyped-def]
-    """Torque of the joint's springs, ripple, offset and curved friction against the motion, N m or N."""
-    out = law[OFFSET]
-    if law[VISCOUS_FORWARD] != 0.0 and v > 0.0:
-        out += law[VISCOUS_FORWARD] * v
-    if law[RIPPLE] != 0.0:
-        out += law[RIPPLE] * math.sin(law[RIPPLE_ORDER] * q + law[RIPPLE_PHASE])
-    if law[SPRING] != 0.0 or law[SPRING_CUBIC] != 0.0:
-        x = q - law[SPRING_POSITION]
-        out += law[SPRING] * x + law[SPRING_CUBIC] * x * x * x
-    if law[CURVE] != 0.0:
-        out += math.copysign(law[CURVE] * (abs(v) / law[CURVE_VELOCITY]) ** law[CURVE_POWER], v)
-    return out
+FARTHEST = 1e3
+"""Position, rad or m, beyond which a loop counts as diverged."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -143,44 +61,139 @@ def invert(A, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def friction_impulses(v, AJ, rows, bounds, impulses):  # type: ignore[no-untyped-def]
-    """Dry friction of a step by projected Gauss-Seidel.
+def presliding(law, level, step, speed, bristle):  # type: ignore[no-untyped-def]
+    """Impulse of the bristles of a joint, and the stiffness of those that stick times half a squared step.
 
     Parameters
     ----------
-    v
-        Velocities without dry friction, shape (N,); with it afterwards.
-    AJ
-        Velocity change per unit impulse of each row, shape (N, R).
-    rows
-        Coordinates of each row (the second is -1 for friction of one joint), shape (R, 2).
-    bounds
-        Largest impulses against positive and negative velocity, shape (R, 2).
-    impulses
-        Impulses, of the step before at first, shape (R,).
+    law
+        Row of the law table.
+    level
+        Dry friction that the bristles carry together.
+    step
+        Step, s.
+    speed
+        Velocity before the step.
+    bristle
+        Deflections, shape (3,).
     """
-    N, R = AJ.shape
-    for r in range(R):
-        impulses[r] = min(max(impulses[r], -bounds[r, 1]), bounds[r, 0])
-        for i in range(N):
-            v[i] -= AJ[i, r] * impulses[r]
-    for _ in range(SWEEPS):
-        worst = 0.0
+    impulse, stiff = 0.0, 0.0
+    for e in range(3):
+        share = ELEMENTS[e, 0] * level
+        reach = ELEMENTS[e, 1] * law[PRESLIDING]
+        z = bristle[e] + step * speed
+        if abs(z) < reach:
+            half = 0.5 * step * step * share / reach
+            impulse += step * share / reach * bristle[e] + half * speed
+            stiff += half
+        else:
+            impulse += step * math.copysign(share, z)
+    return impulse, stiff
+
+
+@njit(cache=True, error_model="numpy")
+def move_bristles(law, move, bristle):  # type: ignore[no-untyped-def]
+    """Move the bristles of a joint by a distance; each slides beyond its reach."""
+    for e in range(3):
+        reach = ELEMENTS[e, 1] * law[PRESLIDING]
+        bristle[e] = min(max(bristle[e] + move, -reach), reach)
+
+
+@njit(cache=True, error_model="numpy")
+def slosh_impulse(law, step, acceleration, slosh):  # type: ignore[no-untyped-def]
+    """Impulse of a mass on a spring on the link, and its motion.
+
+    Parameters
+    ----------
+    law
+        Row of the law table.
+    step
+        Step, s.
+    acceleration
+        Acceleration of the link in the step before.
+    slosh
+        Position and velocity relative to the link, shape (2,); written in place.
+    """
+    w = 2.0 * math.pi * law[SLOSH_FREQUENCY]
+    pull = -w * w * slosh[0] - 2.0 * law[SLOSH_DAMPING] * w * slosh[1]
+    slosh[1] += step * (pull - acceleration)
+    slosh[0] += step * slosh[1]
+    return -step * law[SLOSH] * pull
+
+
+@njit(cache=True, error_model="numpy")
+def add_gears(gears, motor, step, q, v, A, right):  # type: ignore[no-untyped-def]
+    """Add the torques of flexible gears and of contacts with play.
+
+    Parameters
+    ----------
+    gears
+        Table of `GEARS`, shape (E, 5).
+    motor
+        Coordinate of each motor, shape (n,).
+    step
+        Step, s.
+    q, v
+        Coordinates and velocities before the step, shape (N,).
+    A, right
+        Matrix (N, N) and right-hand side (N,) of the step; written in place.
+    """
+    for e in range(gears.shape[0]):
+        j = int(gears[e, 0])
+        m = motor[j]
+        twist, gap = q[m] - q[j], gears[e, 4]
+        if abs(twist) <= gap:
+            continue
+        x = twist - math.copysign(gap, twist)
+        force = gears[e, 1] * x + gears[e, 2] * x * x * x
+        half = 0.5 * step * step * (gears[e, 1] + 3.0 * gears[e, 2] * x * x)
+        both = step * gears[e, 3] + half
+        impulse = step * force + half * (v[m] - v[j])
+        right[m] -= impulse
+        right[j] += impulse
+        A[m, m] += both
+        A[j, j] += both
+        A[m, j] -= both
+        A[j, m] -= both
+
+
+@njit(cache=True, error_model="numpy")
+def solve_step(A, right, rows, bounds, impulses, new):  # type: ignore[no-untyped-def]
+    """Velocities after a step.
+
+    Parameters
+    ----------
+    A, right
+        Matrix (N, N) and right-hand side (N,) without dry friction; ``A`` is overwritten.
+    rows, bounds, impulses
+        Dry friction, see `friction_impulses`.
+    new
+        Resulting velocities, shape (N,).
+    """
+    N, R = right.size, rows.shape[0]
+    inverse, AJ = np.empty((N, N)), np.empty((N, R))
+    invert(A, inverse)
+    for i in range(N):
+        total = 0.0
+        for c in range(N):
+            total += inverse[i, c] * right[c]
+        new[i] = total
         for r in range(R):
-            a, b = rows[r, 0], rows[r, 1]
-            speed, weight = v[a], AJ[a, r]
-            if b >= 0:
-                speed += v[b]
-                weight += AJ[b, r]
-            new = min(max(impulses[r] + speed / weight, -bounds[r, 1]), bounds[r, 0])
-            change = new - impulses[r]
-            if change != 0.0:
-                impulses[r] = new
-                for i in range(N):
-                    v[i] -= AJ[i, r] * change
-                worst = max(worst, abs(change) / (bounds[r, 0] + bounds[r, 1]))
-        if worst < CONVERGED:
-            break
+            AJ[i, r] = inverse[i, rows[r, 0]]
+            if rows[r, 1] >= 0:
+                AJ[i, r] += inverse[i, rows[r, 1]]
+    friction_impulses(new, AJ, rows, bounds, impulses)
+
+
+@njit(cache=True, error_model="numpy")
+def friction_rows(motor, pairs):  # type: ignore[no-untyped-def]
+    """Coordinates of each row of dry friction, shape (R, 2): the motors, then the pairs."""
+    n, C = motor.size, pairs.shape[0]
+    rows = np.full((n + C, 2), -1, np.int64)
+    rows[:n, 0] = motor
+    for c in range(C):
+        rows[n + c, 0], rows[n + c, 1] = motor[int(pairs[c, 0])], motor[int(pairs[c, 1])]
+    return rows
 
 
 @njit(cache=True, error_model="numpy")
@@ -223,70 +236,31 @@ def run(  # type: ignore[no-untyped-def]
         Number of steps; less than K if the loop diverged.
     """
     K, n = qr.shape
-    E, C = gears.shape[0], pairs.shape[0]
-    N, R = n + E, n + C
-    axes, bodies = np.empty((n, 6)), np.empty((n, 10))
-    ML, bias = np.empty((n, n)), np.empty(n)
-    A, Ainv = np.empty((N, N)), np.empty((N, N))
+    N = n + gears.shape[0]
+    axes, bodies, ML, bias = np.empty((n, 6)), np.empty((n, 10)), np.empty((n, n)), np.empty(n)
+    A, right, new = np.empty((N, N)), np.empty(N), np.empty(N)
     q, v, a = np.zeros(N), np.zeros(N), np.zeros(N)
-    right, new = np.empty(N), np.empty(N)
     motor = np.arange(n)
-    for e in range(E):
+    for e in range(gears.shape[0]):
         motor[int(gears[e, 0])] = n + e
-    for j in range(n):
-        q[j] = q[motor[j]] = qr[0, j]
-    rows = np.full((R, 2), -1, np.int64)
-    for j in range(n):
-        rows[j, 0] = motor[j]
-    for c in range(C):
-        rows[n + c, 0], rows[n + c, 1] = motor[int(pairs[c, 0])], motor[int(pairs[c, 1])]
-    AJ, bounds, impulses = np.empty((N, R)), np.empty((R, 2)), np.zeros(R)
-    middle = np.empty(n)
-    tau, command, applied = np.zeros(n), np.zeros(n), np.zeros(n)
-    integral, speed = np.zeros(n), np.zeros(n)
-    work = np.zeros(n)
-    load = np.zeros(n)
-    bristle = np.zeros((n, 3))
-    slosh = np.zeros((n, 2))
-    first = True
+    q[:n] = qr[0]
+    q[motor] = qr[0]
+    rows = friction_rows(motor, pairs)
+    bounds, impulses = np.empty((rows.shape[0], 2)), np.zeros(rows.shape[0])
+    tau, applied, integral, speed, work, load = np.zeros((6, n))
+    bristle, slosh = np.zeros((n, 3)), np.zeros((n, 2))
     for k in range(K):
-        t = k * step
         for j in range(n):
             m = motor[j]
-            law = laws[j]
             position[k, j], velocity[k, j] = q[m], v[m]
-            x = q[m]
-            if law[ECCENTRICITY] != 0.0:
-                x += law[ECCENTRICITY] * math.sin(law[ECCENTRICITY_ORDER] * x + law[ECCENTRICITY_PHASE])
-            reading[k, j] = math.floor(x / resolution[j] + 0.5) * resolution[j]
-        for j in range(n):
-            gains = control[j]
-            window = int(gains[WINDOW])
-            back = max(k - window, 0)
-            rate = (reading[k, j] - reading[back, j]) / ((k - back) * step) if k > back else 0.0
-            speed[j] += gains[FILTER] * (rate - speed[j])
-            error = qr[k, j] - reading[k, j]
-            if gains[ONE_LOOP] > 0.0:
-                # PID: derivative of the error
-                integral[j] += gains[KI] * error * step
-                out = gains[KP] * error + gains[KV] * (qdr[k, j] - speed[j]) + integral[j]
-            else:
-                demand = gains[KP] * error + gains[FEEDFORWARD] * qdr[k, j]
-                integral[j] += gains[KI] * (demand - speed[j]) * step
-                out = gains[KV] * (demand - speed[j]) + integral[j]
-            command[j] = min(max(out, -gains[LIMIT]), gains[LIMIT])
+            reading[k, j] = read_encoder(laws[j], q[m], resolution[j])
+            demand = command(control[j], k, j, step, reading, qr, qdr, speed, integral)
             lag = laws[j, LAG]
-            if lag > 0.0:
-                applied[j] += (command[j] - applied[j]) * (1.0 - math.exp(-step / lag))
-            else:
-                applied[j] = command[j]
+            applied[j] += (demand - applied[j]) * (1.0 - math.exp(-step / lag) if lag > 0.0 else 1.0)
             # The reported torque is the mean of both sides of the sample.
-            torque[k, j] = command[j] if first else 0.5 * (command[j] + tau[j])
-            tau[j] = command[j]
-        first = False
-        for j in range(n):
-            middle[j] = q[j] + 0.5 * step * v[j]
-        place(middle, mdh, prismatic, mass, com, inertia, axes, bodies)
+            torque[k, j] = 0.5 * (demand + tau[j]) if k else demand
+            tau[j] = demand
+        place(q[:n] + 0.5 * step * v[:n], mdh, prismatic, mass, com, inertia, axes, bodies)
         mass_and_bias(v[:n], gravity, axes, bodies, ML, bias)
         A[:, :] = 0.0
         A[:n, :n] = ML
@@ -294,96 +268,44 @@ def run(  # type: ignore[no-untyped-def]
             A[motor[j], motor[j]] += rotor[j]
         right[:] = A @ v
         for j in range(n):
-            m = motor[j]
-            law = laws[j]
+            m, law = motor[j], laws[j]
             right[j] += step * (external[k, j] - bias[j])
             right[m] += step * (applied[j] - smooth_torque(law, q[m], v[m]))
-            faded = 1.0
-            if law[WORK_SCALE] > 0.0:
-                faded -= law[WORK_DROP] * (1.0 - math.exp(-work[j] / law[WORK_SCALE]))
-            if law[TIME_SCALE] > 0.0:
-                faded -= law[TIME_DROP] * t / (t + law[TIME_SCALE])
-            viscous = law[VISCOUS] * faded
+            faded = warmed(law, k * step, work[j])
+            dry, viscous = law[COULOMB] * faded, law[VISCOUS] * faded
             A[m, m] += step * viscous
-            for forward in range(2):
-                bounds[j, 1 - forward] = step * dry_level(law, q[m], v[m], forward, faded, load[j])
+            bounds[j, 0] = step * dry_level(law, q[m], v[m], True, faded, load[j])
+            bounds[j, 1] = step * dry_level(law, q[m], v[m], False, faded, load[j])
             if law[PRESLIDING] > 0.0:
-                for e in range(3):
-                    level = ELEMENTS[e, 0] * law[COULOMB] * faded
-                    reach = ELEMENTS[e, 1] * law[PRESLIDING]
-                    stiffness = level / reach
-                    z = bristle[j, e] + step * v[m]
-                    if abs(z) < reach:
-                        right[m] -= step * (stiffness * bristle[j, e] + 0.5 * step * stiffness * v[m])
-                        A[m, m] += 0.5 * step * step * stiffness
-                    else:
-                        right[m] -= step * math.copysign(level, z)
-                bounds[j, 0] -= step * law[COULOMB] * faded
-                bounds[j, 1] -= step * law[COULOMB] * faded
-                bounds[j, 0], bounds[j, 1] = max(bounds[j, 0], 0.0), max(bounds[j, 1], 0.0)
+                impulse, stiff = presliding(law, dry, step, v[m], bristle[j])
+                right[m] -= impulse
+                A[m, m] += stiff
+                # The bristles replace the dry friction of the joint.
+                bounds[j, 0], bounds[j, 1] = max(bounds[j, 0] - step * dry, 0.0), max(bounds[j, 1] - step * dry, 0.0)
             if law[SLOSH] > 0.0:
-                w = 2.0 * math.pi * law[SLOSH_FREQUENCY]
-                # mass on a spring, position relative to the link: its force acts on the link
-                s0, s1 = slosh[j, 0], slosh[j, 1]
-                pull = -w * w * s0 - 2.0 * law[SLOSH_DAMPING] * w * s1
-                right[j] -= step * law[SLOSH] * pull
-                slosh[j, 1] += step * (pull - a[j])
-                slosh[j, 0] += step * slosh[j, 1]
-            work[j] += step * abs(v[m]) * (viscous * abs(v[m]) + law[COULOMB] * faded)
-        for e in range(E):
-            j, m = int(gears[e, 0]), n + e
-            twist, gap = q[m] - q[j], gears[e, 4]
-            if abs(twist) > gap:
-                x = twist - math.copysign(gap, twist)
-                force = gears[e, 1] * x + gears[e, 2] * x * x * x
-                stiffness = gears[e, 1] + 3.0 * gears[e, 2] * x * x
-                both = step * gears[e, 3] + 0.5 * step * step * stiffness
-                rate = v[m] - v[j]
-                right[m] -= step * force + 0.5 * step * step * stiffness * rate
-                right[j] += step * force + 0.5 * step * step * stiffness * rate
-                A[m, m] += both
-                A[j, j] += both
-                A[m, j] -= both
-                A[j, m] -= both
-        for c in range(C):
-            i, j = rows[n + c, 0], rows[n + c, 1]
-            d = step * pairs[c, 2]
+                right[j] += slosh_impulse(law, step, a[j], slosh[j])
+            work[j] += step * abs(v[m]) * (viscous * abs(v[m]) + dry)
+        add_gears(gears, motor, step, q, v, A, right)
+        for c in range(n, rows.shape[0]):
+            i, j = rows[c]
+            d = step * pairs[c - n, 2]
             A[i, i] += d
             A[j, j] += d
             A[i, j] += d
             A[j, i] += d
-            bounds[n + c, 0] = bounds[n + c, 1] = step * pairs[c, 3]
-        invert(A, Ainv)
-        for i in range(N):
-            total = 0.0
-            for c in range(N):
-                total += Ainv[i, c] * right[c]
-            new[i] = total
-            for r in range(R):
-                AJ[i, r] = Ainv[i, rows[r, 0]]
-                if rows[r, 1] >= 0:
-                    AJ[i, r] += Ainv[i, rows[r, 1]]
-        friction_impulses(new, AJ, rows, bounds, impulses)
-        for i in range(N):
-            a[i] = (new[i] - v[i]) / step
-            q[i] += 0.5 * step * (v[i] + new[i])
-            if not abs(q[i]) < 1e3:
-                return k
+            bounds[c, 0] = bounds[c, 1] = step * pairs[c - n, 3]
+        solve_step(A, right, rows, bounds, impulses, new)
+        a[:] = (new - v) / step
+        q += 0.5 * step * (v + new)
+        if not np.abs(q).max() < FARTHEST:
+            return k
+        load[:] = bias + ML @ a[:n]
         for j in range(n):
             m = motor[j]
-            total = bias[j]
-            for c in range(n):
-                total += ML[j, c] * a[c]
-            load[j] = total
-            # The acceleration at a sample is the mean of both sides.
             acceleration[k, j] = a[m]
             if laws[j, PRESLIDING] > 0.0:
-                move = 0.5 * step * (v[m] + new[m])
-                for e in range(3):
-                    reach = ELEMENTS[e, 1] * laws[j, PRESLIDING]
-                    bristle[j, e] = min(max(bristle[j, e] + move, -reach), reach)
+                move_bristles(laws[j], 0.5 * step * (v[m] + new[m]), bristle[j])
         v[:] = new
-    for k in range(K - 1, 0, -1):
-        for j in range(n):
-            acceleration[k, j] = 0.5 * (acceleration[k, j] + acceleration[k - 1, j])
+    # The acceleration at a sample is the mean of both sides.
+    acceleration[1:] = 0.5 * (acceleration[1:] + acceleration[:-1])
     return K
