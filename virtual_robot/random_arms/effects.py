@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.virtual_robot.random_arms.arm import PRISMATIC_SCALE, Generator
-
 from armident.virtual_robot.random_arms.motions import Motion
 from armident.virtual_robot.random_arms.plant import Plant, with_entry, with_law
 from armident.virtual_robot.random_arms.slots import COULOMB, VISCOUS
@@ -333,8 +332,6 @@ def _slosh(plant: Plant, at: Place, s: float, draw: Shapes) -> Plant:
         slosh_frequency=draw.between(0.7, 3.0),
         slosh_damping=draw.between(0.02, 0.1),
     )
-
-
 
 
 NAMED: dict[str, HiddenEffect] = {

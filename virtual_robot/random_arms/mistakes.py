@@ -39,9 +39,7 @@ Draw = Callable[[Generator, Arm], SetUp | None]
 """Draws a mistake; ``None`` if the arm has no place for it."""
 
 
-def scaled(
-    run: Run, position: Floats | float = 1.0, torque: Floats | float = 1.0, time: float = 1.0
-) -> Run:
+def scaled(run: Run, position: Floats | float = 1.0, torque: Floats | float = 1.0, time: float = 1.0) -> Run:
     """Recording in other units.
 
     Parameters
@@ -165,7 +163,9 @@ def _gear_ratio(rng: Generator, arm: Arm) -> SetUp:
 
 def _all_late(rng: Generator, arm: Arm) -> SetUp:
     delay = log_uniform(rng, (4e-3, 3e-2))
-    return SetUp((), plant=lambda plant, peak: replace(plant, delay=plant.delay + delay), detail=f"{1e3 * delay:.1f} ms")
+    return SetUp(
+        (), plant=lambda plant, peak: replace(plant, delay=plant.delay + delay), detail=f"{1e3 * delay:.1f} ms"
+    )
 
 
 def _gravity_missing(rng: Generator, arm: Arm) -> SetUp:
