@@ -130,7 +130,7 @@ def kind_of(half: Half, index: int) -> tuple[Family, str]:
     kinds = block()
     number, place = divmod(index, len(kinds))
     order = np.random.default_rng([HALVES[half].entropy, 1, number]).permutation(len(kinds))
-    return kinds[order[place]]
+    return kinds[int(order[place])]
 
 
 def make_case(half: Half, index: int, *, with_twin: bool = False) -> RandomCase:
@@ -262,10 +262,16 @@ def _missing_rotor(draft: Draft, robot: RobotConfig, rng: np.random.Generator) -
 
 def _mistaken(kind: str, draft: Draft, robot: RobotConfig, mistake: SetUp) -> _Hidden:
     return _Hidden(
-        "setup", kind, mistake.plant(draft.plant, draft.peak), robot, tuple(robot.joints[j].name for j in mistake.joints),
-        visibility=None, healthy=_residual(robot, noisy(draft, 0, draft.healthy)), recorded=mistake.recorded,
+        "setup",
+        kind,
+        mistake.plant(draft.plant, draft.peak),
+        robot,
+        tuple(robot.joints[j].name for j in mistake.joints),
+        visibility=None,
+        healthy=_residual(robot, noisy(draft, 0, draft.healthy)),
+        recorded=mistake.recorded,
         detail=mistake.detail,
-    )  # fmt: skip
+    )
 
 
 def _case(name: str, draft: Draft, hidden: _Hidden) -> RandomCase:

@@ -102,8 +102,8 @@ def _order(torque_alone: bool) -> Draw:
             if torque_alone:
                 return replace(run, torque=run.torque[:, order])
             return Run(
-                run.t, run.q[:, order], run.qd[:, order], run.qdd[:, order], run.reading[:, order], run.torque[:, order],
-                run.reference[:, order],
+                run.t, run.q[:, order], run.qd[:, order], run.qdd[:, order], run.reading[:, order],
+                run.torque[:, order], run.reference[:, order],
             )  # fmt: skip
 
         joints = tuple(np.flatnonzero(order != np.arange(arm.n)).tolist())

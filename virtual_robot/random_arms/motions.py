@@ -47,7 +47,7 @@ def random_motion(rng: Generator, arm: Arm, kind: MotionKind, duration: float, s
     step
         Step, s.
     """
-    t = np.arange(round(duration / step)) * step
+    t = np.arange(round(duration / step), dtype=np.float64) * step
     make = _fourier if kind == "fourier" else _point_to_point
     position = np.column_stack(
         [make(rng, t, arm.speed[j], PRISMATIC_SCALE if arm.prismatic[j] else 1.0) for j in range(arm.n)]

@@ -144,15 +144,16 @@ def simulate(plant: Plant, motion: Motion, seed: tuple[int, ...]) -> Run:
         If the loop is not stable.
     """
     arm, K, n = plant.arm, motion.position.shape[0], plant.arm.n
-    t = np.arange(K) * plant.step
+    t = np.arange(K, dtype=np.float64) * plant.step
     outside = np.zeros((K, n))
-    for j, torque in plant.external.items():
-        outside[:, j] = torque(np.random.default_rng([*seed, j]), t)
+    for j, push in plant.external.items():
+        outside[:, j] = push(np.random.default_rng([*seed, j]), t)
     position, velocity, acceleration, reading, torque = (np.zeros((K, n)) for _ in range(5))
-    done = run(
+    arguments = (
         plant.step, arm.gravity, *arm.bodies, arm.rotor, plant.laws, plant.gears, plant.pairs, outside, arm.resolution,
         plant.control, motion.position, motion.velocity, position, velocity, acceleration, reading, torque,
     )  # fmt: skip
+    done = run(*arguments)
     if done < K or np.abs(motion.position - position).max() > 0.5:
         raise Diverged("random arm: the closed loop is not stable")
     rows = slice(0, K, plant.every)

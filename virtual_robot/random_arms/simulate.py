@@ -198,8 +198,8 @@ def friction_rows(motor, pairs):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def run(  # type: ignore[no-untyped-def]
-    step, gravity, mdh, prismatic, mass, com, inertia, rotor, laws, gears, pairs, external, resolution, control, qr, qdr,
-    position, velocity, acceleration, reading, torque,
+    step, gravity, mdh, prismatic, mass, com, inertia, rotor, laws, gears, pairs, external, resolution, control, qr,
+    qdr, position, velocity, acceleration, reading, torque,
 ):  # fmt: skip
     """Simulate the closed loop; the arrays of results are filled in place.
 

@@ -43,7 +43,7 @@ def rigid_residual(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats, torqu
     X = _regressor(robot, q, qd, qdd)
     moves = np.abs(qd) > STANDSTILL * np.abs(qd).max(axis=0)
     weights = 1.0 / np.maximum(np.std(torque, axis=0), 1e-12)
-    residual = np.zeros_like(torque)
+    residual, rms = np.zeros_like(torque), np.zeros(n)
     for _ in range(3):
         flat = (X * weights[:, None])[moves]
         scale = np.maximum(np.linalg.norm(flat, axis=0), 1e-12)
@@ -51,7 +51,6 @@ def rigid_residual(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats, torqu
         residual = np.where(moves, torque - X @ (solution / scale), 0.0)
         rms = np.sqrt((residual**2).sum(axis=0) / np.maximum(moves.sum(axis=0), 1))
         weights = 1.0 / np.maximum(rms, 1e-6 / weights)
-    assert rms.shape == (n,)
     return rms
 
 

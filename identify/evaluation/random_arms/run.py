@@ -60,8 +60,10 @@ class RandomOptions:
         Number of cases, from the first; ``None`` for the number of the half.
     jobs
         Cases at a time.
-    first
-        Number of the first case, from 0.
+    numbers
+        Numbers of the cases, from 0; empty for the first ones.
+    twins
+        Diagnose the healthy twins too; without them no share of the gap is known.
     limit_s
         Time limit of a diagnosis, s; a case at the limit counts as failed.
     minutes
@@ -72,9 +74,16 @@ class RandomOptions:
     out: Path
     cases: int | None = None
     jobs: int = 1
-    first: int = 0
+    numbers: tuple[int, ...] = ()
+    twins: bool = True
     limit_s: float = 120.0
     minutes: float | None = None
+
+    @property
+    def selected(self) -> tuple[int, ...]:
+        """Numbers of the cases to run."""
+        count = self.cases if self.cases is not None else CASES[self.half]
+        return self.numbers or tuple(range(count))
 
 
 @dataclass(frozen=True)
@@ -106,9 +115,8 @@ def run_cases(options: RandomOptions, on_score: OnScore = lambda score: None) ->
     on_score
         Called from a thread of a worker after each case.
     """
-    count = options.cases if options.cases is not None else CASES[options.half]
     queue: SimpleQueue[int] = SimpleQueue()
-    for index in range(options.first, options.first + count):
+    for index in options.selected:
         queue.put(index)
     scores: dict[int, RandomScore] = {}
     until = None if options.minutes is None else time.monotonic() + 60.0 * options.minutes
@@ -153,7 +161,13 @@ class _Worker:
 
     def score(self, index: int) -> RandomScore:
         """Simulate, diagnose and score a case; a failure is a score too."""
-        request = {"id": index, "half": self._options.half, "index": index, "twin": True, "out": str(self._folder)}
+        request = {
+            "id": index,
+            "half": self._options.half,
+            "index": index,
+            "twin": self._options.twins,
+            "out": str(self._folder),
+        }
         truth = Truth(f"case {index}", "healthy", "not simulated", (), (), 1.0)
         try:
             answer = self._plant.request(request, SIMULATION_S)
@@ -194,7 +208,7 @@ def run_random_suite(options: RandomOptions, *, as_json: bool = False) -> Random
     as_json
         Print the results as JSON instead of Markdown.
     """
-    count = options.cases if options.cases is not None else CASES[options.half]
+    count = len(options.selected)
     print(f"diagnose-suite: {count} random arms, {options.half} half, {options.jobs} at a time", file=sys.stderr)
     found = run_cases(options, _Progress(count, options.half))
     date = datetime.datetime.now(datetime.UTC).date().isoformat()

@@ -187,8 +187,8 @@ def markdown(tables: RandomTables, title: str) -> str:
     lines = [
         f"# {title}",
         "",
-        f"{tables.cases} cases, {tables.failed} failed; in {tables.worse} the findings do not reduce the reported error. "
-        f"Diagnosis: median {tables.seconds_median:.1f} s, 95 % {tables.seconds_p95:.1f} s, "
+        f"{tables.cases} cases, {tables.failed} failed; in {tables.worse} the findings do not reduce the reported "
+        f"error. Diagnosis: median {tables.seconds_median:.1f} s, 95 % {tables.seconds_p95:.1f} s, "
         f"longest {tables.seconds_longest:.1f} s.",
         "",
         "| aim | cases | % | aim % | reached |",
@@ -203,8 +203,8 @@ def markdown(tables: RandomTables, title: str) -> str:
         f"Right: the right name first, a healthy arm called healthy, an effect outside the catalogue not named. "
         f"Cases below a visibility of {VISIBLE} stand apart and count nowhere.",
         "",
-        f"| family | hidden | cases | failed | right % | among % | no gap % | closed by {CLOSED:.0%} % | below {VISIBLE} "
-        "| of these named wrong |",
+        "| family | hidden | cases | failed | right % | among % | no gap % "
+        f"| closed by {CLOSED:.0%} % | below {VISIBLE} | of these named wrong |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for row in tables.rows:
