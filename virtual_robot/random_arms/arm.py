@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from armident.virtual_robot.random_arms.bodies import evaluate
 from armident.virtual_robot.random_arms.halves import Range, Ranges
-from armident.virtual_robot.random_arms.slots import COULOMB, LAWS, OFFSET, VISCOUS
+from armident.virtual_robot.random_arms.slots import COULOMB, LAWS, OFFSET, SMOOTHING, VISCOUS
 
 Floats = NDArray[np.float64]
 Generator = np.random.Generator
@@ -116,6 +116,8 @@ def random_arm(rng: Generator, ranges: Ranges) -> Arm:
     laws = np.zeros((n, len(LAWS)))
     laws[:, VISCOUS] = log_uniform(rng, ranges.viscous, n) * scale / speed
     laws[:, COULOMB] = log_uniform(rng, ranges.dry, n) * scale
+    sharp = rng.random() < ranges.sharp
+    laws[:, SMOOTHING] = 0.0 if sharp else log_uniform(rng, ranges.smoothing, n) * speed
     laws[:, OFFSET] = 0.03 * scale * rng.normal(size=n)
     ratio = np.round(log_uniform(rng, ranges.ratio, n))
     screw = 2.0 * np.pi / np.round(log_uniform(rng, ranges.pitch, n), 4)

@@ -34,6 +34,8 @@ from armident.virtual_robot.random_arms.slots import (
 
 SWEEPS = 25
 """Largest number of Gauss-Seidel sweeps over the friction impulses of a step."""
+NEWTON = 6
+"""Largest number of Newton steps for the impulse of a smooth sign."""
 CONVERGED = 1e-9
 """Change of a friction impulse, relative to its bound, below which the sweeps end."""
 COLDEST = 0.02
@@ -99,7 +101,40 @@ def smooth_torque(law, q, v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def friction_impulses(v, AJ, rows, bounds, impulses):  # type: ignore[no-untyped-def]
+def one_impulse(speed, weight, forward, backward, smoothing):  # type: ignore[no-untyped-def]
+    """Impulse of one row of dry friction: bounded, or bounded times ``tanh`` of the velocity after the step.
+
+    With a smooth sign the equation is monotone and, from the start value of the piecewise linear sign, convex: Newton's
+    method approaches the solution from one side.
+
+    Parameters
+    ----------
+    speed
+        Velocity without this impulse.
+    weight
+        Velocity change per unit impulse.
+    forward, backward
+        Largest impulses against positive and negative velocity.
+    smoothing
+        Velocity scale of the smooth sign; 0 for a sharp one, which sticks.
+    """
+    if smoothing <= 0.0:
+        return min(max(speed / weight, -backward), forward)
+    level = forward if speed > 0.0 else backward
+    if level <= 0.0:
+        return 0.0
+    out = min(max(speed / (weight + smoothing / level), -level), level)
+    for _ in range(NEWTON):
+        sign = math.tanh((speed - weight * out) / smoothing)
+        change = (out - level * sign) / (1.0 + level * weight / smoothing * (1.0 - sign * sign))
+        out -= change
+        if abs(change) < CONVERGED * level:
+            break
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def friction_impulses(v, AJ, rows, bounds, smoothing, impulses):  # type: ignore[no-untyped-def]
     """Dry friction of a step by projected Gauss-Seidel.
 
     Parameters
@@ -112,6 +147,8 @@ def friction_impulses(v, AJ, rows, bounds, impulses):  # type: ignore[no-untyped
         Coordinates of each row (the second is -1 for friction of one joint), shape (R, 2).
     bounds
         Largest impulses against positive and negative velocity, shape (R, 2).
+    smoothing
+        Velocity scale of the smooth sign of each row; 0 for a sharp one, shape (R,).
     impulses
         Impulses, of the step before at first, shape (R,).
     """
@@ -128,7 +165,8 @@ def friction_impulses(v, AJ, rows, bounds, impulses):  # type: ignore[no-untyped
             if b >= 0:
                 speed += v[b]
                 weight += AJ[b, r]
-            new = min(max(impulses[r] + speed / weight, -bounds[r, 1]), bounds[r, 0])
+            speed += weight * impulses[r]
+            new = one_impulse(speed, weight, bounds[r, 0], bounds[r, 1], smoothing[r])
             change = new - impulses[r]
             if change != 0.0:
                 impulses[r] = new

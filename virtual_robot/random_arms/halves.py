@@ -33,6 +33,10 @@ class Ranges:
         Metres per turn of the motor of prismatic joints.
     rotor
         Rotor inertia, joint side, over the inertia of the links at the joint.
+    sharp
+        Probability that the dry friction of an arm has a sharp sign, so that its joints stick.
+    smoothing
+        Velocity scale of a smooth sign over the largest speed of the joint.
     dry, viscous
         Dry and viscous friction at full speed, over the torque scale of the joint.
     resolution
@@ -65,6 +69,8 @@ class Ranges:
     ratio: Range
     pitch: Range
     rotor: Range
+    sharp: float
+    smoothing: Range
     dry: Range
     viscous: Range
     resolution: Range
@@ -89,6 +95,8 @@ DEVELOPMENT = Ranges(
     ratio=(30.0, 130.0),
     pitch=(0.005, 0.03),
     rotor=(0.15, 1.5),
+    sharp=0.25,
+    smoothing=(0.004, 0.015),
     dry=(0.05, 0.6),
     viscous=(0.05, 0.8),
     resolution=(2e-6, 3e-4),
@@ -113,6 +121,8 @@ RESERVE = Ranges(
     ratio=(20.0, 170.0),
     pitch=(0.003, 0.05),
     rotor=(0.1, 2.5),
+    sharp=0.25,
+    smoothing=(0.003, 0.02),
     dry=(0.03, 0.8),
     viscous=(0.03, 1.0),
     resolution=(1e-6, 5e-4),

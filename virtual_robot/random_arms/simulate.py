@@ -1,8 +1,8 @@
 """Compiled closed loop of a random arm: rigid bodies, dry friction as bounded impulses, controllers, encoders.
 
 One step is linearly implicit in velocities: viscous friction, springs and contacts are stable at any stiffness. Dry
-friction is a box-constrained impulse by joint (projected Gauss-Seidel): a joint sticks where the bound suffices, and
-no velocity scale smooths the sign.
+friction is a bounded impulse by joint (projected Gauss-Seidel). With a sharp sign a joint sticks where the bound
+suffices; with a smooth one (``tanh`` of the velocity) the impulse is that of the velocity after the step.
 """
 
 import math
@@ -20,6 +20,7 @@ from armident.virtual_robot.random_arms.slots import (
     SLOSH,
     SLOSH_DAMPING,
     SLOSH_FREQUENCY,
+    SMOOTHING,
     VISCOUS,
 )
 
@@ -158,14 +159,14 @@ def add_gears(gears, motor, step, q, v, A, right):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy")
-def solve_step(A, right, rows, bounds, impulses, new):  # type: ignore[no-untyped-def]
+def solve_step(A, right, rows, bounds, smoothing, impulses, new):  # type: ignore[no-untyped-def]
     """Velocities after a step.
 
     Parameters
     ----------
     A, right
         Matrix (N, N) and right-hand side (N,) without dry friction; ``A`` is overwritten.
-    rows, bounds, impulses
+    rows, bounds, smoothing, impulses
         Dry friction, see `friction_impulses`.
     new
         Resulting velocities, shape (N,).
@@ -182,7 +183,7 @@ def solve_step(A, right, rows, bounds, impulses, new):  # type: ignore[no-untype
             AJ[i, r] = inverse[i, rows[r, 0]]
             if rows[r, 1] >= 0:
                 AJ[i, r] += inverse[i, rows[r, 1]]
-    friction_impulses(new, AJ, rows, bounds, impulses)
+    friction_impulses(new, AJ, rows, bounds, smoothing, impulses)
 
 
 @njit(cache=True, error_model="numpy")
@@ -246,7 +247,8 @@ def run(  # type: ignore[no-untyped-def]
     q[:n] = qr[0]
     q[motor] = qr[0]
     rows = friction_rows(motor, pairs)
-    bounds, impulses = np.empty((rows.shape[0], 2)), np.zeros(rows.shape[0])
+    bounds, impulses, smoothing = np.empty((rows.shape[0], 2)), np.zeros(rows.shape[0]), np.zeros(rows.shape[0])
+    smoothing[:n] = laws[:, SMOOTHING]
     tau, applied, integral, speed, work, load = np.zeros((6, n))
     bristle, slosh = np.zeros((n, 3)), np.zeros((n, 2))
     for k in range(K):
@@ -294,7 +296,7 @@ def run(  # type: ignore[no-untyped-def]
             A[i, j] += d
             A[j, i] += d
             bounds[c, 0] = bounds[c, 1] = step * pairs[c - n, 3]
-        solve_step(A, right, rows, bounds, impulses, new)
+        solve_step(A, right, rows, bounds, smoothing, impulses, new)
         a[:] = (new - v) / step
         q += 0.5 * step * (v + new)
         if not np.abs(q).max() < FARTHEST:

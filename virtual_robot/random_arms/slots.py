@@ -1,7 +1,7 @@
 """Columns of the tables of laws and controllers that the compiled simulation reads."""
 
 LAWS = (
-    "viscous", "coulomb", "offset",
+    "viscous", "coulomb", "offset", "smoothing",
     "viscous_forward", "coulomb_forward",
     "stribeck", "stribeck_velocity", "stribeck_law",
     "tight", "tight_position", "tight_width",
@@ -19,7 +19,7 @@ LAWS = (
 """Columns of a law table, one row per joint; zero leaves a law out."""
 
 (
-    VISCOUS, COULOMB, OFFSET,
+    VISCOUS, COULOMB, OFFSET, SMOOTHING,
     VISCOUS_FORWARD, COULOMB_FORWARD,
     STRIBECK, STRIBECK_VELOCITY, STRIBECK_LAW,
     TIGHT, TIGHT_POSITION, TIGHT_WIDTH,

@@ -165,7 +165,7 @@ def test_dry_friction_holds_a_joint_up_to_its_bound(drive: float, moves: bool) -
     mass, step, level = 2.0, 1e-3, 3.0
     v = np.array([step * drive * level / mass])
     rows, bounds = np.array([[0, -1]]), np.full((1, 2), step * level)
-    friction_impulses(v, np.array([[1.0 / mass]]), rows, bounds, np.zeros(1))
+    friction_impulses(v, np.array([[1.0 / mass]]), rows, bounds, np.zeros(1), np.zeros(1))
     expected = step * level * (abs(drive) - 1.0) / mass * np.sign(drive) if moves else 0.0
     assert v[0] == pytest.approx(expected, abs=1e-15)
 
