@@ -12,7 +12,13 @@ from numba import njit
 
 @njit(cache=True, error_model="numpy")
 def cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
-    """Cross product of two vectors, as three numbers."""
+    """Cross product of two vectors, as three numbers.
+
+    Parameters
+    ----------
+    ax, ay, az, bx, by, bz
+        Components of the vectors.
+    """
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
@@ -86,7 +92,17 @@ def place(q, mdh, prismatic, mass, com, inertia, axes, bodies):  # type: ignore[
 
 @njit(cache=True, error_model="numpy")
 def momentum(body, v, out):  # type: ignore[no-untyped-def]
-    """Product of a spatial inertia (10,) and a spatial vector (6,), angular before linear."""
+    """Product of a spatial inertia and a spatial vector, angular before linear.
+
+    Parameters
+    ----------
+    body
+        Row of ``bodies`` of `place`, shape (10,).
+    v
+        Velocity or acceleration, shape (6,).
+    out
+        Resulting momentum or force, shape (6,).
+    """
     m, hx, hy, hz = body[0], body[1], body[2], body[3]
     w0, w1, w2, u0, u1, u2 = v[0], v[1], v[2], v[3], v[4], v[5]
     c0, c1, c2 = cross(hx, hy, hz, u0, u1, u2)
@@ -166,7 +182,17 @@ def mass_and_bias(qd, gravity, axes, bodies, M, bias):  # type: ignore[no-untype
 
 @njit(cache=True, error_model="numpy")
 def evaluate(q, qd, gravity, mdh, prismatic, mass, com, inertia):  # type: ignore[no-untyped-def]
-    """Mass matrix (n, n) and bias torques (n,) at one state; arguments as of `place` and `mass_and_bias`."""
+    """Mass matrix, shape (n, n), and bias torques, shape (n,), at one state.
+
+    Parameters
+    ----------
+    q, qd
+        Positions and velocities, shape (n,).
+    gravity
+        Acceleration of gravity in frame 0, m/s^2, shape (3,).
+    mdh, prismatic, mass, com, inertia
+        Bodies, see `place`.
+    """
     n = q.size
     axes, bodies = np.empty((n, 6)), np.empty((n, 10))
     M, bias = np.empty((n, n)), np.empty(n)

@@ -13,6 +13,7 @@ from armident.virtual_robot.random_arms.effects import NAMED, OUTSIDE, HiddenEff
 from armident.virtual_robot.random_arms.halves import HALVES, Half, Ranges
 from armident.virtual_robot.random_arms.mistakes import MISTAKES, SetUp
 from armident.virtual_robot.random_arms.plant import Diverged, Plant, Run
+from armident.virtual_robot.random_arms.slots import SMOOTHING
 from armident.virtual_robot.random_arms.truth import ACCEPTED, Family, block
 from armident.virtual_robot.random_arms.visibility import rigid_residual
 
@@ -189,8 +190,8 @@ def _attempt(
     return draft, _affected(family, kind, draft, robot, effect, ranges)
 
 
-def _residual(robot: RobotConfig, run: Run) -> Floats:
-    return rigid_residual(robot, run.q, run.qd, run.qdd, run.torque)
+def _residual(draft: Draft, robot: RobotConfig, run: Run) -> Floats:
+    return rigid_residual(robot, run.q, run.qd, run.qdd, run.torque, draft.plant.laws[:, SMOOTHING])
 
 
 def _affected(
@@ -206,10 +207,10 @@ def _affected(
     def changed(strength: float) -> Plant:
         return effect.apply(draft.plant, at, strength, Shapes([*draft.seed, 4], ranges.wider))
 
-    healthy = _residual(robot, noisy(draft, 0, draft.healthy))
+    healthy = _residual(draft, robot, noisy(draft, 0, draft.healthy))
 
     def visibility(strength: float) -> tuple[float, Floats]:
-        residual = _residual(robot, simulated(draft, changed(strength), 0))
+        residual = _residual(draft, robot, simulated(draft, changed(strength), 0))
         return float((residual / healthy)[places].max()), residual
 
     strength, seen, residual = _calibrated(visibility, aim, effect.strengths)
@@ -254,7 +255,7 @@ def _missing_rotor(draft: Draft, robot: RobotConfig, rng: np.random.Generator) -
     run = noisy(draft, 0, draft.healthy)
     joints = tuple(j.model_copy(update={"rotor_inertia": k != joint}) for k, j in enumerate(robot.joints))
     configured = robot.model_copy(update={"joints": joints})
-    residual, healthy = _residual(configured, run), _residual(robot, run)
+    residual, healthy = _residual(draft, configured, run), _residual(draft, robot, run)
     seen = float(residual[joint] / healthy[joint])
     name = robot.joints[joint].name
     return _Hidden("effect", "missing_rotor", draft.plant, configured, (name,), None, seen, residual, healthy)
@@ -268,7 +269,7 @@ def _mistaken(kind: str, draft: Draft, robot: RobotConfig, mistake: SetUp) -> _H
         robot,
         tuple(robot.joints[j].name for j in mistake.joints),
         visibility=None,
-        healthy=_residual(robot, noisy(draft, 0, draft.healthy)),
+        healthy=_residual(draft, robot, noisy(draft, 0, draft.healthy)),
         recorded=mistake.recorded,
         detail=mistake.detail,
     )
@@ -276,7 +277,7 @@ def _mistaken(kind: str, draft: Draft, robot: RobotConfig, mistake: SetUp) -> _H
 
 def _case(name: str, draft: Draft, hidden: _Hidden) -> RandomCase:
     first, second = (hidden.recorded(simulated(draft, hidden.plant, part)) for part in range(2))
-    residual = _residual(hidden.robot, first) if hidden.residual is None else hidden.residual
+    residual = _residual(draft, hidden.robot, first) if hidden.residual is None else hidden.residual
     healthy = residual if hidden.healthy is None else hidden.healthy
     seen = hidden.visibility
     if seen is None:

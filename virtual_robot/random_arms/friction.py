@@ -44,7 +44,17 @@ COLDEST = 0.02
 
 @njit(cache=True, error_model="numpy")
 def warmed(law, t, work):  # type: ignore[no-untyped-def]
-    """Factor of friction after a time, s, and an amount of dissipated work, J, at a joint."""
+    """Factor of friction after a time and an amount of dissipated work.
+
+    Parameters
+    ----------
+    law
+        Row of the law table.
+    t
+        Time, s.
+    work
+        Work dissipated at the joint, J.
+    """
     out = 1.0
     if law[WORK_SCALE] > 0.0:
         out -= law[WORK_DROP] * (1.0 - math.exp(-work / law[WORK_SCALE]))
@@ -86,7 +96,15 @@ def dry_level(law, q, v, forward, faded, load):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def smooth_torque(law, q, v):  # type: ignore[no-untyped-def]
-    """Torque of the joint's springs, ripple, offset and curved friction against the motion, N m or N."""
+    """Torque of the joint's springs, ripple, offset and curved friction against the motion, N m or N.
+
+    Parameters
+    ----------
+    law
+        Row of the law table.
+    q, v
+        Position and velocity before the step.
+    """
     out = law[OFFSET]
     if law[VISCOUS_FORWARD] != 0.0 and v > 0.0:
         out += law[VISCOUS_FORWARD] * v

@@ -32,7 +32,15 @@ FARTHEST = 1e3
 
 @njit(cache=True, error_model="numpy")
 def invert(A, out):  # type: ignore[no-untyped-def]
-    """Inverse of a symmetric positive definite matrix by Cholesky's method; ``A`` is overwritten."""
+    """Inverse of a symmetric positive definite matrix by Cholesky's method.
+
+    Parameters
+    ----------
+    A
+        The matrix, shape (N, N); overwritten.
+    out
+        Resulting inverse, shape (N, N).
+    """
     n = A.shape[0]
     for j in range(n):
         d = A[j, j]
@@ -94,7 +102,17 @@ def presliding(law, level, step, speed, bristle):  # type: ignore[no-untyped-def
 
 @njit(cache=True, error_model="numpy")
 def move_bristles(law, move, bristle):  # type: ignore[no-untyped-def]
-    """Move the bristles of a joint by a distance; each slides beyond its reach."""
+    """Move the bristles of a joint by a distance; each slides beyond its reach.
+
+    Parameters
+    ----------
+    law
+        Row of the law table.
+    move
+        Distance, rad or m.
+    bristle
+        Deflections, shape (3,); written in place.
+    """
     for e in range(3):
         reach = ELEMENTS[e, 1] * law[PRESLIDING]
         bristle[e] = min(max(bristle[e] + move, -reach), reach)
@@ -188,7 +206,15 @@ def solve_step(A, right, rows, bounds, smoothing, impulses, new):  # type: ignor
 
 @njit(cache=True, error_model="numpy")
 def friction_rows(motor, pairs):  # type: ignore[no-untyped-def]
-    """Coordinates of each row of dry friction, shape (R, 2): the motors, then the pairs."""
+    """Coordinates of each row of dry friction, shape (R, 2): the motors, then the pairs.
+
+    Parameters
+    ----------
+    motor
+        Coordinate of each motor, shape (n,).
+    pairs
+        Table of `PAIRS`, shape (C, 4).
+    """
     n, C = motor.size, pairs.shape[0]
     rows = np.full((n + C, 2), -1, np.int64)
     rows[:n, 0] = motor

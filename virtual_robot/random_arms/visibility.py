@@ -17,7 +17,7 @@ STANDSTILL = 0.02
 """Speed below which the equation of a joint is left out, over its largest speed: dry friction is undefined there."""
 
 
-def rigid_residual(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats, torque: Floats) -> Floats:
+def rigid_residual(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats, torque: Floats, smoothing: Floats) -> Floats:
     """Residual of the rigid model by joint, fitted by weighted least squares.
 
     The model has the inertial parameters of all links and, by joint, rotor inertia, viscous and dry friction and an
@@ -31,6 +31,8 @@ def rigid_residual(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats, torqu
         Motion, shape (M, n).
     torque
         Recorded torque, N m or N, shape (M, n).
+    smoothing
+        Velocity scale of the sign of dry friction by joint; 0 for a sharp one, shape (n,).
 
     Returns
     -------
@@ -40,22 +42,24 @@ def rigid_residual(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats, torqu
     rows = np.unique(np.linspace(0, len(q) - 1, SAMPLES).astype(np.int64))
     q, qd, qdd, torque = q[rows], qd[rows], qdd[rows], torque[rows]
     n = robot.n
-    X = _regressor(robot, q, qd, qdd)
+    scale = np.where(smoothing > 0.0, smoothing, 1.0)
+    direction = np.where(smoothing > 0.0, np.tanh(qd / scale), np.sign(qd))
+    X = _regressor(robot, q, qd, qdd, direction)
     moves = np.abs(qd) > STANDSTILL * np.abs(qd).max(axis=0)
     weights = 1.0 / np.maximum(np.std(torque, axis=0), 1e-12)
     residual, rms = np.zeros_like(torque), np.zeros(n)
     for _ in range(3):
         flat = (X * weights[:, None])[moves]
-        scale = np.maximum(np.linalg.norm(flat, axis=0), 1e-12)
-        solution = np.linalg.lstsq(flat / scale, (torque * weights)[moves], rcond=1e-9)[0]
-        residual = np.where(moves, torque - X @ (solution / scale), 0.0)
+        size = np.maximum(np.linalg.norm(flat, axis=0), 1e-12)
+        solution = np.linalg.lstsq(flat / size, (torque * weights)[moves], rcond=1e-9)[0]
+        residual = np.where(moves, torque - X @ (solution / size), 0.0)
         rms = np.sqrt((residual**2).sum(axis=0) / np.maximum(moves.sum(axis=0), 1))
         weights = 1.0 / np.maximum(rms, 1e-6 / weights)
     return rms
 
 
-def _regressor(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats) -> Floats:
-    """Regressor of the rigid model, shape (M, n, P)."""
+def _regressor(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats, direction: Floats) -> Floats:
+    """Regressor of the rigid model with the sign of dry friction, shape (M, n, P)."""
     model = configured_model(robot)
     data = model.createData()
     n, M = robot.n, len(q)
@@ -63,7 +67,7 @@ def _regressor(robot: RobotConfig, q: Floats, qd: Floats, qdd: Floats) -> Floats
     for k in range(M):
         out[k, :, : 10 * n] = pin.computeJointTorqueRegressor(model, data, q[k], qd[k], qdd[k])
     for j, joint in enumerate(robot.joints):
-        columns = (qdd[:, j] * joint.rotor_inertia, qd[:, j], np.sign(qd[:, j]), np.ones(M))
+        columns = (qdd[:, j] * joint.rotor_inertia, qd[:, j], direction[:, j], np.ones(M))
         for c, column in enumerate(columns):
             out[:, j, 10 * n + 4 * j + c] = column
     return out

@@ -14,12 +14,12 @@ from armident.virtual_robot.random_arms.arm import Arm, random_arm
 from armident.virtual_robot.random_arms.bodies import evaluate
 from armident.virtual_robot.random_arms.cases import RandomCase, kind_of, make_case
 from armident.virtual_robot.random_arms.disk import write_case, write_recordings
-from armident.virtual_robot.random_arms.draft import draw_draft
+from armident.virtual_robot.random_arms.draft import configuration, draw_draft
 from armident.virtual_robot.random_arms.effects import NAMED, OUTSIDE
-from armident.virtual_robot.random_arms.friction import friction_impulses
+from armident.virtual_robot.random_arms.friction import friction_impulses, one_impulse
 from armident.virtual_robot.random_arms.halves import DEVELOPMENT, HALVES, RESERVE, Half
 from armident.virtual_robot.random_arms.mistakes import MISTAKES
-from armident.virtual_robot.random_arms.slots import COULOMB, VISCOUS
+from armident.virtual_robot.random_arms.slots import COULOMB, SMOOTHING, VISCOUS
 from armident.virtual_robot.random_arms.truth import ACCEPTED, SHARES, block
 from armident.virtual_robot.random_arms.visibility import pin, rigid_residual
 
@@ -152,10 +152,9 @@ def test_the_rigid_model_leaves_the_noise_of_a_healthy_arm(half: Half) -> None:
 def test_without_noise_pinocchio_explains_the_torques_of_the_simulation() -> None:
     seed = (DEVELOPMENT.entropy, 2, index_of("healthy"), 0)
     draft = draw_draft(np.random.default_rng([*seed, 0]), DEVELOPMENT, seed)
-    from armident.virtual_robot.random_arms.draft import configuration
-
-    run = draft.healthy
-    residual = rigid_residual(configuration(draft.plant.arm, "healthy"), run.q, run.qd, run.qdd, run.torque)
+    run, smoothing = draft.healthy, draft.plant.laws[:, SMOOTHING]
+    robot = configuration(draft.plant.arm, "healthy")
+    residual = rigid_residual(robot, run.q, run.qd, run.qdd, run.torque, smoothing)
     # The step is of first order where dry friction changes sign within it.
     assert (residual / run.torque.std(axis=0)).max() < 0.005
 
@@ -168,6 +167,13 @@ def test_dry_friction_holds_a_joint_up_to_its_bound(drive: float, moves: bool) -
     friction_impulses(v, np.array([[1.0 / mass]]), rows, bounds, np.zeros(1), np.zeros(1))
     expected = step * level * (abs(drive) - 1.0) / mass * np.sign(drive) if moves else 0.0
     assert v[0] == pytest.approx(expected, abs=1e-15)
+
+
+@pytest.mark.parametrize("speed", [1e-4, 1e-2, 0.3, -0.3])
+def test_friction_with_a_smooth_sign_is_that_of_the_velocity_after_the_step(speed: float) -> None:
+    weight, level, smoothing = 0.5, 3e-3, 0.01
+    impulse = one_impulse(speed, weight, level, level, smoothing)
+    assert impulse == pytest.approx(level * np.tanh((speed - weight * impulse) / smoothing), rel=1e-6)
 
 
 @pytest.mark.slow
