@@ -13,6 +13,7 @@ from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
 from armident.identify.identification.sign_smoothing import with_numbers
 from armident.identify.identification.verdict import SetupCheck
+from armident.identify.setup.check import check_setup
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def identify_recording(
     robot: RobotConfig | None = None,
     options: Options | None = None,
     progress: Callable[[str, float], None] | None = None,
-    check: Callable[[Sequence[Experiment], RobotConfig], SetupCheck] | None = None,
+    check: Callable[[Sequence[Experiment], RobotConfig], SetupCheck] | None = check_setup,
 ) -> IdentificationOutcome:
     """Identification of recordings, read from files or assembled from the stream.
 
