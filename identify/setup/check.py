@@ -16,12 +16,9 @@ from armident.identify.setup.clipping import clipped_torques
 from armident.identify.setup.describe import described
 from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.result import SetupCheck, SetupFinding
-from armident.identify.setup.search import NOT_UNDERSTOOD, Search, Step
+from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
 
 Array = NDArray[np.float64]
-
-STRUCTURED = 0.3
-"""Correlation of neighbouring residuals above which a large residual is no white noise of the torque."""
 
 TRIED = {
     "position_sign": "wrong sign of positions, or of positions and torques, of each joint and of all",

@@ -51,6 +51,12 @@ WHITE = 0.05
 NOT_UNDERSTOOD = 1.0 / 3.0
 """Largest relative error of a joint that the rigid model explains (DIAGNOSIS.md, principle 1)."""
 
+WELL_UNDERSTOOD = 0.2
+"""Largest relative error of a joint after a correction for which no whole order is tried."""
+
+STRUCTURED = 0.3
+"""Correlation of neighbouring residuals above which a large residual is no white noise of the torque."""
+
 RANKED_ROWS = 100.0
 """Independent rows that weigh the fit against the plausibility of units in the ranking."""
 
@@ -135,7 +141,8 @@ class Search:
         best = self._greedy(first)
         # An exchange that needs a second mistake beside it may be a part of another order.
         simple = len(best.families) < 2 or not {"exchange", "assignment"} & set(best.families)
-        if self.bench.moving.sum() < 3 or (simple and self._understood(best.h)):
+        limit = WELL_UNDERSTOOD if best.families else NOT_UNDERSTOOD
+        if self.bench.moving.sum() < 3 or (simple and self._understood(best.h, limit)):
             return best
         for step in self._orders(first):
             other = self._greedy(step)
@@ -143,9 +150,10 @@ class Search:
                 best = other
         return best
 
-    def _understood(self, h: Hypothesis) -> bool:
-        errors, _ = joint_errors(self.bench, h, free=True)
-        return bool(np.all(errors[self.bench.moving] <= NOT_UNDERSTOOD))
+    def _understood(self, h: Hypothesis, limit: float) -> bool:
+        errors, memory = joint_errors(self.bench, h, free=True)
+        errors = np.where(memory > STRUCTURED, errors, 0.0)
+        return bool(np.all(errors[self.bench.moving] <= limit))
 
     def _greedy(self, step: Step) -> Step:
         while len(step.families) < MOST_MISTAKES:
