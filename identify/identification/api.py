@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from armident.configs import RobotConfig
+from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument, identification_document
 from armident.identify.experiment import Experiment
@@ -70,7 +70,13 @@ def identify_recording(
     recordings = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
     robot = robot or recordings[0].robot
     experiments, notes = experiments_of(recordings, robot, name_files=len(recordings) > 1)
-    setup = None if check is None else check(experiments, robot)
+    setup = None
+    if check is not None:
+        try:
+            setup = check(experiments, robot)
+        except DataError as error:
+            # Too short for the check: the identification itself decides if it is long enough for the parameters.
+            notes = [*notes, f"the set-up was not checked: {error}"]
     result = identify_experiment(experiments, robot, options or Options(), progress, setup)
     document = identification_document(result, recordings, robot, notes)
     return IdentificationOutcome(recordings, with_numbers(robot, result.sign_smoothing), result, document)
