@@ -235,7 +235,7 @@ def run_random_suite(options: RandomOptions, *, as_json: bool = False) -> Random
 
 
 def _entry(score: RandomScore) -> dict[str, Any]:
-    return asdict(score) | {"claims": [str(claim) for claim in score.claims], "right": is_correct(score)}
+    return asdict(score) | {"claims": [str(claim) for claim in score.claims], "right": is_correct(score) and not score.error}
 
 
 def _shortfalls(scores: tuple[RandomScore, ...]) -> str:
