@@ -235,7 +235,8 @@ def run_random_suite(options: RandomOptions, *, as_json: bool = False) -> Random
 
 
 def _entry(score: RandomScore) -> dict[str, Any]:
-    return asdict(score) | {"claims": [str(claim) for claim in score.claims], "right": is_correct(score)}
+    right = is_correct(score) and not score.error
+    return asdict(score) | {"claims": [str(claim) for claim in score.claims], "right": right}
 
 
 def _shortfalls(scores: tuple[RandomScore, ...]) -> str:
