@@ -68,7 +68,7 @@ class Identification:
     sign_smoothing
         ``g`` (n,) of each joint's smoothed sign, s/rad or s/m.
     interval_warnings
-        Reasons why the standard deviations are doubtful; they are among the warnings, too.
+        Reasons why the standard deviations are doubtful; they are among the reasons of the verdict, too.
     bias
         Bias (b,) by derivatives, encoder noise and sampling that was subtracted, SI; ``None``: irrelevant.
     relative_error_pct, relative_error_pct_by_joint

@@ -39,7 +39,8 @@ def test_intervals_hold_the_true_values_with_a_noisy_encoder(method: Method) -> 
 def test_least_squares_says_that_a_noisy_encoder_makes_its_intervals_doubtful() -> None:
     found = noisy(0, "idim-ls")
     assert any("m1 by about" in warning and "doubtful" in warning for warning in found.interval_warnings)
-    assert set(found.interval_warnings) <= set(found.warnings)
+    assert found.verdict.level != "trustworthy"
+    assert any("m1 by about" in reason.message for reason in found.verdict.of_kind("uncertainty"))
     assert abs(found.theta[0] - axis.MASS) > 2 * found.std[0]
 
 
@@ -62,7 +63,7 @@ def test_instrumental_variables_allow_for_coloured_noise() -> None:
 def test_no_decimation_does_not_step_back_on_data_of_exactly_the_model(position: float) -> None:
     experiment = axis.recorded(1, torque=0.5, position=position)
     found = identify_experiment(experiment, axis.robot(), Options(decimation=1))
-    assert not any("IDIM-IV" in warning for warning in found.warnings)
+    assert not any("idim-iv" in reason.message for reason in found.verdict.reasons)
     np.testing.assert_allclose(found.theta[:3], axis.TRUTH[:3], rtol=0.02)
 
 
