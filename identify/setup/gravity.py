@@ -22,6 +22,9 @@ DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in product((-1.0, 0
 STARTS = 2
 """Number of directions that are refined."""
 
+EQUAL = 0.02
+"""Difference of the misfit, nats per row, below which two directions fit equally well: 2 % of one joint's power."""
+
 SHIFTS_S = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 """Shifts that are tried before the refinement, s, to both sides."""
 
@@ -35,12 +38,19 @@ def best_direction(h: Hypothesis, criterion: Criterion) -> Hypothesis:
         Start; the magnitude of its gravity is kept.
     criterion
         Misfit to minimise.
+
+    Notes
+    -----
+    Opposite directions fit equally well where the first moments of the links change sign with gravity and show in
+    nothing else. Of equal directions the one nearest to the configured direction is the likeliest.
     """
     size = float(np.linalg.norm(h.gravity)) or STANDARD
     tried = sorted(DIRECTIONS, key=lambda d: criterion(replace(h, gravity=size * d)))
     starts = [*tried[:STARTS], *([h.gravity / size] if h.gravity.any() else [])]
     found = [_refined(h, size, start, criterion) for start in starts]
-    return min(found, key=lambda pair: pair[0])[1]
+    least = min(misfit for misfit, _ in found)
+    equal = [turned for misfit, turned in found if misfit <= least + EQUAL]
+    return max(equal, key=lambda turned: float(turned.gravity @ h.gravity))
 
 
 def _refined(h: Hypothesis, size: float, start: Array, criterion: Criterion) -> tuple[float, Hypothesis]:
