@@ -115,25 +115,25 @@ def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
     ratios = robot.transmission_matrix
     to_motor = {"position": ratios, "torque": np.linalg.inv(ratios).T}
     found = {signal: np.eye(robot.n) for signal in SIGNALS}
-    for k, stanza in enumerate(robot.effects):
-        if stanza.effect not in NAMES:
+    for k, entry in enumerate(robot.effects):
+        if entry.effect not in NAMES:
             continue
-        meant = [signal for signal in SIGNALS if stanza.parameters.get(signal)]
+        meant = [signal for signal in SIGNALS if entry.parameters.get(signal)]
         if not meant:
-            raise ConfigError(f"effects[{k}]: {stanza.effect} of {stanza.joint} needs position: 1, torque: 1 or both")
-        first = names.index(stanza.joint)
-        joint_side = bool(stanza.parameters.get(JOINT_SIDE)) or stanza.effect == "signal_scale"
+            raise ConfigError(f"effects[{k}]: {entry.effect} of {entry.joint} needs position: 1, torque: 1 or both")
+        first = names.index(entry.joint)
+        joint_side = bool(entry.parameters.get(JOINT_SIDE)) or entry.effect == "signal_scale"
         for signal in meant:
             change = np.eye(robot.n)
-            if stanza.effect == "sign_error":
+            if entry.effect == "sign_error":
                 change[first, first] = -1.0
-            elif stanza.effect == "signal_scale":
-                second = first if stanza.other is None else names.index(stanza.other)
-                change[first, second] = stanza.parameters[signal]
+            elif entry.effect == "signal_scale":
+                second = first if entry.other is None else names.index(entry.other)
+                change[first, second] = entry.parameters[signal]
             else:
-                if stanza.other is None:
-                    raise ConfigError(f"effects[{k}]: joint_order of {stanza.joint} needs the other joint")
-                second = names.index(stanza.other)
+                if entry.other is None:
+                    raise ConfigError(f"effects[{k}]: joint_order of {entry.joint} needs the other joint")
+                second = names.index(entry.other)
                 change[[first, second]] = change[[second, first]]
                 if not joint_side:
                     change = change * worth[signal][:, None] / worth[signal]

@@ -71,9 +71,9 @@ def described(step: Step, robot: RobotConfig, bench: Bench) -> Described:
             made = [_scale(step, first, robot, bench)]
         else:
             continue
-        for finding, stanzas in made:
+        for finding, corrections in made:
             findings.append(finding)
-            entries += stanzas
+            entries += corrections
     update: dict[str, object] = {"effects": (*robot.effects, *entries)} if entries else {}
     share = dict(zip(step.families, step.probability, strict=True))
     for family in [f for f in step.families if f.startswith("gravity")][-1:]:
@@ -213,9 +213,9 @@ def _raw_exchange(step: Step, k: int, robot: RobotConfig) -> tuple[SetupFinding,
     signals = [name for name, m in at_motors.items() if not np.allclose(m, np.eye(robot.n))]
     pair = np.flatnonzero(np.abs(np.diag(at_motors[signals[0]])) < 1e-9)
     names = [robot.joints[j].name for j in pair]
-    stanza = Effect(effect="joint_order", joint=names[0], other=names[1], parameters={s: 1.0 for s in signals})
+    entry = Effect(effect="joint_order", joint=names[0], other=names[1], parameters={s: 1.0 for s in signals})
     message = f"{step.words[k]}: swapped node numbers or plugs of two drives"
-    return SetupFinding("joint_order", tuple(names), step.probability[k], message, _lines([stanza]), True), [stanza]
+    return SetupFinding("joint_order", tuple(names), step.probability[k], message, _lines([entry]), True), [entry]
 
 
 def _sign(

@@ -103,7 +103,7 @@ class RandomCase:
 
 @dataclass(frozen=True, eq=False)
 class _Hidden:
-    """What is hidden, where, and how far it is seen; see `Truth`."""
+    """Hidden effect or mistake of a case, with plant, configuration and joints; see `Truth`."""
 
     family: Family
     kind: str

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SetUp:
-    """What a set-up mistake changes: the plant's readings, the recording, and the joints concerned.
+    """Changes by a set-up mistake: the plant's readings, the recording, and the joints concerned.
 
     Parameters
     ----------
