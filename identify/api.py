@@ -25,6 +25,7 @@ from armident.identify.effects.effect import Effect as Effect
 from armident.identify.effects.registry import catalogue
 from armident.identify.experiment import Experiment
 from armident.identify.identification.api import experiments_of, identify_recording
+from armident.identify.identification.from_recording import rest_notes
 from armident.identify.identification.options import (
     ControllerName,
     DerivativesName,
@@ -33,10 +34,13 @@ from armident.identify.identification.options import (
     Options,
 )
 from armident.identify.identification.result import Identification as Estimation
+from armident.identify.identification.verdict import Reason
 from armident.identify.monitoring.change_test import ParameterChangeTest
 from armident.identify.monitoring.change_test import compare as test_parameter_change
 from armident.identify.regression.equations import MAX_AR_ORDER
 from armident.identify.report.files import robot_yaml
+from armident.identify.setup.check import check_setup
+from armident.identify.setup.result import SetupCheck
 from armident.identify.signals.differentiate import NvrRule
 from armident.identify.tables import EffectTable, ParameterTable, Table
 
@@ -113,6 +117,16 @@ class Identification(_Result):
     result: Estimation
 
     @property
+    def verdict(self) -> str:
+        """``trustworthy``, ``doubtful`` or ``unusable``; an unusable result must not be used."""
+        return self.result.verdict.level
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Reasons of the verdict with the next step in words, the most severe first; empty if trustworthy."""
+        return self.result.verdict.reasons
+
+    @property
     def parameters(self) -> ParameterTable:
         """Table of the base parameters (b,): ``parameters["zz1r"].value``, ``parameters.to_pandas()``."""
         return ParameterTable(self.document.parameters, f"{self.document.robot}: {self.document.method}")
@@ -172,10 +186,9 @@ class Identification(_Result):
     def _summary(self) -> str:
         document = self.document
         essential = sum(p.essential for p in document.parameters)
-        state = "converged" if document.converged else f"not converged ({document.stop_reason})"
         return (
             f"{document.robot}, {document.method}: torque error {document.relative_error_pct:.2f} %, "
-            f"{essential} of {len(document.parameters)} base parameters essential, {state}"
+            f"{essential} of {len(document.parameters)} base parameters essential, {self.result.verdict.sentence}"
         )
 
     def _table(self) -> Table:
@@ -272,6 +285,41 @@ def identify(
     return Identification(outcome.document, outcome.robot, read, outcome.result)
 
 
+def check(recordings: Recorded | Sequence[Recorded], robot: Robot | None = None) -> SetupCheck:
+    """Check signs, order, units, gear ratios, gravity and clocks of recordings against the configuration; seconds.
+
+    Parameters
+    ----------
+    recordings
+        A recording, the path of one, or a sequence of them; all of one robot at one sampling rate.
+    robot
+        Configuration to check, or the path or shipped name of one; by default the one inside the first recording.
+
+    Returns
+    -------
+    SetupCheck
+        Mistakes with their probability and the line of configuration that corrects each.
+
+    Raises
+    ------
+    ConfigError
+        If a file does not exist or a configuration is wrong.
+    DataError
+        If the recordings are too short, or their sampling rates differ.
+
+    Examples
+    --------
+    >>> import armident
+    >>> recording = armident.simulate_recording("tx40", "tx40_excitation", seed=1)
+    >>> armident.check(recording).findings
+    ()
+    """
+    read = _read(recordings)
+    config = _robot(robot, read)
+    experiments, _ = experiments_of(read, config, name_files=True)
+    return check_setup(experiments, config)
+
+
 @dataclass(frozen=True, repr=False)
 class Diagnosis(_Result):
     """Disagreement of a model with recordings, and the effects that explain it.
@@ -335,7 +383,7 @@ class Diagnosis(_Result):
             The document as written, with the path of the model.
         """
         place, document = Path(folder), self.document
-        if self.robot.effects != self.configured.effects:
+        if self.robot != self.configured:
             model = place / "model.yaml"
             write_atomically(model, robot_yaml(self.robot))
             document = document.model_copy(update={"model": str(model)})
@@ -424,6 +472,7 @@ def diagnose(
         read = (*read, *_read(validate))
         held_out, more = experiments_of(read[-1:], config, name_files=True)
         notes += more
+    notes += rest_notes(training, config)
     settings = Settings(false_alarms=false_alarm_rate, material=material)
     references = [reference(recording) for recording in read]
     found = run(training, held_out, config, references, numbers, list(dict.fromkeys(notes)), progress, settings)

@@ -1,7 +1,8 @@
-"""Commands of this package: identify, diagnose, effects, history, trajectory, worker, reproduce, diagnose-suite."""
+"""Commands of this package: identify, check, diagnose, effects, history, trajectory, worker, reproduce, suite."""
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -44,7 +45,9 @@ def identify(
     out: OutDirectory = None,
     json: Json = False,
 ) -> None:
-    """Identify the dynamic model of a robot from a recording.
+    """Identify the dynamic model of a robot from a recording, and judge the result.
+
+    Exit code 3 if the verdict is unusable: the reasons stand in the result.
 
     Example: armident identify tx40.mcap --out results
     """
@@ -62,7 +65,28 @@ def identify(
         "weighted": weighted,
         "physical": physical,
     }
-    identify_command(recording, config, chosen, out, as_json=json)
+    code = identify_command(recording, config, chosen, out, as_json=json)
+    if code:
+        raise typer.Exit(code)
+
+
+def check(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings (.mcap) of one robot at one sampling rate.")],
+    config: Robot = None,
+    json: Json = False,
+) -> None:
+    """Check the set-up in seconds: signs, order of joints, units, gear ratios, gravity, clocks, clipping, standstill.
+
+    Prints what is wrong, how sure that is, and the line of configuration that corrects it. Exit code 0 if the set-up
+    is right, 3 if results would be unusable.
+
+    Example: armident check tx40.mcap --config configs/tx40.yaml
+    """
+    from armident.identify.commands import check_command
+
+    code = check_command(recordings, config, as_json=json)
+    if code:
+        raise typer.Exit(code)
 
 
 def worker(
@@ -255,6 +279,16 @@ def diagnose_suite(
         bool, typer.Option("--any-version", help="Use results of other versions of the code.")
     ] = False,
     list_cases: Annotated[bool, typer.Option("--list", help="Print the cases and end.")] = False,
+    arms: Annotated[
+        Literal["virtual", "random"], typer.Option("--arms", help="The two virtual robots, or arms drawn at random.")
+    ] = "virtual",
+    half: Annotated[
+        Literal["development", "reserve"],
+        typer.Option("--half", help="Half of the random arms; of the reserve only totals are shown and kept."),
+    ] = "development",
+    cases: Annotated[
+        int | None, typer.Option("--cases", help="Number of random arms. [default: 88, reserve 176]", min=1)
+    ] = None,
     json: Json = False,
 ) -> None:
     """Hide effects in virtual arms, diagnose them, and print the detection rate of each effect.
@@ -262,7 +296,15 @@ def diagnose_suite(
     Results are kept case by case: a stopped run continues.
 
     Example: armident diagnose-suite --quick --out suite
+
+    Random arms: armident diagnose-suite --arms random --half development --out DIR
     """
+    if arms == "random":
+        from armident.identify.evaluation.random_arms.run import RandomOptions, run_random_suite
+
+        random_options = RandomOptions(half, out, cases, jobs or len(os.sched_getaffinity(0)), minutes=minutes)
+        run_random_suite(random_options, as_json=json)
+        return
     from armident.identify.evaluation.run import SuiteOptions, list_suite, run_suite
 
     def words(text: str) -> tuple[str, ...]:

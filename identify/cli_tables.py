@@ -15,6 +15,7 @@ from rich.table import Table
 from armident.configs import RobotConfig
 from armident.identify.document import DiagnosisDocument, IdentificationDocument
 from armident.identify.effects.terms import arm_model
+from armident.identify.setup.result import SetupCheck
 
 SHOW_AFTER_S = 2.0
 """Duration after which progress is shown, s."""
@@ -86,6 +87,24 @@ def warn(lines: list[str]) -> None:
         print(f"armident: warning: {line}", file=sys.stderr)
 
 
+def setup_table(result: SetupCheck) -> None:
+    """Print the findings of a set-up check, one below the other, and its hypotheses where a joint is not understood."""
+    before = ", ".join(f"{error:.1f}" for error in result.relative_error_pct)
+    after = ", ".join(f"{error:.1f}" for error in result.corrected_error_pct)
+    if not result.findings:
+        print("set-up: no mistake found")
+    for finding in result.findings:
+        print(f"{finding.kind}: {finding.message} (probability {finding.probability:.2f})")
+        print(f"  correct it by: {finding.remedy}")
+    corrected = f", corrected {after}" if any(f.decisive for f in result.findings) else ""
+    if any(error != 100.0 for error in result.relative_error_pct):
+        print(f"torque error of the rigid model by joint: {before} %{corrected}{' %' if corrected else ''}")
+    if result.joints_not_understood:
+        names = ", ".join(result.joints_not_understood)
+        print(f"not understood: the rigid model leaves more than a third of the torque of {names}")
+        print(f"  tried: {'; '.join(result.tried)}")
+
+
 def design_table(robot: RobotConfig, theta: NDArray[np.float64] | None, std: NDArray[np.float64]) -> None:
     """Print base parameters, if known, and their predicted standard deviations.
 
@@ -121,6 +140,22 @@ def wanted_table(std: Mapping[str, float]) -> None:
     Console().print(table)
 
 
+COLOURS = {"trustworthy": "green", "doubtful": "yellow", "unusable": "red"}
+"""Colours of the levels of a verdict."""
+
+
+def verdict_lines(document: IdentificationDocument) -> None:
+    """Print the verdict of an identification, its reasons, and the next step of each."""
+    level = document.verdict or "not judged"
+    console = Console()
+    console.print(f"verdict: {level}", style=f"bold {COLOURS.get(level, 'default')}", highlight=False)
+    for reason in document.reasons:
+        console.print(
+            f"- {reason.message}.", style=COLOURS[reason.level], highlight=False, soft_wrap=True, markup=False
+        )
+        console.print(f"  Next: {reason.next_step}.", highlight=False, soft_wrap=True, markup=False)
+
+
 def identification_table(document: IdentificationDocument) -> None:
     """Print the essential parameters with their standard deviations, beside the IDIM-LS estimate."""
     beside = {} if document.comparison is None else {p.name: p for p in document.comparison.parameters}
@@ -142,7 +177,9 @@ def identification_table(document: IdentificationDocument) -> None:
     console.print(table)
     essential = sum(p.essential for p in document.parameters)
     errors = ", ".join(f"{name} {value:.1f}" for name, value in document.relative_error_pct_by_joint.items())
-    outside = max((w.fraction_outside_2sigma for w in document.whiteness), default=0.0)
+    coloured = any(reason.kind in ("residual", "uncertainty") for reason in document.reasons)
+    tested = document.verdict in ("trustworthy", "doubtful")
+    residuals = f"; residuals are {'not ' if coloured else ''}noise" if tested else ""
     console.print(
         f"{essential} of {len(document.parameters)} base parameters are essential; "
         f"relative torque error {document.relative_error_pct:.4f} % ({errors})",
@@ -150,8 +187,7 @@ def identification_table(document: IdentificationDocument) -> None:
         soft_wrap=True,
     )
     console.print(
-        f"{document.iterations} iterations, {'converged' if document.converged else 'not converged'}; "
-        f"residual autocorrelation outside 2 sigma at most at {100 * outside:.0f} % of the lags (white: 5 %)",
+        f"{document.iterations} iterations{residuals}",
         highlight=False,
         soft_wrap=True,
     )

@@ -1,20 +1,28 @@
-"""Commands ``identify`` and ``diagnose``: read, compute, write, print."""
+"""Commands ``identify``, ``check`` and ``diagnose``: read, compute, write, print."""
 
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from armident.configs import DataError
 from armident.identify.document import to_json
 from armident.identify.identification.options import parse_decimation, parse_nvr
+
+UNUSABLE = DataError.exit_code
+"""Exit code: the data do not support an identification, and the result says why."""
 
 FOUND = 4
 """Exit code: done, with findings or an unexplained residual."""
 
+UNUSABLE = 3
+"""Exit code: the data cannot support the request as they are configured."""
+
 
 def identify_command(
     path: Path, config: Path | None, chosen: Mapping[str, Any], out: Path | None, *, as_json: bool
-) -> None:
+) -> int:
     """Carry out ``armident identify``.
 
     Parameters
@@ -30,13 +38,18 @@ def identify_command(
     as_json
         Print the document on stdout instead of a table.
 
+    Returns
+    -------
+    int
+        Exit code: `UNUSABLE` if the verdict says so, otherwise 0.
+
     Raises
     ------
     ConfigError, DataError
         If an option or a file is wrong, or the recording cannot be identified.
     """
     from armident.identify.api import identify
-    from armident.identify.cli_tables import identification_table, progress, warn
+    from armident.identify.cli_tables import identification_table, progress, verdict_lines, warn
 
     as_written = {"nvr": parse_nvr(chosen.get("nvr")), "decimation": parse_decimation(chosen.get("decimation"))}
     with progress(f"identify {path.name}") as report:
@@ -44,10 +57,50 @@ def identify_command(
     document, html = result.save(out or _beside(path, "identification"))
     if as_json:
         sys.stdout.write(to_json(result.document))
-        return
-    warn(result.document.warnings)
-    identification_table(result.document)
-    print(f"result: {document}\nreport: {html}")
+    else:
+        verdict_lines(result.document)
+        warn(result.document.warnings)
+        identification_table(result.document)
+        print(f"result: {document}\nreport: {html}")
+    return UNUSABLE if result.verdict == "unusable" else 0
+
+
+def check_command(paths: Sequence[Path], config: Path | None, *, as_json: bool) -> int:
+    """Carry out ``armident check``.
+
+    Parameters
+    ----------
+    paths
+        Recordings.
+    config
+        Robot configuration; ``None``: that of the first recording.
+    as_json
+        Print the result as JSON on stdout instead of a table.
+
+    Returns
+    -------
+    int
+        Exit code: `UNUSABLE` with a decisive finding or a joint that is not understood, otherwise 0.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If a file is wrong, or the recordings cannot be checked.
+    """
+    from armident.identify.api import check
+    from armident.identify.cli_tables import progress, setup_table
+
+    with progress("check"):
+        result = check(list(paths), config)
+    if as_json:
+        content = {**vars(result), "findings": [vars(finding) for finding in result.findings]}
+        robot = result.corrected_robot
+        content["corrected_robot"] = None if robot is None else robot.model_dump(mode="json", by_alias=True)
+        sys.stdout.write(json.dumps(content, indent=2) + "\n")
+    else:
+        setup_table(result)
+    wrong = result.joints_not_understood or any(finding.decisive for finding in result.findings)
+    return UNUSABLE if wrong else 0
 
 
 def diagnose_command(

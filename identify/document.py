@@ -67,6 +67,16 @@ class Whiteness(Document):
     fraction_outside_2sigma: float
 
 
+class VerdictReason(Document):
+    """Defect of an identification: its level, the property judged, one sentence, and the next step."""
+
+    level: Literal["doubtful", "unusable"]
+    kind: str
+    joint: str | None
+    message: str
+    next_step: str
+
+
 class Comparison(Document):
     """Estimate of a simpler method from the same data, for comparison."""
 
@@ -78,12 +88,17 @@ class Comparison(Document):
 class IdentificationDocument(Document):
     """Content of ``identification.json``: estimated parameters, their covariance, the data, method and diagnostics.
 
-    ``torque_delay_samples`` has two numbers per joint: the number of samples by which the torque leads the position,
-    and its standard deviation. A drive that reports the torque that it holds until the next sample has a lead of 0.5.
-    ``sign_smoothing`` is ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
+    ``verdict`` with its ``reasons`` states if the parameters can be used, by the limits in ``criteria``; it is null in
+    documents of former versions. ``torque_delay_samples`` has two numbers per joint: the number of samples by which the
+    torque leads the position, and its standard deviation. A drive that reports the torque that it holds until the next
+    sample has a lead of 0.5. ``sign_smoothing`` is ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or
+    s/m. ``bias`` is the bias by derivatives, encoder noise and sampling that was subtracted from the parameters, null
+    where it is irrelevant.
     """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
+    verdict: Literal["trustworthy", "doubtful", "unusable"] | None = None
+    reasons: list[VerdictReason] = []
     robot: str
     recording: RecordingReference
     method: str
@@ -106,7 +121,9 @@ class IdentificationDocument(Document):
     physical: dict[str, Any] | None = None
     torque_delay_samples: dict[str, list[float]] | None = None
     further_recordings: list[RecordingReference] | None = None
+    bias: dict[str, float] | None = None
     sign_smoothing: dict[str, float] | None = None
+    criteria: dict[str, float] | None = None
 
 
 class Alternative(Document):
@@ -336,6 +353,8 @@ def identification_document(
             ],
         )
     return IdentificationDocument(
+        verdict=result.verdict.level,
+        reasons=[VerdictReason(**plain(reason)) for reason in result.verdict.reasons],
         robot=robot.name,
         recording=reference(recordings[0]),
         method=result.method,
@@ -365,7 +384,9 @@ def identification_document(
             for name, samples, std in zip(joints, result.delay.samples, result.delay.std, strict=True)
         },
         further_recordings=[reference(recording) for recording in recordings[1:]] or None,
+        bias=None if result.bias is None else dict(zip(result.names, map(float, result.bias), strict=True)),
         sign_smoothing=dict(zip(joints, (float(g) for g in result.sign_smoothing), strict=True)),
+        criteria=plain(result.criteria),
     )
 
 

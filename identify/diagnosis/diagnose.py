@@ -13,20 +13,18 @@ from armident.identify.diagnosis.doubt import Outcome, convincing
 from armident.identify.diagnosis.findings import (
     experiment_to_separate,
     gap_of,
-    miswired,
     noise_floor,
     outdated,
     undetectable,
 )
 from armident.identify.diagnosis.hiding import detection_limits
 from armident.identify.diagnosis.numbers import stale_numbers
-from armident.identify.diagnosis.regression import relative_errors
 from armident.identify.diagnosis.search import Search
+from armident.identify.diagnosis.setup_stage import set_up
 from armident.identify.diagnosis.simulated import SimulatedErrors, simulated_errors
 from armident.identify.diagnosis.state import Settings, State, with_values
 from armident.identify.diagnosis.study import Study, build_study
 from armident.identify.diagnosis.where import Disagreement, beyond_noise, survey, where
-from armident.identify.diagnosis.wiring_check import WiringFinding, find_wiring
 from armident.identify.document import (
     BeforeAfter,
     DiagnosisDocument,
@@ -42,12 +40,6 @@ from armident.identify.experiment import Experiment
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
-
-SHARE_OF_ALARMS = 0.1
-"""Share of the false-alarm rate for a wiring error without any other finding."""
-NOTABLY = 0.2
-"""Decrease of the log power of the held-out errors, summed over the joints, from which a wiring error is preferred to
-an equal number of effects: a wrong sign of a wrist resembles a missing rotor inertia."""
 
 
 @dataclass(frozen=True)
@@ -177,23 +169,22 @@ def _diagnose(
     steps: _Steps,
     settings: Settings,
 ) -> Diagnosis:
-    steps("wiring")
-    wiring = find_wiring([*training, *validation], robot)
-    found = _searched(training, validation, robot, wiring if wiring and wiring.certain else None, steps, settings)
-    if wiring is not None and not wiring.certain:
-        # Without any other gap the wiring test alone must be significant at a stricter level.
-        alone = found.open == 0 and wiring.p_values[0] <= SHARE_OF_ALARMS * settings.false_alarms
-        other = _searched(training, validation, robot, wiring, steps, settings) if alone or found.open else None
-        # The wiring error itself counts as one finding.
-        room = 0 if alone else found.open - 1
-        if other is not None and other.open <= room and other.misfit < found.misfit - NOTABLY * (other.open == room):
-            found = other
-        else:
-            wiring = None
-    study, first, outcome, left = found.study, found.first, found.outcome, found.left
+    steps("set-up")
+    stage = set_up(training, validation, robot)
+    found = _searched(stage.training, stage.validation, stage.robot, steps, settings)
+    study, first, outcome = found.study, found.first, found.outcome
     final = outcome.state
-    findings = [*([] if wiring is None else miswired(wiring, robot)), *outcome.findings]
-    lacking = [*(None for _ in findings[len(outcome.findings) :]), *(_beside(final, s) for s in outcome.lacking)]
+    after = gap_of(final, held=True)
+    findings = stage.named(outcome.findings, after)
+    places = {id(f): k for k, f in enumerate(outcome.findings)}
+    lacking = [_beside(final, outcome.lacking[places[id(f)]]) if id(f) in places else None for f in findings]
+    left = stage.left(
+        [
+            Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
+            for d in found.left
+        ],
+        after,
+    )
     if baseline is not None:
         steps("changed parameters")
         findings += outdated(stale_numbers(final.fit, final.workshop, baseline, settings.false_alarms))
@@ -207,19 +198,17 @@ def _diagnose(
         verdict=_verdict(findings, left),
         findings=findings,
         considered=list(outcome.considered),
-        unexplained=[
-            Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint) for d in left
-        ],
+        unexplained=left,
         gap=Gaps(
-            train=BeforeAfter(before=gap_of(first, held=False), after=gap_of(final, held=False)),
-            validation=BeforeAfter(before=gap_of(first, held=True), after=gap_of(final, held=True)),
+            train=BeforeAfter(before=stage.as_configured(gap_of(first, held=False)), after=gap_of(final, held=False)),
+            validation=BeforeAfter(before=stage.as_configured(gap_of(first, held=True)), after=after),
         ),
-        noise_floor=noise_floor(final, left),
+        noise_floor=noise_floor(final, found.left),
         recommended_experiment=experiment_to_separate(findings),
         model=None,
         timing_s=steps.finish(),
         versions=versions(),
-        warnings=[*notes, *study.warnings],
+        warnings=[*notes, *stage.warnings, *study.warnings],
         not_visible=undetectable(first),
         detection_limits=limits,
         simulated=simulated.document(),
@@ -237,14 +226,14 @@ def _diagnose(
         q=_sampled(final, "q"),
         qd=_sampled(final, "qd"),
         where=found.where,
-        left=tuple(left),
+        left=found.left,
         simulated=simulated,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """Result of a search with the drives wired in one way: data, first and final model, and remaining dependences."""
+    """Result of a search: data, first and final model, and remaining dependences."""
 
     study: Study
     first: State
@@ -252,30 +241,17 @@ class _Found:
     where: tuple[Disagreement, ...]
     left: tuple[Disagreement, ...]
 
-    @property
-    def open(self) -> int:
-        """Number of effects that the wiring needs, plus the number of remaining dependences."""
-        return len(self.outcome.findings) + len(self.left)
-
-    @property
-    def misfit(self) -> float:
-        """Sum over the joints of the logarithm of the residual share of the held-out torque's power."""
-        _, each = relative_errors(self.outcome.state.fit, held=True)
-        return float(np.sum(np.log(each**2)))
-
 
 def _searched(
     training: Sequence[Experiment],
     validation: Sequence[Experiment],
     robot: RobotConfig,
-    wiring: WiringFinding | None,
     steps: _Steps,
     settings: Settings,
 ) -> _Found:
-    """Search for effects, with wiring errors corrected."""
-    wired = robot if wiring is None else robot.model_copy(update={"effects": (*wiring.stanzas, *robot.effects)})
+    """Search for effects in the corrected set-up."""
     steps("derivatives and closed loop")
-    study = build_study(training, validation, wired)
+    study = build_study(training, validation, robot)
     steps("base fit")
     search = Search(study, settings, steps)
     first = search.start()
@@ -288,7 +264,7 @@ def _searched(
     return _Found(study, first, outcome, tuple(places), tuple(left))
 
 
-def _verdict(findings: Sequence[Finding], left: Sequence[Disagreement]) -> Verdict:
+def _verdict(findings: Sequence[Finding], left: Sequence[Unexplained]) -> Verdict:
     """Verdict; with ``no_gap`` and ``explained`` the residual is noise (see `excess`) and depends on no variable."""
     if findings:
         return "partly_explained" if left else "explained"

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Stanza
 from armident.identify.diagnosis.candidates import Candidate, places
 from armident.identify.diagnosis.experiment import recommended_experiment
@@ -21,7 +20,6 @@ from armident.identify.diagnosis.state import State, nearer, power_put_right, sh
 from armident.identify.diagnosis.study import ALIKE
 from armident.identify.diagnosis.trial import CLOSE, Trial, judge
 from armident.identify.diagnosis.where import Disagreement, strangers
-from armident.identify.diagnosis.wiring_check import WiringFinding
 from armident.identify.document import Alternative, Finding, Gap, NotVisible
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.recorded import of_recording
@@ -164,45 +162,6 @@ def _instead(rival: Trial, final: State) -> float:
     """
     beside = [t.score for t in final.trials if t.candidate.key == rival.candidate.key and not t.forbidden]
     return rival.score - max([0.0, *beside])
-
-
-def miswired(wiring: WiringFinding, robot: RobotConfig) -> list[Finding]:
-    """Wiring errors as findings; their gaps are residuals of a physical model, percent of the torque of the motor.
-
-    Parameters
-    ----------
-    wiring
-        Result of the wiring check.
-    robot
-        Configuration of the robot.
-    """
-    names = [joint.name for joint in robot.joints]
-    findings = []
-    for stanza, words, p_value, rivals in zip(
-        wiring.stanzas, wiring.words, wiring.p_values, wiring.alternatives, strict=True
-    ):
-        effect, motor = of_entry(stanza), names.index(stanza.joint)
-        findings.append(
-            Finding(
-                effect=effect.name,
-                joint=stanza.joint,
-                other=stanza.other,
-                kind="structure",
-                parameters=stanza.parameters,
-                confidence=1.0 / (1 + len(rivals)),
-                alternatives=[],
-                gap_before=100 * float(np.sqrt(wiring.unexplained_before[motor])),
-                gap_after=100 * float(np.sqrt(wiring.unexplained_after[motor])),
-                evidence={
-                    "title": effect.title,
-                    "description": words,
-                    "reference": effect.reference,
-                    "p_value": p_value,
-                    "equally_likely": list(rivals),
-                },
-            )
-        )
-    return findings
 
 
 def gap_of(state: State, *, held: bool) -> Gap:

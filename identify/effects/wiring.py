@@ -1,4 +1,4 @@
-"""Wiring errors: signals with the wrong sign or of the wrong drive."""
+"""Mistakes of recorded signals: wrong sign, wrong drive or column, wrong scale."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +14,10 @@ from armident.identify.robot.motion import Motion
 Array = NDArray[np.float64]
 
 SIGNALS = ("position", "torque")
-"""Parameters of these effects: a value of 1 selects the signal."""
+"""Parameters of these effects: a value of 1 selects the signal; of `signal_scale` it is the factor."""
+
+JOINT_SIDE = "joint_side"
+"""Parameter with the value 1 where columns in SI units on the joint side are concerned, not raw numbers of drives."""
 
 
 def _none(motion: Motion, place: Place) -> Array:
@@ -42,6 +45,18 @@ EFFECTS = (
         columns=_none,
         needs="different motion of the joints",
         scope="pair",
+        rewires=True,
+    ),
+    Effect(
+        name="signal_scale",
+        title="a signal with the wrong scale",
+        says="position or torque of a joint is recorded in another unit, on the other side of the gear, or with "
+        "another gear ratio; the value is true over recorded",
+        reference="Brunot 2017, equation 2.14",
+        linear=(),
+        columns=_none,
+        needs="motion of the neighbouring joints",
+        scope="motor",
         rewires=True,
     ),
 )
@@ -85,30 +100,52 @@ def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
     """Return the matrices (n, n) that correct the motors' positions and torques for the configured wiring errors.
 
     Raw values (counts, shares of the rated signal) are exchanged, while the scaling belongs to the drive. So these are
-    signed permutations, scaled where two drives differ in resolution, gain or rating.
+    signed permutations, scaled where two drives differ in resolution, gain or rating. With ``joint_side: 1`` columns in
+    SI units on the joint side are concerned, as they are after an import; `signal_scale` always acts on these, and
+    with an ``other`` joint adds a multiple of its signal. Several entries act one after the other: exchanges express
+    any permutation.
+
+    Raises
+    ------
+    ConfigError
+        If an entry does not name the signal or the other joint.
     """
     names = [joint.name for joint in robot.joints]
     worth = {"position": _per_count(robot), "torque": _per_share(robot)}
+    ratios = robot.transmission_matrix
+    to_motor = {"position": ratios, "torque": np.linalg.inv(ratios).T}
     found = {signal: np.eye(robot.n) for signal in SIGNALS}
-    for k, stanza in enumerate(robot.effects):
-        if stanza.effect not in NAMES:
+    for k, entry in enumerate(robot.effects):
+        if entry.effect not in NAMES:
             continue
-        meant = [signal for signal in SIGNALS if stanza.parameters.get(signal)]
+        meant = [signal for signal in SIGNALS if entry.parameters.get(signal)]
         if not meant:
-            raise ConfigError(f"effects[{k}]: {stanza.effect} of {stanza.joint} needs position: 1, torque: 1 or both")
-        first = names.index(stanza.joint)
+            raise ConfigError(f"effects[{k}]: {entry.effect} of {entry.joint} needs position: 1, torque: 1 or both")
+        first = names.index(entry.joint)
+        joint_side = bool(entry.parameters.get(JOINT_SIDE)) or entry.effect == "signal_scale"
         for signal in meant:
             change = np.eye(robot.n)
-            if stanza.effect == "sign_error":
+            if entry.effect == "sign_error":
                 change[first, first] = -1.0
+            elif entry.effect == "signal_scale":
+                second = first if entry.other is None else names.index(entry.other)
+                change[first, second] = entry.parameters[signal]
             else:
-                if stanza.other is None:
-                    raise ConfigError(f"effects[{k}]: joint_order of {stanza.joint} needs the other joint")
-                second = names.index(stanza.other)
+                if entry.other is None:
+                    raise ConfigError(f"effects[{k}]: joint_order of {entry.joint} needs the other joint")
+                second = names.index(entry.other)
                 change[[first, second]] = change[[second, first]]
-                change = change * worth[signal][:, None] / worth[signal]
+                if not joint_side:
+                    change = change * worth[signal][:, None] / worth[signal]
+            if joint_side:
+                change = to_motor[signal] @ change @ np.linalg.inv(to_motor[signal])
             found[signal] = change @ found[signal]
     return found["position"], found["torque"]
+
+
+def raw_scales(robot: RobotConfig) -> tuple[Array, Array]:
+    """Return the motor position per count, rad or m, and the motor torque at the rated signal, N m or N, (n,) each."""
+    return _per_count(robot), _per_share(robot)
 
 
 def _per_count(robot: RobotConfig) -> Array:

@@ -1,7 +1,7 @@
 """The auxiliary model: the closed loop simulated with the last estimate, source of the instruments."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Self
@@ -83,6 +83,11 @@ class AuxiliaryModel:
         points. A prefilter that amplifies high frequencies would take this content for information.
     starts
         Time of the first sample of every experiment since the recordings began, s; ``None``: zero.
+    measured
+        ``measured(positions, k)``: derivatives of simulated positions (N, n) of experiment k by the filter of the
+        measured ones. ``None``: simulated velocities and accelerations.
+    feedback
+        True if the controller is that of the drives, through which the noise of their encoders passes.
     """
 
     model: ArmModel
@@ -95,6 +100,8 @@ class AuxiliaryModel:
     anchor: NDArray[np.float64] | None = None
     band_hz: float = np.inf
     starts: Sequence[float] | None = None
+    measured: Callable[[NDArray[np.float64], int], Derivatives] | None = None
+    feedback: bool = True
     _last: NDArray[np.float64] | None = None
     _warnings: list[str] = field(default_factory=list)
 
@@ -143,8 +150,18 @@ class AuxiliaryModel:
             max_velocity=self.max_velocity / share,
         )
 
-    def simulate(self, theta: NDArray[np.float64]) -> list[Simulation] | None:
-        """All experiments with these base parameters, or ``None`` if one diverges or theta is not finite."""
+    def simulate(
+        self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
+    ) -> list[Simulation] | None:
+        """All experiments with these base parameters, or ``None`` if one diverges or theta is not finite.
+
+        Parameters
+        ----------
+        theta
+            Base parameters (b,), SI.
+        disturbances
+            Additional motor torques, N m or N, one (N, n) array per experiment.
+        """
         if not np.isfinite(theta).all():
             return None
         runs = []
@@ -156,6 +173,7 @@ class AuxiliaryModel:
                 q_ref,
                 self.dt,
                 start=self._start(k),
+                disturbance=None if disturbances is None else disturbances[k],
                 band_hz=FELT * self.band_hz,
                 q0=q0,
                 qd0=qd0,
@@ -199,7 +217,8 @@ class AuxiliaryModel:
 
     def regressors(self, motions: Sequence[Derivatives]) -> list[NDArray[np.float64]]:
         """Filtered regressor at noise-free motions, one (M, n, b) per experiment."""
-        return [filtered_regressor(self.model, self._in_band(motion), self.decimation) for motion in motions]
+        seen = [self._in_band(motion, k) for k, motion in enumerate(motions)]
+        return [filtered_regressor(self.model, motion, self.decimation) for motion in seen]
 
     def equations(self, blocks: Sequence[ExperimentEquations], theta: NDArray[np.float64]) -> list[ExperimentEquations]:
         """Equations with the simulated regressor in place of the measured one (2.32).
@@ -232,8 +251,10 @@ class AuxiliaryModel:
     def _start(self, experiment: int) -> float:
         return 0.0 if self.starts is None else self.starts[experiment]
 
-    def _in_band(self, motion: Derivatives) -> Derivatives:
-        """Motion low-pass filtered at ``band_hz`` where the decimation passes more."""
+    def _in_band(self, motion: Derivatives, experiment: int) -> Derivatives:
+        """Motion after the filter of the measured one, and low-pass filtered where the decimation passes more."""
+        if self.measured is not None:
+            motion = replace(self.measured(motion.q, experiment), start=motion.start)
         if not self.limits_band:
             return motion
         q, qd, qdd = (butterworth(s, self.dt, self.band_hz) for s in (motion.q, motion.qd, motion.qdd))

@@ -22,6 +22,7 @@ from armident.identify.regression.equations import (
     inverse_gram,
     least_squares,
     noise_models,
+    serial_covariance,
     weighted_rows,
 )
 from armident.identify.regression.hac import newey_west
@@ -29,7 +30,10 @@ from armident.identify.regression.hac import newey_west
 Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
-"""Probability of rejecting a true hypothesis, in every test here."""
+"""Probability of rejecting a true hypothesis, in every test here except those of the residuals."""
+
+FALSE_ALARM_RATE = 0.01
+"""Probability that the tests of one kind reject the residuals of any joint of a correct model (Bonferroni)."""
 
 WEAK_F = 23.1
 """Robust first-stage F below which an instrument is weak: bias over 10 % of the worst case cannot be excluded at 5 %
@@ -108,11 +112,11 @@ class JointResiduals:
     ljung_box, ljung_box_degrees, ljung_box_p
         Statistic of Ljung and Box, degrees of freedom (lags less order), probability of more if white.
     white
-        True if whiteness is not rejected at ``SIGNIFICANCE``.
+        True if whiteness is not rejected: p is at least ``FALSE_ALARM_RATE`` over the number of joints.
     breusch_pagan, breusch_pagan_degrees, breusch_pagan_p
         Koenker's form of the Breusch-Pagan statistic against the magnitudes in ``against``.
     homoskedastic
-        True if a constant variance is not rejected at ``SIGNIFICANCE``.
+        True if a constant variance is not rejected, at the same level.
     against
         Magnitudes on which the variance may depend: ``speed``, ``torque``.
     """
@@ -172,6 +176,9 @@ class Diagnostics:
         Residual tests, one per joint.
     essential
         F test of the essential set; ``None`` where no set was given.
+    serial_std_ratio
+        Largest ratio of the standard deviation of a parameter that allows for serially correlated residuals to that of
+        the estimate; 1 where the estimator already models the correlation.
     """
 
     condition_regressor: float
@@ -181,6 +188,7 @@ class Diagnostics:
     endogeneity: Endogeneity | None
     joints: tuple[JointResiduals, ...]
     essential: NestedFit | None
+    serial_std_ratio: float = 1.0
 
     def document(self) -> dict[str, Any]:
         """Plain numbers, strings, lists and dictionaries; numbers that are not finite become ``None``."""
@@ -231,7 +239,10 @@ def diagnose_estimate(
         noise = noise_models(blocks, estimate.theta, estimate.covariance, max_order)
     keep, x = [b.keep for b in blocks], [b.x for b in blocks]
     rows = weighted_rows(x, keep, weights)
-    condition, relevance, endogeneity = None, None, None
+    condition, relevance, endogeneity, ratio = None, None, None, 1.0
+    if not any(w.order for w in [*weights, *estimate.noise]):
+        zeta = x if instruments is None else instruments
+        ratio = _largest_ratio(serial_covariance(zeta, x, keep, weights, noise), estimate.covariance)
     if instruments is not None:
         z = weighted_rows(instruments, keep, weights)
         condition = float(np.linalg.cond(_normalised(z).T @ _normalised(rows)))
@@ -247,6 +258,7 @@ def diagnose_estimate(
         essential=None
         if essential is None
         else nested_f_test(estimate.theta, estimate.covariance, essential, rows.shape[0]),
+        serial_std_ratio=ratio,
     )
 
 
@@ -402,11 +414,11 @@ def residual_tests(
                 ljung_box=q,
                 ljung_box_degrees=degrees,
                 ljung_box_p=p,
-                white=p >= SIGNIFICANCE,
+                white=p >= FALSE_ALARM_RATE / len(joints),
                 breusch_pagan=lm,
                 breusch_pagan_degrees=lm_degrees,
                 breusch_pagan_p=lm_p,
-                homoskedastic=lm_p >= SIGNIFICANCE,
+                homoskedastic=lm_p >= FALSE_ALARM_RATE / len(joints),
                 against=against,
             )
         )
@@ -510,6 +522,13 @@ def _check(
             raise ValueError(f"block {k}: regressor of shape {block.x.shape}, {len(joints)} joints, {len(names)} names")
         if instruments is not None and instruments[k].shape != block.x.shape:
             raise ValueError(f"block {k}: instruments of shape {instruments[k].shape}, regressor {block.x.shape}")
+
+
+def _largest_ratio(covariance: Array, claimed: Array) -> float:
+    """Largest ratio of the standard deviations of two covariances (b, b)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = np.sqrt(np.diag(covariance) / np.diag(claimed))
+    return float(np.nanmax(ratios, initial=0.0))
 
 
 def _normalised(x: Array) -> Array:

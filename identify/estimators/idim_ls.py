@@ -3,11 +3,13 @@
 from collections.abc import Sequence
 
 from armident.identify.regression.equations import (
+    COVARIANCE_PASSES,
     Estimate,
     ExperimentEquations,
     inverse_gram,
     joint_variances,
     least_squares,
+    noise_models,
     require_excitation,
     serial_covariance,
     stacked,
@@ -16,7 +18,9 @@ from armident.identify.regression.equations import (
 )
 
 
-def idim_ls(blocks: Sequence[ExperimentEquations], names: Sequence[str], *, weighted: bool = True) -> Estimate:
+def idim_ls(
+    blocks: Sequence[ExperimentEquations], names: Sequence[str], *, weighted: bool = True, serial_order: int = 0
+) -> Estimate:
     """Ordinary, then weighted least squares.
 
     Parameters
@@ -28,6 +32,9 @@ def idim_ls(blocks: Sequence[ExperimentEquations], names: Sequence[str], *, weig
     weighted
         Weight each joint by its residual variance (2.23); otherwise the ordinary solution (2.22) is the result, its
         covariance still that under residual variances which differ between joints.
+    serial_order
+        Highest order of an AR model of each joint's residuals, used for the covariance alone; 0: the residuals
+        count as white (2.27).
 
     Raises
     ------
@@ -46,4 +53,10 @@ def idim_ls(blocks: Sequence[ExperimentEquations], names: Sequence[str], *, weig
     else:
         regressors = [b.x for b in blocks]
         covariance = serial_covariance(regressors, regressors, [b.keep for b in blocks], plain, noise)
+    if serial_order:
+        weights = noise if weighted else plain
+        regressors = [b.x for b in blocks]
+        for _ in range(COVARIANCE_PASSES):
+            noise = noise_models(blocks, theta, covariance, serial_order)
+            covariance = serial_covariance(regressors, regressors, [b.keep for b in blocks], weights, noise)
     return Estimate(theta, covariance, tuple(noise), whitened_residuals(blocks, theta, noise))

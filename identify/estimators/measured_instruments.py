@@ -44,10 +44,20 @@ class MotionInstruments(AuxiliaryModel):
         # Neither controller nor initial state has a part in it.
         controller = DiscreteController.fir(np.zeros((model.n, 1)), dt)
         at_rest = [(q[0], np.zeros(model.n)) for q in motion]
-        return cls(model, controller, motion, at_rest, dt, decimation, np.full(model.n, np.inf))
+        return cls(model, controller, motion, at_rest, dt, decimation, np.full(model.n, np.inf), feedback=False)
 
-    def simulate(self, theta: NDArray[np.float64]) -> list[Simulation] | None:
-        """The motion of every experiment, with the torques that these base parameters need for it."""
+    def simulate(
+        self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
+    ) -> list[Simulation] | None:
+        """The motion of every experiment, with the torques that these base parameters need for it.
+
+        Parameters
+        ----------
+        theta
+            Base parameters (b,), SI.
+        disturbances
+            Not used: the motion is given.
+        """
         if not np.isfinite(theta).all():
             return None
         runs: list[Simulation] = []

@@ -32,10 +32,12 @@ class PlantProcess:
         File to which the process appends its standard error.
     memory_limit
         Resident memory, bytes.
+    module
+        Module of the server.
     """
 
-    def __init__(self, log: Path, memory_limit: int = MEMORY_LIMIT) -> None:
-        self.log, self.memory_limit = log, memory_limit
+    def __init__(self, log: Path, memory_limit: int = MEMORY_LIMIT, module: str = SERVER) -> None:
+        self.log, self.memory_limit, self.module = log, memory_limit, module
         self._process: CommandProcess | None = None
         self._killed = False
 
@@ -62,7 +64,9 @@ class PlantProcess:
         if self._process is None or not self._process.running:
             self.close()
             # A session of its own: Ctrl-C reaches the suite, which then stops the process.
-            start: Start = partial(start_command, module=SERVER, stdin=True, own_session=True, environment=ONE_THREAD)
+            start: Start = partial(
+                start_command, module=self.module, stdin=True, own_session=True, environment=ONE_THREAD
+            )
             self._process = CommandProcess([], name="plant", log=self.log, start=start).start()
         process = self._process
         if self._killed:

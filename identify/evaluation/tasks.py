@@ -42,6 +42,23 @@ class DiagnosisTask:
 
 
 @dataclass(frozen=True)
+class ValidatedTask:
+    """Recording to diagnose and recording to judge by, without information about the simulated effects.
+
+    Parameters
+    ----------
+    recording, validation
+        Files of the recordings.
+    robot
+        Name or file of the robot configuration.
+    """
+
+    recording: Path
+    validation: Path
+    robot: str
+
+
+@dataclass(frozen=True)
 class IdentificationTask:
     """Recording to identify, and the file for the identification document."""
 
@@ -114,6 +131,26 @@ def diagnose_file(task: DiagnosisTask) -> TimedDiagnosis:
     experiments, notes = experiments_from_recording(recording, robot)
     result = diagnose(experiments, [], robot, [reference(recording)], baseline, notes)
     return TimedDiagnosis(result.document, time.perf_counter() - begin)
+
+
+def diagnose_validated(task: ValidatedTask) -> TimedDiagnosis:
+    """Diagnose a recording, judged by another one, as ``armident diagnose --validate`` does.
+
+    Parameters
+    ----------
+    task
+        Recordings and model.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If the model or a recording does not support a diagnosis.
+    """
+    from armident.identify.api import diagnose
+
+    begin = time.perf_counter()
+    found = diagnose(task.recording, task.robot, validate=task.validation)
+    return TimedDiagnosis(found.document, time.perf_counter() - begin)
 
 
 def identify_file(task: IdentificationTask) -> None:

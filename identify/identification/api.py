@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from armident.configs import RobotConfig
+from armident.configs import DataError, RobotConfig
 from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument, identification_document
 from armident.identify.experiment import Experiment
@@ -12,6 +12,8 @@ from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.result import Identification
 from armident.identify.identification.sign_smoothing import with_numbers
+from armident.identify.identification.verdict import SetupCheck
+from armident.identify.setup.check import check_setup
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ def identify_recording(
     robot: RobotConfig | None = None,
     options: Options | None = None,
     progress: Callable[[str, float], None] | None = None,
+    check: Callable[[Sequence[Experiment], RobotConfig], SetupCheck] | None = check_setup,
 ) -> IdentificationOutcome:
     """Identification of recordings, read from files or assembled from the stream.
 
@@ -54,6 +57,8 @@ def identify_recording(
         Options of the identification; ``None``: the defaults.
     progress
         Called with the name of a stage and the share done, 0 to 1.
+    check
+        Check of the set-up, whose findings enter the verdict; ``None``: none.
 
     Raises
     ------
@@ -65,7 +70,14 @@ def identify_recording(
     recordings = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
     robot = robot or recordings[0].robot
     experiments, notes = experiments_of(recordings, robot, name_files=len(recordings) > 1)
-    result = identify_experiment(experiments, robot, options or Options(), progress)
+    setup = None
+    if check is not None:
+        try:
+            setup = check(experiments, robot)
+        except DataError as error:
+            # Too short for the check: the identification itself decides if it is long enough for the parameters.
+            notes = [*notes, f"the set-up was not checked: {error}"]
+    result = identify_experiment(experiments, robot, options or Options(), progress, setup)
     document = identification_document(result, recordings, robot, notes)
     return IdentificationOutcome(recordings, with_numbers(robot, result.sign_smoothing), result, document)
 

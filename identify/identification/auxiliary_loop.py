@@ -16,14 +16,14 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.measured_instruments import MotionInstruments
 from armident.identify.experiment import Experiment
 from armident.identify.identification.equations import PIV_CUTOFF, Prepared
-from armident.identify.identification.options import Options
+from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.solvers import MEASURED
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
-from armident.identify.signals.differentiate import Derivatives
+from armident.identify.signals.differentiate import Derivatives, differentiate
 
 RUNAWAY = 3.0
 """Speed of a simulated joint, over the highest measured speed, beyond which the simulation has diverged."""
@@ -123,6 +123,8 @@ def closed_loop(
                 # Methods without a measured regressor have the torque's band in both their sides.
                 band_hz=PIV_CUTOFF * bandwidth if options.method in MEASURED else np.inf,
                 starts=[e.start for e in experiments],
+                measured=_bandpassed(options, bandwidth, dt),
+                feedback=description["kind"] in CONTROLLERS,
             )
             runs = auxiliary.simulate(start)
             if runs is None:
@@ -136,12 +138,26 @@ def closed_loop(
             break
     if closest is None:
         if options.method not in MEASURED or options.noise_model == "grey-box":
-            raise DataError("no closed loop could be simulated: it diverges with every controller and start tried")
+            raise DataError(
+                f"{options.method} needs a simulated closed loop, which diverges with every controller and start "
+                "tried. Next: judge the recording by --method idim-ls, or armident check RECORDING"
+            )
         reason = "No closed loop can be simulated with this estimate. Instruments: the smoothed measured motion."
         instruments = MotionInstruments.of(model, smoothed_motion(), dt, decimation)
-        return ClosedLoop(instruments, ls, {"kind": "followed", "reason": reason}, (reason,))
+        return ClosedLoop(instruments, ls, {"kind": "followed", "reason": reason})
     loop = closest[1]
     return loop._replace(warnings=(loop.controller["reason"],)) if loop.controller["kind"] == "nominal" else loop
+
+
+def _bandpassed(options: Options, bandwidth: float, dt: float) -> Callable[[Array, int], Derivatives] | None:
+    """The bandpass of the measured positions, for the instruments; ``None`` where another filter was chosen.
+
+    Without it the instruments of IDIM-PIV hold frequencies that the measured regressor lacks, and the prefilter takes
+    them for information.
+    """
+    if options.derivatives != "bandpass" or options.method not in MEASURED:
+        return None
+    return lambda q, _: differentiate(q, dt, "bandpass", bandwidth_hz=bandwidth)
 
 
 def velocity_error(runs: Sequence[Simulation], signals: Sequence[Derivatives]) -> float:

@@ -1,5 +1,6 @@
 """Experiments from a recording, read from a file or assembled from the stream."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -241,8 +242,6 @@ def _signal_notes(experiments: list[Experiment], robot: RobotConfig) -> list[str
     for j, joint in enumerate(robot.joints):
         low, high = joint.limits.position
         seen = (float(q[:, j].min()), float(q[:, j].max()))
-        if seen[1] - seen[0] < STILL_SHARE * (high - low):
-            notes.append(f"{joint.name} does not move: its own parameters cannot be told from this recording")
         if seen[0] < low or seen[1] > high:
             unit = "rad" if joint.type == "revolute" else "m"
             notes.append(
@@ -261,6 +260,24 @@ def _signal_notes(experiments: list[Experiment], robot: RobotConfig) -> list[str
         if share > 0.01:
             notes.append(f"{robot.joints[j].name}: its drive is saturated in {100 * share:.0f} % of the samples")
     return notes
+
+
+def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[str]:
+    """Remarks on joints that do not move; an identification has them in its verdict.
+
+    Parameters
+    ----------
+    experiments
+        Experiments of one robot.
+    robot
+        Its configuration.
+    """
+    q = np.concatenate([e.q for e in experiments])
+    return [
+        f"{joint.name} does not move: its own parameters cannot be determined from this recording"
+        for joint, width in zip(robot.joints, np.ptp(q, axis=0), strict=True)
+        if width < STILL_SHARE * (joint.limits.position[1] - joint.limits.position[0])
+    ]
 
 
 def _rate_notes(recording: Recording) -> list[str]:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
@@ -15,6 +16,7 @@ from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.experiment import Experiment
 from armident.identify.identification.auxiliary_loop import RELEVANT, ClosedLoop, closed_loop, velocity_error
+from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import (
     Prepared,
     aligned_torque,
@@ -22,6 +24,10 @@ from armident.identify.identification.equations import (
     least_rows,
     published_equations,
 )
+from armident.identify.identification.excitation_check import examine_support
+from armident.identify.identification.interval_doubts import doubts_of_least_squares
+from armident.identify.identification.judgement import Judged, Notes, judgement, refusing_singular, require_finite
+from armident.identify.identification.moving_joints import MOVE, moving_joints, require_motion
 from armident.identify.identification.noise_decimation import decimation_from_noise
 from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.result import (
@@ -34,16 +40,13 @@ from armident.identify.identification.result import (
 )
 from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
 from armident.identify.identification.solvers import MEASURED, PREFILTERED, Problem, Solution, decimation_of, solve
-from armident.identify.identification.torque_delay import HELD, TorqueDelay
+from armident.identify.identification.verdict import Reason, SetupCheck, judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_consistent
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
-
-TOLERATED_DELAY = 1.0
-"""Deviation of the torque delay from the expected one that gives no warning, samples."""
 
 TORQUE_PREDICTIONS = 2
 """Largest number of predictions of the torques on which terms depend."""
@@ -62,8 +65,9 @@ def identify_experiment(
     robot: RobotConfig,
     options: Options | None = None,
     progress: Progress | None = None,
+    setup: SetupCheck | None = None,
 ) -> Identification:
-    """Identify the base parameters of a robot.
+    """Identify the base parameters of a robot, and judge the result.
 
     The steps are those of the thesis: derivatives (5.1), IDIM-LS (2.3.2), controller (5.2), auxiliary closed loop,
     IDIM-IV (2.3.3) or IDIM-PIV (6.2.2). IDIM-LS is always computed: it starts the iterations and is reported beside
@@ -79,6 +83,8 @@ def identify_experiment(
         Options; ``None``: the defaults.
     progress
         Called with a stage and the share done, 0 to 1.
+    setup
+        Check of the set-up of these recordings, which enters the verdict; ``None``: not made.
 
     Raises
     ------
@@ -89,24 +95,39 @@ def identify_experiment(
     """
     experiments = [experiments] if isinstance(experiments, Experiment) else list(experiments)
     _check(experiments, robot)
-    # The matrices are tall and narrow: threads gain little, delay each other on a busy machine, and round differently.
-    with threadpool_limits(1):  # type: ignore[no-untyped-call]
-        return _identify(experiments, robot, options or Options(), _Clock(progress or (lambda stage, share: None)))
+    clock = _Clock(progress or (lambda stage, share: None))
+    try:
+        # The matrices are tall and narrow: threads gain little, delay each other on a busy machine, round differently.
+        with threadpool_limits(1):  # type: ignore[no-untyped-call]
+            return _identify(experiments, robot, options or Options(), clock, setup)
+    except DataError as error:
+        known = judge([], setup).reasons
+        if not known:
+            raise
+        cause = f"{known[0].message}. Next: {known[0].next_step}"
+        raise DataError(f"{str(error).rstrip('.')}. Set-up: {cause}") from error
 
 
 def _identify(
-    experiments: Sequence[Experiment], robot: RobotConfig, options: Options, clock: "_Clock"
+    experiments: Sequence[Experiment],
+    robot: RobotConfig,
+    options: Options,
+    clock: "_Clock",
+    setup: SetupCheck | None,
 ) -> Identification:
     """Carry out the steps of the thesis in their order."""
-    warnings: list[str] = []
+    notes = Notes()
+    criteria = IdentificationCriteria()
 
     clock.enter("model", 0.0)
+    moving = moving_joints(experiments, robot, criteria)
+    require_motion(experiments, robot, moving)
     experiments = put_right(experiments, robot)
     bandwidth = (
         options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], experiments[0].dt)
     )
     given, robot = robot, with_sign_smoothing(robot, experiments, bandwidth)
-    warnings += unsaturated_joints(given, robot, experiments, bandwidth)
+    notes.reasons += [_interval_reason(line) for line in unsaturated_joints(given, robot, experiments, bandwidth)]
     model = arm_model(robot)
 
     clock.enter("derivatives", 0.05)
@@ -116,54 +137,85 @@ def _identify(
     if any(term.depends_on_torque for term in model.terms):
         model = _with_predicted_torques(model, experiments, signals, bandwidth)
     prepared = Prepared(model, experiments, signals)
-    ls = _least_squares(prepared, options, bandwidth, warnings)
+    ls = _least_squares(prepared, options, bandwidth, moving, criteria, notes)
+    support = examine_support(prepared, ls.blocks, ls.decimation, moving, criteria, ls.estimate.noise)
 
-    if options.method == "idim-ls":
-        solution, found = None, MethodResult(ls.estimate, ls.blocks, {"kind": "none"})
-    else:
-        clock.enter("controller", 0.35)
-        solution, found = _solve_in_closed_loop(prepared, options, ls, bandwidth, clock, warnings)
+    with refusing_singular(options.method, model, support, criteria):
+        doubts: tuple[str, ...] = ()
+        if options.method == "idim-ls":
+            solution, found = None, MethodResult(ls.estimate, ls.blocks, {"kind": "none"})
+            doubts = doubts_of_least_squares(prepared, options, ls, bandwidth)
+        else:
+            clock.enter("controller", 0.35)
+            solution, found = _solve_in_closed_loop(prepared, options, ls, bandwidth, clock, notes)
+        require_finite(found.estimate)
+        clock.enter("statistics", 0.85)
+        statistics = _statistics(prepared, found, solution)
+        statistics = replace(statistics, interval_warnings=(*statistics.interval_warnings, *doubts))
+        if options.physical:
+            clock.enter("physical", 0.95)
+            physical = nearest_consistent(model, found.estimate.theta, found.estimate.covariance)
+            statistics = replace(statistics, physical=physical)
 
-    clock.enter("statistics", 0.85)
-    statistics = _statistics(prepared, found, solution, warnings)
-    if options.physical:
-        clock.enter("physical", 0.95)
-        physical = nearest_consistent(model, found.estimate.theta, found.estimate.covariance)
-        statistics = replace(statistics, physical=physical)
-        if not physical.compatible:
-            warnings.append(physical.verdict)
+    clock.enter("verdict", 0.97)
+    reasons = judgement(Judged(prepared, options, ls, found, solution, statistics, support), criteria)
+    doubtful = [_interval_reason(line) for line in statistics.interval_warnings]
+    verdict = judge([*notes.reasons, *reasons, *doubtful], setup)
+    if verdict.of_kind("excitation"):
+        statistics = replace(statistics, essential=statistics.essential & support.supported)
     clock.done()
-    return make_result(options, model, found, ls, statistics, warnings, clock.spent)
+    return make_result(options, model, found, ls, statistics, (verdict, criteria), notes.warnings, clock.spent)
 
 
-def _least_squares(prepared: Prepared, options: Options, bandwidth: float, warnings: list[str]) -> LeastSquares:
+def _least_squares(
+    prepared: Prepared,
+    options: Options,
+    bandwidth: float,
+    moving: NDArray[np.bool_],
+    criteria: IdentificationCriteria,
+    notes: Notes,
+) -> LeastSquares:
     """IDIM-LS (2.3.2); its equations are decimated by the bandwidth, the user's factor, or the noise (6.2.3)."""
     model, experiments = prepared.model, prepared.experiments
     lengths = [e.q.shape[0] for e in experiments]
 
     def decimation(factor: int | None) -> Decimation:
         dt, rows = experiments[0].dt, least_rows(model)
-        return decimation_of("idim-ls", dt, bandwidth, factor, samples=lengths, rows=rows, warnings=warnings)
+        return decimation_of(
+            "idim-ls",
+            dt,
+            bandwidth,
+            factor,
+            samples=lengths,
+            rows=rows,
+            warnings=notes.warnings,
+            reasons=notes.reasons,
+        )
 
     def estimate(blocks: Sequence[ExperimentEquations]) -> Estimate:
-        return idim_ls(blocks, model.base.names, weighted=options.weighted)
+        try:
+            return idim_ls(blocks, model.base.names, weighted=options.weighted)
+        except DataError as error:
+            support = examine_support(prepared, blocks, plain, moving, criteria)
+            raise DataError(f"{error}; {support.sentence(model, criteria)}. Next: {MOVE}") from error
 
     # A factor chosen by the user is that of the method; a method with a noise model keeps its own for the comparison.
     factor = options.decimation if isinstance(options.decimation, int) else None
     plain = decimation(None if options.method in PREFILTERED else factor)
     published = model.robot.preprocessing
-    if options.derivatives is None and options.decimation is None and published is not None:
+    as_published = options.derivatives is None and options.decimation is None and published is not None
+    if as_published and published is not None:
         blocks = published_equations(model, experiments, published)
     else:
         blocks = prepared.equations(plain)
     ls = estimate(blocks)
     if options.decimation == "noise":
-        factor = _memory_of_noise(prepared, ls.theta, warnings)
+        factor = _memory_of_noise(prepared, ls.theta, notes.reasons)
         if options.method not in PREFILTERED:
             plain = decimation(factor)
             blocks = prepared.equations(plain)
             ls = estimate(blocks)
-    return LeastSquares(ls, blocks, plain, factor)
+    return LeastSquares(ls, blocks, plain, factor, as_published)
 
 
 def _solve_in_closed_loop(
@@ -172,7 +224,7 @@ def _solve_in_closed_loop(
     ls: LeastSquares,
     bandwidth: float,
     clock: "_Clock",
-    warnings: list[str],
+    notes: Notes,
 ) -> tuple[Solution, MethodResult]:
     """Controller (5.2), auxiliary closed loop, and the method; a second time if the controller proves unsuitable."""
     experiments, rows = prepared.experiments, least_rows(prepared.model)
@@ -183,7 +235,8 @@ def _solve_in_closed_loop(
         ls.factor,
         samples=[e.q.shape[0] for e in experiments],
         rows=rows,
-        warnings=warnings,
+        warnings=notes.warnings,
+        reasons=notes.reasons,
     )
 
     def in_loop(loop: ClosedLoop) -> Solution:
@@ -201,14 +254,19 @@ def _solve_in_closed_loop(
             if not _defect_of_loop(second, prepared.signals):
                 solution = second
                 loop = other._replace(controller=other.controller | {"reason": defect}, warnings=(defect,))
-    estimate = solution.estimate
-    warnings += [*loop.warnings, *solution.warnings, *estimate.warnings]
-    if not estimate.converged:
-        warnings.append(f"{options.method} did not converge: {estimate.stop_reason}")
-    return solution, MethodResult(estimate, solution.problem.blocks, loop.controller, solution.noise_of)
+    notes.warnings += [*loop.warnings, *_iterates(solution.estimate.warnings)]
+    notes.reasons += [reason for reason in solution.reasons if reason.kind != "residual"]
+    return solution, MethodResult(solution.estimate, solution.problem.blocks, loop.controller, solution.noise_of)
 
 
-def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | None, warnings: list[str]) -> Statistics:
+def _iterates(warnings: Sequence[str]) -> list[str]:
+    """Warnings of an estimator, those of its iterates in one line."""
+    if len(warnings) < 2:
+        return list(warnings)
+    return [f"{len(warnings)} iterates needed correction; the first: {warnings[0]}"]
+
+
+def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | None) -> Statistics:
     """Essential parameters, tests of the estimate, and the delay of the torques where a reference was recorded."""
     model, estimate = prepared.model, found.estimate
     used = sum(r.size for series in estimate.residuals for r in series)
@@ -220,10 +278,16 @@ def _statistics(prepared: Prepared, found: MethodResult, solution: Solution | No
         )
     diagnostics = solution.diagnostics(essential)
     if found.controller["kind"] not in CONTROLLERS:
-        return Statistics(essential, diagnostics)
+        return Statistics(essential, diagnostics, interval_warnings=solution.interval_warnings, bias=solution.bias)
     delay = solution.delay()
-    warnings += _delay_warnings(delay, model.robot)
-    return Statistics(essential, diagnostics, delay)
+    return Statistics(essential, diagnostics, delay, interval_warnings=solution.interval_warnings, bias=solution.bias)
+
+
+def _interval_reason(line: str) -> Reason:
+    """Reason for the verdict from a line about intervals, which ends with the next step."""
+    message, _, step = line.partition(" Next: ")
+    message = message.rstrip(".")
+    return Reason("doubtful", message[0].lower() + message[1:], step.rstrip("."), kind="uncertainty")
 
 
 def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
@@ -232,7 +296,7 @@ def _defect_of_loop(solution: Solution, signals: Sequence[Derivatives]) -> str:
     A controller can move the arm with the first estimate and, at the edge of stability, not with a later one. Then the
     iterates do not settle, or settle where the instruments have little to do with the motion.
     """
-    runs = solution.problem.auxiliary.simulate(solution.estimate.theta)
+    runs = solution.runs
     if runs is None:
         defect = "diverges with"
     elif (error := velocity_error(runs, signals)) >= RELEVANT:
@@ -264,7 +328,7 @@ def _with_predicted_torques(
     return model
 
 
-def _memory_of_noise(prepared: Prepared, theta: Array, warnings: list[str]) -> int:
+def _memory_of_noise(prepared: Prepared, theta: Array, reasons: list[Reason]) -> int:
     """Decimation factor after which the residuals of IDIM-LS at the full rate are hardly correlated (6.2.3)."""
     model = prepared.model
     errors = [
@@ -275,21 +339,12 @@ def _memory_of_noise(prepared: Prepared, theta: Array, warnings: list[str]) -> i
     ]
     found = decimation_from_noise(errors)
     if found.bounded:
-        warnings.append(
-            f"The noise is correlated over more than {found.factor} samples, the limit of the decimation: "
-            "standard deviations may be too small."
+        message = (
+            f"The noise is correlated over more than {found.factor} samples, the limit of the decimation: standard "
+            "deviations may be too small"
         )
+        reasons.append(Reason("doubtful", message, "use --method idim-piv", kind="uncertainty"))
     return found.factor
-
-
-def _delay_warnings(delay: TorqueDelay, robot: RobotConfig) -> list[str]:
-    """A warning for every joint whose torque is recorded more than a sample away from its expected position."""
-    off = delay.contradicts() & (np.abs(delay.samples - HELD) > TOLERATED_DELAY)
-    return [
-        f"{joint.name}: the torque belongs to the position {samples:.1f} +- {std:.1f} samples later, expected is {HELD}"
-        for joint, samples, std, wrong in zip(robot.joints, delay.samples, delay.std, off, strict=True)
-        if wrong
-    ]
 
 
 def _derivatives(

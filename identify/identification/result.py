@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.identify.estimators.diagnostics import Diagnostics
+from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.options import Options
 from armident.identify.identification.torque_delay import TorqueDelay
+from armident.identify.identification.verdict import Verdict
 from armident.identify.regression.ar_noise import whiteness
 from armident.identify.regression.equations import Estimate, ExperimentEquations, residuals
 from armident.identify.robot.arm import ArmModel
@@ -18,6 +20,9 @@ from armident.identify.robot.consistent import ConsistentParameters
 from armident.identify.signals.decimate import Decimation
 
 Array = NDArray[np.float64]
+
+WORTHLESS_PCT = 100.0
+"""Relative torque error, percent, of parameters that are all zero."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,10 @@ class Identification:
 
     Parameters
     ----------
+    verdict
+        Judgement of the result with its reasons.
+    criteria
+        Limits of the verdict.
     method
         Name of the method.
     names, units, formulas, theta, std, covariance, essential
@@ -58,10 +67,15 @@ class Identification:
         Delay of the recorded torques against the positions; ``None`` without a reference trajectory.
     sign_smoothing
         ``g`` (n,) of each joint's smoothed sign, s/rad or s/m.
+    interval_warnings
+        Reasons why the standard deviations are doubtful; they are among the reasons of the verdict, too.
+    bias
+        Bias (b,) by derivatives, encoder noise and sampling that was subtracted, SI; ``None``: irrelevant.
     relative_error_pct, relative_error_pct_by_joint
         ``|y - X theta| / |y|`` on the torques decimated to twice the bandwidth, overall and (n,), percent.
     iterations, converged, stop_reason
-        Iterations of the method, true if they converged, and the rule that ended them.
+        Iterations of the method, true if they converged to parameters that explain torques better than none, and the
+        rule that ended them.
     whiteness, residual_autocorrelation, autocorrelation_bound
         Whiteness test of the whitened residuals, their autocorrelation (n, lags), and its 2-sigma bound (n,).
     noise_model
@@ -80,6 +94,8 @@ class Identification:
         Decimated instants (M,), s, and torques (M, n), N m or N, experiments one after the other.
     """
 
+    verdict: Verdict
+    criteria: IdentificationCriteria
     method: str
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -92,6 +108,8 @@ class Identification:
     physical: ConsistentParameters | None
     delay: TorqueDelay | None
     sign_smoothing: Array
+    interval_warnings: tuple[str, ...]
+    bias: Array | None
     relative_error_pct: float
     relative_error_pct_by_joint: Array
     iterations: int
@@ -124,12 +142,15 @@ class LeastSquares:
         Parallel filter of the methods without a noise model.
     factor
         Decimation factor chosen by the user or from the noise; ``None``: from the bandwidth.
+    published
+        True for the filters of a published fit.
     """
 
     estimate: Estimate
     blocks: Sequence[ExperimentEquations]
     decimation: Decimation
     factor: int | None
+    published: bool = False
 
 
 @dataclass(frozen=True)
@@ -166,12 +187,18 @@ class Statistics:
         Delay of the recorded torques; ``None`` without a reference trajectory.
     physical
         Nearest physically consistent parameters; ``None`` if not requested.
+    interval_warnings
+        Reasons why the standard deviations are doubtful.
+    bias
+        Bias (b,) that was subtracted from the estimate, SI; ``None``: irrelevant.
     """
 
     essential: NDArray[np.bool_]
     diagnostics: Diagnostics
     delay: TorqueDelay | None = None
     physical: ConsistentParameters | None = None
+    interval_warnings: tuple[str, ...] = ()
+    bias: Array | None = None
 
 
 def make_result(
@@ -180,6 +207,7 @@ def make_result(
     found: MethodResult,
     ls: LeastSquares,
     statistics: Statistics,
+    judged: tuple[Verdict, IdentificationCriteria],
     warnings: Sequence[str],
     timing_s: dict[str, float],
 ) -> Identification:
@@ -193,6 +221,8 @@ def make_result(
         Estimate of the method, and of IDIM-LS for comparison.
     statistics
         Tests of the estimate of the method.
+    judged
+        Verdict, and its limits.
     warnings
         Lines for the user; each is kept once.
     timing_s
@@ -202,7 +232,12 @@ def make_result(
     joints = [joint.name for joint in model.robot.joints]
     overall, by_joint = relative_errors(ls_blocks, estimate.theta)
     tests = [whiteness(series) for series in estimate.residuals]
+    converged, stop_reason = estimate.converged, estimate.stop_reason
+    if converged and not overall < WORTHLESS_PCT:
+        converged, stop_reason = False, f"the parameters explain less than none: torque error {overall:.3g} %"
     return Identification(
+        verdict=judged[0],
+        criteria=judged[1],
         method=options.method,
         names=model.base.names,
         formulas={name: formula for name, formula in model.base.formulas.items() if formula != name},
@@ -215,11 +250,13 @@ def make_result(
         physical=statistics.physical,
         delay=statistics.delay,
         sign_smoothing=model.smoothing,
+        interval_warnings=statistics.interval_warnings,
+        bias=statistics.bias,
         relative_error_pct=overall,
         relative_error_pct_by_joint=by_joint,
         iterations=estimate.iterations,
-        converged=estimate.converged,
-        stop_reason=estimate.stop_reason,
+        converged=converged,
+        stop_reason=stop_reason,
         whiteness=tuple(
             JointWhiteness(name, test.lags, test.fraction_outside) for name, test in zip(joints, tests, strict=True)
         ),

@@ -169,13 +169,16 @@ def compare(
     DataError
         If they are of different robots or models.
     Inconclusive
-        If one of them did not converge, or is far less precise than the other.
+        If one of them is unusable or did not converge, or is far less precise than the other.
     """
     for name, document in (("the baseline", baseline), ("the identification", now)):
         if not document.converged:
             raise Inconclusive(
                 f"{now.robot}: {name} did not converge ({document.stop_reason}): whether the arm has changed is unknown"
             )
+        if document.verdict == "unusable":
+            defect = document.reasons[0].message
+            raise Inconclusive(f"{now.robot}: {name} is unusable ({defect}): whether the arm has changed is unknown")
     if baseline.robot != now.robot:
         raise DataError(f"the baseline is of robot {baseline.robot!r}, the identification of {now.robot!r}")
     old = {p.name: k for k, p in enumerate(baseline.parameters)}

@@ -266,15 +266,18 @@ class Worker:
         self._session.put(self._keys.identification, self._last)
         name = assembly.capture if recording.path is None else recording.path.name.removesuffix(".mcap")
         document, report = write_identification(outcome, self._out / f"{name}.identification")
-        self._status("done", capture=assembly.capture, result=str(document))
+        level = outcome.result.verdict.level
+        self._status("done", capture=assembly.capture, result=str(document), verdict=level)
+        for reason in outcome.result.verdict.reasons:
+            log.warning("%s: %s. Next: %s", reason.level, reason.message, reason.next_step)
         for warning in outcome.document.warnings:
             log.warning("%s", warning)
         print(
-            f"worker: relative torque error {outcome.document.relative_error_pct:.2f} %\n"
+            f"worker: {level}, relative torque error {outcome.document.relative_error_pct:.2f} %\n"
             f"result: {document}\nreport: {report}",
             flush=True,
         )
-        return 0
+        return DataError.exit_code if level == "unusable" else 0
 
     def _status(self, state: str, **more: Any) -> None:
         self._session.put(self._keys.status, json.dumps({"component": "worker", "state": state, **more}).encode())

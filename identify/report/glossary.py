@@ -142,10 +142,16 @@ EFFECT_PARAMETERS: dict[str, dict[str, str]] = {
     "sign_error": {
         "position": "1: the position signal has the wrong sign.",
         "torque": "1: the torque signal has the wrong sign.",
+        "joint_side": "1: the signals of the joint, in SI units, not those of the drive.",
     },
     "joint_order": {
         "position": "1: the position signals are exchanged.",
         "torque": "1: the torque signals are exchanged.",
+        "joint_side": "1: columns of the joints, in SI units, not raw numbers of the drives.",
+    },
+    "signal_scale": {
+        "position": "True over recorded position; with another joint, the multiple of its position that is added.",
+        "torque": "True over recorded torque; with another joint, the multiple of its torque that is added.",
     },
 }
 """Meaning of every parameter of the effects of this package."""
@@ -165,6 +171,15 @@ CONVENTIONS: tuple[Entry, ...] = (
 """Rules by which parameter names are formed."""
 
 IDENTIFICATION_TERMS: tuple[Entry, ...] = (
+    Entry("trustworthy", "Verdict of an identification: no check found a defect."),
+    Entry("doubtful", "Verdict of an identification: the parameters can be used within the limits that the reasons "
+          "state."),
+    Entry("unusable", "Verdict of an identification: the parameters must not be used. `armident identify` ends with "
+          "exit code 3."),
+    Entry("nearest possible arm", "Physically consistent parameters closest to an estimate, in units of its "
+          "covariance. If they explain the torques too, impossible values come from small model errors."),
+    Entry("determined", "Parameter whose standard deviation is at most a third of its value, in a fit of those that "
+          "the motion supports together."),
     Entry("base parameters", "Smallest set of parameters that determines the torques; combinations of the standard "
           "ones (thesis section A.3)."),
     Entry("standard deviation", "One standard deviation of an estimate, from the covariance of the regression."),
@@ -173,7 +188,7 @@ IDENTIFICATION_TERMS: tuple[Entry, ...] = (
     Entry("essential", "Base parameters that the data need. The others are removed one by one, the largest relative "
           "standard deviation first, while an F-test does not reject this (level 1 %)."),
     Entry("relative torque error", "Norm of the difference between measured and predicted torques over the norm of the "
-          "measured ones, percent."),
+          "measured ones, percent. Above a third at a joint, the model does not describe it."),
     Entry("residual", "Measured minus predicted torque."),
     Entry("whiteness", "Fraction of the residual's autocorrelation lags outside two standard deviations. White noise "
           "has 5 %; more means that the residual contains model error, and standard deviations may be too small."),

@@ -19,8 +19,6 @@ GOOD_PCT = 5.0
 """Relative standard deviation, percent, up to which a parameter counts as well determined."""
 FAIR_PCT = 20.0
 """Relative standard deviation, percent, up to which a parameter counts as usable."""
-WHITE = 0.15
-"""Fraction of autocorrelation lags outside two standard deviations up to which residuals count as white."""
 
 
 def identification_report(
@@ -51,7 +49,7 @@ def identification_report(
         autocorrelation=_autocorrelation_figure(result.residual_autocorrelation, result.autocorrelation_bound, joints),
         controller=_controller_figure(document.controller),
         beside={} if document.comparison is None else {p.name: p.value for p in document.comparison.parameters},
-        white=_white_words(document),
+        residuals=_residual_words(document),
         glossary=identification_entries(document),
     )
 
@@ -173,19 +171,14 @@ def _units(robot: RobotConfig) -> list[str]:
     return ["N m" if joint.type == "revolute" else "N" for joint in robot.joints]
 
 
-def _white_words(document: IdentificationDocument) -> str:
-    worst = max(document.whiteness, key=lambda w: w.fraction_outside_2sigma, default=None)
-    if worst is None:
-        return "not tested"
-    outside = 100 * worst.fraction_outside_2sigma
-    if worst.fraction_outside_2sigma <= WHITE:
-        return (
-            f"white (at most {outside:.0f} % of the lags outside, on {worst.joint}): standard deviations are reliable"
-        )
-    return (
-        f"not white ({outside:.0f} % of the lags outside on {worst.joint}): they contain model error, and the standard "
-        "deviations may be too small"
-    )
+def _residual_words(document: IdentificationDocument) -> str:
+    """State in one sentence what the verdict says of the residuals."""
+    reasons = [reason.message for reason in document.reasons if reason.kind in ("residual", "uncertainty")]
+    if reasons:
+        return " ".join(f"{message}." for message in reasons)
+    if document.verdict == "unusable":
+        return "They were not tested: the result is unusable."
+    return "No test finds serial correlation or model error in them."
 
 
 def _continued(t: Array) -> Array:

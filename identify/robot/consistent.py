@@ -205,6 +205,54 @@ def nearest_consistent(model: ArmModel, theta_base: ArrayLike, covariance: Array
     )
 
 
+@dataclass(frozen=True, eq=False)
+class NearestBase:
+    """Base parameters of the nearest physically consistent arm, without the choice among equal ones and without test.
+
+    Parameters
+    ----------
+    theta
+        Base parameters (b,), SI.
+    shifts
+        Their changes in standard deviations of the estimate (b,).
+    distance
+        Mahalanobis distance from the estimate, standard deviations.
+    """
+
+    theta: Floats
+    shifts: Floats
+    distance: float
+
+
+def nearest_base(model: ArmModel, theta_base: ArrayLike, covariance: ArrayLike) -> NearestBase:
+    """Find the base parameters of the nearest physically consistent arm: one semidefinite programme.
+
+    Parameters
+    ----------
+    model
+        Arm with b base parameters.
+    theta_base
+        Estimate of the base parameters (b,), SI.
+    covariance
+        Covariance of the estimate (b, b), positive definite.
+
+    Raises
+    ------
+    DataError
+        If shapes are wrong, numbers are not finite, or the covariance is not positive definite.
+    ArmidentError
+        If the solver fails.
+    """
+    theta, p = _checked(model, theta_base, covariance)
+    std = np.sqrt(np.diag(p))
+    factor = std[:, None] * linalg.cholesky(p / np.outer(std, std), lower=True)
+    whitened = linalg.solve_triangular(factor, theta, lower=True)
+    projection = _Projection(model, factor, max(float(np.sqrt(np.mean(whitened**2))), 1.0))
+    standard, residual = projection.nearest(whitened)
+    base = model.base.regroup @ _inside(model, standard)
+    return NearestBase(base, np.asarray((base - theta) / std), float(np.linalg.norm(residual)))
+
+
 def identifiability(model: ArmModel) -> tuple[Identifiability, ...]:
     """Identifiability of each standard parameter (p,) from torques: ``alone``, in a ``group``, or ``no``.
 

@@ -125,10 +125,18 @@ class CountingModel(AuxiliaryModel):
         zeta = super().instruments(theta)
         return [between(z) for z in zeta] if self.midway else zeta
 
-    def simulate(self, theta: Array) -> list[Simulation] | None:
-        """Simulate the closed loop and count the simulation; ``None`` if it diverges."""
+    def simulate(self, theta: Array, disturbances: Sequence[Array] | None = None) -> list[Simulation] | None:
+        """Simulate the closed loop and count the simulation; ``None`` if it diverges.
+
+        Parameters
+        ----------
+        theta
+            Base parameters (b,), SI.
+        disturbances
+            Additional motor torques, N m or N, one (N, n) array per experiment.
+        """
         self.asked.append(1)
-        return super().simulate(theta)
+        return super().simulate(theta, disturbances)
 
 
 class Laboratory:

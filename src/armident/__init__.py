@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from armident.identify.api import Diagnosis as Diagnosis
     from armident.identify.api import Effect as Effect
     from armident.identify.api import Identification as Identification
+    from armident.identify.api import check as check
     from armident.identify.api import compare as compare
     from armident.identify.api import design_trajectory as design_trajectory
     from armident.identify.api import diagnose as diagnose
@@ -39,8 +40,8 @@ _HOMES = {
     "armident.daq.api": ("capture", "import_recording"),
     "armident.daq.recording": ("Recording", "read_recording"),
     "armident.identify.api": (
-        "ChangeTest", "Design", "Diagnosis", "Effect", "Identification", "compare", "design_trajectory", "diagnose",
-        "effects",
+        "ChangeTest", "Design", "Diagnosis", "Effect", "Identification", "check", "compare", "design_trajectory",
+        "diagnose", "effects",
     ),
     "armident.identify.robot_model": ("RobotModel",),
     "armident.virtual_robot.api": ("simulate_recording",),

@@ -121,6 +121,24 @@ def test_stream_and_file_give_the_same_numbers_to_the_last_bit(tmp_path: Path) -
     assert answered.parameters == streamed.parameters
 
 
+def test_an_unusable_result_is_published_with_its_verdict_and_ends_with_exit_code_3(
+    captured: Recording, session: SessionConfig, tmp_path: Path
+) -> None:
+    samples = captured.samples
+    name = samples.named("voltage")
+    assert name is not None
+    turned = replace(samples.fields[name], scale=tuple(-scale for scale in samples.fields[name].scale))
+    wrong = replace(samples, fields={**samples.fields, name: turned})
+    with Worker(session, captured.robot, tmp_path) as worker:
+        publish(replace(captured, streams={**captured.streams, "samples": wrong}), session)
+        assert worker.result(LONGEST_S) == 3
+        replies = answers(session, Keys(session.cell, "emps").identification)
+    assert replies[0].ok is not None
+    published = from_json(bytes(replies[0].ok.payload).decode(), IdentificationDocument, "answer")
+    assert published.verdict == "unusable"
+    assert published.reasons[0].next_step
+
+
 def test_a_capture_too_long_for_the_memory_is_read_from_its_file(
     captured: Recording,
     session: SessionConfig,

@@ -160,7 +160,7 @@ def run_once(seed: int, method: Method, noise: float, folder: Path) -> Path:
         theta=result.theta,
         covariance=result.covariance,
         converged=result.converged,
-        stepped_back=any("noise model cannot explain" in warning for warning in result.warnings),
+        stepped_back=any("a noise model would move" in reason.message for reason in result.verdict.reasons),
         orders=[joint["order"] for joint in result.noise_model["joints"]],
         outside=[joint.fraction_outside_2sigma for joint in result.whiteness],
     )

@@ -195,6 +195,8 @@ def _judged(
         history.add(document, History.began(found.facts, document, Path(found.path)))
         if not document.converged:
             raise DataError(f"the identification did not converge ({document.stop_reason})")
+        if document.verdict == "unusable":
+            raise DataError(f"the identification is unusable ({document.reasons[0].message})")
         baselines.setdefault(arm, first or document)
         drift = None if first is None else compare(first, document, false_alarms)
         if drift is None or first is None:

@@ -222,13 +222,16 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
     folder = _beside(recording, job.out, "identification")
     path, _ = write_identification(done, folder)
     document = done.document
+    for reason in document.reasons:
+        say(f"{reason.level}: {reason.message}. Next: {reason.next_step}")
     for warning in document.warnings:
         say(f"warning: {warning}")
     say(f"identified: relative torque error {document.relative_error_pct:.2f} %")
-    if not document.converged:
+    if document.verdict == "unusable" or not document.converged:
         keep(job.history, recording, document, path, None, None)
+        defect = document.reasons[0].message if document.reasons else document.stop_reason
         raise DataError(
-            f"{recording.path}: the identification did not converge ({document.stop_reason}): "
+            f"{recording.path}: the identification is not usable ({defect}): "
             f"whether the arm has changed is unknown (result: {path})"
         )
     try:

@@ -54,8 +54,8 @@ def test_viscous_friction_as_a_term_moves_the_simulated_arm_like_that_of_the_mod
     more = theta.copy()
     more[model.base.names.index("fv2")] += 2.0
     expected = simulate(model, more, controller, q_ref, DT)
-    stanza = Effect(effect="nonlinear_viscous_friction", joint="joint_2", parameters={"velocity": 100.0})
-    extended = arm_model(with_effects(robot, stanza))
+    entry = Effect(effect="nonlinear_viscous_friction", joint="joint_2", parameters={"velocity": 100.0})
+    extended = arm_model(with_effects(robot, entry))
     # Far below its characteristic velocity, 100 rad/s, the term is viscous friction.
     found = simulate_with_terms(extended, np.append(theta, 2.0 * 100.0), controller, q_ref, DT)
     lag = np.abs(expected.q - simulate(model, theta, controller, q_ref, DT).q).max()
@@ -80,9 +80,9 @@ def test_a_simulated_arm_feels_the_torque_that_its_own_motion_gives_a_term(
     model = arm_model(robot)
     q_ref = reference(robot)
     controller = nominal_controller(model, theta, q_ref[::50], DT, 10.0)
-    stanza = Effect(effect=effect, joint="joint_1", parameters=shapes)
+    entry = Effect(effect=effect, joint="joint_1", parameters=shapes)
     whole = np.append(theta, linear)
-    extended = arm_model(with_effects(robot, stanza)).anchored(whole)
+    extended = arm_model(with_effects(robot, entry)).anchored(whole)
     found = simulate_with_terms(extended, whole, controller, q_ref, DT, band_hz=30.0)
     assert found.diverged_at is None
     torque = extended.term_regressor(extended.motion(found.q, found.qd, found.qdd, DT))[:, 0, 0] * linear

@@ -43,8 +43,8 @@ def test_two_unlike_drives_exchanged_are_put_back_as_they_were(signals: dict[str
 def test_every_exchange_undoes_itself() -> None:
     robot = load_robot("tx40")
     both = {"position": 1.0, "torque": 1.0}
-    stanza = Effect(effect="joint_order", joint="joint_3", other="joint_6", parameters=both)
-    for matrix in exchanges(robot.model_copy(update={"effects": (stanza,)})):
+    entry = Effect(effect="joint_order", joint="joint_3", other="joint_6", parameters=both)
+    for matrix in exchanges(robot.model_copy(update={"effects": (entry,)})):
         np.testing.assert_allclose(matrix @ matrix, np.eye(6), atol=1e-12)
         assert (np.count_nonzero(matrix, axis=0) == 1).all()
 

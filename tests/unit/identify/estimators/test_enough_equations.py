@@ -21,6 +21,7 @@ from armident.identify.identification.equations import (
 )
 from armident.identify.identification.options import Method
 from armident.identify.identification.solvers import decimation_of
+from armident.identify.identification.verdict import Reason
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import differentiate
 
@@ -77,22 +78,23 @@ def test_a_motion_fast_enough_is_not_warned_about() -> None:
     assert not warnings
 
 
-def test_a_factor_by_hand_stands_with_a_warning() -> None:
-    warnings: list[str] = []
-    found = decimation_of("idim-ls", DT, 2.0, 250, samples=SAMPLES, rows=92, warnings=warnings)
+def test_a_factor_by_hand_stands_and_makes_the_result_doubtful() -> None:
+    reasons: list[Reason] = []
+    found = decimation_of("idim-ls", DT, 2.0, 250, samples=SAMPLES, rows=92, reasons=reasons)
     assert found.factor == 250
-    (warning,) = warnings
-    assert "decimation by 250 leaves 6 equations per joint, fewer than 92" in warning
-    assert warning.endswith("record longer or decimate less.")
+    (reason,) = reasons
+    assert reason.level == "doubtful"
+    assert "decimation by 250 leaves 6 equations per joint, fewer than 92" in reason.message
+    assert reason.next_step == "record longer or decimate less"
 
 
-def test_a_recording_too_short_for_any_decimation_keeps_all_samples_with_a_warning() -> None:
-    warnings: list[str] = []
-    found = decimation_of("idim-ls", DT, 2.0, None, samples=(80,), rows=92, warnings=warnings)
+def test_a_recording_too_short_for_any_decimation_keeps_all_samples_and_is_doubtful() -> None:
+    reasons: list[Reason] = []
+    found = decimation_of("idim-ls", DT, 2.0, None, samples=(80,), rows=92, reasons=reasons)
     assert found.factor == 1
-    (warning,) = warnings
-    assert "leaves 80 equations per joint, fewer than 92" in warning
-    assert warning.endswith("record longer.")
+    (reason,) = reasons
+    assert "leaves 80 equations per joint, fewer than 92" in reason.message
+    assert reason.next_step == "record longer"
 
 
 def test_equations_of_slow_motion_are_as_many_as_promised() -> None:

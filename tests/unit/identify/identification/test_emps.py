@@ -86,7 +86,10 @@ def test_prefilter_that_contradicts_the_instruments_is_not_believed(emps: Experi
     found = identify_experiment(emps, load_robot("emps"))
     assert found.method == "idim-piv"
     assert found.converged
-    assert any("the model misses an effect" in warning for warning in found.warnings)
+    (reason,) = found.verdict.of_kind("residual")
+    assert found.verdict.level == "doubtful"
+    assert "a noise model would move fc1 by" in reason.message
+    assert "errors of the model" in reason.message
     np.testing.assert_allclose(found.theta, ls.theta, rtol=0.02)
     assert (found.std > 1.2 * ls.std).all()
     assert found.whiteness[0].fraction_outside_2sigma <= 0.1

@@ -129,6 +129,23 @@ def test_each_recording_of_the_kuka_is_explained_up_to_1_7_percent(kuka: list[Ex
         assert found.relative_error_pct < 1.7
 
 
+def test_both_arms_are_usable_although_some_values_are_impossible(kuka: list[Experiment], panda: Experiment) -> None:
+    """Behind the gears, wrist inertias and friction are so small that model errors make them negative."""
+    for experiments, robot in ((kuka, KUKA), ([panda], PANDA)):
+        verdict = least_squares(experiments, robot).verdict
+        assert verdict.level == "doubtful"
+        (reason,) = verdict.of_kind("physics")
+        assert "mass matrix is not positive definite" in reason.message
+        assert "The nearest possible arm leaves" in reason.message
+
+
+def test_a_joint_whose_ripple_is_not_modelled_makes_the_arm_unusable(kuka: list[Experiment]) -> None:
+    """Without its effects, the model leaves 64 % of the torque of joint 7, mostly ripple."""
+    (reason,) = least_squares(kuka, RIGID).verdict.of_kind("error")
+    assert reason.level == "unusable"
+    assert reason.joint == "lwr_6_joint"
+
+
 def test_too_low_a_bandwidth_leaves_the_kuka_ten_equations_per_parameter_all_the_same(kuka: list[Experiment]) -> None:
     model, dt, slow = arm_model(RIGID), kuka[0].dt, kuka[:2]
     lengths, rows = [len(e.q) for e in slow], least_rows(model)

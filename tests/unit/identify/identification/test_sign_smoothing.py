@@ -66,14 +66,14 @@ def test_friction_of_a_slow_prismatic_joint_is_not_biased_by_the_smoothing(metho
     assert friction["fv1"] == pytest.approx(VISCOUS, rel=0.02)
     assert friction["fc1"] == pytest.approx(COULOMB, rel=0.01)
     assert found.sign_smoothing[0] == pytest.approx(SATURATION / 0.15, rel=0.2)
-    assert not any("smoothed sign" in warning for warning in found.warnings)
+    assert not any("smoothed sign" in reason.message for reason in found.verdict.reasons)
 
 
 def test_a_smoothing_wider_than_the_motion_is_reported_with_the_joint() -> None:
     found = identify_experiment(recorded(), lift(150.0), Options(method="idim-ls"))
-    (warning,) = (warning for warning in found.warnings if "smoothed sign" in warning)
-    assert warning.startswith("lift:")
-    assert "Coulomb and viscous friction are biased" in warning
+    (reason,) = (r for r in found.verdict.reasons if r.message.startswith("lift: the smoothed sign"))
+    assert reason.level == "doubtful"
+    assert "Coulomb and viscous friction are biased" in reason.message
     assert found.theta[1] < 0.8 * VISCOUS
 
 

@@ -4,11 +4,13 @@ import re
 from pathlib import Path
 
 import pytest
+from markupsafe import escape
 
-from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.document import IdentificationDocument, VerdictReason, load_document
 from armident.identify.identification.api import IdentificationOutcome, identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.report.files import write_identification
+from armident.identify.report.identification import identification_report
 from tests.fixtures.arms import FAST, recording
 
 
@@ -41,6 +43,27 @@ def test_every_essential_parameter_stands_in_the_report_with_its_value(
 
 def test_warnings_reach_the_reader(outcome: IdentificationOutcome, page: str) -> None:
     assert page.count('class="warn"') == len(outcome.document.warnings)
+
+
+def test_the_verdict_stands_in_a_card_before_everything_else(outcome: IdentificationOutcome, page: str) -> None:
+    card = page.index(f'<div class="verdict {outcome.document.verdict}">')
+    assert card < page.index('<div class="tiles">')
+    for reason in outcome.document.reasons:
+        assert page.count(str(escape(reason.message))) == 1 + (reason.kind in ("residual", "uncertainty"))
+
+
+def test_an_unusable_result_is_neither_converged_nor_white(outcome: IdentificationOutcome) -> None:
+    reason = VerdictReason(
+        level="unusable", kind="error", joint=None, message="The model explains nothing", next_step="x"
+    )
+    document = outcome.document.model_copy(
+        update={"verdict": "unusable", "reasons": [reason], "converged": False, "relative_error_pct": 36767.0}
+    )
+    (robot, recordings), result = (outcome.robot, outcome.recordings), outcome.result
+    text = identification_report(recordings, robot, result, document)
+    assert '<div class="verdict unusable"><b>unusable</b>' in text
+    assert "not converged" in text
+    assert "They were not tested" in text
 
 
 def test_the_document_is_written_beside_the_report(outcome: IdentificationOutcome, tmp_path: Path) -> None:

@@ -1,12 +1,16 @@
 """Table 5.2 on the simulated EMPS: ranking and orders of magnitude."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from armident.configs import DataError
+from armident.identify.thesis.claims import JUDGEMENTS, derivatives
+from armident.identify.thesis.context import Bench
 from armident.identify.thesis.emps_derivatives import (
     COULOMB,
     GAIN,
@@ -62,6 +66,14 @@ def test_irwsm_beats_the_bandpass_on_velocity_and_acceleration(rows: dict[str, R
         assert rows[label].ours[1] < rows["bandpass"].ours[1]
         assert rows[label].ours[2] < 0.75 * rows["bandpass"].ours[2]
     assert rows["IRWSM 1"].ours[2] < rows["IRWSM 2"].ours[2]
+
+
+def test_claim_3_holds_as_the_thesis_words_it(rows: dict[str, Row]) -> None:
+    findings = derivatives(cast(Bench, SimpleNamespace(emps_derivatives=lambda: list(rows.values()))))
+    assert len(findings) == 4
+    assert all(finding.holds for finding in findings)
+    (claim,) = (j for j in JUDGEMENTS if j.number == 3)
+    assert "less than those of the bandpass" in claim.text
 
 
 def test_acceleration_of_the_bandpass_is_wrong_by_about_a_per_cent(rows: dict[str, Row]) -> None:

@@ -1,0 +1,189 @@
+"""First stage of a diagnosis: mistakes of the set-up are corrected and reported before any effect is looked for."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armident.configs import DataError, RobotConfig
+from armident.identify.document import Finding, Gap, Unexplained
+from armident.identify.experiment import Experiment
+from armident.identify.setup.check import check_setup
+from armident.identify.setup.result import SetupCheck, SetupFinding
+from armident.identify.setup.search import NOT_UNDERSTOOD
+
+SIGNALS = {"position_sign": "position", "torque_sign": "torque"}
+
+REMARKS = ("rate_too_slow", "joint_at_rest")
+"""Kinds of finding that become warnings: they limit the recordings and are no mistake of the model."""
+
+
+@dataclass(frozen=True)
+class SetupStage:
+    """Recordings and configuration with the set-up corrected, and the entries of the document.
+
+    Parameters
+    ----------
+    training, validation
+        Experiments; their clock is corrected.
+    robot
+        Configuration with the corrections.
+    findings
+        Mistakes of the set-up as findings of a diagnosis.
+    unexplained
+        Joints that the rigid model does not explain in any set-up.
+    warnings
+        Remarks on the recordings.
+    errors
+        Relative error of the rigid model in the set-up as configured by joint, percent, (n,).
+    """
+
+    training: tuple[Experiment, ...]
+    validation: tuple[Experiment, ...]
+    robot: RobotConfig
+    findings: tuple[Finding, ...]
+    unexplained: tuple[Unexplained, ...]
+    warnings: tuple[str, ...]
+    errors: tuple[float, ...]
+
+    def as_configured(self, gap: Gap) -> Gap:
+        """Gap of the model in the set-up as configured, from that in the corrected one.
+
+        Parameters
+        ----------
+        gap
+            Relative errors of the model in the corrected set-up.
+        """
+        if not self.findings:
+            return gap
+        names = list(gap.by_joint)
+        after = np.maximum([gap.by_joint[name] for name in names], 1e-12)
+        torque = np.array([gap.rms[name] for name in names]) / after
+        each = np.maximum(self.errors, after)
+        whole = float(np.sqrt(np.sum((each * torque) ** 2) / np.sum(torque**2)))
+        return Gap(
+            all=whole,
+            by_joint=dict(zip(names, (float(v) for v in each), strict=True)),
+            rms=dict(zip(names, (float(v) for v in each * torque), strict=True)),
+        )
+
+    def doubtful(self, gap: Gap) -> list[Unexplained]:
+        """Entries of the joints that are not understood with the effects found, either.
+
+        Parameters
+        ----------
+        gap
+            Held-out errors of the model with the effects found.
+        """
+        return [entry for entry in self.unexplained if gap.by_joint[entry.joint] > 100 * NOT_UNDERSTOOD]
+
+    def named(self, findings: Sequence[Finding], gap: Gap) -> list[Finding]:
+        """Findings of the set-up, then those at joints that are understood.
+
+        Parameters
+        ----------
+        findings
+            Effects found in the corrected set-up.
+        gap
+            Held-out errors of the model with them.
+        """
+        joints = {entry.joint for entry in self.doubtful(gap)}
+        return [*self.findings, *(f for f in findings if f.joint not in joints)]
+
+    def left(self, unexplained: Sequence[Unexplained], gap: Gap) -> list[Unexplained]:
+        """Joints that are not understood, then the dependences at the others.
+
+        Parameters
+        ----------
+        unexplained
+            Remaining dependences of the residual.
+        gap
+            Held-out errors of the model with the effects found.
+        """
+        doubtful = self.doubtful(gap)
+        joints = {entry.joint for entry in doubtful}
+        return [*doubtful, *(entry for entry in unexplained if entry.joint not in joints)]
+
+
+def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], robot: RobotConfig) -> SetupStage:
+    """Check the set-up and correct its mistakes.
+
+    Parameters
+    ----------
+    training, validation
+        Experiments of a diagnosis.
+    robot
+        The configuration.
+
+    Raises
+    ------
+    DataError
+        If nothing moves, or the recordings do not fit together.
+    """
+    check = check_setup([*training, *validation], robot)
+    for finding in check.findings:
+        if finding.kind == "standstill":
+            raise DataError(f"{finding.message}; {finding.remedy}")
+    corrected = robot if check.corrected_robot is None else check.corrected_robot
+    tried = "; ".join(check.tried)
+    hint = f"set-up doubtful: the rigid model leaves more than a third of this torque in every set-up tried: {tried}"
+    return SetupStage(
+        tuple(replace(e, dt=e.dt * check.clock) for e in training),
+        tuple(replace(e, dt=e.dt * check.clock) for e in validation),
+        corrected,
+        tuple(f for finding in check.findings if finding.kind not in REMARKS for f in _findings(finding, check, robot)),
+        tuple(
+            Unexplained(joint=name, share_of_residual=1.0, varies_with="set-up", hint=hint)
+            for name in check.joints_not_understood
+        ),
+        tuple(f"{finding.message}: {finding.remedy}" for finding in check.findings if finding.kind in REMARKS),
+        check.relative_error_pct,
+    )
+
+
+def _findings(finding: SetupFinding, check: SetupCheck, robot: RobotConfig) -> Iterator[Finding]:
+    """A finding of the set-up with the names of the catalogue: one for each joint where signs and delays are meant."""
+    names = [joint.name for joint in robot.joints]
+    corrected = robot if check.corrected_robot is None else check.corrected_robot
+    entries = corrected.effects[len(robot.effects) :]
+    evidence = {
+        "title": finding.kind.replace("_", " "),
+        "description": finding.message,
+        "remedy": finding.remedy,
+        "joints": list(finding.joints),
+    }
+
+    def made(effect: str, joint: str, parameters: dict[str, float], other: str | None = None) -> Finding:
+        j = names.index(joint)
+        return Finding(
+            effect=effect,
+            joint=joint,
+            other=other,
+            kind="structure",
+            parameters=parameters,
+            confidence=finding.probability,
+            alternatives=[],
+            gap_before=check.relative_error_pct[j],
+            gap_after=check.corrected_error_pct[j],
+            evidence=evidence,
+        )
+
+    of_joint = {(e.effect, e.joint): e.parameters for e in entries}
+    if finding.kind in SIGNALS:
+        for joint in finding.joints:
+            yield made("sign_error", joint, dict(of_joint["sign_error", joint]))
+    elif finding.kind == "time_shift":
+        for joint in finding.joints:
+            yield made("time_delay", joint, dict(of_joint["time_delay", joint]))
+    elif finding.kind == "joint_order":
+        first, second = finding.joints[:2]
+        parameters = next(e.parameters for e in entries if e.effect == "joint_order" and e.joint in finding.joints)
+        yield made("joint_order", first, dict(parameters), second)
+    elif finding.kind == "gravity_direction":
+        axes = zip(("gravity_x", "gravity_y", "gravity_z"), corrected.gravity, strict=True)
+        worst = max(finding.joints, key=lambda name: check.relative_error_pct[names.index(name)])
+        yield made("gravity_direction", worst, dict(axes))
+    else:
+        worst = max(finding.joints, key=lambda name: check.relative_error_pct[names.index(name)])
+        scales = of_joint.get(("signal_scale", worst), {})
+        yield made(finding.kind, worst, dict(scales))

@@ -1,0 +1,1 @@
+"""Suite of random arms: ``armident diagnose-suite --arms random``."""

@@ -1,0 +1,78 @@
+"""Limits of the verdict of an identification, each with its unit and source."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class IdentificationCriteria:
+    """Limits by which an identification judges itself; the document contains them.
+
+    Parameters
+    ----------
+    max_joint_error_pct
+        Largest error of a joint's torque that a model may leave, percent of the torque's norm. Above a third the rigid
+        model does not describe the joint (design page of the diagnosis, first principle).
+    max_rest_error_pct
+        The same for a joint at rest, percent: friction at rest has no model, but 100 % is the error of no model at all.
+    sign_tolerance_std
+        Standard deviations by which a quantity must be negative to count as negative. 3: one true value of zero in 740
+        is rejected (Gaussian, one-sided).
+    max_relative_std
+        Relative standard deviation up to which a parameter counts as determined: 1/3, as ``sign_tolerance_std``.
+    max_inertia_std
+        Relative standard deviation of the inertia of a joint above which the motion does not determine it. 1: not even
+        its order of magnitude is known.
+    max_gravity_std
+        Standard deviation of the gravity torque of a joint anywhere between its limits, relative to its recorded
+        torque, above which the motion does not determine it. 1/3: an error as large as ``max_joint_error_pct``.
+    rest_share
+        Range of a joint, relative to the greatest range of a joint of its type, below which it is at rest. 0.01: the
+        deflection of a held joint under the torques of the others (virtual TX40: 0.008 at most).
+    rest_limit_share
+        The same relative to the range of its position limits. 0.001: the deflection of a joint held against noise
+        (virtual TX40: 0.003 rad of 6.3 rad).
+    rest_counts
+        Range, encoder counts, up to which a joint is at rest: quantisation and dither of a servo in position.
+    rest_noise_std
+        Range, standard deviations of the white position noise, up to which a joint is at rest. 10: the range of 1e6
+        Gaussian samples.
+    false_alarm_rate
+        Probability that the tests of all residuals of a correct model find something (Bonferroni over the joints).
+    white_fraction
+        Fraction of autocorrelation lags outside two standard deviations up to which a residual counts as white noise;
+        0.05 is expected, 0.15 is exceeded with a probability of 2 % for 20 lags.
+    max_motion_share
+        Share of the power of a joint's residual that its averages over position or velocity may explain beyond chance.
+        0.2: without it the residual is a tenth smaller. Healthy virtual arms have 0.13 at most.
+    min_motion_deviation
+        Deviation of that share from its mean under circular shifts, standard deviations of the shifts, from which on a
+        dependence counts. 4: noise with a pole up to 0.9 per row reaches 3.7 in 540 tests.
+    max_std_ratio
+        Ratio of the standard deviations that allow for serial correlation to those of the method, above which the
+        latter are too small. 1.5: an interval of two standard deviations covers 82 % instead of 95 %.
+    max_velocity_error
+        Relative error of the simulated velocities above which the closed loop does not move like the robot.
+    max_delay_samples
+        Deviation of the torque delay from the expected half a sample that is tolerated, samples.
+    max_listed
+        Largest number of parameters that a sentence lists by name.
+    """
+
+    max_joint_error_pct: float = 100.0 / 3.0
+    max_rest_error_pct: float = 100.0
+    sign_tolerance_std: float = 3.0
+    max_relative_std: float = 1.0 / 3.0
+    max_inertia_std: float = 1.0
+    max_gravity_std: float = 1.0 / 3.0
+    rest_share: float = 0.01
+    rest_limit_share: float = 1e-3
+    rest_counts: float = 5.0
+    rest_noise_std: float = 10.0
+    false_alarm_rate: float = 0.01
+    white_fraction: float = 0.15
+    max_motion_share: float = 0.2
+    min_motion_deviation: float = 4.0
+    max_std_ratio: float = 1.5
+    max_velocity_error: float = 0.3
+    max_delay_samples: float = 1.0
+    max_listed: int = 12

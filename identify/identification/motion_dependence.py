@@ -1,0 +1,109 @@
+"""Dependence of the residuals on the motion, which noise does not have.
+
+An autoregressive noise model can absorb a model error, so that the whitened residuals are white. Averages of the
+residuals over bins of position and velocity cannot: noise has no part in the motion. Circular shifts of the residuals
+against the motion keep their serial correlation and give the distribution of the averages without a dependence.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.identification.equations import Prepared
+from armident.identify.regression.equations import ExperimentEquations, residuals
+
+POSITION_BINS, VELOCITY_BINS = 100, 40
+"""Largest number of bins of position, for each direction of motion, and of velocity."""
+
+ROWS_PER_BIN = 8
+"""Least mean number of rows in a bin."""
+
+SHIFTS = 199
+"""Number of circular shifts."""
+
+LEAST_SHIFT = 0.05
+"""Least shift, as share of the length of an experiment."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """Dependence of the residuals of one joint on its motion.
+
+    Parameters
+    ----------
+    joint
+        Index of the joint.
+    variable
+        ``position`` (and direction) or ``velocity``.
+    share
+        Share of the power of the residuals that the averages explain beyond chance, 0 to 1.
+    deviation
+        Difference of that share from its mean under shifts, in standard deviations of the shifts.
+    """
+
+    joint: int
+    variable: str
+    share: float
+    deviation: float
+
+
+def motion_dependence(prepared: Prepared, blocks: Sequence[ExperimentEquations], theta: Array) -> list[Dependence]:
+    """Return the dependence of the residuals of every joint on its own position and velocity.
+
+    Parameters
+    ----------
+    prepared
+        Experiments with the derivatives of their positions.
+    blocks
+        Equations of the residuals.
+    theta
+        Base parameters (b,), SI.
+    """
+    dt = prepared.experiments[0].dt
+    errors = residuals(blocks, theta)
+    at = [np.rint(block.t / dt).astype(np.int64) for block in blocks]
+    found = []
+    for j in range(errors[0].shape[1]):
+        kept = [np.where(block.keep[:, j], e[:, j], 0.0) for e, block in zip(errors, blocks, strict=True)]
+        q = np.concatenate([s.q[k, j] for s, k in zip(prepared.signals, at, strict=True)])
+        qd = np.concatenate([s.qd[k, j] for s, k in zip(prepared.signals, at, strict=True)])
+        for variable, bins in (("position", _position_bins(q, qd)), ("velocity", _velocity_bins(qd))):
+            found.append(Dependence(j, variable, *_explained(kept, bins)))
+    return found
+
+
+def _position_bins(q: Array, qd: Array) -> NDArray[np.int64]:
+    """Bin of each row by position and direction."""
+    count = max(min(POSITION_BINS, q.size // (2 * ROWS_PER_BIN)), 1)
+    width = max(float(np.ptp(q)), 1e-300)
+    place = np.minimum(((q - q.min()) / width * count).astype(np.int64), count - 1)
+    return np.asarray(2 * place + (qd > 0), dtype=np.int64)
+
+
+def _velocity_bins(qd: Array) -> NDArray[np.int64]:
+    """Bin of each row by velocity, with about the same number of rows each."""
+    count = max(min(VELOCITY_BINS, qd.size // ROWS_PER_BIN), 1)
+    edges = np.quantile(qd, np.linspace(0, 1, count + 1)[1:-1])
+    return np.asarray(np.searchsorted(edges, qd), dtype=np.int64)
+
+
+def _explained(series: Sequence[Array], bins: NDArray[np.int64]) -> tuple[float, float]:
+    """Share of the power that averages over bins explain beyond chance, and its deviation in std of the shifts."""
+    total = sum(float(e @ e) for e in series)
+    if total <= 0.0:
+        return 0.0, 0.0
+    counts = np.maximum(np.bincount(bins), 1)
+    rng = np.random.default_rng(0)
+
+    def explained(shift: float) -> float:
+        rows = np.concatenate([np.roll(e, round(shift * e.size)) for e in series])
+        return float(np.sum(np.bincount(bins, rows, counts.size) ** 2 / counts)) / total
+
+    here = explained(0.0)
+    shifted = np.array([explained(s) for s in rng.uniform(LEAST_SHIFT, 1 - LEAST_SHIFT, SHIFTS)])
+    usual, spread = float(shifted.mean()), float(shifted.std())
+    return max(here - usual, 0.0) / max(1.0 - usual, 1e-300), (here - usual) / max(spread, 1e-300)

@@ -1,0 +1,137 @@
+"""Physical possibility of an estimate: signs of friction and inertia, mass matrix, and the nearest possible arm."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from armident.configs import ArmidentError
+from armident.identify.experiment import Experiment
+from armident.identify.identification.criteria import IdentificationCriteria
+from armident.identify.identification.excitation_check import NON_NEGATIVE, motion_postures, workspace_postures
+from armident.identify.identification.result import relative_errors, units
+from armident.identify.identification.verdict import Reason, listed
+from armident.identify.regression.equations import ExperimentEquations
+from armident.identify.robot.arm import ArmModel
+from armident.identify.robot.consistent import ConsistentParameters, nearest_base
+
+Array = NDArray[np.float64]
+
+CHECK_SIGNALS = "check signs, units, sides and order of the recorded signals: armident check RECORDING"
+USE_NEAREST = (
+    "take the nearest possible parameters (--physical), or look for a missing effect: armident diagnose RECORDING"
+)
+
+
+def physics_reasons(
+    model: ArmModel,
+    experiments: Sequence[Experiment],
+    blocks: Sequence[ExperimentEquations],
+    theta: Array,
+    covariance: Array,
+    criteria: IdentificationCriteria,
+    consistent: ConsistentParameters | None = None,
+) -> list[Reason]:
+    """Return a reason if no physical arm has these parameters within their uncertainty.
+
+    Small impossible values come from small model errors: then a possible arm explains the torques nearly as well, and
+    the result is doubtful. Where the nearest possible arm leaves more than a third of a joint's torque, which the
+    estimate explains, the signals themselves are wrong, and the result is unusable.
+
+    Parameters
+    ----------
+    model
+        The arm.
+    experiments
+        Recordings.
+    blocks
+        Equations in which the errors of the two arms are compared.
+    theta, covariance
+        Base estimate (b,) and its covariance (b, b), SI.
+    criteria
+        Limits.
+    consistent
+        Nearest physically consistent parameters with their test, if computed; otherwise the distance is tested with b
+        degrees of freedom, more than there are, which is conservative.
+    """
+    if not (np.isfinite(theta).all() and np.isfinite(covariance).all()):
+        return []
+    faults = [
+        *_negative(model, theta, covariance, criteria),
+        *_indefinite(model, experiments, theta, covariance, criteria),
+    ]
+    try:
+        nearest = nearest_base(model, theta, covariance)
+    except ArmidentError:
+        nearest = None
+    far = nearest is not None and nearest.distance**2 > stats.chi2.isf(criteria.false_alarm_rate, theta.size)
+    if consistent is not None:
+        far = consistent.p_value < criteria.false_alarm_rate
+    if far and nearest is not None:
+        worst = int(np.argmax(np.abs(nearest.shifts)))
+        faults.append(
+            f"the nearest possible parameters are {nearest.distance:.3g} standard deviations away "
+            f"({model.base.names[worst]} by {nearest.shifts[worst]:+.2g})"
+        )
+    if not faults:
+        return []
+    message = f"The parameters are physically impossible: {'; '.join(faults)}"
+    if nearest is None:
+        return [Reason("doubtful", message, CHECK_SIGNALS, kind="physics")]
+    names = [joint.name for joint in model.robot.joints]
+    own, errors = relative_errors(blocks, theta), relative_errors(blocks, nearest.theta)
+    wrong = (errors[1] > criteria.max_joint_error_pct) & (own[1] <= criteria.max_joint_error_pct)
+    if wrong.any():
+        left = [f"{errors[1][j]:.0f} % at {names[j]}" for j in np.flatnonzero(wrong)]
+        message += f". No possible arm explains the torques: the nearest one leaves {listed(left)}"
+        return [Reason("unusable", message, CHECK_SIGNALS, kind="physics")]
+    message += f". The nearest possible arm leaves {errors[0]:.3g} % of the torques, the estimate {own[0]:.3g} %"
+    return [Reason("doubtful", message, USE_NEAREST, kind="physics")]
+
+
+def _negative(model: ArmModel, theta: Array, covariance: Array, criteria: IdentificationCriteria) -> list[str]:
+    """Friction and rotor inertias that are significantly negative, as one part of a sentence."""
+    std, unit = np.sqrt(np.maximum(np.diag(covariance), 0.0)), units(model)
+    rigid = model.base.names[: model.base.b - model.e]
+    found = [
+        k
+        for k, name in enumerate(rigid)
+        if name.startswith(NON_NEGATIVE)
+        and "-" not in model.base.formulas.get(name, name)
+        and theta[k] < -criteria.sign_tolerance_std * std[k]
+    ]
+    found.sort(key=lambda k: theta[k] / std[k])
+    values = [f"{rigid[k]} = {theta[k]:.3g} +- {std[k]:.1g} {unit[k]}" for k in found]
+    return [f"negative {listed(values, 3)}"] if values else []
+
+
+def _indefinite(
+    model: ArmModel,
+    experiments: Sequence[Experiment],
+    theta: Array,
+    covariance: Array,
+    criteria: IdentificationCriteria,
+) -> list[str]:
+    """Mass matrix that is significantly not positive definite, along the motion or in the workspace.
+
+    With the eigenvector v of the smallest eigenvalue, ``v' M v`` is linear in theta, so its standard deviation follows
+    from the covariance.
+    """
+    seen = motion_postures(experiments)
+    q = np.concatenate([seen, workspace_postures(model.robot, seen)])
+    rigid = model.base.b - model.e
+    arm, c, still = model.without_terms(), covariance[:rigid, :rigid], np.zeros_like(q)
+    values, vectors = np.linalg.eigh(arm.mass_matrix(theta[:rigid], q))
+    direction = np.ascontiguousarray(vectors[:, :, 0])
+    change = arm.rigid_regressor(q, still, direction) - arm.rigid_regressor(q, still, still)
+    row = np.einsum("kj,kjb->kb", direction, change)
+    std = np.sqrt(np.maximum(np.einsum("kb,bc,kc->k", row, c, row), 1e-300))
+    worst = int(np.argmin(values[:, 0] / std))
+    if values[worst, 0] >= -criteria.sign_tolerance_std * std[worst]:
+        return []
+    negative = 100 * float(np.mean(values[:, 0] < 0))
+    return [
+        f"the mass matrix is not positive definite (smallest eigenvalue {values[worst, 0]:.2g} +- {std[worst]:.1g}, "
+        f"negative at {negative:.0f} % of the postures)"
+    ]

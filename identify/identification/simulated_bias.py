@@ -1,0 +1,298 @@
+"""Bias of an estimate by derivatives, encoder noise and sampling, found by identifying simulated recordings.
+
+The smoother attenuates accelerations and blurs reversals, encoder noise passes through the controller, and torques are
+held between samples. None of this is in the covariance. The closed loop of the auxiliary model with the last estimate,
+encoder noise included, has all of it: what the same estimator returns on such recordings, less the parameters that
+made them, is the bias (indirect inference: Gourieroux, Monfort, Renault, J. Applied Econometrics 8, 1993).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal, stats
+
+from armident.identify.estimators.auxiliary_model import AuxiliaryModel
+from armident.identify.experiment import Experiment
+from armident.identify.identification.equations import Prepared, aligned_torque
+from armident.identify.identification.options import DerivativesName
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.equations import (
+    Estimate,
+    ExperimentEquations,
+    filtered_regressor,
+    joint_variances,
+    least_squares,
+    stacked,
+    whitened_residuals,
+)
+from armident.identify.regression.iv_products import iv_products
+from armident.identify.robot.controller import DiscreteController
+from armident.identify.robot.simulation import Simulation
+from armident.identify.signals.bandpass import central_difference
+from armident.identify.signals.bandwidth import position_noise
+from armident.identify.signals.decimate import Decimation
+from armident.identify.signals.differentiate import Derivatives, differentiate
+
+RELEVANT_BIAS = 0.5
+"""Bias in standard deviations above which an estimate is corrected: a 2-sigma interval with this bias holds the truth
+in 92.7 % of the cases instead of 95.4 %."""
+
+SIMULATION_ERROR = 0.15
+"""Standard deviation of the part of the bias that the simulation misses, over the bias.
+
+Measured on one axis of 0.02 to 0.15 m/s at 1 kHz with encoder noise of 0, 0.1, 1 and 20 um: the bias of simulated
+recordings is 0.88 to 1.13 of that of the recordings."""
+
+DOMINANT = 1.0 / SIMULATION_ERROR
+"""Bias in standard deviations above which intervals are doubtful although it was subtracted: what is left of it is
+then as large as everything else."""
+
+SIGNIFICANCE = 0.05
+"""Probability that the scatter of simulated recordings counts as wider than the standard deviations by chance."""
+
+FEW, MANY = 2, 12
+"""Simulated recordings to see that the bias is irrelevant, and to measure a relevant one."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SimulatedBias:
+    """Bias of an estimator and scatter by encoder noise, from simulated recordings.
+
+    Parameters
+    ----------
+    bias
+        Mean estimate of the simulated recordings less the parameters that made them, SI, (b,).
+    scatter
+        Standard deviations of these estimates, SI, (b,).
+    runs
+        Number of simulated recordings.
+    """
+
+    bias: Array
+    scatter: Array
+    runs: int
+
+    def largest(self, estimate: Estimate) -> tuple[int, float]:
+        """Parameter with the largest bias, and the bias in its standard deviations.
+
+        Parameters
+        ----------
+        estimate
+            Estimate whose standard deviations count.
+        """
+        share = np.abs(self.bias) / estimate.std
+        k = int(np.argmax(share))
+        return k, float(share[k])
+
+
+def simulated_bias(
+    prepared: Prepared,
+    auxiliary: AuxiliaryModel,
+    blocks: Sequence[ExperimentEquations],
+    estimate: Estimate,
+    weights: Sequence[ArModel],
+    derivatives: DerivativesName,
+    *,
+    runs: int | None = None,
+) -> SimulatedBias | None:
+    """Return the bias of an instrumental-variable estimate.
+
+    Parameters
+    ----------
+    prepared
+        Arm, experiments and derivatives.
+    auxiliary
+        Closed loop and decimation of the estimate.
+    blocks
+        Equations of the estimate; only their kept rows are used.
+    estimate
+        Parameters that make the recordings, and their covariance.
+    weights
+        Noise model of each joint by which the estimate weights its rows.
+    derivatives
+        Smoother of the positions.
+    runs
+        Number of simulated recordings; ``None``: few where the bias is irrelevant, else many.
+
+    Returns
+    -------
+    SimulatedBias or None
+        ``None`` if the loop with this estimate cannot be simulated, or its recordings do not determine the parameters.
+    """
+    auxiliary, theta = auxiliary.fresh(), estimate.theta
+    clean = auxiliary.simulate(theta)
+    if clean is None:
+        return None
+    motions = [
+        Derivatives(run.q, run.qd, run.qdd, None, auxiliary.dt, e.start)
+        for run, e in zip(clean, prepared.experiments, strict=True)
+    ]
+    instruments = auxiliary.regressors(motions)
+    rng = np.random.default_rng(0)
+    errors: list[Array] = []
+    while len(errors) < (runs or MANY):
+        recorded = _recorded(prepared, auxiliary, theta, rng, derivatives)
+        if recorded is None:
+            return None
+        kept = [replace(new, keep=block.keep, t=block.t) for new, block in zip(recorded, blocks, strict=True)]
+        try:
+            found = iv_products(instruments, kept, weights).theta
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(found).all():
+            return None
+        errors.append(found - theta)
+        if runs is None and len(errors) == FEW and not _relevant(errors, estimate):
+            break
+    return SimulatedBias(np.mean(errors, axis=0), np.std(errors, axis=0, ddof=1), len(errors))
+
+
+def corrected(estimate: Estimate, found: SimulatedBias, blocks: Sequence[ExperimentEquations]) -> Estimate:
+    """Return the estimate without its bias.
+
+    The covariance contains that of the bias and `SIMULATION_ERROR`. Where encoder noise alone scatters a parameter by
+    more than its standard deviation, which assumes noise that is independent of the motion, it is widened to that
+    scatter.
+
+    Parameters
+    ----------
+    estimate
+        Estimate with its noise models.
+    found
+        Its bias.
+    blocks
+        Equations of the estimate.
+    """
+    theta = estimate.theta - found.bias
+    ratio = found.scatter / estimate.std
+    least = np.sqrt(stats.chi2.ppf(1.0 - SIGNIFICANCE, found.runs - 1) / (found.runs - 1))
+    wider = np.where(ratio > least, ratio, 1.0)
+    covariance = estimate.covariance * np.outer(wider, wider) + np.diag(
+        found.scatter**2 / found.runs + (SIMULATION_ERROR * found.bias) ** 2
+    )
+    residuals = whitened_residuals(blocks, theta, estimate.noise)
+    return replace(estimate, theta=theta, covariance=covariance, residuals=residuals)
+
+
+def _relevant(errors: Sequence[Array], estimate: Estimate) -> bool:
+    return bool(np.any(np.abs(np.mean(errors, axis=0)) > RELEVANT_BIAS * estimate.std))
+
+
+def _recorded(
+    prepared: Prepared,
+    auxiliary: AuxiliaryModel,
+    theta: Array,
+    rng: np.random.Generator,
+    derivatives: DerivativesName,
+) -> list[ExperimentEquations] | None:
+    """Equations of one simulated recording per experiment; ``None`` if a simulation diverges."""
+    noise = [position_noise(e.q, e.dt) * rng.normal(size=e.q.shape) for e in prepared.experiments]
+    pushes = None
+    if auxiliary.feedback:
+        ratios = auxiliary.model.robot.transmission_matrix
+        pushes = [_torque_of_noise(auxiliary.controller, n @ ratios.T) for n in noise]
+    runs = auxiliary.simulate(theta, pushes)
+    if runs is None:
+        return None
+    return [
+        _equations(prepared, auxiliary, run, n, s, e, derivatives)
+        for run, n, s, e in zip(runs, noise, prepared.signals, prepared.experiments, strict=True)
+    ]
+
+
+def _equations(
+    prepared: Prepared,
+    auxiliary: AuxiliaryModel,
+    run: Simulation,
+    noise: Array,
+    signals: Derivatives,
+    experiment: Experiment,
+    derivatives: DerivativesName,
+) -> ExperimentEquations:
+    """Equations of a simulated recording by the smoother of the real one."""
+    nvr = None if signals.nvr is None else signals.nvr[:, 0]
+    smooth: Callable[[Array], Derivatives] = auxiliary_smoother(auxiliary, derivatives, nvr)
+    motion = replace(smooth(run.q + noise), start=experiment.start)
+    y = auxiliary.decimation(aligned_torque(run.tau))
+    x = filtered_regressor(prepared.model, motion, auxiliary.decimation)
+    return ExperimentEquations(y, x, np.ones(y.shape, dtype=np.bool_), np.zeros(y.shape[0]))
+
+
+def auxiliary_smoother(
+    auxiliary: AuxiliaryModel, derivatives: DerivativesName, nvr: Array | None
+) -> Callable[[Array], Derivatives]:
+    """Smoother of the measured positions, for simulated ones.
+
+    Parameters
+    ----------
+    auxiliary
+        Closed loop; it has the bandpass where one was chosen.
+    derivatives
+        Name of the smoother.
+    nvr
+        Noise-variance ratios (n,) of the measured positions; ``None``: bandpass.
+    """
+    if nvr is None:
+        measured = auxiliary.measured
+        assert measured is not None
+        return lambda q: measured(q, 0)
+    return lambda q: differentiate(q, auxiliary.dt, derivatives, nvr)
+
+
+def _torque_of_noise(controller: DiscreteController, noise: Array) -> Array:
+    """Motor torques (N, n), N m or N, that the controller makes of the noise (N, n) of the motor positions."""
+    torque = np.empty_like(noise)
+    length = max(controller.error_taps.shape[1], controller.position_taps.shape[1])
+    for i in range(noise.shape[1]):
+        taps = np.zeros(length)
+        taps[: controller.error_taps.shape[1]] -= controller.error_taps[i]
+        taps[: controller.position_taps.shape[1]] += controller.position_taps[i]
+        torque[:, i] = signal.lfilter(taps, np.append(1.0, -controller.output_taps[i]), noise[:, i])
+    return torque
+
+
+def least_squares_bias(
+    prepared: Prepared,
+    decimation: Decimation,
+    blocks: Sequence[ExperimentEquations],
+    estimate: Estimate,
+    smooth: Callable[[Array, int], Derivatives],
+) -> SimulatedBias:
+    """Return the bias of IDIM-LS, which knows no closed loop: the smoothed motion counts as the true one.
+
+    The noise of the encoders is added to it open-loop, so the part that passes through the controller is missing.
+
+    Parameters
+    ----------
+    prepared
+        Arm, experiments and derivatives.
+    decimation
+        Parallel filter of the equations.
+    blocks
+        Equations of the estimate; only their kept rows are used.
+    estimate
+        Parameters that make the torques, and their covariance.
+    smooth
+        ``smooth(positions, k)``: derivatives of positions (N, n) of experiment k by the smoother of the measured ones.
+    """
+    model, theta = prepared.model, estimate.theta
+    weights = joint_variances(blocks, theta)
+    truths = []
+    for e, s in zip(prepared.experiments, prepared.signals, strict=True):
+        qd = central_difference(s.q, e.dt)
+        motion = Derivatives(s.q, qd, central_difference(qd, e.dt), None, e.dt, e.start)
+        truths.append(filtered_regressor(model, motion, decimation) @ theta)
+    rng, errors = np.random.default_rng(0), list[Array]()
+    for _ in range(FEW):
+        recorded = []
+        for k, (e, s) in enumerate(zip(prepared.experiments, prepared.signals, strict=True)):
+            noise = position_noise(e.q, e.dt) * rng.normal(size=e.q.shape)
+            x = filtered_regressor(model, replace(smooth(s.q + noise, k), start=e.start), decimation)
+            recorded.append(replace(blocks[k], y=truths[k], x=x))
+        x, y = stacked(recorded, weights)
+        errors.append(least_squares(x, y) - theta)
+    return SimulatedBias(np.mean(errors, axis=0), np.std(errors, axis=0, ddof=1), FEW)

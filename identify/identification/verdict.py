@@ -1,0 +1,213 @@
+"""Verdict of an identification: trustworthy, doubtful or unusable, with reasons and the next step in words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol
+
+Level = Literal["trustworthy", "doubtful", "unusable"]
+LEVELS: tuple[Level, ...] = ("trustworthy", "doubtful", "unusable")
+
+AT_REST = ("standstill", "joint_at_rest")
+"""Findings of the set-up that are a matter of the excitation."""
+
+Kind = Literal[
+    "setup", "error", "physics", "excitation", "convergence", "loop", "residual", "uncertainty", "instruments", "delay"
+]
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One defect of a result.
+
+    Parameters
+    ----------
+    level
+        Level of the verdict that the defect causes.
+    message
+        The defect in one sentence, with figures.
+    next_step
+        Action that removes it.
+    joint
+        Joint concerned; ``None``: several, or none in particular.
+    kind
+        Property that was judged.
+    """
+
+    level: Level
+    message: str
+    next_step: str
+    joint: str | None = None
+    kind: Kind = "error"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Judgement of a result.
+
+    Parameters
+    ----------
+    level
+        ``trustworthy``: no defect was found. ``doubtful``: usable within the limits that the reasons state.
+        ``unusable``: the parameters must not be used.
+    reasons
+        Defects, the most severe first; empty if trustworthy.
+    """
+
+    level: Level
+    reasons: tuple[Reason, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """The level and, if not trustworthy, the first reason."""
+        if not self.reasons:
+            return self.level
+        more = len(self.reasons) - 1
+        return f"{self.level}: {self.reasons[0].message}" + (f" (and {more} more)" if more else "")
+
+    def of_kind(self, kind: Kind) -> tuple[Reason, ...]:
+        """Return the reasons of one kind.
+
+        Parameters
+        ----------
+        kind
+            Property that was judged.
+        """
+        return tuple(reason for reason in self.reasons if reason.kind == kind)
+
+    def document(self) -> dict[str, Any]:
+        """Return the verdict as plain strings, lists and dictionaries."""
+        return {
+            "level": self.level,
+            "reasons": [
+                {"level": r.level, "kind": r.kind, "joint": r.joint, "message": r.message, "next_step": r.next_step}
+                for r in self.reasons
+            ],
+        }
+
+
+class SetupFinding(Protocol):
+    """Finding of the check of the set-up, as far as the verdict uses it."""
+
+    @property
+    def kind(self) -> str:
+        """Kind of the mistake, for example ``time_shift`` or ``joint_at_rest``."""
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints concerned."""
+
+    @property
+    def probability(self) -> float:
+        """Posterior probability among the hypotheses tried, 0 to 1."""
+
+    @property
+    def message(self) -> str:
+        """Finding in one sentence."""
+
+    @property
+    def remedy(self) -> str:
+        """Line of configuration, or option, that corrects it."""
+
+    @property
+    def decisive(self) -> bool:
+        """True if results without the correction are unusable."""
+
+
+class SetupCheck(Protocol):
+    """Result of the check of the set-up, as far as the verdict uses it."""
+
+    @property
+    def findings(self) -> Sequence[SetupFinding]:
+        """Findings, the most probable first."""
+
+    @property
+    def joints_not_understood(self) -> tuple[str, ...]:
+        """Joints of whose torque more than a third stays, with every hypothesis."""
+
+    @property
+    def tried(self) -> tuple[str, ...]:
+        """Hypotheses that were tried, in words."""
+
+
+def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict:
+    """Return the verdict that reasons and the check of the set-up lead to.
+
+    The level is that of the most severe reason. Reasons are sorted by severity, those of the set-up first; each message
+    occurs once.
+
+    Parameters
+    ----------
+    reasons
+        Defects found in data and result.
+    setup
+        Check of the set-up; ``None``: not made.
+    """
+    every = _merged(reasons, setup)
+    once = {reason.message: reason for reason in reversed(every)}
+    found = sorted(reversed(once.values()), key=lambda reason: -LEVELS.index(reason.level))
+    return Verdict(found[0].level if found else "trustworthy", tuple(found))
+
+
+def _merged(reasons: Sequence[Reason], setup: SetupCheck | None) -> list[Reason]:
+    """Reasons of the set-up and of the result, each defect once.
+
+    Joints at rest are a matter of the excitation, and a common delay one of the set-up. Joints that no hypothesis
+    explains are named in the reason that gives their error.
+    """
+    if setup is None:
+        return list(reasons)
+    kinds = {reason.kind for reason in reasons}
+    findings = [f for f in setup.findings if f.kind not in AT_REST or "excitation" not in kinds]
+    shifted = any(finding.kind == "time_shift" for finding in findings)
+    rest = [reason for reason in reasons if not (shifted and reason.kind == "delay")]
+    lost = [k for k, reason in enumerate(rest) if reason.kind == "error" and reason.level == "unusable"]
+    if setup.joints_not_understood and not lost:
+        return [*_setup_reasons(findings), _not_understood(setup), *rest]
+    if setup.joints_not_understood:
+        first = rest[lost[0]]
+        rest[lost[0]] = replace(
+            first, message=f"{first.message}; no hypothesis of the set-up explains it{_tried(setup)}"
+        )
+    return [*_setup_reasons(findings), *rest]
+
+
+def _setup_reasons(findings: Sequence[SetupFinding]) -> list[Reason]:
+    """Return a reason for every finding of the set-up."""
+    return [
+        Reason(
+            "unusable" if finding.decisive else "doubtful",
+            f"{finding.message[:1].upper()}{finding.message[1:].rstrip('.')} (probability {finding.probability:.2f})",
+            finding.remedy.rstrip("."),
+            finding.joints[0] if len(finding.joints) == 1 else None,
+            "setup",
+        )
+        for finding in findings
+    ]
+
+
+def _not_understood(setup: SetupCheck) -> Reason:
+    """Reason for joints that the rigid model does not explain with any hypothesis."""
+    joints, tried = listed(setup.joints_not_understood), _tried(setup)
+    message = f"The rigid model leaves more than a third of the torque of {joints}{tried}"
+    step = "check signs, order, units and gear ratios of the recording: armident check RECORDING"
+    return Reason("unusable", message, step, kind="setup")
+
+
+def _tried(setup: SetupCheck) -> str:
+    return f" (tried: {', '.join(setup.tried)})" if setup.tried else ""
+
+
+def listed(names: Sequence[str], most: int = 12) -> str:
+    """Return names as a list in words, cut after ``most``.
+
+    Parameters
+    ----------
+    names
+        Names, at least one.
+    most
+        Largest number of names.
+    """
+    shown = list(names[:most])
+    if len(names) > most:
+        return f"{', '.join(shown)} and {len(names) - most} more"
+    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"

@@ -1,0 +1,1 @@
+"""Check of the set-up before any other test: wiring, units, transmission, gravity, clocks."""

@@ -1,0 +1,137 @@
+"""Proposals of whole permutations: which torque does the motion of a joint explain."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from armident.identify.setup.bench import Bench
+from armident.identify.setup.fit import FLOOR, Hypothesis, normal, physical_least_squares
+
+Array = NDArray[np.float64]
+OrderCriterion = Callable[[Array], float]
+
+
+def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
+    """Return the hypothesis with the signed assignment of torques that the rows of the model explain best.
+
+    Every row of the model is fitted alone to every recorded torque with either sign; the assignment with the least sum
+    of logarithmic residuals is taken (Kuhn 1955).
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        Start.
+    """
+    n = bench.n
+    found = normal(bench, h)
+    x = found.x
+    y = bench.torque(h.shift) @ h.torque.T
+    power = np.maximum((y**2).sum(axis=0), 1e-300)
+    cost, sign = np.zeros((n, n)), np.ones((n, n))
+    for m in range(n):
+        used = np.flatnonzero(np.abs(x[:, m]).max(axis=0) > 0)
+        own = np.ascontiguousarray(x[:, m, used])
+        gram, physical = own.T @ own, found.physical[[m, n + m]][:, used]
+        for k in range(n):
+            right = own.T @ y[:, k]
+            shares = []
+            for s in (1.0, -1.0):
+                theta = physical_least_squares(gram, s * right, physical)
+                shares.append(max((power[k] - 2 * s * right @ theta + theta @ gram @ theta) / power[k], FLOOR))
+            cost[m, k] = np.log(min(shares))
+            sign[m, k] = 1.0 if shares[0] <= shares[1] else -1.0
+    chosen = np.flatnonzero(bench.moving)
+    model, recorded = optimize.linear_sum_assignment(cost[np.ix_(chosen, chosen)])
+    taken = np.eye(n)
+    taken[chosen, chosen] = 0.0
+    taken[chosen[model], chosen[recorded]] = sign[chosen[model], chosen[recorded]]
+    return replace(h, torque=taken @ h.torque)
+
+
+def by_friction(bench: Bench, h: Hypothesis) -> Array:
+    """Return the signed permutation (n, n) from recorded torques to the recorded positions that they belong to.
+
+    Dry friction changes the torque of its own joint where that joint turns round, and of no other joint. Needs no
+    model of the arm.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        Start; its assignments are not used.
+    """
+    n = bench.n
+    x = bench.rows(np.eye(n)).x
+    dry = np.stack([x[:, j, bench.column(f"fc{j + 1}")] for j in range(n)], axis=1)
+    slow = np.stack([x[:, j, bench.column(f"fv{j + 1}")] for j in range(n)], axis=1)
+    fast = np.concatenate([bench._kept(s.qdd) for s in bench.segments])
+    q = np.concatenate([bench._kept(s.q) for s in bench.segments])
+    smooth = np.concatenate([np.ones((q.shape[0], 1)), q, np.sin(q), np.cos(q), fast, slow], axis=1)
+    basis, _ = np.linalg.qr(smooth)
+    y = bench.torque(h.shift)
+    y = y - basis @ (basis.T @ y)
+    own = dry - basis @ (basis.T @ dry)
+    coefficients = np.linalg.lstsq(own, y, rcond=None)[0]
+    spread = np.sqrt(np.mean((y - own @ coefficients) ** 2, axis=0))
+    inverse = np.sqrt(np.maximum(np.diag(np.linalg.pinv(own.T @ own)), 1e-300))
+    t = coefficients / np.maximum(inverse[:, None] * spread, 1e-300)
+    chosen = np.flatnonzero(bench.moving)
+    joint, recorded = optimize.linear_sum_assignment(-np.abs(t[np.ix_(chosen, chosen)]))
+    taken = np.eye(n)
+    taken[chosen, chosen] = 0.0
+    taken[chosen[joint], chosen[recorded]] = np.where(t[chosen[joint], chosen[recorded]] >= 0, 1.0, -1.0)
+    return taken
+
+
+def orders(moving: NDArray[np.bool_]) -> Iterator[Array]:
+    """Permutation matrices (n, n) of the joints that move.
+
+    Parameters
+    ----------
+    moving
+        Mask (n,) of the joints that move.
+    """
+    chosen = np.flatnonzero(moving)
+    for order in permutations(chosen):
+        rows = np.arange(moving.size)
+        rows[chosen] = order
+        yield np.eye(moving.size)[rows]
+
+
+def usual_orders(moving: NDArray[np.bool_]) -> list[Array]:
+    """Orders from which a search by exchanges starts: as configured, reversed, and all rotations.
+
+    Parameters
+    ----------
+    moving
+        Mask (n,) of the joints that move.
+    """
+    own, chosen = np.eye(moving.size), np.flatnonzero(moving)
+    made = []
+    for order in (chosen, chosen[::-1], *(np.roll(chosen, k) for k in range(1, chosen.size))):
+        rows = np.arange(moving.size)
+        rows[chosen] = order
+        made.append(own[rows])
+    return made
+
+
+def exchanged(order: Array, first: int, second: int) -> Array:
+    """Return an order (n, n) with two joints exchanged.
+
+    Parameters
+    ----------
+    order
+        Permutation matrix.
+    first, second
+        Indices of the joints.
+    """
+    other = order.copy()
+    other[[first, second]] = other[[second, first]]
+    return other

@@ -1,0 +1,296 @@
+"""Equations of the rigid arm for any assignment and scale of the signals, at a rate that suits the motion."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import DataError, RobotConfig
+from armident.identify.experiment import Experiment
+from armident.identify.robot.arm import ArmModel
+from armident.identify.signals.bandwidth import motion_bandwidth
+from armident.identify.signals.decimate import Decimation, design
+
+Array = NDArray[np.float64]
+
+CUTOFF = 2.0
+"""Cut-off of the equations in closed-loop bandwidths (thesis 2.3.1: ``w_Fp >= 2 w_dyn``)."""
+
+WORKING_RATE = 8.0
+"""Rate of the derivatives over the cut-off: central differences then err by 0.5 % at a fifth of the cut-off."""
+
+MOST_ROWS = 600
+"""Largest number of instants: 600 of each joint determine the 130 parameters of seven joints."""
+
+LEAST_ROWS = 40
+"""Least number of instants for any comparison."""
+
+LEAST_SAMPLES = 200
+"""Least number of samples: ten per period of twenty periods of a motion."""
+
+SLOW = 0.02
+"""Share of a joint's largest velocity below which the sign of its velocity is smoothed."""
+
+BREAKAWAY = 0.1
+"""Share of a joint's largest velocity over which the free friction term of low velocities decays."""
+
+FRICTION_TERMS = 4
+"""Free terms of every joint beside the rigid model: spring, asymmetric, quadratic and low-velocity friction."""
+
+POSTURES = 40
+"""Postures over which moments of inertia are averaged."""
+
+GENERIC = np.array([3.1, -5.3, -7.6])
+"""Direction of gravity, m/s^2, without any symmetry: its base parameters serve for every direction."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Signals of one experiment at the working rate.
+
+    Parameters
+    ----------
+    q, qd, qdd
+        Recorded positions and their derivatives, (W, n); rad or m, s.
+    tau
+        Recorded torques, (W, n), N m or N.
+    dt
+        Working period, s.
+    """
+
+    q: Array
+    qd: Array
+    qdd: Array
+    tau: Array
+    dt: float
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Equations of all joints for one assignment of positions.
+
+    Parameters
+    ----------
+    x
+        Regressors: base parameters without gravity, then free terms, (M, n, c).
+    gravity
+        What gravity along each base axis adds to the regressors, per m/s^2, (3, M, n, c).
+    physical
+        Rows whose product with the parameters must not be negative: mean moment of inertia, and power of friction,
+        (2 n, c).
+    """
+
+    x: Array
+    gravity: Array
+    physical: Array
+
+
+@dataclass(eq=False)
+class Bench:
+    """Signals of a set of recordings, and a cache of their equations.
+
+    Parameters
+    ----------
+    model
+        Rigid model, with base parameters for gravity in any direction.
+    robot
+        The configuration.
+    segments
+        Signals of each experiment.
+    decimation
+        Filter from the working rate to the rows.
+    moving
+        Mask (n,) of the joints that move.
+    period
+        Sampling period of the recordings, s.
+    rows_kept
+        Largest number of instants.
+    normals
+        Cache of `armident.identify.setup.fit.normal`.
+    """
+
+    model: ArmModel
+    robot: RobotConfig
+    segments: tuple[Segment, ...]
+    decimation: Decimation
+    moving: NDArray[np.bool_]
+    period: float
+    rows_kept: int = MOST_ROWS
+    normals: dict[bytes, Any] = field(default_factory=dict, repr=False)
+    _rows: dict[bytes, Rows] = field(default_factory=dict, repr=False)
+    _torques: dict[bytes, Array] = field(default_factory=dict, repr=False)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.model.n
+
+    @property
+    def stride(self) -> int:
+        """Kept are one of so many instants."""
+        count = sum(self.decimation.count(s.q.shape[0]) for s in self.segments)
+        return max(1, -(-count // self.rows_kept))
+
+    @property
+    def rigid(self) -> int:
+        """Number of base parameters: the first columns of the regressors."""
+        return self.model.base.b
+
+    @cached_property
+    def recorded(self) -> tuple[Array, Array, Array]:
+        """Recorded positions, velocities and torques at the instants of the rows, (M, n) each."""
+        q, qd, tau = (np.concatenate([self._kept(getattr(s, x)) for s in self.segments]) for x in ("q", "qd", "tau"))
+        return q, qd, tau
+
+    def coarse(self, rows: int) -> "Bench":
+        """Return the same signals with fewer instants.
+
+        Parameters
+        ----------
+        rows
+            Largest number of instants.
+        """
+        return Bench(self.model, self.robot, self.segments, self.decimation, self.moving, self.period, rows)
+
+    def column(self, name: str) -> int:
+        """Column of a standard parameter that is a base parameter, possibly with others regrouped into it.
+
+        Parameters
+        ----------
+        name
+            Standard parameter.
+        """
+        return list(self.model.base.independent).index(self.model.names.index(name))
+
+    def torque(self, shift: Array) -> Array:
+        """Recorded torques at the instants of the rows, moved to earlier times, (M, n), N m or N.
+
+        Parameters
+        ----------
+        shift
+            Time by which each torque is late, s, (n,).
+        """
+        key = np.round(shift, 9).tobytes()
+        if key not in self._torques:
+            parts = [self._kept(_shifted(s.tau, shift / s.dt)) for s in self.segments]
+            self._torques[key] = np.concatenate(parts)
+        return self._torques[key]
+
+    def instants(self) -> Array:
+        """Number of the segment of every row, (M,)."""
+        counts = [self._kept(s.tau[:, :1]).shape[0] for s in self.segments]
+        return np.repeat(np.arange(len(counts)), counts)
+
+    def rows(self, position: Array) -> Rows:
+        """Equations with the joint positions ``position @ q_recorded``.
+
+        Parameters
+        ----------
+        position
+            Matrix (n, n): signs, permutation and scale.
+        """
+        key = np.round(position, 9).tobytes()
+        if key not in self._rows:
+            if len(self._rows) > 64:
+                self._rows.clear()
+            self._rows[key] = self._make(position)
+        return self._rows[key]
+
+    def _kept(self, x: Array) -> Array:
+        return self.decimation(x)[:: self.stride]
+
+    def _make(self, position: Array) -> Rows:
+        n, b = self.n, self.rigid
+        q, qd, qdd = (
+            np.concatenate([self._kept(getattr(s, name)) for s in self.segments]) @ position.T
+            for name in ("q", "qd", "qdd")
+        )
+        top = np.maximum(np.max([np.abs(s.qd @ position.T).max(axis=0) for s in self.segments], axis=0), 1e-12)
+        free = np.concatenate([self._kept(_friction(s.qd @ position.T, top)) for s in self.segments])
+        still = np.zeros_like(q)
+        postures = np.ascontiguousarray(q[:: max(1, q.shape[0] // POSTURES)])
+        weightless = self.model.with_gravity(np.zeros(3))
+        x = np.zeros((q.shape[0], n, b + FRICTION_TERMS * n))
+        x[:, :, :b] = weightless.rigid_regressor(q, qd, qdd)
+        at_rest = weightless.rigid_regressor(q, still, still)
+        along = [self.model.with_gravity(axis).rigid_regressor(q, still, still) for axis in np.eye(3)]
+        gravity = np.stack(along) - at_rest
+        physical = np.zeros((2, n, x.shape[2]))
+        spring = q - q.mean(axis=0)
+        for j in range(n):
+            dry = self.column(f"fc{j + 1}")
+            x[:, :, dry] = 0.0
+            x[:, j, dry] = free[:, j, 0]
+            own = b + FRICTION_TERMS * j + np.arange(FRICTION_TERMS)
+            x[:, j, own[0]] = spring[:, j]
+            x[:, j, own[1:]] = free[:, j, 1:]
+            push = np.zeros_like(postures)
+            push[:, j] = 1.0
+            motionless = np.zeros_like(postures)
+            unit = weightless.rigid_regressor(postures, motionless, push) - weightless.rigid_regressor(
+                postures, motionless, motionless
+            )
+            physical[0, j, :b] = unit[:, j].mean(axis=0)
+            columns = [self.column(f"fv{j + 1}"), dry, *own[1:]]
+            physical[1, j, columns] = (x[:, j, columns] * qd[:, j, None]).mean(axis=0)
+        return Rows(x, gravity, physical.reshape(2 * n, -1))
+
+
+def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]) -> Bench:
+    """Filter and differentiate the recordings.
+
+    Parameters
+    ----------
+    experiments
+        SI, joint side, one sampling rate.
+    robot
+        The configuration.
+    moving
+        Mask (n,) of the joints that move.
+
+    Raises
+    ------
+    DataError
+        If the recordings are too short for any comparison.
+    """
+    dt = experiments[0].dt
+    cutoff = min(CUTOFF * motion_bandwidth([e.q for e in experiments], dt), 0.45 / dt)
+    first_factor = max(1, int(1.0 / (dt * WORKING_RATE * cutoff)))
+    working = dt * first_factor
+    first = design(dt, 0.4 / working, first_factor) if first_factor > 1 else design(dt, 0.5 / dt, 1)
+    second = design(working, cutoff, max(1, int(0.5 / (working * cutoff) + 1e-9)))
+    segments = []
+    for e in experiments:
+        if second.count(first.count(e.q.shape[0])) < 4:
+            continue
+        q = first(e.q)
+        qd = np.gradient(q, working, axis=0)
+        qdd = np.gradient(qd, working, axis=0)
+        segments.append(Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, -0.5))), working))
+    count = sum(second.count(s.q.shape[0]) for s in segments)
+    samples = sum(e.q.shape[0] for e in experiments)
+    if count < LEAST_ROWS or samples < LEAST_SAMPLES:
+        raise DataError(
+            f"the recordings are too short for a check of the set-up: {samples} samples, {count} after filtering; "
+            f"at least {LEAST_SAMPLES} and {LEAST_ROWS} are needed: record longer"
+        )
+    generic = robot.model_copy(update={"gravity": tuple(GENERIC), "effects": ()})
+    return Bench(ArmModel.from_config(generic), robot, tuple(segments), second, moving, dt)
+
+
+def _shifted(x: Array, samples: Array) -> Array:
+    """Signals (N, n) moved to earlier times by numbers of samples (n,), linearly interpolated."""
+    if not samples.any():
+        return x
+    t = np.arange(x.shape[0], dtype=np.float64)
+    return np.stack([np.interp(t + s, t, column) for s, column in zip(samples, x.T, strict=True)], axis=1)
+
+
+def _friction(qd: Array, top: Array) -> Array:
+    """Free friction terms (W, n, 4): dry, asymmetric viscous, quadratic, and dry at low velocity only."""
+    u = qd / top
+    sign = 2 / np.pi * np.arctan(u / SLOW)
+    return np.stack([sign, np.abs(u), u * np.abs(u), sign * np.exp(-np.abs(u) / BREAKAWAY)], axis=2)

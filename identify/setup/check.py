@@ -1,0 +1,164 @@
+"""Check of the set-up: wiring, units, transmission, gravity and clocks, before anything else."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from armident.configs import DataError, RobotConfig
+from armident.identify.effects.recorded import put_right
+from armident.identify.experiment import Experiment
+from armident.identify.setup import signals
+from armident.identify.setup.bench import Bench, make_bench
+from armident.identify.setup.clipping import clipped_torques
+from armident.identify.setup.describe import described
+from armident.identify.setup.fit import Hypothesis, joint_errors
+from armident.identify.setup.result import SetupCheck, SetupFinding
+from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
+
+Array = NDArray[np.float64]
+
+TRIED = {
+    "position_sign": "wrong sign of positions, or of positions and torques, of each joint and of all",
+    "torque_sign": "wrong sign of torques of each joint and of all",
+    "exchange": "exchange of any two joints: positions, torques, both",
+    "assignment": "any other order of the torques",
+    "order": "any other order of the joints",
+    "position_unit": "positions in degrees or mm",
+    "torque_unit": "torques in thousands, thousandths or per mille of their unit",
+    "position_scale": "another encoder resolution of each joint",
+    "torque_scale": "another torque constant of each joint",
+    "torque_scales": "every torque in a unit of its own drive",
+    "gear_ratio": "another gear ratio of each joint",
+    "side": "motor side taken for joint side, and the reverse",
+    "gravity_direction": "any direction of gravity",
+    "gravity_missing": "torques without gravity",
+    "time_unit": "time in ms, us, ns",
+    "time_shift": "all torques late or early by the same time",
+}
+"""Families of hypotheses in words."""
+
+
+def check_setup(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
+    """Compare the set-up as configured with its possible mistakes, each with everything refitted.
+
+    Parameters
+    ----------
+    experiments
+        SI, joint side, of one robot at one sampling rate.
+    robot
+        The configuration; mistakes that its ``effects`` correct are corrected first.
+
+    Returns
+    -------
+    SetupCheck
+        The mistakes with their probability and remedy.
+
+    Raises
+    ------
+    DataError
+        If the recordings do not fit together or are too short.
+    """
+    _validate(experiments, robot)
+    # The matrices are small: threads delay each other.
+    with threadpool_limits(1):  # type: ignore[no-untyped-call]
+        try:
+            return _check(put_right(experiments, robot), robot)
+        except np.linalg.LinAlgError as error:
+            message = f"the set-up cannot be checked: the equations of the motion are singular ({error})"
+            raise DataError(message) from error
+
+
+def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
+    moving = signals.moving_joints(experiments, robot)
+    findings = signals.rest_findings(moving, robot)
+    if not moving.any():
+        nothing = (100.0,) * robot.n
+        return SetupCheck(tuple(findings), nothing, nothing, (), ("standstill",), None)
+    findings += signals.clipped_findings(experiments, robot, moving)
+    bench, search, best = _searched(experiments, robot, moving)
+    found = described(best, robot, bench)
+    tried, before = search.tried, _errors(bench, _as_configured(robot))
+    setup_findings, corrected = found.findings, found.robot
+    clock = best.h.clock
+    if clock != 1.0:
+        # Velocities enter friction and limits: everything else is judged with the right clock.
+        experiments = [replace(e, dt=e.dt * clock) for e in experiments]
+        bench, again, best = _searched(experiments, robot, moving)
+        found = described(best, robot, bench)
+        of_clock = tuple(finding for finding in setup_findings if finding.kind == "time_unit")
+        setup_findings, corrected = (*of_clock, *found.findings), found.robot
+        tried = tried | again.tried
+    findings += signals.rate_findings(experiments, robot)
+    findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
+    return SetupCheck(
+        findings=(*setup_findings, *findings),
+        relative_error_pct=before,
+        corrected_error_pct=_errors(bench, best.h),
+        joints_not_understood=_not_understood(bench, best),
+        tried=tuple(words for family, words in TRIED.items() if family in tried),
+        corrected_robot=corrected,
+        clock=clock,
+    )
+
+
+def _searched(
+    experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]
+) -> tuple[Bench, Search, Step]:
+    bench = make_bench(experiments, robot, moving)
+    search = Search(bench)
+    return bench, search, search.run(_as_configured(robot))
+
+
+def _clipped(bench: Bench, best: Step, robot: RobotConfig, known: set[str]) -> list[SetupFinding]:
+    """Return the torques that are clipped behind noise, and were not found by equal values."""
+    findings = []
+    for clip in clipped_torques(bench, best.h):
+        name = robot.joints[clip.joint].name
+        if name in known:
+            continue
+        unit = "N m" if robot.joints[clip.joint].type == "revolute" else "N"
+        message = (
+            f"the torque of {name} is clipped at {clip.level:.4g} {unit} in {100 * clip.share:.0f} % of the time: the "
+            f"model needs {clip.needed:.2g} times as much there"
+        )
+        unusable = clip.share >= signals.CLIPPED_UNUSABLE
+        findings.append(SetupFinding("torque_clipped", (name,), 1.0, message, signals.CLIPPED_REMEDY, unusable))
+    return findings
+
+
+def _as_configured(robot: RobotConfig) -> Hypothesis:
+    return Hypothesis(np.eye(robot.n), np.eye(robot.n), np.array(robot.gravity), np.zeros(robot.n))
+
+
+def _errors(bench: Bench, h: Hypothesis) -> tuple[float, ...]:
+    """Relative error of every joint's corrected torque, percent, (n,); 100 at a joint at rest."""
+    return tuple(float(100 * e) for e in np.where(bench.moving, joint_errors(bench, h)[0], 1.0))
+
+
+def _not_understood(bench: Bench, best: Step) -> tuple[str, ...]:
+    """Names of moving joints with a large residual that is not noise."""
+    # A spring or another law of friction is no doubt about the set-up.
+    errors, memory = joint_errors(bench, best.h, free=True)
+    bad = bench.moving & (errors > NOT_UNDERSTOOD) & (memory > STRUCTURED)
+    return tuple(bench.robot.joints[j].name for j in np.flatnonzero(bad))
+
+
+def _validate(experiments: Sequence[Experiment], robot: RobotConfig) -> None:
+    if not experiments:
+        raise DataError("no recording to check")
+    for e in experiments:
+        if e.q.shape != e.tau.shape or e.q.ndim != 2 or e.q.shape[1] != robot.n:
+            raise DataError(
+                f"positions of shape {e.q.shape} and torques of shape {e.tau.shape}: {robot.name} has {robot.n} joints"
+            )
+        if not (np.isfinite(e.q).all() and np.isfinite(e.tau).all()):
+            raise DataError("positions or torques are not finite")
+    rates = sorted({round(1.0 / e.dt, 6) for e in experiments})
+    if any(abs(e.dt - experiments[0].dt) > 1e-9 * experiments[0].dt for e in experiments):
+        raise DataError(
+            f"the recordings have different sampling rates ({', '.join(f'{r:g}' for r in rates)} Hz): "
+            "check each rate alone, or import them with one --rate"
+        )

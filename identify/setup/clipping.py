@@ -1,0 +1,93 @@
+"""Clipped torques behind noise: the model needs more than the largest recorded torque wherever that is reached."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.setup.bench import Bench
+from armident.identify.setup.fit import Hypothesis, equations, fit_rows
+
+Array = NDArray[np.float64]
+
+NEAR = 0.94
+"""Torque over its largest value from which on a row may be clipped: noise and filters blur the level."""
+
+LEAST_ROWS = 0.03
+"""Least share of rows near the level for a test."""
+
+LEAST_FREE = 0.1
+"""Least share of rows below the level that must be left for the fit."""
+
+LEAST_EXCESS = 1.04
+"""Median of the predicted torque over the level from which on it counts as clipped."""
+
+LEAST_IMPROVEMENT = 1.5
+"""Factor by which the residual power of the rows below the level must fall without the rows near it."""
+
+MOST_SLOPE = 0.3
+"""Largest slope of recorded over predicted torques near the level: 0 where they are clipped, near 1 elsewhere."""
+
+LEVEL_QUANTILE = 0.98
+"""Quantile of the magnitude of the torques that stands for the level: single peaks of noise lie above it."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A clipped torque.
+
+    Parameters
+    ----------
+    joint
+        Index of the recorded torque.
+    level
+        Largest recorded torque, N m or N.
+    share
+        Share of rows at the level.
+    needed
+        Median over the level of the torque that the model needs there.
+    """
+
+    joint: int
+    level: float
+    share: float
+    needed: float
+
+
+def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
+    """Return the torques whose largest values lie where the model, fitted to the other rows, needs clearly more.
+
+    A torque of dry friction is also nearly constant over long times, but there the model needs no more than recorded.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        Corrections of the signals.
+    """
+    x, y, physical = equations(bench, h)
+    found = []
+    for k in np.flatnonzero(bench.moving):
+        level = float(np.quantile(np.abs(y[:, k]), LEVEL_QUANTILE))
+        near = np.abs(y[:, k]) > NEAR * level
+        share = float(near.mean())
+        if share < LEAST_ROWS or 1.0 - share < LEAST_FREE:
+            continue
+        used = np.ones(y.shape, dtype=np.bool_)
+        whole = fit_rows(x, y, used, physical, bench.moving)
+        used[near, k] = False
+        below = fit_rows(x, y, used, physical, bench.moving)
+        residual = [np.mean((y[~near, k] - x[~near, k] @ theta) ** 2) for theta in (whole, below)]
+        needed = float(np.median((x[near, k] @ below) * np.sign(y[near, k]))) / level
+        flat = _slope(np.abs(x[near, k] @ below), np.abs(y[near, k])) < MOST_SLOPE
+        if flat and needed > LEAST_EXCESS and residual[0] > LEAST_IMPROVEMENT * residual[1]:
+            found.append(Clip(int(k), level, share, needed))
+    return found
+
+
+def _slope(x: Array, y: Array) -> float:
+    """Slope of the regression line of y on x; 1 if x does not vary."""
+    spread = x - x.mean()
+    power = float(spread @ spread)
+    return float(spread @ y) / power if power > 0 else 1.0

@@ -1,0 +1,348 @@
+"""Findings of a set-up check in words, with the lines of configuration that correct them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from armident.configs import RobotConfig
+from armident.configs.schema.robot import Effect
+from armident.identify.setup.bench import Bench
+from armident.identify.setup.fit import Hypothesis
+from armident.identify.setup.plausible import plausible_factor, position_ratio, torque_ratio, velocity_ratio
+from armident.identify.setup.prior import WIRING
+from armident.identify.setup.result import SetupFinding
+from armident.identify.setup.scales import LEAST_TORQUE
+from armident.identify.setup.search import EACH_OWN, Step
+
+Array = NDArray[np.float64]
+
+SCALES = ("position_unit", "torque_unit", "side", "gear_ratio", "torque_scale", "torque_scales", "position_scale")
+"""Families that scale signals."""
+
+KINDS = {"torque_scale": "torque_unit", "torque_scales": "torque_unit", "position_scale": "position_unit"}
+"""Kind of the finding where it is not the family."""
+
+CLOCK_WORDS = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "ks"}
+
+
+@dataclass(frozen=True)
+class Described:
+    """Findings of a search, and what a configuration can express of their corrections.
+
+    Parameters
+    ----------
+    findings
+        The findings.
+    robot
+        Configuration with the corrections; ``None`` if there are none that it can express.
+    """
+
+    findings: tuple[SetupFinding, ...]
+    robot: RobotConfig | None
+
+
+def described(step: Step, robot: RobotConfig, bench: Bench) -> Described:
+    """Return the findings of a search.
+
+    Parameters
+    ----------
+    step
+        Its result.
+    robot
+        The configuration.
+    bench
+        Signals, for the figures of the messages.
+    """
+    findings: list[SetupFinding] = []
+    entries: list[Effect] = []
+    step = _scales_merged(step, bench)
+    for first, last in _groups(step):
+        if step.families[first] in WIRING and not step.made[first][2]:
+            made = _wiring(step, first, last, robot)
+        elif step.families[first] in WIRING:
+            made = [_raw_exchange(step, first, robot)]
+        elif step.families[first] == "time_shift":
+            made = [_late(step, first, robot, bench)] if "time_shift" not in step.families[last:] else []
+        elif step.families[first] in SCALES and not _of_a_drive(step, first):
+            made = [_scale(step, first, robot, bench)]
+        else:
+            continue
+        for finding, corrections in made:
+            findings.append(finding)
+            entries += corrections
+    update: dict[str, object] = {"effects": (*robot.effects, *entries)} if entries else {}
+    share = dict(zip(step.families, step.probability, strict=True))
+    for family in [f for f in step.families if f.startswith("gravity")][-1:]:
+        if family != "gravity_missing" or not step.h.gravity.any():
+            findings.append(_gravity(family, step, robot, share[family]))
+            update["gravity"] = tuple(float(round(g, 4)) for g in step.h.gravity)
+    if "time_unit" in step.families:
+        findings.append(_clock(step, robot, bench, share["time_unit"]))
+    return Described(tuple(findings), robot.model_copy(update=update) if update else None)
+
+
+def _scales_merged(step: Step, bench: Bench) -> Step:
+    """Make one mistake of all scales of torques where every torque is in a unit of its own drive."""
+    single = step.families.count("torque_scale")
+    if "torque_scales" not in step.families and single < 2:
+        return step
+    n = bench.n
+    scales = [
+        k
+        for k, (family, (position, torque, _)) in enumerate(zip(step.families, step.made, strict=True))
+        if family in SCALES and np.array_equal(position, np.eye(n)) and _diagonal(torque)
+    ]
+    whole = np.eye(n)
+    for k in scales:
+        whole = step.made[k][1] @ whole
+    logs, common = np.log(np.abs(np.diag(whole))), plausible_factor(bench, step.h)
+    if common == 1.0 and np.max(np.abs(logs - np.median(logs))) < np.log(LEAST_TORQUE):
+        return step
+    whole = whole * common
+    last = scales[-1]
+    kept = [k for k in range(len(step.families)) if k == last or k not in scales]
+
+    def of(values: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(values[k] for k in kept)
+
+    return replace(
+        step,
+        families=of(tuple("torque_scales" if k == last else f for k, f in enumerate(step.families))),
+        words=of(tuple(EACH_OWN if k == last else words for k, words in enumerate(step.words))),
+        made=of(tuple((np.eye(n), whole, False) if k == last else m for k, m in enumerate(step.made))),
+        probability=of(step.probability),
+        rivals=of(step.rivals),
+    )
+
+
+def _groups(step: Step) -> Iterator[tuple[int, int]]:
+    """First mistake and the one after the last of each group: consecutive mistakes of the wiring make one."""
+    first = 0
+    while first < len(step.families):
+        last = first + 1
+        while last < len(step.families) and _mergeable(step, first) and _mergeable(step, last):
+            last += 1
+        yield first, last
+        first = last
+
+
+def _of_a_drive(step: Step, k: int) -> bool:
+    """True for a torque constant that differs moderately: an effect of the drive (`drive_gain_error`)."""
+    if step.families[k] != "torque_scale":
+        return False
+    factors = np.diag(step.made[k][1])
+    return bool(np.all(np.abs(np.log(factors)) < np.log(LEAST_TORQUE)))
+
+
+def _mergeable(step: Step, k: int) -> bool:
+    return step.families[k] in WIRING and not step.made[k][2]
+
+
+def _wiring(step: Step, first: int, last: int, robot: RobotConfig) -> list[tuple[SetupFinding, list[Effect]]]:
+    """Signs and orders of some mistakes together, in as few words as possible."""
+    n, names = robot.n, [joint.name for joint in robot.joints]
+    position, torque = np.eye(n), np.eye(n)
+    for of_position, of_torque, _ in step.made[first:last]:
+        position, torque = of_position @ position, of_torque @ torque
+    share = min(step.probability[first:last])
+    rivals = [words for some in step.rivals[first:last] for words in some]
+    orders = [np.abs(m).argmax(axis=1) for m in (position, torque)]
+    turned = [np.sign(m[np.arange(n), order]) < 0 for m, order in zip((position, torque), orders, strict=True)]
+    if np.array_equal(orders[0], orders[1]):
+        groups: list[tuple[NDArray[np.int64], tuple[str, ...]]] = [(orders[0], ("position", "torque"))]
+    else:
+        groups = [(orders[0], ("position",)), (orders[1], ("torque",))]
+    found = [
+        _order(order, signals, share, names) for order, signals in groups if not np.array_equal(order, np.arange(n))
+    ]
+    for mask, signals in (
+        (turned[0] & turned[1], ("position", "torque")),
+        (turned[0] & ~turned[1], ("position",)),
+        (~turned[0] & turned[1], ("torque",)),
+    ):
+        if mask.any():
+            found.append(_sign([names[j] for j in np.flatnonzero(mask)], signals, share, rivals))
+    return found
+
+
+def _order(
+    order: NDArray[np.int64], signals: Sequence[str], share: float, names: Sequence[str]
+) -> tuple[SetupFinding, list[Effect]]:
+    """Recorded column ``order[j]`` belongs to joint j."""
+    moved = [j for j in range(len(names)) if order[j] != j]
+    entries = [_entry("joint_order", names[a], signals, names[b]) for a, b in transpositions(order)]
+    plural = " and ".join(f"{signal}s" for signal in signals)
+    if len(moved) == 2:
+        message = f"the {plural} of {names[moved[0]]} and {names[moved[1]]} are exchanged"
+    else:
+        columns = [names[int(np.flatnonzero(order == k)[0])] for k in range(len(names))]
+        message = f"the {plural} are recorded in the order {', '.join(columns)}"
+    joints = tuple(names[j] for j in moved)
+    return SetupFinding("joint_order", joints, share, message, _lines(entries), True), entries
+
+
+def transpositions(order: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Return exchanges that, one after the other, bring recorded column ``order[j]`` to joint j.
+
+    Parameters
+    ----------
+    order
+        Recorded column of each joint, (n,).
+    """
+    current = list(range(len(order)))
+    pairs = []
+    for j, wanted in enumerate(order):
+        if current[j] != wanted:
+            k = current.index(int(wanted))
+            current[j], current[k] = current[k], current[j]
+            pairs.append((j, k))
+    return pairs
+
+
+def _raw_exchange(step: Step, k: int, robot: RobotConfig) -> tuple[SetupFinding, list[Effect]]:
+    position, torque, _ = step.made[k]
+    ratios = robot.transmission_matrix
+    at_motors = {
+        "position": ratios @ position @ np.linalg.inv(ratios),
+        "torque": np.linalg.inv(ratios.T) @ torque @ ratios.T,
+    }
+    signals = [name for name, m in at_motors.items() if not np.allclose(m, np.eye(robot.n))]
+    pair = np.flatnonzero(np.abs(np.diag(at_motors[signals[0]])) < 1e-9)
+    names = [robot.joints[j].name for j in pair]
+    entry = Effect(effect="joint_order", joint=names[0], other=names[1], parameters={s: 1.0 for s in signals})
+    message = f"{step.words[k]}: swapped node numbers or plugs of two drives"
+    return SetupFinding("joint_order", tuple(names), step.probability[k], message, _lines([entry]), True), [entry]
+
+
+def _sign(
+    joints: Sequence[str], signals: Sequence[str], share: float, rivals: Sequence[str]
+) -> tuple[SetupFinding, list[Effect]]:
+    entries = [_entry("sign_error", name, signals) for name in joints]
+    verb = "have" if len(joints) > 1 or len(signals) > 1 else "has"
+    message = f"{' and '.join(signals)} of {', '.join(joints)} {verb} the wrong sign"
+    if len(signals) == 2:
+        message += ": the joint turns opposite to its configured direction"
+    if rivals:
+        message += f" (equally well explained by: {'; '.join(rivals)})"
+    kind = "torque_sign" if tuple(signals) == ("torque",) else "position_sign"
+    return SetupFinding(kind, tuple(joints), share, message, _lines(entries), True), entries
+
+
+def _scale(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFinding, list[Effect]]:
+    """A unit, a side or a gear ratio."""
+    family, (position, torque, _) = step.families[k], step.made[k]
+    changed = sum(np.abs(m - np.eye(robot.n)).max(axis=1) for m in (position, torque)) > 1e-12
+    joints = [int(j) for j in np.flatnonzero(changed)]
+    names = tuple(robot.joints[j].name for j in joints)
+    entries = [*_linear_map(position, "position", robot), *_linear_map(torque, "torque", robot)]
+    remedy, message = _lines(entries), step.words[k]
+    j = joints[0]
+    if family == "gear_ratio":
+        configured, true = robot.transmission_matrix[j, j], robot.transmission_matrix[j, j] / position[j, j]
+        message = f"the gear ratio of {names[0]} is {true:.4g} by its motion and torque, not {configured:.4g}"
+        remedy = f"transmission: row of {names[0]}: {true:.4g} in place of {configured:.4g}; or {remedy}"
+    elif family == "torque_scale":
+        message = f"the torque of {names[0]} is {torque[j, j]:.3g} times the recorded one by those of the other joints"
+        remedy = f"joints: {names[0]}: drive: gain: {torque[j, j]:.3g} times the present one; or {remedy}"
+    elif family == "position_scale":
+        message = f"the position of {names[0]} is {position[j, j]:.3g} times the recorded one by the arm's geometry"
+        resolution = f"counts_per_unit: {1 / position[j, j]:.3g} times the present one"
+        remedy = f"joints: {names[0]}: drive: {resolution}; or {remedy}"
+    elif family == "torque_scales":
+        factors = ", ".join(f"{torque[i, i]:.3g}" for i in range(robot.n))
+        message += f" (per mille, or currents): by the links that they share, true over recorded is as {factors}"
+        remedy = f"joints: drive: gain or rated of each drive by its data sheet; or {remedy}"
+    elif len(joints) > 1:
+        h = _as_configured(robot)
+        message += (
+            f": the largest positions are on average {position_ratio(bench, h):.3g} of their limits, "
+            f"the largest torques {torque_ratio(bench, h):.3g}"
+        )
+        if family == "side":
+            remedy = f"armident import FILE --motor-side where positions and torques are the motors'; or {remedy}"
+    return SetupFinding(KINDS.get(family, family), names, step.probability[k], message, remedy, True), entries
+
+
+def _linear_map(matrix: Array, signal: str, robot: RobotConfig) -> list[Effect]:
+    """Entries of `signal_scale` for a matrix (n, n): factors of an upper, a diagonal and a lower triangular matrix."""
+    n, names = robot.n, [joint.name for joint in robot.joints]
+    _, lower, upper = linalg.lu(matrix) if not _diagonal(matrix) else (None, np.eye(n), matrix)
+    pivots = np.diag(upper)
+    upper = upper / pivots[:, None]
+
+    def entry(i: int, k: int, factor: float) -> Effect:
+        other = None if k == i else names[k]
+        return Effect(effect="signal_scale", joint=names[i], other=other, parameters={signal: _rounded(factor)})
+
+    made = [entry(i, k, upper[i, k]) for i in range(n) for k in range(i + 1, n) if abs(upper[i, k]) > 1e-12]
+    made += [entry(i, i, pivots[i]) for i in range(n) if abs(pivots[i] - 1.0) > 1e-12]
+    made += [entry(i, k, lower[i, k]) for i in reversed(range(n)) for k in range(i) if abs(lower[i, k]) > 1e-12]
+    return made
+
+
+def _diagonal(matrix: Array) -> bool:
+    return bool(np.allclose(matrix, np.diag(np.diag(matrix))))
+
+
+def _late(step: Step, k: int, robot: RobotConfig, bench: Bench) -> tuple[SetupFinding, list[Effect]]:
+    # One drive may be late by a time of its own.
+    shift = float(np.median(step.h.shift[bench.moving]))
+    delay = float(f"{shift:.3g}")
+    names = tuple(joint.name for joint in robot.joints)
+    entries = [Effect(effect="time_delay", joint=name, parameters={"delay": delay}) for name in names]
+    direction = "late" if shift > 0 else "early"
+    message = f"all torques are {1000 * abs(shift):.3g} ms {direction} against the positions"
+    return SetupFinding("time_shift", names, step.probability[k], message, _lines(entries), True), entries
+
+
+def _gravity(family: str, step: Step, robot: RobotConfig, share: float) -> SetupFinding:
+    names = tuple(joint.name for joint in robot.joints)
+    if family == "gravity_missing":
+        message = "the torques contain no gravity: the controller has subtracted its model of it"
+        return SetupFinding(family, names, share, message, "gravity: [0.0, 0.0, 0.0]", True)
+    own, found = np.array(robot.gravity), step.h.gravity
+    vector = ", ".join(f"{g:.3f}" for g in found)
+    if not own.any():
+        message = f"gravity acts along [{vector}] m/s^2, and the configuration has none"
+    else:
+        cosine = float(own @ found / np.linalg.norm(own) / np.linalg.norm(found))
+        angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        message = f"gravity acts along [{vector}] m/s^2, {angle:.1f} degrees from the configured direction"
+    return SetupFinding(family, names, share, message, f"gravity: [{vector}]", True)
+
+
+def _clock(step: Step, robot: RobotConfig, bench: Bench, share: float) -> SetupFinding:
+    names = tuple(joint.name for joint in robot.joints)
+    unit = CLOCK_WORDS.get(step.h.clock, f"{step.h.clock:g} s")
+    rate = 1.0 / (bench.period * step.h.clock)
+    message = (
+        f"the time column is in {unit}, not in s: at {1 / bench.period:.4g} Hz the largest velocities are on average "
+        f"{100 * velocity_ratio(bench, _as_configured(robot)):.2g} % of their limits"
+    )
+    return SetupFinding("time_unit", names, share, message, f"armident import FILE --rate {rate:.6g}", True)
+
+
+def _as_configured(robot: RobotConfig) -> Hypothesis:
+    return Hypothesis(np.eye(robot.n), np.eye(robot.n), np.array(robot.gravity), np.zeros(robot.n))
+
+
+def _entry(effect: str, joint: str, signals: Sequence[str], other: str | None = None) -> Effect:
+    return Effect(effect=effect, joint=joint, other=other, parameters={s: 1.0 for s in signals} | {"joint_side": 1.0})
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+def _lines(entries: Sequence[Effect]) -> str:
+    """Entries of a configuration's ``effects`` in flow style, on one line."""
+    each = []
+    for e in entries:
+        other = "" if e.other is None else f", other: {e.other}"
+        values = ", ".join(f"{name}: {value:.6g}" for name, value in e.parameters.items())
+        each.append(f"{{effect: {e.effect}, joint: {e.joint}{other}, parameters: {{{values}}}}}")
+    return f"effects: [{', '.join(each)}]"

@@ -1,0 +1,116 @@
+"""Gravity and clock of a set-up: direction anywhere on the sphere, no gravity at all, torques late by one time."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from armident.identify.setup.fit import Hypothesis
+
+Array = NDArray[np.float64]
+Criterion = Callable[[Hypothesis], float]
+
+STANDARD = 9.81
+"""Magnitude of gravity where the configuration has none, m/s^2."""
+
+DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
+"""Directions from which the search starts: faces, edges and corners of a cube, (26, 3)."""
+
+STARTS = 2
+"""Number of directions that are refined."""
+
+EQUAL = 0.02
+"""Difference of the misfit, nats per row, below which two directions fit equally well: 2 % of one joint's power."""
+
+SHIFTS_S = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
+"""Shifts that are tried before the refinement, s, to both sides."""
+
+
+def best_direction(h: Hypothesis, criterion: Criterion) -> Hypothesis:
+    """Return the hypothesis with the direction of gravity that fits best.
+
+    Parameters
+    ----------
+    h
+        Start; the magnitude of its gravity is kept.
+    criterion
+        Misfit to minimise.
+
+    Notes
+    -----
+    Opposite directions fit equally well where the first moments of the links change sign with gravity and show in
+    nothing else. Of equal directions the one nearest to the configured direction is the likeliest.
+    """
+    size = float(np.linalg.norm(h.gravity)) or STANDARD
+    tried = sorted(DIRECTIONS, key=lambda d: criterion(replace(h, gravity=size * d)))
+    starts = [*tried[:STARTS], *([h.gravity / size] if h.gravity.any() else [])]
+    found = [_refined(h, size, start, criterion) for start in starts]
+    least = min(misfit for misfit, _ in found)
+    equal = [turned for misfit, turned in found if misfit <= least + EQUAL]
+    return max(equal, key=lambda turned: float(turned.gravity @ h.gravity))
+
+
+def _refined(h: Hypothesis, size: float, start: Array, criterion: Criterion) -> tuple[float, Hypothesis]:
+    """Least misfit near a direction, and its hypothesis."""
+    first, second = _across(start)
+
+    def turned(angles: Array) -> Hypothesis:
+        angle = float(np.linalg.norm(angles))
+        side = (angles[0] * first + angles[1] * second) / max(angle, 1e-12)
+        return replace(h, gravity=size * (np.cos(angle) * start + np.sin(angle) * side))
+
+    def misfit(angles: Array) -> float:
+        return criterion(turned(angles))
+
+    simplex = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.2]])
+    found = optimize.minimize(
+        misfit,
+        np.zeros(2),
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-3, "maxfev": 80},
+    )
+    return float(found.fun), turned(np.asarray(found.x))
+
+
+def without_gravity(h: Hypothesis) -> Hypothesis:
+    """Return the hypothesis that the torques contain no gravity."""
+    return replace(h, gravity=np.zeros(3))
+
+
+def best_shift(h: Hypothesis, criterion: Criterion, dt: float, mask: NDArray[np.bool_]) -> Hypothesis:
+    """Return the hypothesis with the best common shift of some torques.
+
+    Parameters
+    ----------
+    h
+        Start.
+    criterion
+        Misfit to minimise.
+    dt
+        Sampling period, s: longer shifts than 1000 samples are not tried.
+    mask
+        Torques that are late by the same time, (n,).
+    """
+
+    def late(shift: float) -> Hypothesis:
+        return replace(h, shift=h.shift + shift * mask)
+
+    steps = [s for s in (*SHIFTS_S, 2 * dt, 5 * dt, 10 * dt) if 0.5 * dt <= s <= 1000 * dt]
+    grid = sorted({0.0, *steps, *(-s for s in steps)})
+    values = [criterion(late(s)) for s in grid]
+    k = int(np.argmin(values))
+    bounds = grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)]
+    found = optimize.minimize_scalar(
+        lambda s: criterion(late(float(s))), bounds=bounds, method="bounded", options={"xatol": 0.1 * dt, "maxiter": 25}
+    )
+    return late(float(found.x)) if found.fun < values[k] else late(grid[k])
+
+
+def _across(direction: Array) -> tuple[Array, Array]:
+    start = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    first = start - (start @ direction) * direction
+    first /= np.linalg.norm(first)
+    return first, np.cross(direction, first)

@@ -1,0 +1,184 @@
+"""Single mistakes of a set-up, each as the correction that it needs."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import RobotConfig
+from armident.identify.effects.wiring import raw_scales
+from armident.identify.setup.fit import Hypothesis
+
+Array = NDArray[np.float64]
+
+DEGREES = np.pi / 180.0
+THOUSANDTH = 1e-3
+
+LEAST_SPREAD = 0.01
+"""Least spread of the logarithms of rated torques: equal ones make per mille a common factor."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """One mistake: what to do to the corrections found so far.
+
+    Parameters
+    ----------
+    family
+        Kind of the mistake, for the prior: all members of a family share its probability.
+    words
+        Description.
+    position, torque
+        Matrices (n, n) that multiply the corrections; ``None``: no change.
+    drives
+        True if raw numbers of two drives are exchanged, with the scales of both.
+    """
+
+    family: str
+    words: str
+    position: Array | None = None
+    torque: Array | None = None
+    drives: bool = False
+
+    def __call__(self, h: Hypothesis) -> Hypothesis:
+        """Return the hypothesis with this mistake corrected, too."""
+        position = h.position if self.position is None else self.position @ h.position
+        torque = h.torque if self.torque is None else self.torque @ h.torque
+        return replace(h, position=position, torque=torque)
+
+
+def sign_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
+    """Signals with the wrong sign: of one joint, and of all.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    joints
+        Indices of the joints that move.
+    """
+    names = [joint.name for joint in robot.joints]
+    groups: list[tuple[str, list[int]]] = [(names[j], [j]) for j in joints]
+    if len(joints) > 1:
+        groups.append(("all joints", list(range(robot.n))))
+    for where, chosen in groups:
+        turned = np.eye(robot.n)
+        turned[chosen, chosen] = -1.0
+        yield Move("position_sign", f"position of {where} with the wrong sign", turned, None)
+        yield Move("torque_sign", f"torque of {where} with the wrong sign", None, turned)
+        yield Move("position_sign", f"position and torque of {where} with the wrong sign", turned, turned)
+
+
+def exchange_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
+    """Two joints exchanged: as columns in SI units, and as raw numbers of the drives where that differs.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    joints
+        Indices of the joints that move.
+    """
+    names = [joint.name for joint in robot.joints]
+    ratios = robot.transmission_matrix
+    counts, rated = raw_scales(robot)
+    for i, k in combinations(joints, 2):
+        swap = np.eye(robot.n)
+        swap[[i, k]] = swap[[k, i]]
+        pairs: list[tuple[str, Array, Array]] = [("columns", swap, swap)]
+        at_drives = np.asarray(np.linalg.solve(ratios, (swap * counts[:, None] / counts) @ ratios), np.float64)
+        of_drives: Array = ratios.T @ (swap * rated[:, None] / rated) @ np.linalg.inv(ratios.T)
+        if not (np.allclose(at_drives, swap, rtol=1e-3) and np.allclose(of_drives, swap, rtol=1e-3)):
+            pairs.append(("drives", at_drives, of_drives))
+        for what, position, torque in pairs:
+            where = f"{names[i]} and {names[k]}" + (" (raw numbers of the drives)" if what == "drives" else "")
+            raw = what == "drives"
+            yield Move("exchange", f"torques of {where} exchanged", None, torque, raw)
+            yield Move("exchange", f"positions of {where} exchanged", position, None, raw)
+            yield Move("exchange", f"positions and torques of {where} exchanged", position, torque, raw)
+
+
+def unit_moves(robot: RobotConfig) -> Iterator[Move]:
+    """Units and sides of a whole signal.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    """
+    n, ratios = robot.n, robot.transmission_matrix
+    inverse = np.asarray(np.linalg.inv(ratios), np.float64)
+    revolute = np.array([joint.type == "revolute" for joint in robot.joints])
+    units = " and ".join(sorted({_unit(joint.type) for joint in robot.joints}))
+    small = np.diag(np.where(revolute, DEGREES, THOUSANDTH))
+    yield Move("position_unit", f"the positions are in {units}", small, None)
+    yield Move("torque_unit", "the torques are 1000 times too small (kN m for N m, or A for mA)", None, 1e3 * np.eye(n))
+    yield Move("torque_unit", "the torques are 1000 times too large (mN m for N m, mA for A)", None, 1e-3 * np.eye(n))
+    if np.abs(ratios - np.eye(n)).max() > 1e-9:
+        for what, places in (("torques", (False, True)), ("positions", (True, False)), ("signals", (True, True))):
+            yield Move(
+                "side", f"the {what} are those of the motors, not of the joints", *_where(places, inverse, ratios.T)
+            )
+            words = f"the {what} are those of the joints, and were converted as those of the motors"
+            yield Move("side", words, *_where(places, ratios, inverse.T))
+    _, rated = raw_scales(robot)
+    if np.ptp(np.log(rated)) > LEAST_SPREAD:
+        share = ratios.T @ np.diag(rated / 1000.0)
+        yield Move("torque_unit", "the torques are in per mille of the rated torque", None, share @ inverse.T)
+        yield Move("torque_unit", "the torques are the motors', in per mille of the rated torque", None, share)
+
+
+def _where(places: tuple[bool, bool], position: Array, torque: Array) -> tuple[Array | None, Array | None]:
+    return position if places[0] else None, torque if places[1] else None
+
+
+def single_unit_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
+    """Unit or side of one joint's signal.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    joints
+        Indices of the joints that move.
+    """
+    for j in joints:
+        name, ratio = robot.joints[j].name, float(robot.transmission_matrix[j, j])
+
+        def at(factor: float, j: int = j) -> Array:
+            return scaled(robot.n, j, factor)
+
+        unit, word = (DEGREES, "degrees") if robot.joints[j].type == "revolute" else (THOUSANDTH, "mm")
+        yield Move("position_unit", f"the position of {name} is in {word}", at(unit), None)
+        yield Move("torque_unit", f"the torque of {name} is 1000 times too large", None, at(1e-3))
+        yield Move("torque_unit", f"the torque of {name} is 1000 times too small", None, at(1e3))
+        if ratio == 0.0 or abs(abs(ratio) - 1.0) < 1e-9:
+            continue
+        of_motor, of_joint = "is that of its motor", "is that of the joint, and was converted as that of the motor"
+        yield Move("side", f"the torque of {name} {of_motor}", None, at(ratio))
+        yield Move("side", f"the position of {name} {of_motor}", at(1.0 / ratio), None)
+        yield Move("side", f"the position of {name} {of_joint}", at(ratio), None)
+        yield Move("side", f"the torque of {name} {of_joint}", None, at(1.0 / ratio))
+
+
+def scaled(n: int, joint: int, factor: float) -> Array:
+    """Identity (n, n) with a factor at one joint.
+
+    Parameters
+    ----------
+    n
+        Number of joints.
+    joint
+        Index of the joint.
+    factor
+        The factor.
+    """
+    matrix = np.eye(n)
+    matrix[joint, joint] = factor
+    return matrix
+
+
+def _unit(kind: str) -> str:
+    return "degrees" if kind == "revolute" else "mm"

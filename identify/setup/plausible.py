@@ -1,0 +1,117 @@
+"""Plausibility of units: recorded signals against the limits of the configuration."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.setup.bench import Bench
+from armident.identify.setup.fit import Hypothesis
+
+Array = NDArray[np.float64]
+
+POSITION_MOST = 1.2
+"""Largest position over the limit that is plausible: limits of a configuration are often rounded."""
+
+VELOCITY = (0.01, 2.0)
+"""Plausible range of the largest velocity over the limit: 1 % is a very slow motion of a robot."""
+
+TORQUE = (0.02, 1.5)
+"""Plausible range of the largest torque over the limit: 2 % is less than friction and gravity of usual robots take."""
+
+RATE_LEAST_HZ = 20.0
+"""Sampling rate below which a recording of a robot is implausible, Hz: ten samples per period of a 2 Hz motion."""
+
+SPREAD = float(np.log(2.0))
+"""Standard deviation of the logarithm of these ratios beyond the range."""
+
+NO_LIMIT = 1e6
+"""Limits from this value on are placeholders of a file format."""
+
+
+def position_ratio(bench: Bench, h: Hypothesis) -> float:
+    """Geometric mean over the moving joints of the largest position over its limit.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        Corrections.
+    """
+    limits = np.array([max(abs(end) for end in joint.limits.position) for joint in bench.robot.joints])
+    peaks = np.abs(bench.recorded[0] @ h.position.T).max(axis=0)
+    return _mean(peaks / limits, limits, bench.moving)
+
+
+def velocity_ratio(bench: Bench, h: Hypothesis) -> float:
+    """Geometric mean over the moving joints of the largest velocity over its limit.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        Corrections.
+    """
+    limits = np.array([joint.limits.velocity for joint in bench.robot.joints])
+    peaks = np.abs(bench.recorded[1] @ h.position.T).max(axis=0)
+    return _mean(peaks / h.clock / limits, limits, bench.moving)
+
+
+def torque_ratio(bench: Bench, h: Hypothesis) -> float:
+    """Geometric mean over the moving joints of the largest torque over its limit.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        Corrections.
+    """
+    limits = np.array([joint.limits.torque for joint in bench.robot.joints])
+    peaks = np.abs(bench.recorded[2] @ h.torque.T).max(axis=0)
+    return _mean(peaks / limits, limits, bench.moving)
+
+
+def plausible_factor(bench: Bench, h: Hypothesis) -> float:
+    """Common factor that brings the torques to the middle of their plausible range, 1 inside of it.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        Corrections.
+    """
+    ratio = torque_ratio(bench, h)
+    return 1.0 if TORQUE[0] <= ratio <= TORQUE[1] else float(np.sqrt(TORQUE[0] * TORQUE[1])) / ratio
+
+
+def log_plausibility(bench: Bench, h: Hypothesis) -> float:
+    """Logarithm of the plausibility of the corrected signals against the limits, 0 or less.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    h
+        Corrections.
+    """
+    rate = 1.0 / (bench.period * h.clock)
+    return (
+        _beyond(position_ratio(bench, h), 0.0, POSITION_MOST)
+        + _beyond(velocity_ratio(bench, h), *VELOCITY)
+        + _beyond(torque_ratio(bench, h), *TORQUE)
+        + _beyond(rate, RATE_LEAST_HZ, np.inf)
+    )
+
+
+def _mean(ratios: Array, limits: Array, moving: NDArray[np.bool_]) -> float:
+    """Geometric mean; 1 if no limit is usable."""
+    used = moving & (limits < NO_LIMIT) & (ratios > 0)
+    return float(np.exp(np.mean(np.log(ratios[used])))) if used.any() else 1.0
+
+
+def _beyond(ratio: float, least: float, most: float) -> float:
+    """Logarithm of a normal density of the logarithm beyond a range, 0 inside it."""
+    excess = max(np.log(ratio / most) if np.isfinite(most) else 0.0, np.log(least / ratio) if least > 0 else 0.0, 0.0)
+    return -0.5 * float(excess / SPREAD) ** 2

@@ -1,0 +1,86 @@
+"""Prior of the set-up hypotheses: the number of things that are wrong."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MISTAKE = math.log(100.0)
+"""Cost of each mistake, nats: one set-up of a hundred has a mistake of a given kind."""
+
+RAW = 1.0
+"""Further cost of an exchange of raw numbers, nats: columns are meant where both explain the recordings equally."""
+
+FACTOR = math.log(10.0)
+"""Cost of each free factor of all torques, nats: it lies in one of ten intervals that the data tell apart."""
+
+PREFERENCE = {"torque": 0.0, "both": 0.2, "position": 0.4}
+"""Further cost, nats, among hypotheses that a symmetry of the arm makes equal: signs of torques are a convention."""
+
+WIRING = ("position_sign", "torque_sign", "exchange", "assignment", "order")
+"""Families that only permute signals or change their signs."""
+
+
+def cost(families: tuple[str, ...], made: tuple[tuple[Array, Array, bool], ...], n: int) -> float:
+    """Negative logarithm of the prior of a hypothesis, nats.
+
+    Permutations and signs are judged by their product, so that two ways to the same wiring cost the same.
+
+    Parameters
+    ----------
+    families
+        Kind of each mistake.
+    made
+        Changes of each mistake, see `armident.identify.setup.search.Step`.
+    n
+        Number of joints.
+    """
+    total, position, torque = 0.0, np.eye(n), np.eye(n)
+    for family, (of_position, of_torque, raw) in zip(families, made, strict=True):
+        if family in WIRING and not raw:
+            position, torque = of_position @ position, of_torque @ torque
+        else:
+            total += MISTAKE + math.log(n) + (RAW if raw else 0.0)
+            if family == "torque_scales":
+                total += n * FACTOR
+    return total + wiring_cost(position, torque)
+
+
+def wiring_cost(position: Array, torque: Array) -> float:
+    """Negative logarithm of the prior of signed permutations of positions and torques, nats.
+
+    Parameters
+    ----------
+    position, torque
+        Signed permutation matrices, (n, n).
+    """
+    n = position.shape[0]
+    own = np.arange(n)
+    orders = [np.abs(m).argmax(axis=1) for m in (position, torque)]
+    turned = [np.sign(m[own, order]) < 0 for m, order in zip((position, torque), orders, strict=True)]
+    moved = [order for order in orders if not np.array_equal(order, own)]
+    if len(moved) == 2 and np.array_equal(orders[0], orders[1]):
+        total = _order_cost(orders[0]) + PREFERENCE["both"]
+    else:
+        total = sum(_order_cost(order) for order in moved)
+    groups = {
+        "both": turned[0] & turned[1],
+        "position": turned[0] & ~turned[1],
+        "torque": ~turned[0] & turned[1],
+    }
+    return total + sum(_sign_cost(mask) + PREFERENCE[name] for name, mask in groups.items() if mask.any())
+
+
+def _order_cost(order: NDArray[np.int64]) -> float:
+    """One exchange of two among all pairs, or one order among all."""
+    n = order.size
+    pair = int(np.sum(order != np.arange(n))) == 2
+    return MISTAKE + (math.log(n * (n - 1) / 2) if pair else math.lgamma(n + 1))
+
+
+def _sign_cost(mask: NDArray[np.bool_]) -> float:
+    """One signal among n, all signals together, or several of them."""
+    n, count = mask.size, int(mask.sum())
+    return MISTAKE * (1 if count in (1, n) else min(count, n - count + 1)) + math.log(n)

@@ -1,0 +1,134 @@
+"""Scales of single joints that may have any value: gear ratio, torque constant, encoder resolution."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from armident.configs import RobotConfig
+from armident.identify.setup.fit import Hypothesis
+from armident.identify.setup.moves import Move, scaled
+
+Array = NDArray[np.float64]
+Criterion = Callable[[Hypothesis], float]
+
+FACTORS = (0.2, 0.32, 0.5, 0.7, 0.85, 1.0, 1.18, 1.4, 2.0, 3.1, 5.0)
+"""True over configured values that are tried before the refinement."""
+
+WORTH_REFINING = 0.02
+"""Least drop of the criterion at the tried values for a refinement, nats per row."""
+
+LEAST_GEAR = 0.05
+"""Least relative error of a gear ratio or a resolution: below it other effects of drives and links resemble it."""
+
+LEAST_GAIN = 1.3
+"""Least factor of a single torque that is corrected for the search."""
+
+WIDEST = float(np.log(1e3))
+"""Largest logarithm of a factor over its start: three decades."""
+
+LEAST_TORQUE = 3.0
+"""Least factor of a single torque for a finding: up to it, a torque constant may differ from its data sheet.
+
+Below, the factor is an effect of the drive (`drive_gain_error`): corrected for the search, and not reported.
+"""
+
+
+def scale_moves(robot: RobotConfig, joint: int, h: Hypothesis, criterion: Criterion) -> Iterator[Move]:
+    """Best factor of one joint for its gear ratio, its torque alone and its position alone.
+
+    A wrong gear ratio scales the position by ``f`` and the torque by ``1 / f``: their power stays.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    joint
+        Index of the joint.
+    h
+        Corrections so far.
+    criterion
+        Misfit to minimise.
+    """
+    n, name = robot.n, robot.joints[joint].name
+
+    def gear(f: float) -> Move:
+        return Move("gear_ratio", f"gear ratio of {name}", scaled(n, joint, f), scaled(n, joint, 1.0 / f))
+
+    def torque(f: float) -> Move:
+        return Move("torque_scale", f"scale of the torque of {name}", None, scaled(n, joint, f))
+
+    def position(f: float) -> Move:
+        return Move("position_scale", f"scale of the position of {name}", scaled(n, joint, f), None)
+
+    for made, least in ((gear, 1.0 + LEAST_GEAR), (torque, LEAST_GAIN), (position, 1.0 + LEAST_GEAR)):
+        factor = _best(made, h, criterion)
+        if abs(np.log(factor)) >= np.log(least):
+            yield made(factor)
+
+
+def torque_scales(h: Hypothesis, criterion: Criterion, starts: Sequence[Array]) -> Array | None:
+    """Best factors (n,) of all torques together, or ``None`` if none of them is far from the others.
+
+    The torques of joints that carry the same links determine the proportions; the common factor is free.
+
+    Parameters
+    ----------
+    h
+        Corrections so far.
+    criterion
+        Misfit to minimise.
+    starts
+        Factors (n,) from which the search starts.
+    """
+
+    def misfit(logs: Array) -> float:
+        return criterion(replace(h, torque=np.exp(logs)[:, None] * h.torque))
+
+    found = [
+        optimize.minimize(
+            misfit,
+            np.log(np.abs(start)),
+            method="L-BFGS-B",
+            bounds=[(v - WIDEST, v + WIDEST) for v in np.log(np.abs(start))],
+            options={"maxiter": 12, "eps": 1e-3},
+        )
+        for start in starts
+    ]
+    best = min(found, key=lambda f: float(f.fun))
+    logs = np.asarray(best.x)
+    if np.max(np.abs(logs - np.median(logs))) < np.log(LEAST_TORQUE):
+        return None
+    factors: Array = np.exp(logs)
+    return factors
+
+
+def _best(made: Callable[[float], Move], h: Hypothesis, criterion: Criterion) -> float:
+    """Factor with the least misfit: the best of `FACTORS`, refined between its neighbours."""
+    values = [criterion(made(f)(h)) for f in FACTORS]
+    k = int(np.argmin(values))
+    if values[k] > values[FACTORS.index(1.0)] - WORTH_REFINING:
+        return 1.0
+    low, high = np.log(FACTORS[max(k - 1, 0)]), np.log(FACTORS[min(k + 1, len(FACTORS) - 1)])
+    found = optimize.minimize_scalar(
+        lambda v: criterion(made(float(np.exp(v)))(h)),
+        bounds=(low, high),
+        method="bounded",
+        options={"xatol": 2e-3, "maxiter": 15},
+    )
+    return float(np.exp(found.x)) if found.fun < values[k] else FACTORS[k]
+
+
+def with_clock(h: Hypothesis, factor: float) -> Hypothesis:
+    """Return the hypothesis with another unit of time.
+
+    Parameters
+    ----------
+    h
+        Corrections so far.
+    factor
+        True over recorded duration.
+    """
+    return replace(h, clock=h.clock * factor)

@@ -1,0 +1,372 @@
+"""Search for the corrections of a set-up: best-first over single mistakes, and over whole permutations."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.setup import assignment, gravity, moves, scales
+from armident.identify.setup.bench import Bench
+from armident.identify.setup.fit import Hypothesis, fit, fit_shares, held_out, joint_errors
+from armident.identify.setup.plausible import log_plausibility, plausible_factor
+from armident.identify.setup.prior import WIRING, cost, wiring_cost
+
+Array = NDArray[np.float64]
+
+MOST_MISTAKES = 6
+"""Largest number of mistakes that are corrected one after the other."""
+
+LEAST_ODDS = float(np.log(99.0))
+"""Least gain of the score for a finding, nats: posterior odds of 99 to 1, a false alarm in less than 1 %."""
+
+LEAST_DROP = float(np.log(2.0))
+"""Least drop of the held-out residual power for a finding, nats, summed over the joints: half of one joint's."""
+
+LEAST_DROP_LATE = 0.2
+"""The same for torques that are late by one time: the phase of a few milliseconds is small in the band of a motion.
+
+"""
+
+LEAST_DROP_EARLY = 2.0
+"""The same for torques that are early: noise in a closed loop, and current loops that lag, resemble it."""
+
+LEAST_TOGETHER = 1.5
+"""Least factor by which the structured residual shares of all joints together must fall.
+
+A hypothesis that improves one joint of small torque at the expense of the others is no explanation: the exchange of two
+wrist joints of a measured KUKA LWR4+ reaches 1.3, mistakes made on purpose 2 and more.
+"""
+
+LEAST_TOGETHER_LATE = 1.2
+"""The same for torques that are late: friction and gravity hardly change with a delay."""
+
+CLEAR_TILT = 3.0
+"""Drop from which a direction of gravity needs no `LEAST_TOGETHER`, nats: a tilt shows at few joints."""
+
+WHITE = 0.05
+"""Least correlation of neighbouring residuals that counts as structure: below it, estimates are noise."""
+
+NOT_UNDERSTOOD = 1.0 / 3.0
+"""Largest relative error of a joint that the rigid model explains (DIAGNOSIS.md, principle 1)."""
+
+WELL_UNDERSTOOD = 0.2
+"""Largest relative error of a joint after a correction for which no whole order is tried."""
+
+STRUCTURED = 0.3
+"""Correlation of neighbouring residuals above which a large residual is no white noise of the torque."""
+
+RANKED_ROWS = 100.0
+"""Independent rows that weigh the fit against the plausibility of units in the ranking."""
+
+EXHAUSTIVE = 6
+"""Largest number of joints of which all orders are tried; with more, a search by exchanges starts from several."""
+
+EACH_OWN = "every torque is in a unit of its own drive"
+
+CANDIDATES = 4
+"""Number of best-ranked mistakes whose held-out score is computed."""
+
+EQUAL = 0.1
+"""Odds to the best hypothesis from which on another one is named beside it."""
+
+ORDERS_KEPT = 2
+"""Number of best orders from which the search continues."""
+
+ORDER_ROWS = 150
+"""Instants with which orders are ranked: enough for residuals that differ by tens of percent."""
+
+CLOCKS = (1e-3, 1e-6, 1e-9, 1e3)
+"""Units of time that are tried: ms, us and ns taken for s, and s taken for ms."""
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A hypothesis with the mistakes that lead to it.
+
+    Parameters
+    ----------
+    h
+        The hypothesis.
+    families, words
+        Kind and description of each mistake.
+    made
+        Changes of each mistake: matrices of positions and torques (n, n), and True for an exchange of raw numbers.
+    rank
+        Criterion of the ranking, in sample, nats per row: lower is better.
+    rivals
+        For each mistake, others of the same kind that explain the recordings equally well.
+    probability
+        Posterior share of each mistake.
+    """
+
+    h: Hypothesis
+    families: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
+    made: tuple[tuple[Array, Array, bool], ...] = ()
+    rank: float = np.inf
+    rivals: tuple[tuple[str, ...], ...] = ()
+    probability: tuple[float, ...] = ()
+
+
+@dataclass(eq=False)
+class Search:
+    """Search over the hypotheses of one set of recordings.
+
+    Parameters
+    ----------
+    bench
+        Signals.
+    tried
+        Families of hypotheses that were tried, in words, filled by the search.
+    """
+
+    bench: Bench
+    tried: dict[str, int] = field(default_factory=dict)
+
+    def rank(self, h: Hypothesis) -> float:
+        """Criterion of the ranking: misfit in sample minus plausibility of the units, nats per row."""
+        return _rank(self.bench, h)
+
+    def run(self, start: Hypothesis) -> Step:
+        """Return the corrected set-up.
+
+        Parameters
+        ----------
+        start
+            The set-up as configured.
+        """
+        first = Step(start, rank=self.rank(start))
+        best = self._greedy(first)
+        # An exchange that needs a second mistake beside it may be a part of another order.
+        simple = len(best.families) < 2 or not {"exchange", "assignment"} & set(best.families)
+        limit = WELL_UNDERSTOOD if best.families else NOT_UNDERSTOOD
+        if self.bench.moving.sum() < 3 or (simple and self._understood(best.h, limit)):
+            return best
+        for step in self._orders(first):
+            other = self._greedy(step)
+            if self._gain(best, other)[0] > 0:
+                best = other
+        return best
+
+    def _understood(self, h: Hypothesis, limit: float) -> bool:
+        errors, memory = joint_errors(self.bench, h, free=True)
+        errors = np.where(memory > STRUCTURED, errors, 0.0)
+        return bool(np.all(errors[self.bench.moving] <= limit))
+
+    def _greedy(self, step: Step) -> Step:
+        while len(step.families) < MOST_MISTAKES:
+            found = sorted(self._neighbours(step), key=lambda s: s.rank)
+            taken = self._taken(step, found)
+            if taken is None:
+                return step
+            step = taken
+        return step
+
+    def _taken(self, step: Step, found: list[Step]) -> Step | None:
+        """Best neighbour that is a mistake of the set-up, certain and material."""
+        for best in found[:CANDIDATES]:
+            taken = self._accepted(step, best, [s for s in found[: 2 * CANDIDATES] if s is not best])
+            if taken is not None:
+                return taken
+        return None
+
+    def _accepted(self, step: Step, best: Step, found: list[Step]) -> Step | None:
+        gain, drop, plausible = self._gain(step, best)
+        least, together = LEAST_DROP, LEAST_TOGETHER
+        if best.families[-1] == "time_shift":
+            shift = float(best.h.shift[self.bench.moving][0] - step.h.shift[self.bench.moving][0])
+            if shift > 0.0:
+                least, together = LEAST_DROP_LATE, LEAST_TOGETHER_LATE
+            else:
+                least = LEAST_DROP_EARLY
+            if abs(shift) < self.bench.period:
+                return None
+            one = self._one_late(step)
+            if one is not None and one.rank < best.rank:
+                # The delay of one drive alone is an effect of its own, and no clock of the set-up.
+                best, least, together = one, LEAST_DROP, LEAST_TOGETHER
+                gain, drop, plausible = self._gain(step, best)
+        if best.families[-1] == "gravity_direction" and drop >= CLEAR_TILT:
+            together = 1.0
+        material = drop >= least and self._together(step.h, best.h) >= together
+        if gain < LEAST_ODDS or not (material or plausible >= LEAST_ODDS):
+            return None
+        others = [s for s in found if _differs(s.h, best.h)]
+        odds = {s.words[-1]: float(np.exp(min(-self._gain(s, best)[0], 0.0))) for s in others}
+        # A symmetry of the arm makes some signs equal: that one of them is wrong is certain all the same.
+        equal = {w: p for s in others if (p := odds[w := s.words[-1]]) > EQUAL and _same_kind(s, best)}
+        share = (1.0 + sum(equal.values())) / (1.0 + sum(odds.values()) + float(np.exp(-gain)))
+        rivals = (*step.rivals, tuple(equal))
+        return replace(best, rivals=rivals, probability=(*step.probability, share))
+
+    def _together(self, old: Hypothesis, new: Hypothesis) -> float:
+        """Factor by which the structured residual shares of all moving joints together fall.
+
+        The covariance of neighbouring residuals is the power of their structured part, without white noise.
+        """
+        sums = []
+        for h in (old, new):
+            residual, torque = fit(self.bench, h).residual, self.bench.torque(h.shift)
+            power = np.maximum((torque**2).sum(axis=0), 1e-300)
+            white = WHITE * (residual**2).sum(axis=0)
+            shares = np.maximum((residual[1:] * residual[:-1]).sum(axis=0), white) / power
+            sums.append(float(shares[self.bench.moving].sum()))
+        return sums[0] / max(sums[1], 1e-300)
+
+    def _one_late(self, step: Step) -> Step | None:
+        """Best delay of one drive alone; ``None`` for a single joint."""
+        n, names = self.bench.n, [joint.name for joint in self.bench.robot.joints]
+        if self.bench.moving.sum() < 2:
+            return None
+        alone = [
+            self._made(
+                step,
+                "one_late",
+                f"torque of {names[j]} late",
+                gravity.best_shift(step.h, self.rank, self.bench.period, np.arange(n) == j),
+            )
+            for j in np.flatnonzero(self.bench.moving)
+        ]
+        return min(alone, key=lambda s: s.rank)
+
+    def _gain(self, old: Step, new: Step) -> tuple[float, float, float]:
+        """Gain of the score, drop of the held-out residual power, and gain of plausibility, nats each."""
+        moving = self.bench.moving
+        try:
+            before, after = held_out(self.bench, old.h)[moving], held_out(self.bench, new.h)[moving]
+        except np.linalg.LinAlgError:
+            return -np.inf, 0.0, 0.0
+        rows = independent_rows(fit(self.bench, new.h).residual)[moving]
+        drops = np.log(before / after)
+        plausible = log_plausibility(self.bench, new.h) - log_plausibility(self.bench, old.h)
+        n = self.bench.n
+        dearer = cost(new.families, new.made, n) - cost(old.families, old.made, n)
+        return float(0.5 * rows @ drops + plausible - dearer), float(drops.sum()), plausible
+
+    def _neighbours(self, step: Step) -> Iterator[Step]:
+        bench, h = self.bench, step.h
+        robot = bench.robot
+        joints = [int(j) for j in np.flatnonzero(bench.moving)]
+        singles: Iterable[moves.Move] = (
+            *moves.sign_moves(robot, joints),
+            *moves.exchange_moves(robot, joints),
+            *moves.unit_moves(robot),
+            *moves.single_unit_moves(robot, joints),
+            *(move for j in joints if len(joints) > 1 for move in scales.scale_moves(robot, j, h, self.rank)),
+        )
+        for move in singles:
+            yield self._made(step, move.family, move.words, move(h), move.drives)
+        if len(joints) > 1:
+            yield self._made(step, "assignment", "torques in another order", assignment.by_rows(bench, h))
+        if h.gravity.any():
+            yield self._made(step, "gravity_missing", "torques without gravity", gravity.without_gravity(h))
+        if len(joints) > 1:
+            yield from self._torque_scales(step)
+        turned = gravity.best_direction(h, self.rank)
+        yield self._made(step, "gravity_direction", "another direction of gravity", turned)
+        for clock in CLOCKS:
+            yield self._made(step, "time_unit", f"time in units of {clock:g} s", scales.with_clock(h, clock))
+        late = gravity.best_shift(h, self.rank, bench.period, bench.moving)
+        yield self._made(step, "time_shift", "all torques late by the same time", late)
+
+    def _torque_scales(self, step: Step) -> Iterator[Step]:
+        """All torques in a unit of each drive's own: per mille of unknown rated torques, currents of the motors."""
+        bench, h = self.bench, step.h
+        ratios = np.abs(np.diag(bench.robot.transmission_matrix))
+        starts = [np.ones(bench.n), *([ratios] if np.all(ratios > 0) and np.ptp(ratios) > 0 else [])]
+        factors = scales.torque_scales(h, self.rank, starts)
+        if factors is None:
+            return
+        scaled = replace(h, torque=factors[:, None] * h.torque)
+        factors = factors * plausible_factor(bench, scaled)
+        yield self._made(step, "torque_scales", EACH_OWN, replace(h, torque=factors[:, None] * h.torque))
+
+    def _made(self, step: Step, family: str, words: str, h: Hypothesis, raw: bool = False) -> Step:
+        self.tried[family] = self.tried.get(family, 0) + 1
+        # What this mistake adds to the corrections before it.
+        change = (
+            h.position @ np.linalg.inv(step.h.position),
+            h.torque @ np.linalg.inv(step.h.torque),
+            raw,
+        )
+        families, made = (*step.families, family), (*step.made, change)
+        rank = self.rank(h) + 2.0 * cost(families, made, self.bench.n) / RANKED_ROWS
+        return replace(step, h=h, families=families, words=(*step.words, words), made=made, rank=rank)
+
+    def _orders(self, first: Step) -> list[Step]:
+        """Best orders of all joints, with torques in the order of positions, or as their friction assigns them."""
+        n, start = self.bench.n, first.h
+        coarse = self.bench.coarse(ORDER_ROWS)
+        relative = [np.eye(n)]
+        by_friction = assignment.by_friction(self.bench, start)
+        if not np.array_equal(by_friction, np.eye(n)):
+            relative.append(by_friction)
+        seen: dict[bytes, tuple[float, Hypothesis]] = {}
+
+        def at(order: Array, own: Array) -> float:
+            key = np.concatenate([order, own]).tobytes()
+            if key not in seen:
+                self.tried["order"] = self.tried.get("order", 0) + 1
+                h = replace(start, position=order @ start.position, torque=order @ own @ start.torque)
+                seen[key] = _rank(coarse, h) + 2.0 * wiring_cost(order, order @ own) / RANKED_ROWS, h
+            return seen[key][0]
+
+        for own in relative:
+            if self.bench.moving.sum() <= EXHAUSTIVE:
+                for order in assignment.orders(self.bench.moving):
+                    at(order, own)
+            else:
+                for begin in assignment.usual_orders(self.bench.moving):
+                    _climb(begin, self.bench.moving, partial(at, own=own))
+        best = sorted(seen.values(), key=lambda pair: pair[0])[: 4 * ORDERS_KEPT]
+        steps = [self._made(first, "order", "joints in another order", h) for _, h in best]
+        return [replace(s, probability=(1.0,), rivals=((),)) for s in sorted(steps, key=lambda s: s.rank)[:ORDERS_KEPT]]
+
+
+def _rank(bench: Bench, h: Hypothesis) -> float:
+    try:
+        shares = fit_shares(bench, h)
+    except np.linalg.LinAlgError:
+        return np.inf
+    return float(np.log(shares[bench.moving]).sum()) - 2.0 * log_plausibility(bench, h) / RANKED_ROWS
+
+
+def _climb(order: Array, moving: NDArray[np.bool_], criterion: "assignment.OrderCriterion") -> None:
+    """Exchange two joints as long as the criterion falls."""
+    least, chosen = criterion(order), np.flatnonzero(moving)
+    while True:
+        swapped = [assignment.exchanged(order, i, k) for i in map(int, chosen) for k in map(int, chosen) if k < i]
+        values = [criterion(other) for other in swapped]
+        k = int(np.argmin(values))
+        if values[k] >= least:
+            return
+        order, least = swapped[k], values[k]
+
+
+def _differs(a: Hypothesis, b: Hypothesis) -> bool:
+    """True if two hypotheses correct the signals differently."""
+    same = np.allclose(a.position, b.position, rtol=0.05) and np.allclose(a.torque, b.torque, rtol=0.05)
+    return not (same and np.allclose(a.gravity, b.gravity, atol=0.5) and a.clock == b.clock)
+
+
+def _same_kind(a: Step, b: Step) -> bool:
+    """True if both last mistakes are mistakes of the wiring, or both of the units."""
+    return (a.families[-1] in WIRING) == (b.families[-1] in WIRING)
+
+
+def independent_rows(residual: Array) -> Array:
+    """Number of independent rows with the serial correlation of the residuals, (n,).
+
+    ``M (1 - r) / (1 + r)`` for the correlation r of neighbouring rows (Bartlett 1946), at least 4.
+
+    Parameters
+    ----------
+    residual
+        Residuals (M, n).
+    """
+    power = np.maximum((residual**2).sum(axis=0), 1e-300)
+    r = np.clip((residual[1:] * residual[:-1]).sum(axis=0) / power, 0.0, 0.99)
+    rows: Array = np.maximum(residual.shape[0] * (1 - r) / (1 + r), 4.0)
+    return rows

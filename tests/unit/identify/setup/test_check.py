@@ -1,0 +1,257 @@
+"""Mistakes of a set-up on random arms and the virtual robots: each is named and corrected, healthy data give none."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armident.configs import DataError, RobotConfig, load_robot
+from armident.identify.experiment import Experiment
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.setup.check import check_setup
+from tests.fixtures import setups
+from tests.fixtures.arms import FAST, recording
+
+Made = Callable[[list[Experiment], RobotConfig], list[Experiment]]
+
+
+@pytest.fixture(scope="module")
+def arm() -> RobotConfig:
+    return setups.random_arm(3, 4)
+
+
+@pytest.fixture(scope="module")
+def healthy(arm: RobotConfig) -> list[Experiment]:
+    return setups.record(arm, 0)
+
+
+@pytest.fixture(scope="module")
+def tx40() -> RobotConfig:
+    return load_robot("tx40")
+
+
+@pytest.fixture(scope="module")
+def virtual(tx40: RobotConfig) -> list[Experiment]:
+    return experiments_from_recording(recording("tx40", "tx40_excitation", 3, period=FAST), tx40)[0]
+
+
+def late(experiments: list[Experiment], seconds: float) -> list[Experiment]:
+    made = []
+    for e in experiments:
+        k = round(seconds / e.dt)
+        tau = np.roll(e.tau, k, axis=0)
+        made.append(replace(e, q=e.q[abs(k) : -abs(k)], tau=tau[abs(k) : -abs(k)], q_ref=None))
+    return made
+
+
+def motor_torques(experiments: list[Experiment], robot: RobotConfig) -> list[Experiment]:
+    return setups.with_torques(experiments, np.linalg.inv(robot.transmission_matrix.T))
+
+
+BOTH = setups.in_order(2, 0, 3, 1)
+
+MISTAKES: dict[str, tuple[Made, str, tuple[str, ...]]] = {
+    "torque sign": (lambda e, r: setups.with_torques(e, setups.turned(4, 1)), "torque_sign", ("axis_2",)),
+    "position sign": (lambda e, r: setups.with_positions(e, setups.turned(4, 2)), "position_sign", ("axis_3",)),
+    "joint turned": (
+        lambda e, r: setups.with_torques(setups.with_positions(e, setups.turned(4, 1)), setups.turned(4, 1)),
+        "position_sign",
+        ("axis_2",),
+    ),
+    "all torque signs": (
+        lambda e, r: setups.with_torques(e, -np.eye(4)),
+        "torque_sign",
+        ("axis_1", "axis_2", "axis_3", "axis_4"),
+    ),
+    "torques exchanged": (
+        lambda e, r: setups.with_torques(e, setups.in_order(0, 2, 1, 3)),
+        "joint_order",
+        ("axis_2", "axis_3"),
+    ),
+    "torques in another order": (
+        lambda e, r: setups.with_torques(e, BOTH),
+        "joint_order",
+        ("axis_1", "axis_2", "axis_3", "axis_4"),
+    ),
+    "joints in another order": (
+        lambda e, r: setups.with_torques(setups.with_positions(e, BOTH), BOTH),
+        "joint_order",
+        ("axis_1", "axis_2", "axis_3", "axis_4"),
+    ),
+    "degrees": (
+        lambda e, r: setups.with_positions(e, np.eye(4) * 180 / np.pi),
+        "position_unit",
+        ("axis_1", "axis_2", "axis_3", "axis_4"),
+    ),
+    "kN m": (
+        lambda e, r: setups.with_torques(e, 1e-3 * np.eye(4)),
+        "torque_unit",
+        ("axis_1", "axis_2", "axis_3", "axis_4"),
+    ),
+    "mN m": (
+        lambda e, r: setups.with_torques(e, 1e3 * np.eye(4)),
+        "torque_unit",
+        ("axis_1", "axis_2", "axis_3", "axis_4"),
+    ),
+    "torques of the motors": (motor_torques, "side", ("axis_1", "axis_2", "axis_3", "axis_4")),
+    "gear ratio": (
+        lambda e, r: setups.with_torques(
+            setups.with_positions(e, setups.scaled(4, 1, 1.5)), setups.scaled(4, 1, 1 / 1.5)
+        ),
+        "gear_ratio",
+        ("axis_2",),
+    ),
+    "all late": (lambda e, r: late(e, 12e-3), "time_shift", ("axis_1", "axis_2", "axis_3", "axis_4")),
+    "time in ms": (
+        lambda e, r: [replace(one, dt=1e3 * one.dt) for one in e],
+        "time_unit",
+        ("axis_1", "axis_2", "axis_3", "axis_4"),
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_named_alone(name: str, healthy: list[Experiment], arm: RobotConfig) -> None:
+    make, kind, joints = MISTAKES[name]
+    found = check_setup(make(healthy, arm), arm)
+    assert [(f.kind, f.joints) for f in found.findings] == [(kind, joints)]
+    assert found.findings[0].probability > 0.9
+    assert found.findings[0].decisive
+    assert max(found.corrected_error_pct) < 8.0
+    assert found.joints_not_understood == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in MISTAKES if name != "time in ms"])
+def test_the_corrected_configuration_has_no_mistake_left(
+    name: str, healthy: list[Experiment], arm: RobotConfig
+) -> None:
+    wrong = MISTAKES[name][0](healthy, arm)
+    corrected = check_setup(wrong, arm).corrected_robot
+    assert corrected is not None
+    again = check_setup(wrong, corrected)
+    assert again.findings == ()
+    assert max(again.relative_error_pct) < 8.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gravity", [(-9.81, 0.0, 0.0), (0.0, 0.0, 9.81), (0.9, 0.0, -9.77), (5.0, -6.0, 5.9)])
+def test_gravity_is_found_in_any_direction(gravity: tuple[float, float, float], arm: RobotConfig) -> None:
+    found = check_setup(setups.record(arm, 0, gravity=gravity), arm)
+    assert [f.kind for f in found.findings] == ["gravity_direction"]
+    assert found.corrected_robot is not None
+    np.testing.assert_allclose(found.corrected_robot.gravity, gravity, atol=0.15)
+
+
+@pytest.mark.slow
+def test_torques_without_gravity_are_named(arm: RobotConfig) -> None:
+    found = check_setup(setups.record(arm, 0, gravity=(0.0, 0.0, 0.0)), arm)
+    assert [f.kind for f in found.findings] == ["gravity_missing"]
+    assert found.corrected_robot is not None
+    assert found.corrected_robot.gravity == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("added", [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, 0.2)])
+def test_healthy_arms_and_structural_effects_give_no_finding(seed: int, added: tuple[float, float, float]) -> None:
+    robot = setups.random_arm(seed, 2 + seed % 4)
+    experiments = setups.record(robot, seed, added=np.array(added))
+    found = check_setup(experiments, robot)
+    assert found.findings == ()
+    assert found.joints_not_understood == ()
+    assert found.corrected_robot is None
+
+
+@pytest.mark.slow
+def test_the_healthy_virtual_tx40_has_no_finding(virtual: list[Experiment], tx40: RobotConfig) -> None:
+    assert check_setup(virtual, tx40).findings == ()
+
+
+@pytest.mark.slow
+def test_a_coupled_wrist_with_motor_side_torques_is_corrected_by_the_configuration(
+    virtual: list[Experiment], tx40: RobotConfig
+) -> None:
+    wrong = motor_torques(virtual, tx40)
+    found = check_setup(wrong, tx40)
+    assert [f.kind for f in found.findings] == ["side"]
+    assert "--motor-side" in found.findings[0].remedy
+    assert found.corrected_robot is not None
+    assert check_setup(wrong, found.corrected_robot).findings == ()
+
+
+@pytest.mark.slow
+def test_an_order_of_six_joints_is_found_as_a_whole(virtual: list[Experiment], tx40: RobotConfig) -> None:
+    order = setups.in_order(5, 0, 1, 2, 3, 4)
+    found = check_setup(setups.with_torques(setups.with_positions(virtual, order), order), tx40)
+    (finding,) = found.findings
+    assert finding.kind == "joint_order"
+    assert "in the order joint_6, joint_1, joint_2, joint_3, joint_4, joint_5" in finding.message
+
+
+@pytest.mark.slow
+def test_a_single_axis_is_checked_by_friction_and_inertia() -> None:
+    robot = load_robot("emps")
+    experiments = experiments_from_recording(recording("emps", "emps_excitation", 1), robot)[0]
+    assert check_setup(experiments, robot).findings == ()
+    found = check_setup(setups.with_torques(experiments, -np.eye(1)), robot)
+    assert [f.kind for f in found.findings] == ["torque_sign"]
+    assert "equally well explained by: position" in found.findings[0].message
+
+
+def test_nothing_moves(healthy: list[Experiment], arm: RobotConfig) -> None:
+    still = [replace(e, q=np.tile(e.q[:1], (e.q.shape[0], 1))) for e in healthy]
+    found = check_setup(still, arm)
+    assert [(f.kind, f.decisive) for f in found.findings] == [("standstill", True)]
+
+
+@pytest.mark.slow
+def test_a_joint_at_rest_is_named_and_not_judged(arm: RobotConfig, healthy: list[Experiment]) -> None:
+    parts = []
+    for e in healthy:
+        q = e.q.copy()
+        q[:, 3] = q[0, 3]
+        parts.append(replace(e, q=q))
+    found = check_setup(parts, arm)
+    assert ("joint_at_rest", ("axis_4",), False) in [(f.kind, f.joints, f.decisive) for f in found.findings]
+    assert "axis_4" not in found.joints_not_understood
+
+
+@pytest.mark.slow
+def test_clipped_torques_are_named(healthy: list[Experiment], arm: RobotConfig) -> None:
+    level = 0.6 * np.abs(healthy[0].tau[:, 1]).max()
+    clipped = [replace(e, tau=np.clip(e.tau, [-1e9, -level, -1e9, -1e9], [1e9, level, 1e9, 1e9])) for e in healthy]
+    found = check_setup(clipped, arm)
+    assert [(f.kind, f.joints) for f in found.findings] == [("torque_clipped", ("axis_2",))]
+
+
+@pytest.mark.slow
+def test_a_torque_that_resembles_no_motion_is_not_understood(healthy: list[Experiment], arm: RobotConfig) -> None:
+    made = []
+    for number, e in enumerate(healthy):
+        walk = np.cumsum(np.random.default_rng(number).normal(size=e.tau.shape[0]))
+        tau = e.tau.copy()
+        tau[:, 1] = walk / np.std(walk) * np.std(tau[:, 1])
+        made.append(replace(e, tau=tau))
+    found = check_setup(made, arm)
+    assert "axis_2" in found.joints_not_understood
+    assert len(found.tried) > 10
+
+
+def test_a_rate_too_slow_for_the_motion_is_named(arm: RobotConfig) -> None:
+    t = 0.05 * np.arange(400)
+    q = 0.5 * np.sin(2 * np.pi * np.outer(t, [3.0, 3.1, 2.9, 3.2]))
+    experiments = [Experiment(q, q.copy(), None, 0.05)]
+    assert "rate_too_slow" in [f.kind for f in check_setup(experiments, arm).findings]
+
+
+def test_different_rates_and_short_recordings_are_refused_in_one_line(
+    healthy: list[Experiment], arm: RobotConfig
+) -> None:
+    with pytest.raises(DataError, match=r"different sampling rates \(250, 500 Hz\)"):
+        check_setup([healthy[0], replace(healthy[1], dt=4e-3)], arm)
+    short = replace(healthy[0], q=healthy[0].q[:40], tau=healthy[0].tau[:40])
+    with pytest.raises(DataError, match="too short"):
+        check_setup([short], arm)

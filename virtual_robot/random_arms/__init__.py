@@ -1,0 +1,1 @@
+"""Random arms with hidden effects: plants of the suite ``armident diagnose-suite --arms random``."""
