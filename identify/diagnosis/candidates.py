@@ -11,6 +11,7 @@ from armident.identify.diagnosis.stretch import Stretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.whitening import joints_of, whitened
 from armident.identify.effects.effect import Effect, Place
+from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel
@@ -278,7 +279,7 @@ def candidates(workshop: Workshop) -> Iterator[Candidate]:
         present.setdefault(here, []).append(tuple(term.shapes.items()))
     coupled = {frozenset(names.index(j) for j in c.joints) for c in study.robot.couplings}
     for effect in catalogue().values():
-        if effect.rewires or effect.numbers is not None:
+        if effect.rewires or effect.numbers is not None or effect.name == TRANSITION:
             continue
         right = {names.index(stanza.joint) for stanza in study.recorded if stanza.effect == effect.name}
         for place in places(effect, study.robot.n):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.diagnosis.candidates import Candidate, Shapes, Workshop, candidates
+from armident.identify.diagnosis.candidates import Candidate, Shapes, Workshop, candidates, grid
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.lines import residuals
 from armident.identify.diagnosis.order_analysis import strongest_orders
@@ -33,14 +33,13 @@ from armident.identify.diagnosis.state import refit
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.trial import refined, screened
 from armident.identify.effects.effect import Place
+from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import Term, effect_terms, stanza_of
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
-WIDTHS = (3.0, 1.5)
-"""Factors by which the width of the smoothed sign is changed, a coarse and a fine step."""
-WIDEST = (0.02, 20.0)
-"""Range of the sharpness of the sign, over that of the joint's top speed (`SATURATION`)."""
+CLEAR = 3.0
+"""Standard deviations of a transition of dry friction from which it is a part of the friction model."""
 
 Array = NDArray[np.float64]
 Key = tuple[str, int, int | None]
@@ -159,23 +158,40 @@ class StepwiseSelection:
         """Model as configured."""
         state = self._state(self.study.robot, None)
         assert state is not None
-        return state if self.study.sign_given else self._with_sign_widths(state)
+        if not self.study.sign_given:
+            state = self._with_transitions(state)
+            self.study = replace(self.study, robot=state.robot, model=state.study.model, sign_given=True)
+        return state
 
-    def _with_sign_widths(self, state: ModelState) -> ModelState:
-        """Model with the width of each joint's sign at which it predicts best: friction near standstill is unknown."""
+    def _with_transitions(self, state: ModelState) -> ModelState:
+        """Model with the transition of dry friction at the reversals of each joint, where it predicts better.
+
+        The smoothed sign of the model approaches its limits slowly; other laws of friction near standstill look like
+        friction that depends on the velocity (Stribeck) beside it.
+        """
+        effect = known(TRANSITION)
+        workshop = Workshop(state.study, state.fit.theta)
+        noise = state.fit.renoised(noise_beyond_shapes(state.fit, workshop))
+        motion = workshop.motion(state.study.train[0], "measured")
+        entries = []
         for j in range(state.robot.n):
-            for step in WIDTHS:
-                for factor in (step, 1.0 / step):
-                    while True:
-                        g = list(state.robot.sign_smoothing)
-                        g[j] *= factor
-                        if not WIDEST[0] <= g[j] / self.study.robot.sign_smoothing[j] <= WIDEST[1]:
-                            break
-                        other = self._state(_with_sign(state.robot, g), state)
-                        if other is None or other.score.log_likelihood <= state.score.log_likelihood + 1.0:
-                            break
-                        state = other
-        self.study = replace(self.study, robot=state.robot, sign_given=True)
+            candidate = Candidate(effect, Place(j), grid(effect, motion, Place(j)))
+            found = screened(noise, candidate, workshop)
+            if found is not None and found[0] > CLEAR**2:
+                shapes = refined(noise, candidate, workshop, found)
+                entries.append(stanza_of(effect, Place(j), state.robot, dict(shapes)))
+        while entries:
+            made = self._state(state.robot.model_copy(update={"effects": (*state.robot.effects, *entries)}), state)
+            if made is None:
+                return state
+            ratios = []
+            for term in made.terms[-len(entries) :]:
+                values, std = made.values_of(term)
+                ratios.append(float(values[0] / std[0]))
+            if min(ratios) > CLEAR:
+                better = made.score.log_likelihood > state.score.log_likelihood
+                return made if better else state
+            entries.pop(int(np.argmin(ratios)))
         return state
 
     def run(self) -> ModelState:
@@ -323,12 +339,6 @@ class StepwiseSelection:
                 return state
             state = weakest[1]
         return state
-
-
-def _with_sign(robot: RobotConfig, smoothing: Sequence[float]) -> RobotConfig:
-    """Return the configuration with another smoothing of the sign of each joint."""
-    friction = robot.friction.model_copy(update={"sign_smoothing": tuple(float(g) for g in smoothing)})
-    return robot.model_copy(update={"friction": friction})
 
 
 def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]:
