@@ -19,7 +19,9 @@ from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
 Shapes = tuple[tuple[str, float], ...]
-Key = tuple[str, int, int | None, Shapes, str, str]
+Key = tuple[str, int, int | None]
+"""Name of an effect and its place."""
+Cached = tuple[str, int, int | None, Shapes, str, str]
 Kept = tuple[Array, bool]
 """Columns of one stretch: (M, k) of the joint of their place and ``True``, or (M, n, k) of all joints and ``False``."""
 
@@ -41,7 +43,7 @@ class Candidate:
     grid: tuple[Shapes, ...]
 
     @property
-    def key(self) -> tuple[str, int, int | None]:
+    def key(self) -> Key:
         """Name and place."""
         return self.effect.key, self.place.joint, self.place.other
 
@@ -89,7 +91,7 @@ class Workshop:
 
     study: Study
     theta: Array
-    kept: dict[Key, tuple[Kept, ...]] = field(default_factory=dict)
+    kept: dict[Cached, tuple[Kept, ...]] = field(default_factory=dict)
     _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
 
     def with_theta(self, study: Study, theta: Array) -> "Workshop":
@@ -208,7 +210,7 @@ class Workshop:
         """Columns of a grid in the band of the comparison, of every shape and every stretch."""
         kind = "measured" if effect.sudden else kind
 
-        def key(shapes: Shapes) -> Key:
+        def key(shapes: Shapes) -> Cached:
             return (effect.key, place.joint, place.other, shapes, part, kind)
 
         missing = [shapes for shapes in grid if key(shapes) not in self.kept]

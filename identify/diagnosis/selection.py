@@ -1,90 +1,41 @@
 """Stepwise selection of the effects that a model lacks.
 
-Each step adds the candidate with the highest predictive score, if it is significant, material and physically possible:
-
 1. Screening: the score statistic of every candidate at every place, in one factorisation of the model's equations.
 2. Closed loop: each of the best candidates is added to the model, the loop with it is simulated, and all parameters are
    estimated with instruments from that loop.
-3. Ranking by cross-validated log-likelihood (see `armident.identify.diagnosis.predictive_score`).
-4. Admission of the first that is significant, material and physically possible.
-
-Then findings that the later ones made superfluous are removed, and each finding competes once more with all others.
+3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.predictive_score`).
+4. Admission of the best one that is significant, material and physically possible; then the next step.
+5. Findings that later ones made superfluous are removed, and each finding competes with all others once more.
+6. Report part: a finding stays if the data that chose nothing confirm it (`armident.identify.diagnosis.confirmation`).
 """
 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.diagnosis.candidates import Candidate, Shapes, Workshop, candidates, grid
+from armident.configs.schema.robot import Effect as Entry
+from armident.identify.diagnosis.candidates import Candidate, Key, Shapes, Workshop, candidates, grid
+from armident.identify.diagnosis.confirmation import Confirmation, confirmed
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.lines import residuals
-from armident.identify.diagnosis.order_analysis import strongest_orders
-from armident.identify.diagnosis.predictive_score import PredictiveScore
-from armident.identify.diagnosis.regression import Fit
-from armident.identify.diagnosis.screening import noise_beyond_shapes
-from armident.identify.diagnosis.shaping import both_ends
-from armident.identify.diagnosis.state import refit
+from armident.identify.diagnosis.model_state import ModelState, fitted
+from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
+from armident.identify.diagnosis.screening import noise_beyond_shapes, refined, screened
 from armident.identify.diagnosis.study import Study
-from armident.identify.diagnosis.trial import refined, screened
 from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import TRANSITION
-from armident.identify.effects.registry import known
-from armident.identify.effects.terms import Term, effect_terms, stanza_of
+from armident.identify.effects.registry import known, of_entry
+from armident.identify.effects.terms import stanza_of
 from armident.identify.effects.unnamed import NAME as UNNAMED
+
+Array = NDArray[np.float64]
 
 CLEAR = 3.0
 """Standard deviations of a transition of dry friction from which it is a part of the friction model."""
-
-Array = NDArray[np.float64]
-Key = tuple[str, int, int | None]
-
-
-@dataclass(frozen=True, eq=False)
-class ModelState:
-    """Model of one step: data with its own closed loop, fit, and predictive score.
-
-    Parameters
-    ----------
-    study
-        Data with the model and the motion of its closed loop.
-    fit
-        Fit of the model.
-    """
-
-    study: Study
-    fit: Fit
-
-    @property
-    def robot(self) -> RobotConfig:
-        """Configuration of the model."""
-        return self.study.robot
-
-    @cached_property
-    def score(self) -> PredictiveScore:
-        """Predictive score on the training data."""
-        return PredictiveScore(self.fit)
-
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """Effects of the model."""
-        return effect_terms(self.study.model)
-
-    def values_of(self, term: Term) -> tuple[Array, Array]:
-        """Linear parameters of a term and their standard deviations, (k,) each.
-
-        Parameters
-        ----------
-        term
-            Term of the model.
-        """
-        own = [self.study.model.base.names.index(name) for name in term.names]
-        return self.fit.theta[own], np.sqrt(np.maximum(np.diag(self.fit.covariance)[own], 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +49,8 @@ class Addition:
     state
         Model with the effect.
     gain
-        Gain of log-likelihood over the model without it.
-    own_gain
-        The same with each model under its own noise models.
+        Gain of log-likelihood over the model without it: the smaller one of the gains with equal noise models and with
+        each model's own.
     share
         Largest share of the power of a joint's predicted errors that it removes.
     material_pct
@@ -113,7 +63,6 @@ class Addition:
     shapes: Shapes
     state: ModelState
     gain: float
-    own_gain: float
     share: float
     material_pct: float
     allowed: bool
@@ -129,6 +78,64 @@ class Addition:
         place = self.candidate.place
         name = self.candidate.effect.name if self.named else self.candidate.effect.key
         return name, place.joint, place.other
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log-likelihood of the model with the effect."""
+        return self.state.score.log_likelihood
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Candidates that were added to one model, highest log-likelihood first.
+
+    Parameters
+    ----------
+    state
+        Model without them.
+    ranked
+        Candidates in the model.
+    tests
+        Number of candidates and nonlinear parameters from which they were selected.
+    """
+
+    state: ModelState
+    ranked: tuple[Addition, ...]
+    tests: int
+
+    def shares(self) -> dict[Key, float]:
+        """Posterior probability of each physically possible effect, whatever its law, with equal prior odds."""
+        best: dict[Key, float] = {}
+        for addition in self.ranked:
+            if addition.allowed and addition.named:
+                best[addition.family] = max(best.get(addition.family, -np.inf), addition.log_likelihood)
+        total = special.logsumexp(list(best.values())) if best else 0.0
+        return {key: float(np.exp(value - total)) for key, value in best.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """An effect that was selected.
+
+    Parameters
+    ----------
+    entry
+        Its entry in the configuration.
+    step
+        Step in which it was compared with the others, without it in the model.
+    addition
+        Test of the effect in that step.
+    confirmation
+        Comparison of the final models with and without it on the report part; ``None`` before that.
+    without
+        Final model without it; ``None`` before the comparison.
+    """
+
+    entry: Entry
+    step: Step
+    addition: Addition
+    confirmation: Confirmation | None = None
+    without: ModelState | None = None
 
 
 @dataclass
@@ -151,30 +158,142 @@ class StepwiseSelection:
     criteria: Criteria = field(default_factory=Criteria)
     progress: Callable[[str], None] = lambda stage: None
     deadline: float = float("inf")
+    stopped: bool = False
+    hidden: frozenset[Key] = frozenset()
     _states: dict[str, ModelState | None] = field(default_factory=dict)
-    steps: list[tuple[Addition, ...]] = field(default_factory=list)
+    _steps: dict[str, Step] = field(default_factory=dict)
 
     def start(self) -> ModelState:
-        """Model as configured."""
-        state = self._state(self.study.robot, None)
-        assert state is not None
+        """Model as configured, with the transition of dry friction at reversals where the configuration leaves it free.
+
+        Raises
+        ------
+        DataError
+            If the motion does not determine the parameters of the model.
+        """
+        state = fitted(self.study, self.study.robot, None)
         if not self.study.sign_given:
             state = self._with_transitions(state)
-            self.study = replace(self.study, robot=state.robot, model=state.study.model, sign_given=True)
+        self.study = replace(self.study, robot=state.robot, model=state.study.model, sign_given=True)
+        self._states[_key(state.robot)] = state
         return state
+
+    def run(self, first: ModelState) -> tuple[ModelState, tuple[Selected, ...]]:
+        """Select effects.
+
+        Parameters
+        ----------
+        first
+            Model to start from, of `start`.
+
+        Returns
+        -------
+        tuple
+            Model with the effects, and the effects, highest gain first.
+        """
+        state, found = first, ()
+        while len(found) < self.criteria.most_findings and not self._late():
+            step = self.step(state)
+            best = self.admitted(step)
+            if best is None:
+                break
+            name = self.study.joints[best.candidate.place.joint]
+            self.progress(f"adding {best.candidate.effect.name.replace('_', ' ')} of {name}")
+            found = (*found, Selected(best.state.robot.effects[-1], step, best))
+            state, found = self._reduced(best.state, found)
+        state, found = self._exchanged(state, found)
+        return self._confirmed(state, found)
+
+    def step(self, state: ModelState) -> Step:
+        """Compare all candidates in a model.
+
+        Parameters
+        ----------
+        state
+            Model without them.
+        """
+        key = _key(state.robot)
+        if key not in self._steps:
+            shortlist, tests = self._shortlist(state)
+            additions = (self._added(state, *one) for one in shortlist)
+            able = [a for a in additions if a is not None]
+            self._steps[key] = Step(state, tuple(sorted(able, key=lambda a: -a.log_likelihood)), tests)
+        return self._steps[key]
+
+    def last(self, state: ModelState) -> Step | None:
+        """Comparison of all candidates in a model, if it has been made.
+
+        Parameters
+        ----------
+        state
+            The model.
+        """
+        return self._steps.get(_key(state.robot))
+
+    def passes(self, addition: Addition, tests: int) -> bool:
+        """True if an addition is significant, material and physically possible.
+
+        A ratio of likelihoods of ``r`` has at most the probability ``1 / r`` without the effect (Ville 1939), so that
+        no null distribution is needed.
+
+        Parameters
+        ----------
+        addition
+            The addition.
+        tests
+            Number of candidates among which it was found.
+        """
+        negligible = addition.candidate.effect.negligible
+        values, _ = addition.state.values_of(addition.state.terms[-1])
+        return (
+            addition.allowed
+            and addition.gain > np.log(max(tests, 1) / self.criteria.alpha["selection"])
+            and addition.share >= self.criteria.least_share
+            and addition.material_pct >= self.criteria.material_pct
+            and not (negligible is not None and negligible(values, self.study.sample))
+        )
+
+    def admitted(self, step: Step) -> Addition | None:
+        """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
+
+        An effect with a name comes first if it explains most of what the best term without a name does. A law comes
+        before a free shape of the same effect if it predicts as well.
+
+        Parameters
+        ----------
+        step
+            The step.
+        """
+        able = [a for a in step.ranked if self.passes(a, step.tests)]
+        if not able:
+            return None
+        best = able[0]
+        if not best.named:
+            named = [a for a in able if a.named and a.gain >= self.criteria.named_share * best.gain]
+            best = named[0] if named else best
+        same = [a for a in able if a.family == best.family and not a.candidate.effect.free]
+        laws = [a for a in same if a.log_likelihood > best.log_likelihood - self.criteria.close]
+        return laws[0] if laws and best.candidate.effect.free else best
+
+    def _late(self) -> bool:
+        self.stopped = self.stopped or time.monotonic() > self.deadline
+        return self.stopped
 
     def _with_transitions(self, state: ModelState) -> ModelState:
         """Model with the transition of dry friction at the reversals of each joint, where it predicts better.
 
-        The smoothed sign of the model approaches its limits slowly; other laws of friction near standstill look like
-        friction that depends on the velocity (Stribeck) beside it.
+        The smoothed sign of the model approaches its limits slowly. Beside another law of the reversal it looks like
+        friction that depends on the velocity (Stribeck).
         """
         effect = known(TRANSITION)
         workshop = Workshop(state.study, state.fit.theta)
         noise = state.fit.renoised(noise_beyond_shapes(state.fit, workshop))
         motion = workshop.motion(state.study.train[0], "measured")
+        present = {e.joint for e in state.robot.effects if e.effect == TRANSITION}
         entries = []
-        for j in range(state.robot.n):
+        for j, name in enumerate(self.study.joints):
+            if name in present:
+                continue
             candidate = Candidate(effect, Place(j), grid(effect, motion, Place(j)))
             found = screened(noise, candidate, workshop)
             if found is not None and found[0] > CLEAR**2:
@@ -184,120 +303,43 @@ class StepwiseSelection:
             made = self._state(state.robot.model_copy(update={"effects": (*state.robot.effects, *entries)}), state)
             if made is None:
                 return state
-            ratios = []
-            for term in made.terms[-len(entries) :]:
-                values, std = made.values_of(term)
-                ratios.append(float(values[0] / std[0]))
+            fits = [made.values_of(term) for term in made.terms[-len(entries) :]]
+            ratios = [float(values[0] / std[0]) for values, std in fits]
             if min(ratios) > CLEAR:
-                better = made.score.log_likelihood > state.score.log_likelihood
-                return made if better else state
+                return made if made.score.log_likelihood > state.score.log_likelihood else state
             entries.pop(int(np.argmin(ratios)))
         return state
 
-    def run(self) -> ModelState:
-        """Model after stepwise selection."""
-        state = self.start()
-        own = len(self.study.robot.effects)
-        while len(state.robot.effects) - own < self.criteria.most_findings and time.monotonic() < self.deadline:
-            best = self._best(state)
-            if best is None:
-                break
-            self.progress(f"adding {best.candidate.effect.name} of {self.study.joints[best.candidate.place.joint]}")
-            state = self._reduced(best.state, own)
-        return state
-
-    def additions(self, state: ModelState) -> tuple[Addition, ...]:
-        """Candidates in the model, each in its own closed loop, highest log-likelihood first.
-
-        Parameters
-        ----------
-        state
-            Model without them.
-        """
-        found = [self._added(state, *one) for one in self._shortlist(state)]
-        able = [a for a in found if a is not None]
-        ranked = tuple(sorted(able, key=lambda a: -a.state.score.log_likelihood))
-        self.steps.append(ranked)
-        return ranked
-
-    def passes(self, addition: Addition, tests: int) -> bool:
-        """True if an addition is significant, material and physically possible.
-
-        Parameters
-        ----------
-        addition
-            The addition.
-        tests
-            Number of candidates among which it was found.
-        """
-        effect = addition.candidate.effect
-        term = addition.state.terms[-1]
-        values, _ = addition.state.values_of(term)
-        return (
-            addition.allowed
-            and min(addition.gain, addition.own_gain) > np.log(max(tests, 1) / self.criteria.false_alarm_rate)
-            and addition.share >= self.criteria.least_share
-            and addition.material_pct >= self.criteria.material_pct
-            and not (effect.negligible is not None and effect.negligible(values, self.study.sample))
-        )
-
-    def _best(self, state: ModelState) -> Addition | None:
-        ranked = self.additions(state)
-        tests = len(list(candidates(Workshop(state.study, state.fit.theta))))
-        return next((a for a in ranked if self.passes(a, tests)), None)
-
-    def _shortlist(self, state: ModelState) -> list[tuple[Candidate, Shapes]]:
-        """Candidates with the highest score statistics less their numbers of parameters, with nonlinear parameters."""
+    def _shortlist(self, state: ModelState) -> tuple[list[tuple[Candidate, Shapes]], int]:
+        """Candidates with the highest score statistics less their numbers of parameters, and the number of all."""
         workshop = Workshop(state.study, state.fit.theta)
         noise = state.fit.renoised(noise_beyond_shapes(state.fit, workshop))
         looks: list[tuple[float, Candidate, tuple[float, Shapes]]] = []
-        for candidate in self._with_orders(state, candidates(workshop)):
+        tests, hidden = 0, set()
+        for every in candidates(workshop):
+            candidate = every
+            if candidate.effect.order_of == "motor":
+                candidate = replace(candidate, grid=motor_orders(state.study, state.fit.theta, candidate.place.joint))
+            tests += 1
             found = screened(noise, candidate, workshop)
-            if found is not None:
+            if found is None:
+                hidden.add(candidate.key)
+            else:
                 looks.append((found[0] - 2.0 * len(candidate.effect.linear), candidate, found))
+        if not self._steps:
+            self.hidden = frozenset(hidden)
         looks.sort(key=lambda look: -look[0])
         named = [x for x in looks if x[1].effect.name != UNNAMED][: self.criteria.shortlist]
         unnamed = [x for x in looks if x[1].effect.name == UNNAMED][: self.criteria.unnamed]
         chosen: list[tuple[Candidate, Shapes]] = []
-        for _, candidate, found in (*named, *unnamed):
+        for _, own, first in (*named, *unnamed):
+            candidate, found = own, first
             if candidate.effect.order_of:
-                candidate = self._finer(state, candidate, found[1][0][1])
+                near = nearby_orders(state.study, candidate.place.joint, found[1][0][1])
+                candidate = replace(candidate, grid=near)
                 found = screened(noise, candidate, workshop) or found
-            shapes = refined(noise, candidate, workshop, found)
-            chosen += [(candidate, ends) for ends in both_ends(noise, candidate, workshop, shapes)]
-        return chosen
-
-    def _with_orders(self, state: ModelState, every: Sequence[Candidate]) -> list[Candidate]:
-        """Candidates whose order is found by order analysis get the strongest orders of the residual as their grid."""
-        left = residuals(state.study, state.study.train, state.fit.theta)
-        out = []
-        for candidate in every:
-            if candidate.effect.order_of == "motor":
-                grid = tuple((("harmonic", order),) for order in self._orders(state, candidate.place, left))
-                candidate = replace(candidate, grid=grid)
-            out.append(candidate)
-        return out
-
-    def _orders(self, state: ModelState, place: Place, left: Sequence[Array]) -> list[float]:
-        """Orders per radian of the motor of the strongest ripples of a joint's residual."""
-        study, motor = state.study, place.joint
-        ratios = study.robot.transmission_matrix[motor]
-        angles = [s.measured.q @ ratios for s in study.train]
-        speed = np.concatenate([np.abs(s.measured.qd @ ratios) for s in study.train])
-        moving = speed[speed > 0.02 * speed.max()]
-        slow = float(np.quantile(moving, 0.2)) if moving.size else 1.0
-        cutoff = 0.5 / (study.dt * study.decimation.factor)
-        joint = int(np.argmax(np.abs(ratios)))
-        found = strongest_orders(angles, [e[:, joint] for e in left], 2 * np.pi * cutoff / slow)
-        apart = 2 * np.pi / max(float(np.ptp(np.concatenate(angles))), 1e-12)
-        return [order + shift * apart for order, _ in found for shift in (-0.5, -0.25, 0.0, 0.25, 0.5)]
-
-    def _finer(self, state: ModelState, candidate: Candidate, order: float) -> Candidate:
-        """Candidate with orders close to one order, at a sixteenth of the resolution of the motion."""
-        ratios = state.study.robot.transmission_matrix[candidate.place.joint]
-        apart = 2 * np.pi / max(float(np.ptp(np.concatenate([s.measured.q @ ratios for s in state.study.train]))), 1e-12)
-        near = tuple((("harmonic", order + float(k) * apart / 16),) for k in range(-3, 4))
-        return replace(candidate, grid=near)
+            chosen.append((candidate, refined(noise, candidate, workshop, found)))
+        return chosen, tests
 
     def _added(self, state: ModelState, candidate: Candidate, shapes: Shapes) -> Addition | None:
         effect = candidate.effect
@@ -308,37 +350,100 @@ class StepwiseSelection:
             return None
         term = made.terms[-1]
         values, std = made.values_of(term)
-        allowed = known(effect.key).allows(term.of_effect(values), term.of_effect(std), dict(term.shapes))
+        largest: dict[str, float] = {}
+        for name, value in (pair for one in candidate.grid for pair in one):
+            largest[name] = max(value, largest.get(name, value))
+        allowed = known(effect.key).allows(term.of_effect(values), term.of_effect(std), dict(term.shapes), largest)
         share, changed = materiality(state, made)
-        return Addition(candidate, shapes, made, made.score.gain_over(state.score), made.score.log_likelihood - state.score.log_likelihood, share, changed, allowed)
+        return Addition(candidate, shapes, made, gain(made, state), share, changed, allowed)
 
-    def _state(self, robot: RobotConfig, before: ModelState | None) -> ModelState | None:
+    def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""
-        key = "\n".join([str(robot.sign_smoothing), *(entry.model_dump_json() for entry in robot.effects)])
+        key = _key(robot)
         if key not in self._states:
             try:
-                self._states[key] = ModelState(*refit(self.study, robot, None if before is None else before.fit))
+                self._states[key] = fitted(self.study, robot, before)
             except (DataError, np.linalg.LinAlgError):
                 self._states[key] = None
         return self._states[key]
 
-    def _reduced(self, state: ModelState, own: int) -> ModelState:
-        """Model without findings that are not significant or material beside the others."""
-        while len(state.robot.effects) - own > 1:
-            weakest: tuple[float, ModelState] | None = None
-            for k in range(own, len(state.robot.effects)):
-                effects = (*state.robot.effects[:k], *state.robot.effects[k + 1 :])
-                less = self._state(state.robot.model_copy(update={"effects": effects}), state)
+    def _without(self, state: ModelState, entry: Entry) -> ModelState | None:
+        """The model without one of its effects."""
+        effects = list(state.robot.effects)
+        effects.remove(entry)
+        return self._state(state.robot.model_copy(update={"effects": tuple(effects)}), state)
+
+    def _reduced(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
+        """Model without findings that later ones made insignificant or immaterial."""
+        while len(found) > 1:
+            weak: list[tuple[float, ModelState, Selected]] = []
+            for one in found[:-1]:
+                less = self._without(state, one.entry)
                 if less is None:
                     continue
-                share, _ = materiality(less, state)
-                gain = state.score.gain_over(less.score)
-                if share < self.criteria.least_share or gain < -np.log(self.criteria.false_alarm_rate):
-                    weakest = min(weakest or (gain, less), (gain, less), key=lambda one: one[0])
-            if weakest is None:
-                return state
-            state = weakest[1]
-        return state
+                share, changed = materiality(less, state)
+                gained = gain(state, less)
+                needed = np.log(max(one.step.tests, 1) / self.criteria.alpha["selection"])
+                if gained < needed or share < self.criteria.least_share or changed < self.criteria.material_pct:
+                    weak.append((gained, less, one))
+            if not weak:
+                break
+            _, state, gone = min(weak, key=lambda one: one[0])
+            found = tuple(one for one in found if one is not gone)
+        return state, found
+
+    def _exchanged(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
+        """Model whose findings have competed with all other effects beside the findings made after them."""
+        for one in found[:-1]:
+            less = None if self._late() else self._without(state, one.entry)
+            if less is None:
+                continue
+            self.progress(f"exchanging {one.entry.effect.replace('_', ' ')} of {one.entry.joint}")
+            step = self.step(less)
+            best = self.admitted(step)
+            if best is None or best.family == one.addition.family:
+                continue
+            if best.log_likelihood > state.score.log_likelihood + self.criteria.close:
+                other = Selected(best.state.robot.effects[-1], step, best)
+                state, found = best.state, tuple(other if f is one else f for f in found)
+        return state, found
+
+    def _confirmed(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
+        """Model with the findings that the report part confirms, highest gain first."""
+        self.progress("confirmation by the report part")
+        while True:
+            checked: list[Selected] = []
+            for one in found:
+                less = self._without(state, one.entry)
+                if less is not None:
+                    checked.append(replace(one, confirmation=confirmed(state, less), without=less))
+            failed = [one for one in checked if not self._holds(one)]
+            if not failed:
+                return state, tuple(sorted(checked, key=lambda one: -_gained(state, one)))
+            gone = max(failed, key=lambda one: 1.0 if one.confirmation is None else one.confirmation.p_value)
+            assert gone.without is not None
+            state, found = gone.without, tuple(one for one in found if one.entry is not gone.entry)
+
+    def _holds(self, one: Selected) -> bool:
+        """True if the report part confirms a finding: significant there, with smaller errors of its joint."""
+        report = one.confirmation
+        assert report is not None
+        return report.p_value < self.criteria.confirmation_level and bool(np.max(report.share) > 0.0)
+
+
+def gain(with_it: ModelState, without: ModelState) -> float:
+    """Gain of log-likelihood by an effect.
+
+    The smaller one of the gain with the noise models of the model with the effect, and of that with each model's own
+    noise models.
+
+    Parameters
+    ----------
+    with_it, without
+        Models with and without the effect.
+    """
+    own = with_it.score.log_likelihood - without.score.log_likelihood
+    return min(own, with_it.score.gain_over(without.score))
 
 
 def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]:
@@ -354,24 +459,14 @@ def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]
     joint = int(np.argmax(removed / np.maximum(before**2, 1e-300)))
     torque = np.concatenate([s.y[:, joint] for s in without.study.train])
     size = float(np.sqrt(np.mean(torque**2)))
-    return float(removed[joint] / max(before[joint] ** 2, 1e-300)), 100 * float(np.sqrt(removed[joint])) / max(
-        size, 1e-300
-    )
+    share = float(removed[joint] / max(before[joint] ** 2, 1e-300))
+    return share, 100 * float(np.sqrt(removed[joint])) / max(size, 1e-300)
 
 
-def posterior_shares(ranked: Sequence[Addition]) -> dict[Key, float]:
-    """Return the posterior probability of each effect among those tested in one step, whatever its law.
+def _gained(state: ModelState, one: Selected) -> float:
+    return np.inf if one.without is None else gain(state, one.without)
 
-    Parameters
-    ----------
-    ranked
-        Additions to the same model.
-    """
-    best: dict[Key, float] = {}
-    for addition in ranked:
-        if addition.allowed:
-            best[addition.family] = max(best.get(addition.family, -np.inf), addition.state.score.log_likelihood)
-    if not best:
-        return {}
-    total = special.logsumexp(list(best.values()))
-    return {key: float(np.exp(value - total)) for key, value in best.items()}
+
+def _key(robot: RobotConfig) -> str:
+    """Identity of a model: its effects, whatever their order."""
+    return "\n".join(sorted(entry.model_dump_json() for entry in robot.effects))
