@@ -22,7 +22,7 @@ from armident.identify.diagnosis.findings import (
     noise_floor,
     undetectable,
 )
-from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.model_state import ModelState, with_report_part
 from armident.identify.diagnosis.numbers import stale_numbers
 from armident.identify.diagnosis.selection import Selected, StepwiseSelection
 from armident.identify.diagnosis.setup_stage import set_up
@@ -187,7 +187,8 @@ def _diagnose(
     selection = StepwiseSelection(study, criteria, steps, deadline)
     first = selection.start()
     steps("comparison of effects")
-    final, selected = selection.run(first)
+    chosen, selected = selection.run(first)
+    final = with_report_part(chosen)
     after = gap_of(final, held=True)
     named = findings_of(final, selected, criteria)
     places = {id(f): k for k, f in enumerate(named)}
@@ -203,7 +204,7 @@ def _diagnose(
     steps("simulation")
     simulated = simulated_errors(first, final)
     steps("detection limits")
-    last = selection.last(final)
+    last = selection.last(chosen)
     limits = detection_limits(final, last, criteria)
     document = DiagnosisDocument(
         robot=robot.name,

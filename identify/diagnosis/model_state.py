@@ -65,18 +65,15 @@ class ModelState:
         own = [self.study.model.base.names.index(name) for name in term.names]
         return self.fit.theta[own], np.sqrt(np.maximum(np.diag(self.fit.covariance)[own], 0.0))
 
-    def term_of(self, entry: int) -> Term | None:
-        """Term of an entry of the configuration; ``None`` for an entry that corrects the recordings.
+    def term_of(self, entry: Entry) -> Term:
+        """Term of an entry of the configuration.
 
         Parameters
         ----------
         entry
-            Number of the entry.
+            Entry that is a term of the model, and no correction of the recordings.
         """
-        effects = self.robot.effects
-        if of_recording(effects[entry]):
-            return None
-        return self.terms[sum(not of_recording(e) for e in effects[:entry])]
+        return self.terms[[e for e in self.robot.effects if not of_recording(e)].index(entry)]
 
     def with_values(self, shapes: Mapping[int, Mapping[str, float]] | None = None) -> RobotConfig:
         """Configuration with the estimated values in its effect entries.
@@ -88,9 +85,9 @@ class ModelState:
         """
         entries: list[Entry] = list(self.robot.effects)
         for k, entry in enumerate(entries):
-            term = self.term_of(k)
-            if term is None:
+            if of_recording(entry):
                 continue
+            term = self.term_of(entry)
             values, _ = self.values_of(term)
             linear = {p.name: float(value) for p, value in zip(term.linear, values, strict=True)}
             found = {**term.shapes, **linear, **dict((shapes or {}).get(k, {}))}
@@ -125,13 +122,27 @@ def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> Model
         bare = robot.model_copy(update={"effects": ()})
         rigid = fit(replace(changed, robot=bare, model=arm_model(bare)))
         theta = np.concatenate([rigid.theta, np.zeros(model.e)])
-    first = fit(changed, theta)
+    start = None if before is None else before.fit.noise
+    first = fit(changed, theta, start)
     moved = changed.resimulated(first.theta)
     if moved is not changed:
-        first = fit(moved, first.theta if model.e else None)
+        first = fit(moved, first.theta if model.e else None, first.noise)
     if any(term.scales_torque for term in effect_terms(model)):
         first = _iterated(first)
     return ModelState(moved, first)
+
+
+def with_report_part(state: ModelState) -> ModelState:
+    """Return a model whose loop is simulated for the report part, too; the selection simulates the training part alone.
+
+    Parameters
+    ----------
+    state
+        Model of the selection.
+    """
+    moved = state.study.with_report_part(state.fit.theta)
+    equations = replace(state.fit.equations, study=moved)
+    return ModelState(moved, replace(state.fit, study=moved, equations=equations))
 
 
 def _iterated(found: Fit) -> Fit:
@@ -142,7 +153,7 @@ def _iterated(found: Fit) -> Fit:
     terms = slice(found.study.model.base.b - found.study.model.e, None)
     for _ in range(ITERATIONS):
         before, std = found.theta[terms], np.sqrt(np.diag(found.covariance)[terms])
-        found = fit(found.study, found.theta)
+        found = fit(found.study, found.theta, found.noise)
         if np.all(np.abs(found.theta[terms] - before) <= CONVERGED * std):
             break
     return found

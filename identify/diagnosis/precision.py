@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from armident.identify.diagnosis.candidates import Workshop
 from armident.identify.diagnosis.regression import Fit
 from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.terms import Term
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.hac import newey_west
@@ -34,7 +35,7 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
     """
     study, fit = state.study, state.fit
     workshop = Workshop(study, fit.theta)
-    terms = {k: term for k in range(len(state.robot.effects)) if (term := state.term_of(k)) is not None}
+    terms = {k: state.term_of(e) for k, e in enumerate(state.robot.effects) if not of_recording(e)}
     slopes: list[Array] = []
     owners: list[tuple[int, str]] = []
     for k, term in terms.items():

@@ -22,9 +22,10 @@ from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, Key, Shapes, Workshop, candidates, grid
 from armident.identify.diagnosis.confirmation import Confirmation, confirmed
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.model_state import ModelState, fitted
+from armident.identify.diagnosis.model_state import ModelState, fitted, with_report_part
 from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
 from armident.identify.diagnosis.screening import noise_beyond_shapes, refined, screened
+from armident.identify.diagnosis.shaping import both_ends
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import TRANSITION
@@ -35,7 +36,7 @@ from armident.identify.effects.unnamed import NAME as UNNAMED
 Array = NDArray[np.float64]
 
 CLEAR = 3.0
-"""Standard deviations of a transition of dry friction from which it is a part of the friction model."""
+"""Gain of log-likelihood from which a transition of dry friction is a part of the friction model: odds of 20 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,8 @@ class Addition:
     ----------
     candidate, shapes
         The effect with its place, and its nonlinear parameters.
+    entry
+        Entry of the effect in the configuration.
     state
         Model with the effect.
     gain
@@ -61,6 +64,7 @@ class Addition:
 
     candidate: Candidate
     shapes: Shapes
+    entry: Entry
     state: ModelState
     gain: float
     share: float
@@ -199,7 +203,7 @@ class StepwiseSelection:
                 break
             name = self.study.joints[best.candidate.place.joint]
             self.progress(f"adding {best.candidate.effect.name.replace('_', ' ')} of {name}")
-            found = (*found, Selected(best.state.robot.effects[-1], step, best))
+            found = (*found, Selected(best.entry, step, best))
             state, found = self._reduced(best.state, found)
         state, found = self._exchanged(state, found)
         return self._confirmed(state, found)
@@ -244,7 +248,7 @@ class StepwiseSelection:
             Number of candidates among which it was found.
         """
         negligible = addition.candidate.effect.negligible
-        values, _ = addition.state.values_of(addition.state.terms[-1])
+        values, _ = addition.state.values_of(addition.state.term_of(addition.entry))
         return (
             addition.allowed
             and addition.gain > np.log(max(tests, 1) / self.criteria.alpha["selection"])
@@ -256,8 +260,8 @@ class StepwiseSelection:
     def admitted(self, step: Step) -> Addition | None:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
-        An effect with a name comes first if it explains most of what the best term without a name does. A law comes
-        before a free shape of the same effect if it predicts as well.
+        An effect with a name comes first if it explains most of what the best term without a name does. Of the laws of
+        one effect that predict as well, that with the fewest parameters comes first, and a free shape last.
 
         Parameters
         ----------
@@ -271,9 +275,9 @@ class StepwiseSelection:
         if not best.named:
             named = [a for a in able if a.named and a.gain >= self.criteria.named_share * best.gain]
             best = named[0] if named else best
-        same = [a for a in able if a.family == best.family and not a.candidate.effect.free]
-        laws = [a for a in same if a.log_likelihood > best.log_likelihood - self.criteria.close]
-        return laws[0] if laws and best.candidate.effect.free else best
+        close = best.log_likelihood - self.criteria.close
+        same = [a for a in able if a.family == best.family and a.log_likelihood > close]
+        return min(same, key=lambda a: (a.candidate.effect.free, len(a.candidate.effect.linear)))
 
     def _late(self) -> bool:
         self.stopped = self.stopped or time.monotonic() > self.deadline
@@ -283,32 +287,28 @@ class StepwiseSelection:
         """Model with the transition of dry friction at the reversals of each joint, where it predicts better.
 
         The smoothed sign of the model approaches its limits slowly. Beside another law of the reversal it looks like
-        friction that depends on the velocity (Stribeck).
+        friction that depends on the velocity (Stribeck). Each velocity is tried at all joints at once; each joint keeps
+        the one with which its own torque is predicted best.
         """
         effect = known(TRANSITION)
         workshop = Workshop(state.study, state.fit.theta)
-        noise = state.fit.renoised(noise_beyond_shapes(state.fit, workshop))
         motion = workshop.motion(state.study.train[0], "measured")
         present = {e.joint for e in state.robot.effects if e.effect == TRANSITION}
-        entries = []
-        for j, name in enumerate(self.study.joints):
-            if name in present:
-                continue
-            candidate = Candidate(effect, Place(j), grid(effect, motion, Place(j)))
-            found = screened(noise, candidate, workshop)
-            if found is not None and found[0] > CLEAR**2:
-                shapes = refined(noise, candidate, workshop, found)
-                entries.append(stanza_of(effect, Place(j), state.robot, dict(shapes)))
-        while entries:
-            made = self._state(state.robot.model_copy(update={"effects": (*state.robot.effects, *entries)}), state)
-            if made is None:
-                return state
-            fits = [made.values_of(term) for term in made.terms[-len(entries) :]]
-            ratios = [float(values[0] / std[0]) for values, std in fits]
-            if min(ratios) > CLEAR:
-                return made if made.score.log_likelihood > state.score.log_likelihood else state
-            entries.pop(int(np.argmin(ratios)))
-        return state
+        places = [Place(j) for j, name in enumerate(self.study.joints) if name not in present]
+        best = {place: (state.score.log_likelihoods[place.joint] + CLEAR, None) for place in places}
+        for shapes in zip(*(grid(effect, motion, place) for place in places), strict=True):
+            entries = [
+                stanza_of(effect, place, state.robot, dict(one)) for place, one in zip(places, shapes, strict=True)
+            ]
+            made = self._state(with_entries(state.robot, entries), state)
+            for place, entry in zip(places, entries, strict=True) if made else ():
+                value = float(made.values_of(made.term_of(entry))[0][0])
+                score = float(made.score.log_likelihoods[place.joint])
+                if value > 0.0 and score > best[place][0]:
+                    best[place] = score, entry
+        chosen = [entry for _, entry in best.values() if entry is not None]
+        made = self._state(with_entries(state.robot, chosen), state) if chosen else None
+        return made if made is not None and made.score.log_likelihood > state.score.log_likelihood else state
 
     def _shortlist(self, state: ModelState) -> tuple[list[tuple[Candidate, Shapes]], int]:
         """Candidates with the highest score statistics less their numbers of parameters, and the number of all."""
@@ -338,24 +338,25 @@ class StepwiseSelection:
                 near = nearby_orders(state.study, candidate.place.joint, found[1][0][1])
                 candidate = replace(candidate, grid=near)
                 found = screened(noise, candidate, workshop) or found
-            chosen.append((candidate, refined(noise, candidate, workshop, found)))
+            shapes = refined(noise, candidate, workshop, found)
+            chosen += [(candidate, ends) for ends in both_ends(noise, candidate, workshop, shapes)]
         return chosen, tests
 
     def _added(self, state: ModelState, candidate: Candidate, shapes: Shapes) -> Addition | None:
         effect = candidate.effect
         spared = tuple(p.name for p in known(effect.key).linear if p.through is not None)
         entry = stanza_of(effect, candidate.place, state.robot, dict(shapes), spared)
-        made = self._state(state.robot.model_copy(update={"effects": (*state.robot.effects, entry)}), state)
+        made = self._state(with_entries(state.robot, [entry]), state)
         if made is None:
             return None
-        term = made.terms[-1]
+        term = made.term_of(entry)
         values, std = made.values_of(term)
         largest: dict[str, float] = {}
         for name, value in (pair for one in candidate.grid for pair in one):
             largest[name] = max(value, largest.get(name, value))
         allowed = known(effect.key).allows(term.of_effect(values), term.of_effect(std), dict(term.shapes), largest)
         share, changed = materiality(state, made)
-        return Addition(candidate, shapes, made, gain(made, state), share, changed, allowed)
+        return Addition(candidate, shapes, entry, made, gain(made, state), share, changed, allowed)
 
     def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""
@@ -404,7 +405,7 @@ class StepwiseSelection:
             if best is None or best.family == one.addition.family:
                 continue
             if best.log_likelihood > state.score.log_likelihood + self.criteria.close:
-                other = Selected(best.state.robot.effects[-1], step, best)
+                other = Selected(best.entry, step, best)
                 state, found = best.state, tuple(other if f is one else f for f in found)
         return state, found
 
@@ -416,7 +417,8 @@ class StepwiseSelection:
             for one in found:
                 less = self._without(state, one.entry)
                 if less is not None:
-                    checked.append(replace(one, confirmation=confirmed(state, less), without=less))
+                    compared = confirmed(with_report_part(state), with_report_part(less))
+                    checked.append(replace(one, confirmation=compared, without=less))
             failed = [one for one in checked if not self._holds(one)]
             if not failed:
                 return state, tuple(sorted(checked, key=lambda one: -_gained(state, one)))
@@ -425,10 +427,25 @@ class StepwiseSelection:
             state, found = gone.without, tuple(one for one in found if one.entry is not gone.entry)
 
     def _holds(self, one: Selected) -> bool:
-        """True if the report part confirms a finding: significant there, with smaller errors of its joint."""
-        report = one.confirmation
+        """True if the report part confirms a finding: the change goes the same way, and its joint has smaller errors."""
+        report, place = one.confirmation, one.addition.candidate.place
         assert report is not None
-        return report.p_value < self.criteria.confirmation_level and bool(np.max(report.share) > 0.0)
+        whole = one.addition.candidate.effect.scope == "arm"
+        joints = range(report.share.size) if whole else [j for j in (place.joint, place.other) if j is not None]
+        return report.p_value < self.criteria.confirmation_level and float(max(report.share[j] for j in joints)) > 0.0
+
+
+def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
+    """Return a configuration with further effect entries.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    entries
+        Entries to add.
+    """
+    return robot.model_copy(update={"effects": (*robot.effects, *entries)})
 
 
 def gain(with_it: ModelState, without: ModelState) -> float:

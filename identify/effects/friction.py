@@ -66,7 +66,7 @@ TRANSITION = "coulomb_transition"
 
 
 def transitions(motion: Motion, joint: int) -> Sequence[float]:
-    """Return velocities of the transition of dry friction, from 0.2 to 3 % of the joint's top speed, rad/s or m/s.
+    """Return velocities of the transition of dry friction, from 0.06 to 3 % of the joint's top speed, rad/s or m/s.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def transitions(motion: Motion, joint: int) -> Sequence[float]:
     joint
         Index of the joint, from 0.
     """
-    return [float(v) for v in float(motion.top_speed[joint]) * np.geomspace(0.002, 0.03, 7)]
+    return [float(v) for v in float(motion.top_speed[joint]) * np.geomspace(0.0006, 0.03, 7)]
 
 
 def _transition(motion: Motion, place: Place, *, velocity: float) -> Array:

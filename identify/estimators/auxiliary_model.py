@@ -150,6 +150,21 @@ class AuxiliaryModel:
             max_velocity=self.max_velocity / share,
         )
 
+    def of_experiments(self, numbers: Sequence[int]) -> Self:
+        """The loop of some of the experiments.
+
+        Parameters
+        ----------
+        numbers
+            Numbers of the experiments, from 0.
+        """
+        return replace(
+            self,
+            references=[self.references[k] for k in numbers],
+            initial=[self.initial[k] for k in numbers],
+            starts=[self._start(k) for k in numbers],
+        )
+
     def simulate(
         self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
     ) -> list[Simulation] | None:
