@@ -23,21 +23,32 @@ class Confirmation:
     p_value
         Probability of so large a projection of the errors without the effect on the change by the effect, if the effect
         is not there.
-    share
-        Share of the power of the errors of each joint that the effect removes, (n,).
     before, after
         Relative errors without and with the effect, percent, (n,).
+    noiseless
+        Relative errors with the effect whose torque is computed at the simulated motion, percent, (n,): measured
+        positions that are differentiated twice for an effect may add more noise than it has torque.
     """
 
     p_value: float
-    share: Array
     before: Array
     after: Array
+    noiseless: Array
 
     @property
-    def joint(self) -> int:
-        """Joint at which the effect removes the largest share."""
-        return int(np.argmax(self.share))
+    def share(self) -> Array:
+        """Share of the power of the errors of each joint that the effect removes, (n,)."""
+        return np.asarray(1.0 - (self.best / np.maximum(self.before, 1e-300)) ** 2)
+
+    @property
+    def best(self) -> Array:
+        """Relative errors with the effect, at measured or at simulated motion: where they are smaller altogether."""
+        return min(self.after, self.noiseless, key=lambda errors: float(np.sum(np.log(np.maximum(errors, 1e-300)))))
+
+    @property
+    def smaller(self) -> bool:
+        """True if the errors are smaller with the effect: the mean of their logarithms, as joints differ in size."""
+        return float(np.mean(np.log(np.maximum(self.best, 1e-300) / np.maximum(self.before, 1e-300)))) < 0.0
 
 
 def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
@@ -59,23 +70,23 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
         change = [applied(z, theta) for _, z, _ in with_it.fit.equations.held]
     else:
         change = [b - a for b, a in zip(before, after, strict=True)]
-    lengths = [e.shape[0] for e in before]
+    noiseless = [b - c for b, c in zip(before, change, strict=True)]
     products = whitened(before, noise) * whitened(change, noise)
     sums = np.zeros(SUMS)
-    for rows in rows_of_joints(lengths, noise):
+    for rows in rows_of_joints([e.shape[0] for e in before], noise):
         sums += [part.sum() for part in np.array_split(products[rows], SUMS)]
-    size = [float(sum(np.sum(e[:, j] ** 2) for e in errors)) for errors in (before, after) for j in range(len(noise))]
-    n = len(noise)
-    power, left = np.array(size[:n]), np.array(size[n:])
-    torque = np.array([sum(float(s.y[:, j] @ s.y[:, j]) for s in with_it.study.held) for j in range(n)])
     spread = float(sums.std(ddof=1)) / np.sqrt(SUMS)
-    statistic = float(sums.mean()) / max(spread, 1e-300)
+    torque = np.concatenate([s.y for s in with_it.study.held])
     return Confirmation(
-        float(stats.t.sf(statistic, SUMS - 1)),
-        1.0 - left / np.maximum(power, 1e-300),
-        100 * np.sqrt(power / np.maximum(torque, 1e-300)),
-        100 * np.sqrt(left / np.maximum(torque, 1e-300)),
+        float(stats.t.sf(float(sums.mean()) / max(spread, 1e-300), SUMS - 1)),
+        *(_relative(errors, torque) for errors in (before, after, noiseless)),
     )
+
+
+def _relative(errors: list[Array], torque: Array) -> Array:
+    """Norm of the errors of each joint over that of its torque, percent, (n,)."""
+    size = np.linalg.norm(np.concatenate(errors), axis=0)
+    return np.asarray(100 * size / np.maximum(np.linalg.norm(torque, axis=0), 1e-300))
 
 
 def _less(with_it: ModelState, without: ModelState) -> Array:

@@ -32,6 +32,9 @@ class Criteria:
         of its torque, so that the set-up is in question.
     most_findings
         Most effects of one diagnosis.
+    promising
+        Least gain of log-likelihood that the screening promises, over that which a finding needs, for a test in the
+        closed loop. In that loop an effect may gain more.
     shortlist, unnamed
         Numbers of named and unnamed candidates that are tested in their own closed loop, in each step.
     """
@@ -44,6 +47,7 @@ class Criteria:
     close: float = float(np.log(20.0))
     set_up_doubtful_pct: float = 100.0 / 3.0
     most_findings: int = 8
+    promising: float = 0.25
     shortlist: int = 10
     unnamed: int = 4
 

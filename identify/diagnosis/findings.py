@@ -53,7 +53,10 @@ def _finding(
     addition, report = one.addition, one.confirmation
     assert report is not None
     effect, place = of_entry(one.entry), addition.candidate.place
-    joint = report.joint if effect.scope == "arm" else place.joint
+    # The gap is that of the joint of the effect, or of the joint whose errors it reduces most.
+    joint = place.joint
+    if effect.scope == "arm" or report.share[joint] <= 0.0:
+        joint = int(np.argmax(report.share))
     chance = min(1.0, one.step.tests * float(np.exp(-addition.gain)))
     shares = tempered_shares(one.step)
     rivals = _rivals(one.step, addition.family)
@@ -72,13 +75,15 @@ def _finding(
             for key, rival in rivals[:ALTERNATIVES]
         ],
         gap_before=float(report.before[joint]),
-        gap_after=float(report.after[joint]),
+        gap_after=float(report.best[joint]),
         evidence={
             "title": effect.title,
             "description": effect.says,
             "reference": effect.reference,
             "score": addition.gain,
             "p_value": report.p_value,
+            "gap_joint": final.study.joints[joint],
+            "gap_at_measured_motion": float(report.after[joint]),
             "p_value_selection": chance,
             "tests": one.step.tests,
             "share_of_residual": float(report.share[joint]),

@@ -205,8 +205,13 @@ class StepwiseSelection:
             self.progress(f"adding {best.candidate.effect.name.replace('_', ' ')} of {name}")
             found = (*found, Selected(best.entry, step, best))
             state, found = self._reduced(best.state, found)
-        state, found = self._exchanged(state, found)
-        return self._confirmed(state, found)
+        # Removing a finding changes the comparison of the others.
+        while True:
+            state, found = self._exchanged(state, found)
+            state, kept = self._confirmed(state, found)
+            if len(kept) == len(found):
+                return state, kept
+            found = kept
 
     def step(self, state: ModelState) -> Step:
         """Compare all candidates in a model.
@@ -328,7 +333,9 @@ class StepwiseSelection:
                 looks.append((found[0] - 2.0 * len(candidate.effect.linear), candidate, found))
         if not self._steps:
             self.hidden = frozenset(hidden)
-        looks.sort(key=lambda look: -look[0])
+        # A score statistic is twice the gain of log-likelihood that it promises.
+        least = 2.0 * self.criteria.promising * np.log(max(tests, 1) / self.criteria.alpha["selection"])
+        looks = sorted((look for look in looks if look[2][0] > least), key=lambda look: -look[0])
         named = [x for x in looks if x[1].effect.name != UNNAMED][: self.criteria.shortlist]
         unnamed = [x for x in looks if x[1].effect.name == UNNAMED][: self.criteria.unnamed]
         chosen: list[tuple[Candidate, Shapes]] = []
@@ -395,7 +402,7 @@ class StepwiseSelection:
 
     def _exchanged(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
         """Model whose findings have competed with all other effects beside the findings made after them."""
-        for one in found[:-1]:
+        for one in found:
             less = None if self._late() else self._without(state, one.entry)
             if less is None:
                 continue
@@ -427,12 +434,10 @@ class StepwiseSelection:
             state, found = gone.without, tuple(one for one in found if one.entry is not gone.entry)
 
     def _holds(self, one: Selected) -> bool:
-        """True if the report part confirms a finding: the change goes the same way, and its joint has smaller errors."""
-        report, place = one.confirmation, one.addition.candidate.place
+        """True if the report part confirms a finding: the change goes the same way, and errors are smaller with it."""
+        report = one.confirmation
         assert report is not None
-        whole = one.addition.candidate.effect.scope == "arm"
-        joints = range(report.share.size) if whole else [j for j in (place.joint, place.other) if j is not None]
-        return report.p_value < self.criteria.confirmation_level and float(max(report.share[j] for j in joints)) > 0.0
+        return report.p_value < self.criteria.confirmation_level and report.smaller
 
 
 def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:

@@ -38,6 +38,10 @@ WORKING_RATE = 20.0
 """Rate at which effects are evaluated, over the frequency up to which model and data are compared."""
 
 
+ROUNDS = 8
+"""Most simulations of a loop with terms: instruments have to follow the arm, not to solve its equations."""
+SETTLED = 0.01
+"""Relative difference of the torque of the terms and the simulated load that ends these simulations."""
 ALIKE = 0.9
 """Indifference ratio of squared closed-loop velocity errors."""
 STIFF_LOOP = 1.5
@@ -258,7 +262,9 @@ class Study:
 
     def _simulated(self, theta: Array, numbers: Sequence[int]) -> dict[int, Derivatives] | None:
         """Motion of the closed loop with the model of the study by experiment; ``None`` if it diverges."""
-        auxiliary = replace(self.auxiliary.fresh(), model=self.model.anchored(theta), anchor=None)
+        auxiliary = replace(
+            self.auxiliary.fresh(), model=self.model.anchored(theta), anchor=None, rounds=ROUNDS, settled=SETTLED
+        )
         runs = auxiliary.of_experiments(numbers).simulate(theta)
         if runs is None:
             return None
