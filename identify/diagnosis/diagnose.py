@@ -187,10 +187,11 @@ def _diagnose(
     selection = StepwiseSelection(study, criteria, steps, deadline)
     first = selection.start()
     steps("comparison of effects")
-    chosen, selected = selection.run(first)
+    chosen, every = selection.run(first)
     final = with_report_part(chosen)
+    selected = [one for one in every if not one.conventional(final)]
     after = gap_of(final, held=True)
-    named = findings_of(final, selected, criteria)
+    named = findings_of(final, selected)
     places = {id(f): k for k, f in enumerate(named)}
     findings = stage.named(named, after)
     lacking = [_lacking(final, selected[places[id(f)]]) if id(f) in places else None for f in findings]
@@ -225,7 +226,7 @@ def _diagnose(
         not_visible=undetectable(first, selection.hidden),
         detection_limits=limits,
         simulated=simulated.document(),
-        negligible=negligible(final, last, criteria),
+        negligible=negligible(final, every, last, criteria),
         sign_smoothing=dict(zip(study.joints, map(float, first.robot.sign_smoothing), strict=True)),
         transitions={e.joint: e.parameters["velocity"] for e in final.robot.effects if e.effect == TRANSITION},
         criteria=asdict(criteria),

@@ -21,11 +21,13 @@ Array = NDArray[np.float64]
 
 ALTERNATIVES = 3
 """Most alternatives named beside a finding."""
+STRONG = float(np.exp(Criteria.close))
+"""Odds beyond which an explanation is no longer ambiguous."""
 DOUBTFUL = 0.6
 """Confidence below which another experiment is recommended."""
 
 
-def findings_of(final: ModelState, selected: Sequence[Selected], criteria: Criteria) -> list[Finding]:
+def findings_of(final: ModelState, selected: Sequence[Selected]) -> list[Finding]:
     """Return the findings of a selection, highest gain first.
 
     Parameters
@@ -34,8 +36,6 @@ def findings_of(final: ModelState, selected: Sequence[Selected], criteria: Crite
         Model with all of them.
     selected
         Effects of the selection.
-    criteria
-        Thresholds.
     """
     deviations = standard_deviations(final)
     entries = list(final.robot.effects)
@@ -43,12 +43,12 @@ def findings_of(final: ModelState, selected: Sequence[Selected], criteria: Crite
     found = []
     for one in selected:
         number = entries.index(one.entry)
-        found.append(_finding(final, one, values[number].parameters, deviations.get(number, {}), criteria))
+        found.append(_finding(final, one, values[number].parameters, deviations.get(number, {})))
     return found
 
 
 def _finding(
-    final: ModelState, one: Selected, parameters: Mapping[str, float], std: dict[str, float], criteria: Criteria
+    final: ModelState, one: Selected, parameters: Mapping[str, float], std: dict[str, float]
 ) -> Finding:
     addition, report = one.addition, one.confirmation
     assert report is not None
@@ -58,8 +58,8 @@ def _finding(
     if effect.scope == "arm" or report.share[joint] <= 0.0:
         joint = int(np.argmax(report.share))
     chance = min(1.0, one.step.tests * float(np.exp(-addition.gain)))
-    shares = tempered_shares(one.step)
-    rivals = _rivals(one.step, addition.family)
+    rivals = one.step.rivals(addition)
+    odds = tempered_odds(one.step, addition)
     return Finding(
         effect=effect.name,
         law=effect.law,
@@ -67,13 +67,8 @@ def _finding(
         other=one.entry.other,
         kind="structure",
         parameters=dict(parameters),
-        confidence=(1.0 - chance) * (shares.get(addition.family, 1.0) if addition.named else 1.0),
-        alternatives=[
-            Alternative(
-                effect=key[0], joint=final.study.joints[key[1]], score=rival.log_likelihood - addition.log_likelihood
-            )
-            for key, rival in rivals[:ALTERNATIVES]
-        ],
+        confidence=(1.0 - chance) * (1.0 / (1.0 + sum(odds.values())) if addition.named else 1.0),
+        alternatives=_alternatives(final, addition, rivals),
         gap_before=float(report.before[joint]),
         gap_after=float(report.best[joint]),
         evidence={
@@ -90,64 +85,69 @@ def _finding(
             "change_of_torque_pct": addition.material_pct,
             "std": std,
             "units": _units(effect, final.robot.joints[place.joint].type == "prismatic"),
-            "ambiguous_with": [
-                key[0]
-                for key, rival in rivals
-                if addition.named and shares.get(key, 0.0) * np.exp(criteria.close) > shares.get(addition.family, 1.0)
-            ],
+            "ambiguous_with": [key[0] for key, ratio in odds.items() if addition.named and ratio * STRONG > 1.0],
         },
     )
 
 
-def tempered_shares(step: Step) -> dict[Key, float]:
-    """Return the posterior probability of each effect of a step, whatever its law, with equal prior odds.
+def tempered_odds(step: Step, one: Addition) -> dict[Key, float]:
+    """Return the posterior odds of each other effect in place of one, whatever its law, with equal prior odds.
 
     Differences of log-likelihood are reduced by the serial correlation that the noise models leave: the gain of the
-    best effect with it over that without it.
+    effect with it over that without it.
 
     Parameters
     ----------
     step
         Step of the selection.
+    one
+        The effect.
     """
-    able = [a for a in step.ranked if a.allowed and a.named]
-    if not able:
-        return {}
-    own = able[0].log_likelihood - step.state.score.log_likelihood
-    factor = float(np.clip(able[0].gain / own, 0.0, 1.0)) if own > 0.0 else 1.0
-    best: dict[Key, float] = {}
-    for addition in able:
-        best.setdefault(addition.family, factor * (addition.log_likelihood - able[0].log_likelihood))
-    total = float(sum(np.exp(v) for v in best.values()))
-    return {key: float(np.exp(v)) / total for key, v in best.items()}
+    own = one.log_likelihood - step.state.score.log_likelihood
+    factor = float(np.clip(one.gain / own, 0.0, 1.0)) if own > 0.0 else 1.0
+    odds: dict[Key, float] = {}
+    for rival in step.rivals(one):
+        if rival.named:
+            odds.setdefault(rival.family, float(np.exp(min(0.0, factor * (rival.log_likelihood - one.log_likelihood)))))
+    return odds
 
 
-def _rivals(step: Step, family: Key) -> list[tuple[Key, Addition]]:
-    """Best law of each other effect of a step that physics allows, highest log-likelihood first."""
-    found: dict[Key, Addition] = {}
-    for addition in step.ranked:
-        if addition.allowed and addition.named and addition.family != family:
-            found.setdefault(addition.family, addition)
-    return list(found.items())
+def _alternatives(final: ModelState, one: Addition, rivals: Sequence[Addition]) -> list[Alternative]:
+    """Best law of each other effect, highest log-likelihood first."""
+    found: dict[Key, Alternative] = {}
+    for rival in rivals:
+        if rival.named:
+            joint = final.study.joints[rival.candidate.place.joint]
+            entry = Alternative(
+                effect=rival.family[0], joint=joint, score=rival.log_likelihood - one.log_likelihood
+            )
+            found.setdefault(rival.family, entry)
+    return list(found.values())[:ALTERNATIVES]
 
 
-def negligible(final: ModelState, step: Step | None, criteria: Criteria) -> list[Negligible]:
-    """Return the effects that are significant, and smaller than what counts as a cause.
+def negligible(
+    final: ModelState, selected: Sequence[Selected], step: Step | None, criteria: Criteria
+) -> list[Negligible]:
+    """Return the effects that are significant, and no cause: too small, or within the sampling convention of drives.
 
     Parameters
     ----------
     final
         Model with the findings.
+    selected
+        Effects of the selection.
     step
         Comparison of all effects in it; ``None`` if it was not made.
     criteria
         Thresholds.
     """
     found: dict[Key, Negligible] = {}
-    for addition in () if step is None else step.ranked:
-        significant = addition.gain > np.log(max(step.tests, 1) / criteria.alpha["selection"]) if step else False
-        small = addition.material_pct < criteria.material_pct or addition.share < criteria.least_share
-        if significant and small and addition.allowed and addition.named:
+    small = [one.addition for one in selected if one.conventional(final)]
+    if step is not None:
+        needed = np.log(max(step.tests, 1) / criteria.alpha["selection"])
+        small += [a for a in step.ranked if a.gain > needed and a not in step.passing]
+    for addition in small:
+        if addition.allowed and addition.named:
             joint = final.study.joints[addition.candidate.place.joint]
             entry = Negligible(
                 effect=addition.candidate.effect.name,

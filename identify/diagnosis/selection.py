@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
@@ -35,6 +34,8 @@ from armident.identify.effects.unnamed import NAME as UNNAMED
 
 Array = NDArray[np.float64]
 
+FINER = (1.4, 1.2, 1.1)
+"""Factors of the refinement of the velocity of a transition; the grid has factors of 1.9."""
 CLEAR = 3.0
 """Gain of log-likelihood from which a transition of dry friction is a part of the friction model: odds of 20 to 1."""
 
@@ -99,22 +100,31 @@ class Step:
         Model without them.
     ranked
         Candidates in the model.
+    passing
+        Those that are significant, material and physically possible.
     tests
         Number of candidates and nonlinear parameters from which they were selected.
     """
 
     state: ModelState
     ranked: tuple[Addition, ...]
+    passing: tuple[Addition, ...]
     tests: int
 
-    def shares(self) -> dict[Key, float]:
-        """Posterior probability of each physically possible effect, whatever its law, with equal prior odds."""
-        best: dict[Key, float] = {}
-        for addition in self.ranked:
-            if addition.allowed and addition.named:
-                best[addition.family] = max(best.get(addition.family, -np.inf), addition.log_likelihood)
-        total = special.logsumexp(list(best.values())) if best else 0.0
-        return {key: float(np.exp(value - total)) for key, value in best.items()}
+    def rivals(self, one: Addition) -> tuple[Addition, ...]:
+        """Physically possible explanations in place of an addition: others that pass, and others of the same joint.
+
+        Parameters
+        ----------
+        one
+            The addition.
+        """
+        joint = one.candidate.place.joint
+        return tuple(
+            a
+            for a in self.ranked
+            if a.allowed and a.family != one.family and (a in self.passing or a.candidate.place.joint == joint)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +150,17 @@ class Selected:
     addition: Addition
     confirmation: Confirmation | None = None
     without: ModelState | None = None
+
+    def conventional(self, state: ModelState) -> bool:
+        """True if the effect is within the sampling convention of drives: a part of the model, and no finding.
+
+        Parameters
+        ----------
+        state
+            Final model.
+        """
+        negligible = self.addition.candidate.effect.negligible
+        return negligible is not None and negligible(state.values_of(state.term_of(self.entry))[0], state.study.sample)
 
 
 @dataclass
@@ -226,7 +247,8 @@ class StepwiseSelection:
             shortlist, tests = self._shortlist(state)
             additions = (self._added(state, *one) for one in shortlist)
             able = [a for a in additions if a is not None]
-            self._steps[key] = Step(state, tuple(sorted(able, key=lambda a: -a.log_likelihood)), tests)
+            ranked = tuple(sorted(able, key=lambda a: -a.log_likelihood))
+            self._steps[key] = Step(state, ranked, tuple(a for a in ranked if self.passes(a, tests)), tests)
         return self._steps[key]
 
     def last(self, state: ModelState) -> Step | None:
@@ -252,20 +274,18 @@ class StepwiseSelection:
         tests
             Number of candidates among which it was found.
         """
-        negligible = addition.candidate.effect.negligible
-        values, _ = addition.state.values_of(addition.state.term_of(addition.entry))
         return (
             addition.allowed
             and addition.gain > np.log(max(tests, 1) / self.criteria.alpha["selection"])
             and addition.share >= self.criteria.least_share
             and addition.material_pct >= self.criteria.material_pct
-            and not (negligible is not None and negligible(values, self.study.sample))
         )
 
     def admitted(self, step: Step) -> Addition | None:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
-        An effect with a name comes first if it explains most of what the best term without a name does. Of the laws of
+        An effect is admitted only if no other explanation of the same joint is clearly better, even one that is too
+        small to be a finding. An effect with a name comes first if it explains most of what the best term without a name does. Of the laws of
         one effect that predict as well, that with the fewest parameters comes first, and a free shape last.
 
         Parameters
@@ -273,7 +293,7 @@ class StepwiseSelection:
         step
             The step.
         """
-        able = [a for a in step.ranked if self.passes(a, step.tests)]
+        able = [a for a in step.passing if not self._superseded(a, step)]
         if not able:
             return None
         best = able[0]
@@ -283,6 +303,11 @@ class StepwiseSelection:
         close = best.log_likelihood - self.criteria.close
         same = [a for a in able if a.family == best.family and a.log_likelihood > close]
         return min(same, key=lambda a: (a.candidate.effect.free, len(a.candidate.effect.linear)))
+
+    def _superseded(self, addition: Addition, step: Step) -> bool:
+        """True if an explanation of the same joint that does not pass is clearly better than an addition."""
+        better = (a for a in step.rivals(addition) if a not in step.passing)
+        return any(a.log_likelihood > addition.log_likelihood + self.criteria.close for a in better)
 
     def _late(self) -> bool:
         self.stopped = self.stopped or time.monotonic() > self.deadline
@@ -300,19 +325,24 @@ class StepwiseSelection:
         motion = workshop.motion(state.study.train[0], "measured")
         present = {e.joint for e in state.robot.effects if e.effect == TRANSITION}
         places = [Place(j) for j, name in enumerate(self.study.joints) if name not in present]
-        best = {place: (state.score.log_likelihoods[place.joint] + CLEAR, None) for place in places}
-        for shapes in zip(*(grid(effect, motion, place) for place in places), strict=True):
-            entries = [
-                stanza_of(effect, place, state.robot, dict(one)) for place, one in zip(places, shapes, strict=True)
-            ]
-            made = self._state(with_entries(state.robot, entries), state)
-            for place, entry in zip(places, entries, strict=True) if made else ():
-                value = float(made.values_of(made.term_of(entry))[0][0])
+        best = {place: (state.score.log_likelihoods[place.joint] + CLEAR, 0.0) for place in places}
+
+        def tried(velocities: Sequence[float]) -> ModelState | None:
+            chosen = [(place, v) for place, v in zip(places, velocities, strict=True) if v > 0.0]
+            entries = [stanza_of(effect, place, state.robot, {"velocity": v}) for place, v in chosen]
+            made = self._state(with_entries(state.robot, entries), state) if entries else None
+            for (place, v), entry in zip(chosen, entries, strict=True) if made else ():
                 score = float(made.score.log_likelihoods[place.joint])
-                if value > 0.0 and score > best[place][0]:
-                    best[place] = score, entry
-        chosen = [entry for _, entry in best.values() if entry is not None]
-        made = self._state(with_entries(state.robot, chosen), state) if chosen else None
+                if made.values_of(made.term_of(entry))[0][0] > 0.0 and score > best[place][0]:
+                    best[place] = score, v
+            return made
+
+        for shapes in zip(*(grid(effect, motion, place) for place in places), strict=True):
+            tried([dict(one)["velocity"] for one in shapes])
+        for factor in FINER:
+            tried([factor * v for _, v in best.values()])
+            tried([v / factor for _, v in best.values()])
+        made = tried([v for _, v in best.values()])
         return made if made is not None and made.score.log_likelihood > state.score.log_likelihood else state
 
     def _shortlist(self, state: ModelState) -> tuple[list[tuple[Candidate, Shapes]], int]:
