@@ -59,6 +59,8 @@ class Segment:
         Recorded torques, (W, n), N m or N.
     dt
         Working period, s.
+    q_ref
+        Reference positions, (W, n); ``None``: not recorded.
     """
 
     q: Array
@@ -66,6 +68,7 @@ class Segment:
     qdd: Array
     tau: Array
     dt: float
+    q_ref: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +212,7 @@ class Bench:
             for name in ("q", "qd", "qdd")
         )
         top = np.maximum(np.max([np.abs(s.qd @ position.T).max(axis=0) for s in self.segments], axis=0), 1e-12)
-        free = np.concatenate([self._kept(_friction(s.qd @ position.T, top)) for s in self.segments])
+        free = np.concatenate([self._kept(friction_terms(s.qd @ position.T, top)) for s in self.segments])
         still = np.zeros_like(q)
         postures = np.ascontiguousarray(q[:: max(1, q.shape[0] // POSTURES)])
         weightless = self.model.with_gravity(np.zeros(3))
@@ -269,7 +272,8 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
         q = first(e.q)
         qd = np.gradient(q, working, axis=0)
         qdd = np.gradient(qd, working, axis=0)
-        segments.append(Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, -0.5))), working))
+        q_ref = None if e.q_ref is None else first(e.q_ref)
+        segments.append(Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, -0.5))), working, q_ref))
     count = sum(second.count(s.q.shape[0]) for s in segments)
     samples = sum(e.q.shape[0] for e in experiments)
     if count < LEAST_ROWS or samples < LEAST_SAMPLES:
@@ -289,8 +293,16 @@ def _shifted(x: Array, samples: Array) -> Array:
     return np.stack([np.interp(t + s, t, column) for s, column in zip(samples, x.T, strict=True)], axis=1)
 
 
-def _friction(qd: Array, top: Array) -> Array:
-    """Free friction terms (W, n, 4): dry, asymmetric viscous, quadratic, and dry at low velocity only."""
+def friction_terms(qd: Array, top: Array) -> Array:
+    """Return the free friction terms (W, n, 4): dry, asymmetric viscous, quadratic, and dry at low velocity only.
+
+    Parameters
+    ----------
+    qd
+        Velocities, (W, n), rad/s or m/s.
+    top
+        Largest velocity of each joint, (n,).
+    """
     u = qd / top
     sign = 2 / np.pi * np.arctan(u / SLOW)
     return np.stack([sign, np.abs(u), u * np.abs(u), sign * np.exp(-np.abs(u) / BREAKAWAY)], axis=2)
