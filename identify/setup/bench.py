@@ -12,6 +12,7 @@ from armident.configs import DataError, RobotConfig
 from armident.identify.experiment import Experiment
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandwidth import motion_bandwidth
+from armident.identify.signals.differentiate import differentiate
 from armident.identify.signals.decimate import Decimation, design
 
 Array = NDArray[np.float64]
@@ -242,7 +243,7 @@ class Bench:
         return Rows(x, gravity, physical.reshape(2 * n, -1))
 
 
-def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]) -> Bench:
+def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_], band: float = CUTOFF, over: float = WORKING_RATE, smooth: bool = False) -> Bench:
     """Filter and differentiate the recordings.
 
     Parameters
@@ -253,6 +254,8 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
         The configuration.
     moving
         Mask (n,) of the joints that move.
+    band
+        Cut-off of the equations in closed-loop bandwidths.
 
     Raises
     ------
@@ -260,8 +263,8 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
         If the recordings are too short for any comparison.
     """
     dt = experiments[0].dt
-    cutoff = min(CUTOFF * motion_bandwidth([e.q for e in experiments], dt), 0.45 / dt)
-    first_factor = max(1, int(1.0 / (dt * WORKING_RATE * cutoff)))
+    cutoff = min(band * motion_bandwidth([e.q for e in experiments], dt), 0.45 / dt)
+    first_factor = max(1, int(1.0 / (dt * over * cutoff)))
     working = dt * first_factor
     first = design(dt, 0.4 / working, first_factor) if first_factor > 1 else design(dt, 0.5 / dt, 1)
     second = design(working, cutoff, max(1, int(0.5 / (working * cutoff) + 1e-9)))
@@ -272,6 +275,9 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
         q = first(e.q)
         qd = np.gradient(q, working, axis=0)
         qdd = np.gradient(qd, working, axis=0)
+        if smooth:
+            dd = differentiate(q, working)
+            q, qd, qdd = dd.q, dd.qd, dd.qdd
         q_ref = None if e.q_ref is None else first(e.q_ref)
         segments.append(Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, -0.5))), working, q_ref))
     count = sum(second.count(s.q.shape[0]) for s in segments)
@@ -293,7 +299,7 @@ def _shifted(x: Array, samples: Array) -> Array:
     return np.stack([np.interp(t + s, t, column) for s, column in zip(samples, x.T, strict=True)], axis=1)
 
 
-def friction_terms(qd: Array, top: Array) -> Array:
+def friction_terms(qd: Array, top: Array, slow: float = SLOW) -> Array:
     """Return the free friction terms (W, n, 4): dry, asymmetric viscous, quadratic, and dry at low velocity only.
 
     Parameters
@@ -304,5 +310,5 @@ def friction_terms(qd: Array, top: Array) -> Array:
         Largest velocity of each joint, (n,).
     """
     u = qd / top
-    sign = 2 / np.pi * np.arctan(u / SLOW)
+    sign = 2 / np.pi * np.arctan(u / slow)
     return np.stack([sign, np.abs(u), u * np.abs(u), sign * np.exp(-np.abs(u) / BREAKAWAY)], axis=2)

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import os
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
@@ -16,8 +18,8 @@ Array = NDArray[np.float64]
 
 MAX_AR_ORDER = 10
 PASSES = 3
-RANK = 1e-4
-LAGS = 16
+RANK = float(os.environ.get("RANK","1e-4"))
+LAGS = int(os.environ.get("LAGS","16"))
 
 
 @dataclass(frozen=True)
@@ -38,18 +40,31 @@ def estimate(bench: Bench, h: Hypothesis, free: bool = True) -> Estimated:
     def regressor(motion):
         q, qd, qdd = (np.ascontiguousarray(v @ h.position.T) for v in motion)
         x = model.rigid_regressor(q, qd, qdd)
-        f = friction_terms(qd, top)
+        mode = os.environ.get('MODE', 'w')
+        u = qd / top
+        h_ = bench.segments[0].dt
+        sharp = np.clip(qd / np.maximum(np.abs(qdd) * h_ / 2, 1e-9 * top), -1, 1)
+        widths = [float(v) for v in os.environ.get('SLOW', '0.02').split(',')]
+        f = [np.arctan(u / w_) * 2 / np.pi for w_ in widths]
+        if 's' in mode:
+            f.insert(0, sharp)
+        f += [np.abs(u), u * np.abs(u), f[0] * np.exp(-np.abs(u) / 0.1)]
+        if 'e' in mode:
+            f += [f[0] * np.exp(-np.abs(u) / 0.03)]
+        f = np.stack(f, axis=2)
+        k_ = f.shape[2] - 1
         for j in range(n):
             x[:, :, dry[j]] = 0.0
             x[:, j, dry[j]] = f[:, j, 0]
         if free:
-            extra = np.zeros((*x.shape[:2], 3 * n))
+            extra = np.zeros((*x.shape[:2], k_ * n))
             for j in range(n):
-                extra[:, j, 3 * j : 3 * j + 3] = f[:, j, 1:]
+                extra[:, j, k_ * j : k_ * (j + 1)] = f[:, j, 1:]
             x = np.concatenate([x, extra], axis=2)
         return x
 
-    instrumented = all(s.q_ref is not None for s in bench.segments)
+    import os
+    instrumented = not os.environ.get("LS") and all(s.q_ref is not None for s in bench.segments)
     full = [regressor(m) for m in measured]
     fullz = [regressor(m) for m in _followed(bench)] if instrumented else full
     y = [bench.decimation(s.tau @ h.torque.T) for s in bench.segments]
