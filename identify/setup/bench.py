@@ -12,7 +12,6 @@ from armident.configs import DataError, RobotConfig
 from armident.identify.experiment import Experiment
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.bandwidth import motion_bandwidth
-from armident.identify.signals.differentiate import differentiate
 from armident.identify.signals.decimate import Decimation, design
 
 Array = NDArray[np.float64]
@@ -61,7 +60,7 @@ class Segment:
     dt
         Working period, s.
     q_ref
-        Reference positions, (W, n); ``None``: not recorded.
+        Reference positions, (W, n), rad or m; ``None``: not recorded.
     """
 
     q: Array
@@ -213,7 +212,7 @@ class Bench:
             for name in ("q", "qd", "qdd")
         )
         top = np.maximum(np.max([np.abs(s.qd @ position.T).max(axis=0) for s in self.segments], axis=0), 1e-12)
-        free = np.concatenate([self._kept(friction_terms(s.qd @ position.T, top)) for s in self.segments])
+        free = np.concatenate([self._kept(_friction(s.qd @ position.T, top)) for s in self.segments])
         still = np.zeros_like(q)
         postures = np.ascontiguousarray(q[:: max(1, q.shape[0] // POSTURES)])
         weightless = self.model.with_gravity(np.zeros(3))
@@ -243,7 +242,13 @@ class Bench:
         return Rows(x, gravity, physical.reshape(2 * n, -1))
 
 
-def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_], band: float = CUTOFF, over: float = WORKING_RATE, smooth: bool = False) -> Bench:
+def make_bench(
+    experiments: Sequence[Experiment],
+    robot: RobotConfig,
+    moving: NDArray[np.bool_],
+    working_rate: float = WORKING_RATE,
+    model: ArmModel | None = None,
+) -> Bench:
     """Filter and differentiate the recordings.
 
     Parameters
@@ -254,8 +259,10 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
         The configuration.
     moving
         Mask (n,) of the joints that move.
-    band
-        Cut-off of the equations in closed-loop bandwidths.
+    working_rate
+        Rate of the derivatives over the cut-off of the equations.
+    model
+        Model of another bench of the same robot; ``None``: made.
 
     Raises
     ------
@@ -263,8 +270,8 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
         If the recordings are too short for any comparison.
     """
     dt = experiments[0].dt
-    cutoff = min(band * motion_bandwidth([e.q for e in experiments], dt), 0.45 / dt)
-    first_factor = max(1, int(1.0 / (dt * over * cutoff)))
+    cutoff = min(CUTOFF * motion_bandwidth([e.q for e in experiments], dt), 0.45 / dt)
+    first_factor = max(1, int(1.0 / (dt * working_rate * cutoff)))
     working = dt * first_factor
     first = design(dt, 0.4 / working, first_factor) if first_factor > 1 else design(dt, 0.5 / dt, 1)
     second = design(working, cutoff, max(1, int(0.5 / (working * cutoff) + 1e-9)))
@@ -275,9 +282,6 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
         q = first(e.q)
         qd = np.gradient(q, working, axis=0)
         qdd = np.gradient(qd, working, axis=0)
-        if smooth:
-            dd = differentiate(q, working)
-            q, qd, qdd = dd.q, dd.qd, dd.qdd
         q_ref = None if e.q_ref is None else first(e.q_ref)
         segments.append(Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, -0.5))), working, q_ref))
     count = sum(second.count(s.q.shape[0]) for s in segments)
@@ -287,8 +291,9 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
             f"the recordings are too short for a check of the set-up: {samples} samples, {count} after filtering; "
             f"at least {LEAST_SAMPLES} and {LEAST_ROWS} are needed: record longer"
         )
-    generic = robot.model_copy(update={"gravity": tuple(GENERIC), "effects": ()})
-    return Bench(ArmModel.from_config(generic), robot, tuple(segments), second, moving, dt)
+    if model is None:
+        model = ArmModel.from_config(robot.model_copy(update={"gravity": tuple(GENERIC), "effects": ()}))
+    return Bench(model, robot, tuple(segments), second, moving, dt)
 
 
 def _shifted(x: Array, samples: Array) -> Array:
@@ -299,16 +304,8 @@ def _shifted(x: Array, samples: Array) -> Array:
     return np.stack([np.interp(t + s, t, column) for s, column in zip(samples, x.T, strict=True)], axis=1)
 
 
-def friction_terms(qd: Array, top: Array, slow: float = SLOW) -> Array:
-    """Return the free friction terms (W, n, 4): dry, asymmetric viscous, quadratic, and dry at low velocity only.
-
-    Parameters
-    ----------
-    qd
-        Velocities, (W, n), rad/s or m/s.
-    top
-        Largest velocity of each joint, (n,).
-    """
+def _friction(qd: Array, top: Array) -> Array:
+    """Free friction terms (W, n, 4): dry, asymmetric viscous, quadratic, and dry at low velocity only."""
     u = qd / top
-    sign = 2 / np.pi * np.arctan(u / slow)
+    sign = 2 / np.pi * np.arctan(u / SLOW)
     return np.stack([sign, np.abs(u), u * np.abs(u), sign * np.exp(-np.abs(u) / BREAKAWAY)], axis=2)

@@ -4,6 +4,15 @@ from dataclasses import dataclass
 
 from armident.configs import RobotConfig
 
+SIGNIFICANT = 3.0
+"""Standard deviations from which a shift is significant: one false alarm in 370, as for the torque delay of identify."""
+
+LEAST_AGREEMENT = 0.01
+"""Least p-value of the test that all joints have one shift: a refusal by chance in one recording of a hundred."""
+
+MOST_UNCERTAIN = 0.25
+"""Largest standard deviation of a shift that is corrected, samples: a correction by half a sample must not be a guess."""
+
 
 @dataclass(frozen=True)
 class SetupFinding:
@@ -36,6 +45,50 @@ class SetupFinding:
 
 
 @dataclass(frozen=True)
+class TorqueShift:
+    """Time by which all torques together are late against the positions, beyond the torque held until the next sample.
+
+    Parameters
+    ----------
+    samples, std
+        Common estimate and its standard deviation, samples; negative: early.
+    dt
+        Sampling period, s.
+    by_joint
+        Estimate and standard deviation of every joint that moves, samples.
+    agreement
+        Probability of shifts that differ as much if the joints have one in common, chi-squared test.
+    instrumented
+        True if recorded references gave instruments that no disturbance of the loop affects.
+    """
+
+    samples: float
+    std: float
+    dt: float
+    by_joint: dict[str, tuple[float, float]]
+    agreement: float
+    instrumented: bool
+
+    @property
+    def applied(self) -> bool:
+        """True if the shift is significant, common to the joints and no longer than a sample: it is corrected."""
+        certain = abs(self.samples) > SIGNIFICANT * self.std and self.agreement >= LEAST_AGREEMENT
+        return certain and self.std <= MOST_UNCERTAIN and abs(self.samples) <= 1.0
+
+    @property
+    def remark(self) -> str:
+        """The correction in one sentence; empty if none is made."""
+        if not self.applied:
+            return ""
+        direction, move = ("late", "earlier") if self.samples > 0 else ("early", "later")
+        return (
+            f"all torques are {abs(self.samples):.2f} +- {self.std:.2f} samples "
+            f"({1000 * abs(self.samples) * self.dt:.3g} ms) {direction} against the positions, in agreement of the "
+            f"joints: they were moved {move} by this time"
+        )
+
+
+@dataclass(frozen=True)
 class SetupCheck:
     """Result of `armident.identify.setup.check.check_setup`.
 
@@ -56,6 +109,8 @@ class SetupCheck:
         Configuration with the corrections that a configuration can express; ``None`` if there are none.
     clock
         True over recorded duration: the sampling period has to be multiplied by it.
+    torque_shift
+        Common shift of the torques by less than a sample or two; ``None``: not estimated.
     """
 
     findings: tuple[SetupFinding, ...]
@@ -65,3 +120,4 @@ class SetupCheck:
     tried: tuple[str, ...]
     corrected_robot: RobotConfig | None
     clock: float = 1.0
+    torque_shift: TorqueShift | None = None

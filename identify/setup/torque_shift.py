@@ -1,138 +1,272 @@
-"""Time shift of less than two samples between all torques and positions, estimated with instruments (thesis 2.33)."""
+"""Time shift between all torques and the positions, in fractions of a sample, estimated with instruments (thesis 2.33).
+
+Drives and importers differ in when a torque is sampled against the position. At low rates half a sample changes the
+residual of the rigid model as much as an effect does. A recorded torque that is late by ``s`` is, to first order,
+``phi theta - s d(phi theta)/dt``: one more parameter of each joint, beside all others.
+
+Two errors would enter such an estimate, and have terms or instruments of their own:
+
+- A disturbance moves the arm first and the torque of the closed loop afterwards. The instruments are therefore the
+  regressors of the motion that a linear filter makes of the recorded references.
+- Dry friction does not change where the velocity does: a joint stops suddenly, and leaves standstill slowly. The
+  change of the friction with time has free factors, so that inertia and gravity alone determine the shift.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-import os
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from armident.identify.experiment import Experiment
 from armident.identify.regression.ar_noise import ArModel, fit_ar
-from armident.identify.regression.equations import error_variances, serial_covariance, weighted_rows
-from armident.identify.setup.bench import Bench, friction_terms
+from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis
+from armident.identify.setup.result import TorqueShift
 
 Array = NDArray[np.float64]
+Motion = tuple[Array, Array, Array]
+
+SHIFT_RATE = 20.0
+"""Rate of the derivatives over the cut-off: central differences then err by 3 % at the cut-off itself."""
+
+MOST_SAMPLES = 8000
+"""Largest number of samples at the working rate: 20 s of six axes at 400 Hz. The first part of longer recordings."""
 
 MAX_AR_ORDER = 10
-PASSES = 3
-RANK = float(os.environ.get("RANK","1e-4"))
-LAGS = int(os.environ.get("LAGS","16"))
+"""Highest order of the noise models after decimation."""
+
+PASSES = 2
+"""Fits with noise models, after the first one without."""
+
+RANK = 1e-6
+"""Singular value of the normalised regressor, relative to the largest, from which a direction counts as excited."""
+
+LAGS = 16
+"""Coefficients of the filter from reference to motion: eight closed-loop periods at the rate of the rows."""
+
+WIDTHS = (0.02, 0.005)
+"""Shares of a joint's largest velocity over which the smoothed signs of its dry friction change."""
+
+BREAKAWAY = 0.1
+"""Share of a joint's largest velocity over which its friction of low velocities decays."""
 
 
-@dataclass(frozen=True)
-class Estimated:
-    samples: Array
-    covariance: Array
-    instrumented: bool
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """Regressors of one joint at the rows and at the working rate, for all segments.
+
+    Parameters
+    ----------
+    rows
+        Filtered and decimated, (M, c) per segment.
+    fine
+        At the working rate, (W, c) per segment.
+    """
+
+    rows: list[Array]
+    fine: list[Array]
 
 
-def estimate(bench: Bench, h: Hypothesis, free: bool = True) -> Estimated:
+def torque_shift(bench: Bench, h: Hypothesis) -> TorqueShift:
+    """Estimate the common shift of the torques, and its agreement with the shift of every single joint.
+
+    Parameters
+    ----------
+    bench
+        Signals, made with the working rate `SHIFT_RATE`.
+    h
+        Corrections of the signals; its shift is not used.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the motion determines no shift.
+    """
+    segments = _shortened(bench)
     joints = np.flatnonzero(bench.moving)
-    n = bench.n
-    model = bench.model.with_gravity(h.gravity)
-    dry = [bench.column(f"fc{j + 1}") for j in range(n)]
-    measured = [(s.q, s.qd, s.qdd) for s in bench.segments]
-    top = np.maximum(np.max([np.abs(s.qd @ h.position.T).max(axis=0) for s in bench.segments], axis=0), 1e-12)
+    instrumented = all(s.q_ref is not None for s in segments.segments)
+    measured = _columns(segments, h, [(s.q, s.qd, s.qdd) for s in segments.segments])
+    followed = _columns(segments, h, _followed(segments)) if instrumented else measured
+    y = [bench.decimation(s.tau @ h.torque.T) for s in segments.segments]
+    basis = _excited([np.concatenate(measured[j].rows) for j in joints], [_scale(y, j) for j in joints])
+    noise = [ArModel(np.empty(0), 1.0 / _scale(y, j) ** 2, 0.0) for j in joints]
+    theta, covariance = np.zeros(basis.shape[1]), np.empty((0, 0))
+    for done in range(PASSES + 1):
+        shifts = joints.size if done else 0
 
-    def regressor(motion):
+        def block(columns: _Columns, k: int, theta: Array = theta, shifts: int = shifts) -> list[Array]:
+            return [
+                np.hstack([r @ basis, _late(bench, f @ (basis @ theta[: basis.shape[1]]), k, shifts)])
+                for r, f in zip(columns.rows, columns.fine, strict=True)
+            ]
+
+        x = [block(measured[j], k) for k, j in enumerate(joints)]
+        z = [block(followed[j], k) for k, j in enumerate(joints)] if instrumented else x
+        theta, covariance = _solved(z, x, [[v[:, j] for v in y] for j in joints], noise)
+        noise = [
+            fit_ar([v[:, j] - own @ theta for v, own in zip(y, x[k], strict=True)], MAX_AR_ORDER)
+            for k, j in enumerate(joints)
+        ]
+    c, samples = basis.shape[1], segments.period
+    return _common(theta[c:] / samples, covariance[c:, c:] / samples**2, segments, instrumented)
+
+
+def shifted(experiments: Sequence[Experiment], samples: float) -> list[Experiment]:
+    """Return the experiments with all torques moved to earlier times, by cubic convolution.
+
+    Keys, Cubic Convolution Interpolation for Digital Image Processing, IEEE Trans. ASSP 29, 1981. Linear
+    interpolation by half a sample, as in the alignment of the torque, would weaken high frequencies a second time.
+
+    Parameters
+    ----------
+    experiments
+        Recordings.
+    samples
+        Samples by which the torques are late.
+    """
+    whole = int(np.floor(samples))
+    s = samples - whole
+    weights = np.array(
+        [
+            ((-0.5 * s + 1.0) * s - 0.5) * s,
+            (1.5 * s - 2.5) * s * s + 1.0,
+            ((-1.5 * s + 2.0) * s + 0.5) * s,
+            (0.5 * s - 0.5) * s * s,
+        ]
+    )
+    moved = []
+    for e in experiments:
+        last = e.tau.shape[0] - 1
+        k = np.arange(last + 1) + whole
+        tau = sum(w * e.tau[np.clip(k + i, 0, last)] for i, w in zip((-1, 0, 1, 2), weights, strict=True))
+        moved.append(replace(e, tau=np.ascontiguousarray(tau)))
+    return moved
+
+
+def _shortened(bench: Bench) -> Bench:
+    total = sum(s.q.shape[0] for s in bench.segments)
+    if total <= MOST_SAMPLES:
+        return bench
+    least = 2 * bench.decimation.taps.size
+    kept = [max(int(s.q.shape[0] * MOST_SAMPLES / total), least) for s in bench.segments]
+    cut = [
+        replace(
+            s, q=s.q[:k], qd=s.qd[:k], qdd=s.qdd[:k], tau=s.tau[:k], q_ref=None if s.q_ref is None else s.q_ref[:k]
+        )
+        for s, k in zip(bench.segments, kept, strict=True)
+    ]
+    return replace(bench, segments=tuple(cut))
+
+
+def _columns(bench: Bench, h: Hypothesis, motions: Sequence[Motion]) -> list[_Columns]:
+    """Regressors of every joint: rigid arm, then the free friction terms of all joints."""
+    n, model = bench.n, bench.model.with_gravity(h.gravity)
+    dry = [bench.column(f"fc{j + 1}") for j in range(n)]
+    top = np.maximum(np.max([np.abs(s.qd @ h.position.T).max(axis=0) for s in bench.segments], axis=0), 1e-12)
+    found = [_Columns([], []) for _ in range(n)]
+    for motion, segment in zip(motions, bench.segments, strict=True):
         q, qd, qdd = (np.ascontiguousarray(v @ h.position.T) for v in motion)
         x = model.rigid_regressor(q, qd, qdd)
-        mode = os.environ.get('MODE', 'w')
-        u = qd / top
-        h_ = bench.segments[0].dt
-        sharp = np.clip(qd / np.maximum(np.abs(qdd) * h_ / 2, 1e-9 * top), -1, 1)
-        widths = [float(v) for v in os.environ.get('SLOW', '0.02').split(',')]
-        f = [np.arctan(u / w_) * 2 / np.pi for w_ in widths]
-        if 's' in mode:
-            f.insert(0, sharp)
-        f += [np.abs(u), u * np.abs(u), f[0] * np.exp(-np.abs(u) / 0.1)]
-        if 'e' in mode:
-            f += [f[0] * np.exp(-np.abs(u) / 0.03)]
-        f = np.stack(f, axis=2)
-        k_ = f.shape[2] - 1
+        x[:, :, dry] = 0.0
+        filtered = bench.decimation(x)
+        friction = _friction(qd, top, segment.dt)
+        terms, low = friction.shape[2], bench.decimation(friction)
         for j in range(n):
-            x[:, :, dry[j]] = 0.0
-            x[:, j, dry[j]] = f[:, j, 0]
-        if free:
-            extra = np.zeros((*x.shape[:2], k_ * n))
-            for j in range(n):
-                extra[:, j, k_ * j : k_ * (j + 1)] = f[:, j, 1:]
-            x = np.concatenate([x, extra], axis=2)
-        return x
-
-    import os
-    instrumented = not os.environ.get("LS") and all(s.q_ref is not None for s in bench.segments)
-    full = [regressor(m) for m in measured]
-    fullz = [regressor(m) for m in _followed(bench)] if instrumented else full
-    y = [bench.decimation(s.tau @ h.torque.T) for s in bench.segments]
-    keep = [np.ones(v.shape, dtype=np.bool_) & bench.moving for v in y]
-    keep = [np.ascontiguousarray(k) for k in keep]
-    # excited subspace
-    x0 = [bench.decimation(v) for v in full]
-    stacked = np.concatenate([v[:, joints].reshape(-1, v.shape[2]) for v in x0])
-    # weights by torque power
-    w = 1 / np.maximum(np.sqrt(np.mean(np.concatenate(y)[:, joints] ** 2, axis=0)), 1e-300)
-    rows = np.concatenate([(v[:, joints] * w[:, None]).reshape(-1, v.shape[2]) for v in x0])
-    norms = np.linalg.norm(rows, axis=0)
-    used = norms > 1e-12 * norms.max()
-    values, vectors = np.linalg.eigh((rows[:, used] / norms[used]).T @ (rows[:, used] / norms[used]))
-    basis = np.zeros((norms.size, int((values > RANK**2 * values[-1]).sum())))
-    basis[used] = vectors[:, values > RANK**2 * values[-1]] / norms[used, None]
-    x = [v @ basis for v in x0]
-    z = [bench.decimation(v) @ basis for v in fullz] if instrumented else x
-    c = basis.shape[1]
-    noise: Sequence[ArModel] = error_variances(y, keep, 0)
-    theta = _solve(z, x, y, keep, noise)
-    errors = [b - a @ theta for a, b in zip(x, y, strict=True)]
-    noise = error_variances(errors, keep, c)
-    theta = _solve(z, x, y, keep, noise)
-    for _ in range(PASSES):
-        xs = [_with_rates(a, f @ (basis @ theta[:c]), bench, joints) for a, f in zip(x, full, strict=True)]
-        zs = xs if not instrumented else [
-            _with_rates(a, f @ (basis @ theta[:c]), bench, joints) for a, f in zip(z, fullz, strict=True)
-        ]
-        theta = _solve(zs, xs, y, keep, noise)
-        errors = [b - a @ theta for a, b in zip(xs, y, strict=True)]
-        noise = [fit_ar([e[:, j] for e in errors], MAX_AR_ORDER) if bench.moving[j] else noise[j] for j in range(n)]
-    theta = _solve(zs, xs, y, keep, noise)
-    covariance = serial_covariance(zs, xs, keep, noise, noise)
-    return Estimated(theta[c:] / bench.period, covariance[c:, c:] / bench.period**2, instrumented)
+            for into, rigid, own in ((found[j].fine, x, friction), (found[j].rows, filtered, low)):
+                columns = np.zeros((rigid.shape[0], bench.rigid + terms * n))
+                columns[:, : bench.rigid] = rigid[:, j]
+                columns[:, bench.rigid + terms * j : bench.rigid + terms * (j + 1)] = own[:, j]
+                into.append(columns)
+    return found
 
 
-def _solve(z, x, y, keep, noise):
-    zw, xw, yw = (weighted_rows(v, keep, noise) for v in (z, x, y))
-    return np.linalg.solve(zw.T @ xw, zw.T @ yw)
+def _friction(qd: Array, top: Array, dt: float) -> Array:
+    """Free friction terms (W, n, .): dry, its change with time, asymmetric viscous, quadratic, at low velocity."""
+    u = qd / top
+    signs = [2 / np.pi * np.arctan(u / width) for width in WIDTHS]
+    changes = [np.gradient(sign, dt, axis=0) for sign in signs]
+    others = [np.abs(u), u * np.abs(u), signs[0] * np.exp(-np.abs(u) / BREAKAWAY)]
+    return np.stack([*signs, *changes, *others], axis=2)
 
 
-def _with_rates(x, torque, bench, joints):
-    dt = bench.segments[0].dt
-    rate = bench.decimation(np.gradient(torque, dt, axis=0))
-    own = np.zeros((*x.shape[:2], joints.size))
-    own[:, joints, np.arange(joints.size)] = -rate[:, joints]
-    return np.concatenate([x, own], axis=2)
-
-
-def _followed(bench):
-    """Motion that a linear filter of the references makes of them."""
+def _followed(bench: Bench) -> list[Motion]:
+    """Motions that a linear filter makes of the references, with its coefficients fitted to each joint."""
     step = bench.decimation.factor
     lagged = []
     for s in bench.segments:
-        first = np.repeat(s.q_ref[:1], step * LAGS, axis=0)
-        padded = np.concatenate([first, s.q_ref])
-        lagged.append(np.stack([padded[step * (LAGS - k) :][: s.q.shape[0]] for k in range(LAGS)], axis=2))
-    motions = [np.empty_like(s.q) for s in bench.segments]
+        assert s.q_ref is not None
+        padded = np.concatenate([np.repeat(s.q_ref[:1], step * LAGS, axis=0), s.q_ref])
+        parts = [padded[step * (LAGS - k) :][: s.q.shape[0]] for k in range(LAGS)]
+        lagged.append(np.stack([*parts, np.ones_like(s.q)], axis=2))
+    followed = [np.empty_like(s.q) for s in bench.segments]
     for j in range(bench.n):
-        a = np.concatenate([l[:, j] for l in lagged])
-        b = np.concatenate([s.q[:, j] for s in bench.segments])
-        a1 = np.column_stack([a, np.ones(a.shape[0])])
-        coef = np.linalg.lstsq(a1, b, rcond=1e-8)[0]
-        for m, l in zip(motions, lagged, strict=True):
-            m[:, j] = l[:, j] @ coef[:-1] + coef[-1]
-    out = []
-    for m, s in zip(motions, bench.segments, strict=True):
-        qd = np.gradient(m, s.dt, axis=0)
-        out.append((m, qd, np.gradient(qd, s.dt, axis=0)))
-    return out
+        taps = np.linalg.lstsq(
+            np.concatenate([v[:, j] for v in lagged]),
+            np.concatenate([s.q[:, j] for s in bench.segments]),
+            rcond=1e-8,
+        )[0]
+        for q, v in zip(followed, lagged, strict=True):
+            q[:, j] = v[:, j] @ taps
+    motions = []
+    for q, s in zip(followed, bench.segments, strict=True):
+        qd = np.gradient(q, s.dt, axis=0)
+        motions.append((q, qd, np.gradient(qd, s.dt, axis=0)))
+    return motions
+
+
+def _scale(y: Sequence[Array], j: int) -> float:
+    """One over the rms torque of a joint."""
+    return float(1.0 / max(np.sqrt(np.mean(np.concatenate([v[:, j] for v in y]) ** 2)), 1e-300))
+
+
+def _excited(x: Sequence[Array], scale: Sequence[float]) -> Array:
+    """Combinations of columns, (c, r), that the motion excites."""
+    gram = sum(s**2 * (v.T @ v) for v, s in zip(x, scale, strict=True))
+    norms = np.sqrt(np.diag(gram))
+    used = norms > 1e-12 * norms.max()
+    values, vectors = np.linalg.eigh(gram[np.ix_(used, used)] / np.outer(norms[used], norms[used]))
+    kept = values > max(RANK**2, 1e-14) * values[-1]
+    basis = np.zeros((norms.size, int(kept.sum())))
+    basis[used] = vectors[:, kept] / norms[used, None]
+    return basis
+
+
+def _late(bench: Bench, torque: Array, k: int, shifts: int) -> Array:
+    """Columns (M, shifts) of the delays: that of joint k holds the filtered change of its torque."""
+    columns = np.zeros((bench.decimation.count(torque.shape[0]), shifts))
+    if shifts:
+        columns[:, k] = -bench.decimation(np.gradient(torque, bench.segments[0].dt)[:, None])[:, 0]
+    return columns
+
+
+def _solved(
+    z: Sequence[Sequence[Array]], x: Sequence[Sequence[Array]], y: Sequence[Sequence[Array]], noise: Sequence[ArModel]
+) -> tuple[Array, Array]:
+    """Instrumental-variable estimate (2.33) of rows whitened by their noise, and its covariance."""
+    left, right, meat, rows = 0.0, 0.0, 0.0, 0
+    for zeta, phi, tau, ar in zip(z, x, y, noise, strict=True):
+        for a, b, t in zip(zeta, phi, tau, strict=True):
+            wb, wt = ar.whiten(b), ar.whiten(t)
+            wa = wb if a is b else ar.whiten(a)
+            left, right, meat, rows = left + wa.T @ wb, right + wa.T @ wt, meat + wa.T @ wa, rows + wt.size
+    inverse = np.linalg.inv(np.asarray(left))
+    count = inverse.shape[0]
+    covariance = inverse @ np.asarray(meat) @ inverse.T * (rows / max(rows - count, 1))
+    return inverse @ np.asarray(right), covariance
+
+
+def _common(samples: Array, covariance: Array, bench: Bench, instrumented: bool) -> TorqueShift:
+    """Weighted mean of the joints' shifts, and the chi-squared test that they are equal."""
+    weights = np.linalg.inv(covariance)
+    variance = 1.0 / float(weights.sum())
+    common = variance * float(weights.sum(axis=0) @ samples)
+    apart = samples - common
+    agreement = float(stats.chi2.sf(apart @ weights @ apart, samples.size - 1)) if samples.size > 1 else 1.0
+    if not (variance > 0 and np.isfinite([common, variance, agreement]).all()):
+        raise np.linalg.LinAlgError("the motion determines no shift of the torques")
+    names = [bench.robot.joints[j].name for j in np.flatnonzero(bench.moving)]
+    std = np.sqrt(np.diag(covariance))
+    each = {name: (float(s), float(d)) for name, s, d in zip(names, samples, std, strict=True)}
+    return TorqueShift(common, float(np.sqrt(variance)), bench.period, each, agreement, instrumented)
