@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from armident.identify.experiment import Experiment
 from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis
@@ -111,38 +110,6 @@ def torque_shift(bench: Bench, h: Hypothesis) -> TorqueShift:
         ]
     c, samples = basis.shape[1], segments.period
     return _common(theta[c:] / samples, covariance[c:, c:] / samples**2, segments, instrumented)
-
-
-def shifted(experiments: Sequence[Experiment], samples: float) -> list[Experiment]:
-    """Return the experiments with all torques moved to earlier times, by cubic convolution.
-
-    Keys, Cubic Convolution Interpolation for Digital Image Processing, IEEE Trans. ASSP 29, 1981. Linear
-    interpolation by half a sample, as in the alignment of the torque, would weaken high frequencies a second time.
-
-    Parameters
-    ----------
-    experiments
-        Recordings.
-    samples
-        Samples by which the torques are late.
-    """
-    whole = int(np.floor(samples))
-    s = samples - whole
-    weights = np.array(
-        [
-            ((-0.5 * s + 1.0) * s - 0.5) * s,
-            (1.5 * s - 2.5) * s * s + 1.0,
-            ((-1.5 * s + 2.0) * s + 0.5) * s,
-            (0.5 * s - 0.5) * s * s,
-        ]
-    )
-    moved = []
-    for e in experiments:
-        last = e.tau.shape[0] - 1
-        k = np.arange(last + 1) + whole
-        tau = sum(w * e.tau[np.clip(k + i, 0, last)] for i, w in zip((-1, 0, 1, 2), weights, strict=True))
-        moved.append(replace(e, tau=np.ascontiguousarray(tau)))
-    return moved
 
 
 def _shortened(bench: Bench) -> Bench:
