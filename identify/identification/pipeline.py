@@ -44,9 +44,9 @@ from armident.identify.identification.verdict import Reason, SetupCheck, judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_consistent
+from armident.identify.setup.result import with_torque_shift
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
-from armident.identify.setup.result import with_torque_shift
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
 
 TORQUE_PREDICTIONS = 2

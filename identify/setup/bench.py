@@ -283,7 +283,9 @@ def make_bench(
         qd = np.gradient(q, working, axis=0)
         qdd = np.gradient(qd, working, axis=0)
         q_ref = None if e.q_ref is None else first(e.q_ref)
-        segments.append(Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, e.torque_shift - 0.5))), working, q_ref))
+        segments.append(
+            Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, e.torque_shift - 0.5))), working, q_ref)
+        )
     count = sum(second.count(s.q.shape[0]) for s in segments)
     samples = sum(e.q.shape[0] for e in experiments)
     if count < LEAST_ROWS or samples < LEAST_SAMPLES:

@@ -16,8 +16,8 @@ from armident.identify.setup.clipping import clipped_torques
 from armident.identify.setup.describe import described
 from armident.identify.setup.fit import Hypothesis, joint_errors
 from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
-from armident.identify.setup.torque_shift import SHIFT_RATE, torque_shift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
+from armident.identify.setup.torque_shift import SHIFT_RATE, torque_shift
 
 Array = NDArray[np.float64]
 

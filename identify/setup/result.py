@@ -7,7 +7,7 @@ from armident.configs import RobotConfig
 from armident.identify.experiment import Experiment
 
 SIGNIFICANT = 3.0
-"""Standard deviations from which a shift is significant: one false alarm in 370, as for the torque delay of identify."""
+"""Standard deviations from which a shift is significant: one false alarm in 370, as for `torque_delay`."""
 
 LEAST_AGREEMENT = 0.01
 """Least p-value of the test that all joints have one shift: a refusal by chance in one recording of a hundred."""
@@ -16,7 +16,7 @@ LONGEST = 1.0
 """Longest shift that is corrected without a finding, samples: longer ones are `time_shift`, a mistake of the set-up."""
 
 MOST_UNCERTAIN = 0.25
-"""Largest standard deviation of a shift that is corrected, samples: a correction by half a sample must not be a guess."""
+"""Largest standard deviation of a shift that is corrected, samples: half a sample is then known by a factor of 2."""
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ def torque_shift(bench: Bench, h: Hypothesis) -> TorqueShift:
         If the motion determines no shift.
     """
     segments = _shortened(bench)
-    joints = np.flatnonzero(bench.moving)
+    joints = [int(j) for j in np.flatnonzero(bench.moving)]
     instrumented = all(s.q_ref is not None for s in segments.segments)
     measured = _columns(segments, h, [(s.q, s.qd, s.qdd) for s in segments.segments])
     followed = _columns(segments, h, _followed(segments)) if instrumented else measured
@@ -93,7 +93,7 @@ def torque_shift(bench: Bench, h: Hypothesis) -> TorqueShift:
     noise = [ArModel(np.empty(0), 1.0 / _scale(y, j) ** 2, 0.0) for j in joints]
     theta, covariance = np.zeros(basis.shape[1]), np.empty((0, 0))
     for done in range(PASSES + 1):
-        shifts = joints.size if done else 0
+        shifts = len(joints) if done else 0
 
         def block(columns: _Columns, k: int, theta: Array = theta, shifts: int = shifts) -> list[Array]:
             return [
@@ -119,9 +119,7 @@ def _shortened(bench: Bench) -> Bench:
     least = 2 * bench.decimation.taps.size
     kept = [max(int(s.q.shape[0] * MOST_SAMPLES / total), least) for s in bench.segments]
     cut = [
-        replace(
-            s, q=s.q[:k], qd=s.qd[:k], qdd=s.qdd[:k], tau=s.tau[:k], q_ref=None if s.q_ref is None else s.q_ref[:k]
-        )
+        replace(s, q=s.q[:k], qd=s.qd[:k], qdd=s.qdd[:k], tau=s.tau[:k], q_ref=None if s.q_ref is None else s.q_ref[:k])
         for s, k in zip(bench.segments, kept, strict=True)
     ]
     return replace(bench, segments=tuple(cut))
@@ -190,7 +188,8 @@ def _scale(y: Sequence[Array], j: int) -> float:
 
 def _excited(x: Sequence[Array], scale: Sequence[float]) -> Array:
     """Combinations of columns, (c, r), that the motion excites."""
-    gram = sum(s**2 * (v.T @ v) for v, s in zip(x, scale, strict=True))
+    scaled = np.concatenate([s * v for v, s in zip(x, scale, strict=True)])
+    gram = scaled.T @ scaled
     norms = np.sqrt(np.diag(gram))
     used = norms > 1e-12 * norms.max()
     values, vectors = np.linalg.eigh(gram[np.ix_(used, used)] / np.outer(norms[used], norms[used]))
@@ -212,16 +211,16 @@ def _solved(
     z: Sequence[Sequence[Array]], x: Sequence[Sequence[Array]], y: Sequence[Sequence[Array]], noise: Sequence[ArModel]
 ) -> tuple[Array, Array]:
     """Instrumental-variable estimate (2.33) of rows whitened by their noise, and its covariance."""
-    left, right, meat, rows = 0.0, 0.0, 0.0, 0
+    c = x[0][0].shape[1]
+    left, right, meat, rows = np.zeros((c, c)), np.zeros(c), np.zeros((c, c)), 0
     for zeta, phi, tau, ar in zip(z, x, y, noise, strict=True):
         for a, b, t in zip(zeta, phi, tau, strict=True):
             wb, wt = ar.whiten(b), ar.whiten(t)
             wa = wb if a is b else ar.whiten(a)
             left, right, meat, rows = left + wa.T @ wb, right + wa.T @ wt, meat + wa.T @ wa, rows + wt.size
-    inverse = np.linalg.inv(np.asarray(left))
-    count = inverse.shape[0]
-    covariance = inverse @ np.asarray(meat) @ inverse.T * (rows / max(rows - count, 1))
-    return inverse @ np.asarray(right), covariance
+    inverse = np.linalg.inv(left)
+    covariance = inverse @ meat @ inverse.T * (rows / max(rows - c, 1))
+    return inverse @ right, covariance
 
 
 def _common(samples: Array, covariance: Array, bench: Bench, instrumented: bool) -> TorqueShift:
