@@ -324,7 +324,7 @@ def build_study(
     train: list[Stretch] = []
     held: list[Stretch] = []
     for k, (e, s, z) in enumerate(zip(experiments, signals, simulated, strict=True)):
-        torque = first(aligned_torque(e.tau))
+        torque = first(aligned_torque(e.tau, e.torque_shift))
         kept = first.instants(e.tau.shape[0])
         pieces = [(train if k < len(training) else held, slice(0, None))]
         if not validation:
