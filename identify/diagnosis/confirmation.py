@@ -46,6 +46,11 @@ class Confirmation:
         return min(self.after, self.noiseless, key=lambda errors: float(np.sum(np.log(np.maximum(errors, 1e-300)))))
 
     @property
+    def change(self) -> float:
+        """Largest change of the error of a joint, percent of its torque."""
+        return float(np.sqrt(np.max(np.maximum(self.before**2 - self.best**2, 0.0))))
+
+    @property
     def smaller(self) -> bool:
         """True if the errors are smaller with the effect: the mean of their logarithms, as joints differ in size."""
         return float(np.mean(np.log(np.maximum(self.best, 1e-300) / np.maximum(self.before, 1e-300)))) < 0.0

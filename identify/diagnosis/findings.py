@@ -28,7 +28,7 @@ DOUBTFUL = 0.6
 
 
 def findings_of(final: ModelState, selected: Sequence[Selected]) -> list[Finding]:
-    """Return the findings of a selection, highest gain first.
+    """Return the findings of a selection, in its order.
 
     Parameters
     ----------

@@ -53,8 +53,7 @@ class Addition:
     state
         Model with the effect.
     gain
-        Gain of log-likelihood over the model without it: the smaller one of the gains with equal noise models and with
-        each model's own.
+        Gain of log-likelihood over the model without it, see `gain`.
     share
         Largest share of the power of a joint's predicted errors that it removes.
     material_pct
@@ -214,7 +213,7 @@ class StepwiseSelection:
         Returns
         -------
         tuple
-            Model with the effects, and the effects, highest gain first.
+            Model with the effects, and the effects, largest change of the errors first.
         """
         state, found = first, ()
         while len(found) < self.criteria.most_findings and not self._late():
@@ -447,7 +446,7 @@ class StepwiseSelection:
         return state, found
 
     def _confirmed(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Model with the findings that the report part confirms, highest gain first."""
+        """Model with the findings that the report part confirms, largest change of the errors first."""
         self.progress("confirmation by the report part")
         while True:
             checked: list[Selected] = []
@@ -458,7 +457,7 @@ class StepwiseSelection:
                     checked.append(replace(one, confirmation=compared, without=less))
             failed = [one for one in checked if not self._holds(one)]
             if not failed:
-                return state, tuple(sorted(checked, key=lambda one: -_gained(state, one)))
+                return state, tuple(sorted(checked, key=lambda one: -one.confirmation.change))
             gone = max(failed, key=lambda one: 1.0 if one.confirmation is None else one.confirmation.p_value)
             assert gone.without is not None
             state, found = gone.without, tuple(one for one in found if one.entry is not gone.entry)
@@ -484,18 +483,19 @@ def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
 
 
 def gain(with_it: ModelState, without: ModelState) -> float:
-    """Gain of log-likelihood by an effect.
+    """Gain of log-likelihood by an effect under the noise models of the model with it.
 
-    The smaller one of the gain with the noise models of the model with the effect, and of that with each model's own
-    noise models.
+    The noise models of the model without it may take the effect for noise. They decide its sign only: the effect gains
+    nothing where they explain the errors better than it does.
 
     Parameters
     ----------
     with_it, without
         Models with and without the effect.
     """
-    own = with_it.score.log_likelihood - without.score.log_likelihood
-    return min(own, with_it.score.gain_over(without.score))
+    if with_it.score.log_likelihood < without.score.log_likelihood:
+        return 0.0
+    return with_it.score.gain_over(without.score)
 
 
 def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]:
@@ -513,10 +513,6 @@ def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]
     size = float(np.sqrt(np.mean(torque**2)))
     share = float(removed[joint] / max(before[joint] ** 2, 1e-300))
     return share, 100 * float(np.sqrt(removed[joint])) / max(size, 1e-300)
-
-
-def _gained(state: ModelState, one: Selected) -> float:
-    return np.inf if one.without is None else gain(state, one.without)
 
 
 def _key(robot: RobotConfig) -> str:

@@ -19,11 +19,13 @@ LATE = 0.3
 
 The largest one tried is a third of the joint's top speed.
 """
+SLOWEST = 0.03
+"""Least characteristic speed of a friction law over the joint's top speed: below it laws look like the reversal."""
 VISCOUS = ("N m s/rad", "N s/m")
 
 
 def speeds(motion: Motion, joint: int) -> Sequence[float]:
-    """Return characteristic speeds from a hundredth of the joint's top speed to a third of it, rad/s or m/s.
+    """Return characteristic speeds from those of the reversal to a third of the joint's top speed, rad/s or m/s.
 
     Parameters
     ----------
@@ -33,7 +35,7 @@ def speeds(motion: Motion, joint: int) -> Sequence[float]:
         Index of the joint, from 0.
     """
     top = float(motion.top_speed[joint])
-    return [float(v) for v in top * np.geomspace(0.01, 0.35, 8)]
+    return [float(v) for v in top * np.geomspace(SLOWEST, 0.35, 7)]
 
 
 def _asymmetric_viscous(motion: Motion, place: Place) -> Array:
@@ -75,7 +77,7 @@ def transitions(motion: Motion, joint: int) -> Sequence[float]:
     joint
         Index of the joint, from 0.
     """
-    return [float(v) for v in float(motion.top_speed[joint]) * np.geomspace(0.0006, 0.03, 7)]
+    return [float(v) for v in float(motion.top_speed[joint]) * np.geomspace(0.0006, SLOWEST, 7)]
 
 
 def _transition(motion: Motion, place: Place, *, velocity: float) -> Array:
