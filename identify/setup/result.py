@@ -12,6 +12,9 @@ SIGNIFICANT = 3.0
 LEAST_AGREEMENT = 0.01
 """Least p-value of the test that all joints have one shift: a refusal by chance in one recording of a hundred."""
 
+SHORTEST = 0.1
+"""Shortest shift that is corrected, samples: derivatives and interpolation err by some hundredths."""
+
 LONGEST = 1.0
 """Longest shift that is corrected without a finding, samples: longer ones are `time_shift`, a mistake of the set-up."""
 
@@ -81,7 +84,7 @@ class TorqueShift:
         compared = sum(std <= MOST_UNCERTAIN for _, std in self.by_joint.values())
         # Disturbances that feed back bias each joint differently: without instruments, two joints must confirm it.
         agreed = self.agreement >= LEAST_AGREEMENT and (self.instrumented or compared >= 2)
-        return certain and agreed and abs(self.samples) <= LONGEST
+        return certain and agreed and SHORTEST <= abs(self.samples) <= LONGEST
 
     @property
     def remark(self) -> str:

@@ -1,0 +1,133 @@
+"""Common shift of all torques: it is estimated and aligned, and the delay of one joint is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from armident.configs import RobotConfig, load_robot
+from armident.identify.diagnosis.setup_stage import set_up
+from armident.identify.experiment import Experiment
+from armident.identify.identification.equations import aligned_torque
+from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.identification.options import Options
+from armident.identify.identification.pipeline import identify_experiment
+from armident.identify.setup.check import check_setup
+from armident.identify.setup.result import TorqueShift, with_torque_shift
+from tests.fixtures import setups
+from tests.fixtures.arms import FAST, recording
+
+LATE = 0.5
+
+
+def late(experiments: list[Experiment], samples: NDArray[np.float64]) -> list[Experiment]:
+    """Experiments whose torques are late by numbers of samples, (n,)."""
+    made = []
+    for e in experiments:
+        k = np.arange(e.tau.shape[0], dtype=np.float64)
+        moved = [CubicSpline(k, x)(k - s) for x, s in zip(e.tau.T, samples, strict=True)]
+        made.append(replace(e, tau=np.stack(moved, axis=1)[5:-5], q=e.q[5:-5]))
+    return made
+
+
+@pytest.fixture(scope="module")
+def arm() -> RobotConfig:
+    return setups.random_arm(3, 4)
+
+
+@pytest.fixture(scope="module")
+def healthy(arm: RobotConfig) -> list[Experiment]:
+    return setups.record(arm, 0, noise=0.003, dt=4e-3)
+
+
+def estimate(experiments: list[Experiment], robot: RobotConfig) -> TorqueShift:
+    found = check_setup(experiments, robot).torque_shift
+    assert found is not None
+    return found
+
+
+def test_torques_held_until_the_next_sample_are_not_shifted(healthy: list[Experiment], arm: RobotConfig) -> None:
+    found = estimate(healthy, arm)
+    assert abs(found.samples) < 3 * found.std
+    assert not found.applied
+    assert found.remark == ""
+
+
+@pytest.mark.parametrize("samples", [LATE, -LATE])
+def test_a_common_shift_of_half_a_sample_is_a_remark_and_no_mistake(
+    healthy: list[Experiment], arm: RobotConfig, samples: float
+) -> None:
+    check = check_setup(late(healthy, np.full(arm.n, samples)), arm)
+    found = check.torque_shift
+    assert check.findings == ()
+    assert found is not None and found.applied
+    assert found.samples == pytest.approx(samples, abs=4 * found.std)
+    assert ("late" if samples > 0 else "early") in found.remark
+
+
+def test_the_delay_of_one_joint_is_left_to_the_diagnosis(healthy: list[Experiment], arm: RobotConfig) -> None:
+    found = estimate(late(healthy, np.array([0.0, 3.0, 0.0, 0.0])), arm)
+    assert found.agreement < 0.01
+    assert not found.applied
+
+
+def test_a_shift_that_was_applied_is_not_found_again(healthy: list[Experiment], arm: RobotConfig) -> None:
+    moved = late(healthy, np.full(arm.n, LATE))
+    again = estimate(with_torque_shift(moved, estimate(moved, arm)), arm)
+    assert abs(again.samples) < 0.05
+    assert not again.applied
+
+
+def test_the_diagnosis_begins_with_aligned_experiments(healthy: list[Experiment], arm: RobotConfig) -> None:
+    stage = set_up(late(healthy, np.full(arm.n, LATE)), (), arm)
+    assert [e.torque_shift for e in stage.training] == pytest.approx([LATE, LATE], abs=0.1)
+    assert stage.findings == ()
+    assert any("samples" in line for line in stage.warnings)
+
+
+def test_identify_aligns_its_equations_and_says_so(healthy: list[Experiment], arm: RobotConfig) -> None:
+    moved = late(healthy, np.full(arm.n, LATE))
+    options = Options(method="idim-ls")
+    before, with_shift = (identify_experiment(moved, arm, options, setup=s) for s in (None, check_setup(moved, arm)))
+    original = identify_experiment(healthy, arm, options)
+    assert with_shift.relative_error_pct < before.relative_error_pct
+    assert with_shift.relative_error_pct == pytest.approx(original.relative_error_pct, rel=0.1)
+    assert any("all torques are" in line for line in with_shift.warnings)
+    assert not any("all torques are" in line for line in before.warnings)
+
+
+def test_parameters_do_not_move_where_no_shift_is_significant(healthy: list[Experiment], arm: RobotConfig) -> None:
+    options = Options(method="idim-ls")
+    one, other = (identify_experiment(healthy, arm, options, setup=s) for s in (None, check_setup(healthy, arm)))
+    np.testing.assert_array_equal(one.theta, other.theta)
+
+
+def test_the_virtual_arm_with_references_is_not_shifted() -> None:
+    robot = load_robot("tx40")
+    experiments = experiments_from_recording(recording("tx40", "tx40_excitation", 3, period=FAST), robot)[0]
+    found = estimate(experiments, robot)
+    assert found.instrumented
+    assert abs(found.samples) < 3 * found.std
+    assert not found.applied
+
+
+def test_aligned_torques_are_interpolated_at_the_instants_of_the_positions() -> None:
+    tau = np.arange(20.0)[:, None]
+    np.testing.assert_allclose(aligned_torque(tau, 1e-12)[1:], aligned_torque(tau)[1:])
+    np.testing.assert_allclose(aligned_torque(tau, 0.5), tau)
+    np.testing.assert_allclose(aligned_torque(tau, -0.5)[2:], tau[1:-1])
+
+
+def test_without_references_one_joint_alone_confirms_no_shift() -> None:
+    of_joints = {"axis_1": (0.5, 0.05), "axis_2": (0.4, 3.0)}
+    alone = TorqueShift(0.5, 0.05, 4e-3, of_joints, 0.97, instrumented=False)
+    assert not alone.applied
+    assert replace(alone, instrumented=True).applied
+    assert replace(alone, by_joint={"axis_1": (0.5, 0.05), "axis_2": (0.4, 0.2)}).applied
+
+
+def test_a_shift_longer_than_a_sample_is_left_to_the_findings() -> None:
+    shift = TorqueShift(1.2, 0.05, 4e-3, {"axis_1": (1.2, 0.07), "axis_2": (1.2, 0.07)}, 0.5, instrumented=True)
+    assert not shift.applied
