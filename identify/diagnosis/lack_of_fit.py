@@ -37,6 +37,9 @@ HELD_OUT_LEVEL = 0.05
 ROWS_PER_COLUMN = 12
 """Least number of equations per function of all functions together, against overfitting of short recordings."""
 
+MOST_TAKEN = 3
+"""Most sets of functions taken out of the residual of one joint for its noise model."""
+
 MOST = 2
 """Most unexplained dependences of one joint."""
 
@@ -171,7 +174,7 @@ class LackOfFit:
     @property
     def level(self) -> float:
         """Significance level of one test: the false-alarm rate over the number of all tests (Bonferroni)."""
-        return self.criteria.false_alarm_rate / max(len(self.projections) + self.fit.study.robot.n, 1)
+        return self.criteria.false_alarm_rate / max(self.tests, 1)
 
     @property
     def dependences(self) -> tuple[Dependence, ...]:
@@ -276,10 +279,47 @@ class LackOfFit:
 
     @cached_property
     def joints(self) -> tuple[JointResidual, ...]:
-        """Residual and functions of every joint, whitened by noise models of the residual beyond the functions."""
-        train, held = self._columns(self.fit.study.train), self._columns(self.fit.study.held)
-        together = [[c[:, self._all_together(j)] for c in own] for j, own in enumerate(train)]
-        fit = self.fit.renoised(noise_beyond(self.fit, together))
+        """Residual and functions of every joint, whitened by noise models of the residual beyond its dependences."""
+        errors = self.fit.errors(self.fit.theta, held=False)
+        model = [[z[:, j] for _, z, _ in self.fit.equations.train] for j in range(self.fit.study.robot.n)]
+        taken: list[set[int]] = [set() for _ in model]
+        noise = [noise_beyond([e[:, j] for e in errors], z) for j, z in enumerate(model)]
+        while True:
+            joints = self._whitened(self.fit.renoised(noise))
+            changed = False
+            for own, known in zip(joints, taken, strict=True):
+                found = self._clearest(own, known)
+                if found is None or len(known) == MOST_TAKEN:
+                    continue
+                known.add(found)
+                changed = True
+                columns = np.concatenate([self._sets(own.joint)[k] for k in known])
+                functions = [
+                    np.concatenate([z, c[:, columns]], axis=1)
+                    for z, c in zip(model[own.joint], self.columns[0][own.joint], strict=True)
+                ]
+                noise[own.joint] = noise_beyond([e[:, own.joint] for e in errors], functions)
+            if not changed:
+                return joints
+
+    def _clearest(self, own: JointResidual, known: set[int]) -> int | None:
+        """Number of the set of functions with the most significant projection beyond those already taken out."""
+        sets = self._sets(own.joint)
+        for k in known:
+            own = own.beyond(sets[k])
+        every = [
+            (own.projection(f, c), k) for k, (f, c) in enumerate(zip(self.functions[own.joint], sets, strict=True))
+        ]
+        found = [(p.p_value, k) for p, k in every if p is not None and k not in known]
+        p_value, best = min(found, default=(1.0, 0))
+        return best if p_value * self.tests < self.criteria.false_alarm_rate else None
+
+    @cached_property
+    def tests(self) -> int:
+        """Number of all tests: every set of functions, and of each joint all functions together and its spectrum."""
+        return sum(len(own) + 2 for own in self.functions)
+
+    def _whitened(self, fit: Fit) -> tuple[JointResidual, ...]:
         rows, held_rows = (
             rows_of_joints([y.shape[0] for _, _, y in part], fit.noise)
             for part in (fit.equations.train, fit.equations.held)
@@ -288,7 +328,7 @@ class LackOfFit:
         covariance = np.zeros((fit.theta.size,) * 2) if fit.fixed else fit.covariance
         errors = fit.errors(fit.theta, held=True)
         out = []
-        for j, (own, unseen) in enumerate(zip(train, held, strict=True)):
+        for j, (own, unseen) in enumerate(zip(*self.columns, strict=True)):
             d = np.concatenate([fit.noise[j].whiten(c) for c in own])
             full = np.zeros((fit.residual.size, d.shape[1]))
             full[rows[j]] = d
@@ -303,6 +343,11 @@ class LackOfFit:
                 )
             )  # fmt: skip
         return tuple(out)
+
+    @cached_property
+    def columns(self) -> tuple[list[list[Array]], list[list[Array]]]:
+        """Functions of each joint in the training and in the held-out data, (M, K) of every stretch."""
+        return self._columns(self.fit.study.train), self._columns(self.fit.study.held)
 
     def _motion(self, stretch: Stretch) -> Motion:
         return self.fit.study.motion(stretch, "simulated", self.fit.theta)

@@ -1,4 +1,9 @@
-"""Noise models of a residual beyond free functions, corrected for the noise that the functions take away."""
+"""Noise model of a residual of which regressor and missing effects have been taken out.
+
+An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away. Least
+squares on the functions that the effect follows removes it, and noise with it. The expected autocovariances of that
+noise are added.
+"""
 
 from collections.abc import Sequence
 
@@ -6,67 +11,46 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
-from armident.identify.regression.ar_noise import ArModel, lagged_sums, lowest_aic
+from armident.identify.diagnosis.regression import MAX_AR_ORDER
+from armident.identify.regression.ar_noise import ArModel, lagged_sums, levinson_durbin, lowest_aic
 
 Array = NDArray[np.float64]
 
-PASSES = 3
+PASSES = 4
 """Iterations between the noise model and the noise that the functions take away."""
 
 RANK = 1e-8
 """Power of a direction, relative to a unit column, below which functions do not span it."""
 
 
-def noise_beyond(fit: Fit, functions: Sequence[Sequence[Array]]) -> list[ArModel]:
-    """Autoregressive noise model of each joint, of the residual beyond functions and beyond the regressor of the model.
+def noise_beyond(errors: Sequence[Array], functions: Sequence[Array]) -> ArModel:
+    """Autoregressive noise model of one joint, of the residual beyond some functions.
 
-    Least squares on k functions removes not only an effect but also the noise in their directions, which are those of
-    low frequency. The expected autocovariances of this part, by the noise model itself, are added.
-
-    Parameters
-    ----------
-    fit
-        Fit of the model.
-    functions
-        Functions of each joint in the band of the comparison, (M, k) of every stretch.
-    """
-    errors = fit.errors(fit.theta, held=False)
-    out = []
-    for j, own in enumerate(functions):
-        model = [rows[1][:, j] for rows in fit.equations.train]
-        columns = [np.concatenate([z, c], axis=1) for z, c in zip(model, own, strict=True)]
-        out.append(noise_orthogonal_to([e[:, j] for e in errors], columns))
-    return out
-
-
-def noise_orthogonal_to(errors: Sequence[Array], columns: Sequence[Array]) -> ArModel:
-    """Autoregressive model of the noise in a residual that also contains a combination of functions.
+    Least squares removes noise in the directions of the functions, which are those of low frequency. The expected
+    autocovariances of this part, by the noise model itself, are added.
 
     Parameters
     ----------
     errors
-        Residual of one joint, (M,) of every stretch, zero where the joint stands still.
-    columns
-        Functions, (M, k) of every stretch.
+        Residual, (M,) of every stretch, zero where the joint stands still.
+    functions
+        Instruments of the model and functions of the effects, (M, k) of every stretch.
     """
-    span = _orthonormal(columns)
+    span = _orthonormal(functions)
     inside = sum(q.T @ e for q, e in zip(span, errors, strict=True))
     left = [e - q @ inside for q, e in zip(span, errors, strict=True)]
     rows = sum(int(np.count_nonzero(e)) for e in errors)
-    highest = max(0, min(MAX_AR_ORDER, rows // 10, min(e.size for e in errors) - 1))
-    sums = np.zeros(highest + 1)
-    for e in left:
-        sums += lagged_sums(e[:, None], highest)
-    free = rows - span[0].shape[1]
-    if sums[0] <= 0 or free <= 0:
+    highest = max(0, min(MAX_AR_ORDER, rows // 10, min(e.size for e in left) - 1))
+    sums = np.asarray(sum(lagged_sums(e[:, None], highest) for e in left))
+    if sums[0] <= 0:
         return ArModel(np.empty(0), np.finfo(np.float64).tiny, -np.inf)
-    noise = lowest_aic(sums / free, rows)
+    noise = lowest_aic(sums / rows, rows)
     for _ in range(PASSES):
-        better = lowest_aic((sums + _taken(noise, span, highest)) / rows, rows)
-        if not np.isfinite(better.variance) or better.variance <= 0:
+        covariances = (sums + _taken(noise, span, highest)) / rows
+        # A sum of an observed and an expected part need not be an autocovariance.
+        if not np.all(levinson_durbin(covariances)[1] > 0.0):
             break
-        noise = better
+        noise = lowest_aic(covariances, rows)
     return noise
 
 
