@@ -415,7 +415,7 @@ def diagnose(
     validate: Recorded | None = None,
     baseline: Identification | IdentificationDocument | str | Path | None = None,
     false_alarm_rate: float = 0.01,
-    material: float = 0.01,
+    material: float = 0.2,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Find the effects that a model lacks: where it disagrees with the data, which effect is missing, what is left.
@@ -458,7 +458,7 @@ def diagnose(
     ('asymmetric_viscous_friction', 'joint_2')
     """
     from armident.identify.diagnosis.diagnose import diagnose as run
-    from armident.identify.diagnosis.state import Settings
+    from armident.identify.diagnosis.criteria import Criteria
 
     read = _read(recordings)
     config = _robot(robot, read)
@@ -473,9 +473,9 @@ def diagnose(
         held_out, more = experiments_of(read[-1:], config, name_files=True)
         notes += more
     notes += rest_notes(training, config)
-    settings = Settings(false_alarms=false_alarm_rate, material=material)
+    criteria = Criteria(false_alarm_rate=false_alarm_rate, material_pct=material)
     references = [reference(recording) for recording in read]
-    found = run(training, held_out, config, references, numbers, list(dict.fromkeys(notes)), progress, settings)
+    found = run(training, held_out, config, references, numbers, list(dict.fromkeys(notes)), progress, criteria)
     return Diagnosis(found.document, found.robot, config, found)
 
 

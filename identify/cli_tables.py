@@ -96,6 +96,8 @@ def setup_table(result: SetupCheck) -> None:
     for finding in result.findings:
         print(f"{finding.kind}: {finding.message} (probability {finding.probability:.2f})")
         print(f"  correct it by: {finding.remedy}")
+    if result.torque_shift is not None and result.torque_shift.applied:
+        print(f"remark: {result.torque_shift.remark}")
     corrected = f", corrected {after}" if any(f.decisive for f in result.findings) else ""
     if any(error != 100.0 for error in result.relative_error_pct):
         print(f"torque error of the rigid model by joint: {before} %{corrected}{' %' if corrected else ''}")

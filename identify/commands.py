@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,7 @@ def check_command(paths: Sequence[Path], config: Path | None, *, as_json: bool) 
         result = check(list(paths), config)
     if as_json:
         content = {**vars(result), "findings": [vars(finding) for finding in result.findings]}
+        content["torque_shift"] = None if result.torque_shift is None else asdict(result.torque_shift)
         robot = result.corrected_robot
         content["corrected_robot"] = None if robot is None else robot.model_dump(mode="json", by_alias=True)
         sys.stdout.write(json.dumps(content, indent=2) + "\n")

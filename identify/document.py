@@ -141,9 +141,14 @@ Verdict = Literal["no_gap", "explained", "partly_explained", "unexplained"]
 
 
 class Finding(Document):
-    """One effect that the model lacks; gaps are relative torque errors in percent on held-out data."""
+    """One effect that the model lacks; gaps are relative torque errors in percent on held-out data.
+
+    ``law`` is the formula of the effect, empty for the first one of the catalogue, ``table`` for a free shape. The
+    effect ``unnamed`` is a regular torque without a known cause; its law is the variable that it depends on.
+    """
 
     effect: str
+    law: str = ""
     joint: str
     other: str | None = None
     kind: Literal["structure", "numbers"]
@@ -175,6 +180,19 @@ class Unexplained(Document):
     share_of_residual: float
     varies_with: str
     hint: str
+
+
+class Negligible(Document):
+    """Effect that is significant and smaller than what counts as a cause; it is not in the model.
+
+    ``change_of_torque_pct`` is its torque in percent of that of the joint, ``share_of_residual`` the share of the power
+    of the joint's residual that it removes.
+    """
+
+    effect: str
+    joint: str
+    change_of_torque_pct: float
+    share_of_residual: float
 
 
 class NotVisible(Document):
@@ -224,8 +242,11 @@ class Gaps(Document):
 class DiagnosisDocument(Document):
     """``diagnosis.json``: effects that the model lacks, their share of the torque error, and the unexplained rest.
 
-    ``considered`` are effects that passed the tests but have a confidence below 0.5; they are not in the model.
-    ``sign_smoothing`` is ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m.
+    ``considered`` are effects that documents of former versions list beside the findings. ``negligible`` are effects
+    below the least change that counts (``--material``). ``sign_smoothing`` is ``g`` of each joint's
+    ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or s/m; ``transitions`` are the velocities over which the dry friction of
+    a joint reverses, rad/s or m/s, where the data show them. ``criteria`` has all thresholds, and ``alpha`` the
+    division of the false-alarm rate among the tests.
     """
 
     schema_: Literal["armident/diagnosis/2"] = Field("armident/diagnosis/2", alias="schema")
@@ -245,7 +266,11 @@ class DiagnosisDocument(Document):
     detection_limits: list[DetectionLimit] = []
     simulated: dict[str, dict[str, float]] | None = None
     considered: list[Finding] = []
+    negligible: list[Negligible] = []
     sign_smoothing: dict[str, float] | None = None
+    transitions: dict[str, float] | None = None
+    criteria: dict[str, float] | None = None
+    alpha: dict[str, float] | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -23,6 +23,9 @@ class Experiment:
         Sampling period, s.
     start
         Time of the first sample since the recordings began, s, for friction that depends on temperature.
+    torque_shift
+        Samples by which all torques are late against this convention; negative: early. The equations of motion are
+        aligned with it, and everything else takes the torque as recorded.
     """
 
     q: NDArray[np.float64]
@@ -30,3 +33,4 @@ class Experiment:
     q_ref: NDArray[np.float64] | None
     dt: float
     start: float = 0.0
+    torque_shift: float = 0.0

@@ -11,6 +11,7 @@ from armident.identify.diagnosis.stretch import Stretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.whitening import joints_of, whitened
 from armident.identify.effects.effect import Effect, Place
+from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel
@@ -18,7 +19,9 @@ from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
 Shapes = tuple[tuple[str, float], ...]
-Key = tuple[str, int, int | None, Shapes, str, str]
+Key = tuple[str, int, int | None]
+"""Name of an effect and its place."""
+Cached = tuple[str, int, int | None, Shapes, str, str]
 Kept = tuple[Array, bool]
 """Columns of one stretch: (M, k) of the joint of their place and ``True``, or (M, n, k) of all joints and ``False``."""
 
@@ -40,7 +43,7 @@ class Candidate:
     grid: tuple[Shapes, ...]
 
     @property
-    def key(self) -> tuple[str, int, int | None]:
+    def key(self) -> Key:
         """Name and place."""
         return self.effect.key, self.place.joint, self.place.other
 
@@ -88,7 +91,7 @@ class Workshop:
 
     study: Study
     theta: Array
-    kept: dict[Key, tuple[Kept, ...]] = field(default_factory=dict)
+    kept: dict[Cached, tuple[Kept, ...]] = field(default_factory=dict)
     _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
 
     def with_theta(self, study: Study, theta: Array) -> "Workshop":
@@ -207,7 +210,7 @@ class Workshop:
         """Columns of a grid in the band of the comparison, of every shape and every stretch."""
         kind = "measured" if effect.sudden else kind
 
-        def key(shapes: Shapes) -> Key:
+        def key(shapes: Shapes) -> Cached:
             return (effect.key, place.joint, place.other, shapes, part, kind)
 
         missing = [shapes for shapes in grid if key(shapes) not in self.kept]
@@ -278,7 +281,7 @@ def candidates(workshop: Workshop) -> Iterator[Candidate]:
         present.setdefault(here, []).append(tuple(term.shapes.items()))
     coupled = {frozenset(names.index(j) for j in c.joints) for c in study.robot.couplings}
     for effect in catalogue().values():
-        if effect.rewires or effect.numbers is not None:
+        if effect.rewires or effect.numbers is not None or effect.name == TRANSITION:
             continue
         right = {names.index(stanza.joint) for stanza in study.recorded if stanza.effect == effect.name}
         for place in places(effect, study.robot.n):

@@ -8,7 +8,7 @@ from scipy import stats
 
 from armident.identify.diagnosis.baseline import Change, Comparison
 from armident.identify.diagnosis.candidates import Workshop, places
-from armident.identify.diagnosis.trial import CLOSE
+from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.effects.registry import catalogue
 
 STRUCTURAL = {
@@ -19,7 +19,7 @@ STRUCTURAL = {
 """Effects of the model structure that base parameters absorb in part, with the words for a change (of either sign)
 against a baseline."""
 
-USUAL = CLOSE
+USUAL = Criteria.close
 """Prior log-odds of common changes (friction, loads, offsets) against rare ones (`STRUCTURAL`): where the torque of a
 joint is nearly all friction, more friction and another torque constant are ambiguous."""
 

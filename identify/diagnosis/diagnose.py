@@ -1,30 +1,33 @@
-"""Diagnosis of a model: lack of fit, missing effects, held-out validation, unexplained residual dependences."""
+"""Diagnosis of a model: set-up, missing effects, confirmation on data that chose nothing, and the unexplained rest."""
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import RobotConfig
-from armident.identify.diagnosis.doubt import Outcome, convincing
+from armident.identify.diagnosis.candidates import Workshop
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.detection_limits import detection_limits
 from armident.identify.diagnosis.findings import (
+    changed_parameters,
     experiment_to_separate,
+    findings_of,
     gap_of,
+    negligible,
     noise_floor,
-    outdated,
     undetectable,
 )
-from armident.identify.diagnosis.hiding import detection_limits
+from armident.identify.diagnosis.model_state import ModelState, with_report_part
 from armident.identify.diagnosis.numbers import stale_numbers
-from armident.identify.diagnosis.search import Search
+from armident.identify.diagnosis.selection import Selected, StepwiseSelection
 from armident.identify.diagnosis.setup_stage import set_up
 from armident.identify.diagnosis.simulated import SimulatedErrors, simulated_errors
-from armident.identify.diagnosis.state import Settings, State, with_values
 from armident.identify.diagnosis.study import Study, build_study
-from armident.identify.diagnosis.where import Disagreement, beyond_noise, survey, where
 from armident.identify.document import (
     BeforeAfter,
     DiagnosisDocument,
@@ -36,6 +39,8 @@ from armident.identify.document import (
     Verdict,
     versions,
 )
+from armident.identify.effects.friction import TRANSITION
+from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.experiment import Experiment
 
 Array = NDArray[np.float64]
@@ -77,8 +82,8 @@ class Diagnosis:
     lacking: tuple[Array | None, ...]
     q: Array
     qd: Array
-    where: tuple[Disagreement, ...]
-    left: tuple[Disagreement, ...]
+    where: tuple[Any, ...]
+    left: tuple[Any, ...]
     simulated: SimulatedErrors
 
 
@@ -90,16 +95,17 @@ def diagnose(
     baseline: IdentificationDocument | None = None,
     notes: Sequence[str] = (),
     progress: Progress | None = None,
-    settings: Settings | None = None,
+    criteria: Criteria | None = None,
+    time_limit_s: float | None = None,
 ) -> Diagnosis:
     """Find the effects that a model lacks by stepwise selection.
 
     Parameters
     ----------
     training
-        Experiments to fit.
+        Experiments to fit and to select effects by.
     validation
-        Held-out experiments; without them the last part of the training experiments is held out.
+        Experiments of the report part; without them the last part of the training experiments is the report part.
     robot
         Configuration of the model to diagnose.
     recordings
@@ -110,8 +116,10 @@ def diagnose(
         Messages of the conversion, for the document's warnings.
     progress
         Called with a stage and the share done, 0 to 1.
-    settings
-        Error rates.
+    criteria
+        Thresholds; ``None``: the defaults.
+    time_limit_s
+        Time after which no further step of the selection begins, s; ``None``: without limit.
 
     Returns
     -------
@@ -123,10 +131,11 @@ def diagnose(
     DataError
         If the recordings cannot support a diagnosis.
     """
+    deadline = float("inf") if time_limit_s is None else time.monotonic() + time_limit_s
     # Threads gain little on tall and narrow matrices, and round otherwise.
     with threadpool_limits(1):  # type: ignore[no-untyped-call]
         return _diagnose(
-            training, validation, robot, recordings, baseline, notes, _Steps(progress), settings or Settings()
+            training, validation, robot, recordings, baseline, notes, _Steps(progress), criteria or Criteria(), deadline
         )
 
 
@@ -167,57 +176,66 @@ def _diagnose(
     baseline: IdentificationDocument | None,
     notes: Sequence[str],
     steps: _Steps,
-    settings: Settings,
+    criteria: Criteria,
+    deadline: float,
 ) -> Diagnosis:
     steps("set-up")
     stage = set_up(training, validation, robot)
-    found = _searched(stage.training, stage.validation, stage.robot, steps, settings)
-    study, first, outcome = found.study, found.first, found.outcome
-    final = outcome.state
+    steps("derivatives and closed loop")
+    study = build_study(stage.training, stage.validation, stage.robot)
+    steps("base fit")
+    selection = StepwiseSelection(study, criteria, steps, deadline)
+    first = selection.start()
+    steps("comparison of effects")
+    chosen, every = selection.run(first)
+    final = with_report_part(chosen)
+    selected = [one for one in every if not one.conventional(final)]
     after = gap_of(final, held=True)
-    findings = stage.named(outcome.findings, after)
-    places = {id(f): k for k, f in enumerate(outcome.findings)}
-    lacking = [_beside(final, outcome.lacking[places[id(f)]]) if id(f) in places else None for f in findings]
-    left = stage.left(
-        [
-            Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
-            for d in found.left
-        ],
-        after,
-    )
+    named = findings_of(final, selected)
+    places = {id(f): k for k, f in enumerate(named)}
+    findings = stage.named(named, after)
+    lacking = [_lacking(final, selected[places[id(f)]]) if id(f) in places else None for f in findings]
+    steps("unexplained dependences")
+    left = stage.left([], after)
     if baseline is not None:
         steps("changed parameters")
-        findings += outdated(stale_numbers(final.fit, final.workshop, baseline, settings.false_alarms))
+        alpha = criteria.alpha["changed_parameters"]
+        workshop = Workshop(final.study, final.fit.theta)
+        findings += changed_parameters(stale_numbers(final.fit, workshop, baseline, alpha))
     steps("simulation")
     simulated = simulated_errors(first, final)
     steps("detection limits")
-    limits = detection_limits(final, settings)
+    last = selection.last(chosen)
+    limits = detection_limits(final, last, criteria)
     document = DiagnosisDocument(
         robot=robot.name,
         recordings=list(recordings),
         verdict=_verdict(findings, left),
         findings=findings,
-        considered=list(outcome.considered),
         unexplained=left,
         gap=Gaps(
             train=BeforeAfter(before=stage.as_configured(gap_of(first, held=False)), after=gap_of(final, held=False)),
             validation=BeforeAfter(before=stage.as_configured(gap_of(first, held=True)), after=after),
         ),
-        noise_floor=noise_floor(final, found.left),
+        noise_floor=noise_floor(final, left),
         recommended_experiment=experiment_to_separate(findings),
         model=None,
         timing_s=steps.finish(),
         versions=versions(),
-        warnings=[*notes, *stage.warnings, *study.warnings],
-        not_visible=undetectable(first),
+        warnings=[*notes, *stage.warnings, *study.warnings, *_stopped(selection, len(selected))],
+        not_visible=undetectable(first, selection.hidden),
         detection_limits=limits,
         simulated=simulated.document(),
-        sign_smoothing=dict(zip(study.joints, map(float, study.robot.sign_smoothing), strict=True)),
+        negligible=negligible(final, every, last, criteria),
+        sign_smoothing=dict(zip(study.joints, map(float, first.robot.sign_smoothing), strict=True)),
+        transitions={e.joint: e.parameters["velocity"] for e in final.robot.effects if e.effect == TRANSITION},
+        criteria=asdict(criteria),
+        alpha=criteria.alpha,
     )
     held = final.study.held
     return Diagnosis(
         document=document,
-        robot=with_values(final),
+        robot=final.with_values(),
         t=_continued([s.t for s in held]),
         measured=np.concatenate([s.y for s in held]),
         before=_beside(final, first),
@@ -225,64 +243,47 @@ def _diagnose(
         lacking=(*lacking, *(None for _ in findings[len(lacking) :])),
         q=_sampled(final, "q"),
         qd=_sampled(final, "qd"),
-        where=found.where,
-        left=found.left,
+        where=(),
+        left=(),
         simulated=simulated,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """Result of a search: data, first and final model, and remaining dependences."""
-
-    study: Study
-    first: State
-    outcome: Outcome
-    where: tuple[Disagreement, ...]
-    left: tuple[Disagreement, ...]
-
-
-def _searched(
-    training: Sequence[Experiment],
-    validation: Sequence[Experiment],
-    robot: RobotConfig,
-    steps: _Steps,
-    settings: Settings,
-) -> _Found:
-    """Search for effects in the corrected set-up."""
-    steps("derivatives and closed loop")
-    study = build_study(training, validation, robot)
-    steps("base fit")
-    search = Search(study, settings, steps)
-    first = search.start()
-    steps("residual dependences")
-    seen = survey(first.fit, first.workshop, settings.false_alarms)
-    places = where(first.fit, first.workshop, seen=seen)
-    outcome = convincing(search, first, search.run(), seen)
-    steps("unexplained dependences")
-    left = beyond_noise(outcome.state.fit, outcome.left, settings.false_alarms)
-    return _Found(study, first, outcome, tuple(places), tuple(left))
+def _stopped(selection: StepwiseSelection, findings: int) -> list[str]:
+    """Warning of a selection that its time limit ended."""
+    if not selection.stopped:
+        return []
+    return [
+        f"the time limit ended the selection of effects after {findings} finding{'' if findings == 1 else 's'}; "
+        "there may be more: repeat with a longer --time-limit"
+    ]
 
 
 def _verdict(findings: Sequence[Finding], left: Sequence[Unexplained]) -> Verdict:
-    """Verdict; with ``no_gap`` and ``explained`` the residual is noise (see `excess`) and depends on no variable."""
-    if findings:
-        return "partly_explained" if left else "explained"
-    return "unexplained" if left else "no_gap"
+    """Verdict: terms without a name close the gap, and explain nothing."""
+    unnamed = bool(left) or any(f.effect == UNNAMED for f in findings)
+    if any(f.effect != UNNAMED for f in findings):
+        return "partly_explained" if unnamed else "explained"
+    return "unexplained" if unnamed else "no_gap"
 
 
-def _predicted(state: State) -> Array:
+def _predicted(state: ModelState) -> Array:
     """Torques of the model on the held-out data, (M, n)."""
     return np.concatenate([x @ state.fit.theta for x, _, _ in state.fit.equations.held])
 
 
-def _beside(final: State, state: State) -> Array:
+def _beside(final: ModelState, state: ModelState) -> Array:
     """Torques (M, n) of another model, with its residuals referred to the corrected recordings of the final one."""
     pairs = zip(final.study.held, state.study.held, strict=True)
     return np.asarray(_predicted(state) + np.concatenate([right.y - own.y for right, own in pairs]))
 
 
-def _sampled(state: State, name: str) -> Array:
+def _lacking(final: ModelState, one: Selected) -> Array | None:
+    """Torques (M, n) of the model without one finding."""
+    return None if one.without is None else _beside(final, one.without)
+
+
+def _sampled(state: ModelState, name: str) -> Array:
     """A measured signal at the held-out instants, (M, n)."""
     signals = [getattr(s.measured, name) for s in state.study.held]
     return np.concatenate([s[state.study.decimation.instants(s.shape[0])] for s in signals])

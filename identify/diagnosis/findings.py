@@ -1,170 +1,165 @@
-"""Findings of a search as entries of the document: parameters, confidence, alternatives, undetectable effects."""
+"""Selected effects as entries of the document: parameters, confidence, alternatives, undetectable effects."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
-from armident.configs.schema.robot import Effect as Stanza
-from armident.identify.diagnosis.candidates import Candidate, places
+from armident.identify.diagnosis.candidates import Key, Workshop, places
+from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.experiment import recommended_experiment
+from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.numbers import NumbersFinding
 from armident.identify.diagnosis.precision import standard_deviations
 from armident.identify.diagnosis.regression import relative_errors
-from armident.identify.diagnosis.retrial import in_loop_of
-from armident.identify.diagnosis.search import Search
-from armident.identify.diagnosis.simulated import foretold_errors
-from armident.identify.diagnosis.stanzas import without
-from armident.identify.diagnosis.state import State, nearer, power_put_right, share_explained, with_values
-from armident.identify.diagnosis.study import ALIKE
-from armident.identify.diagnosis.trial import CLOSE, Trial, judge
-from armident.identify.diagnosis.where import Disagreement, strangers
-from armident.identify.document import Alternative, Finding, Gap, NotVisible
+from armident.identify.diagnosis.selection import Addition, Selected, Step
+from armident.identify.document import Alternative, Finding, Gap, Negligible, NotVisible, Unexplained
 from armident.identify.effects.effect import Effect
-from armident.identify.effects.recorded import of_recording
-from armident.identify.effects.registry import catalogue, known
-from armident.identify.effects.terms import place_of
+from armident.identify.effects.registry import catalogue, known, of_entry
 
 Array = NDArray[np.float64]
 
-RIVALS = 3
-"""Alternatives named beside every finding."""
-
+ALTERNATIVES = 3
+"""Most alternatives named beside a finding."""
+STRONG = float(np.exp(Criteria.close))
+"""Odds beyond which an explanation is no longer ambiguous."""
 DOUBTFUL = 0.6
 """Confidence below which another experiment is recommended."""
 
 
-def described(search: Search, first: State, final: State, left: Sequence[Disagreement]) -> list[Finding]:
-    """Findings in the order in which they were made.
-
-    Every finding is compared with its rivals in the model of all others. Its confidence is its share of the likelihood,
-    times the share of the error of its joint that it explains.
+def findings_of(final: ModelState, selected: Sequence[Selected]) -> list[Finding]:
+    """Return the findings of a selection, highest gain first.
 
     Parameters
     ----------
-    search
-        The search, with its settings.
-    first, final
-        Model as configured, and with the findings.
-    left
-        Dependences of the residual of the final model.
+    final
+        Model with all of them.
+    selected
+        Effects of the selection.
     """
-    own = len(first.study.robot.effects)
-    stanzas = list(with_values(final).effects)
-    deviations = dict(zip(_terms(final), standard_deviations(final), strict=True))
-    findings: list[Finding] = []
-    for k in range(own, len(stanzas)):
-        if of_recording(stanzas[k]):
-            deviations[k] = _still_missing(final, stanzas[k])
-        rest = search.state(without(final.study.robot, k), final)
-        findings.append(_finding(search, rest, final, stanzas[k], deviations.get(k, {}), left))
-    return findings
-
-
-def _still_missing(final: State, stanza: Stanza) -> dict[str, float]:
-    """Standard deviation of the parameter of a correction: that of a further correction in the final model."""
-    effect = of_entry(stanza)
-    place = place_of(stanza, effect, final.study.robot, stanza.effect)
-    rest = judge(final.fit, Candidate(effect, place, ((),)), (), final.workshop)
-    return {} if rest is None else {effect.linear[0].name: float(rest.std[0])}
+    deviations = standard_deviations(final)
+    entries = list(final.robot.effects)
+    values = final.with_values().effects
+    found = []
+    for one in selected:
+        number = entries.index(one.entry)
+        found.append(_finding(final, one, values[number].parameters, deviations.get(number, {})))
+    return found
 
 
 def _finding(
-    search: Search, rest: State, final: State, stanza: Stanza, std: dict[str, float], left: Sequence[Disagreement]
+    final: ModelState, one: Selected, parameters: Mapping[str, float], std: dict[str, float]
 ) -> Finding:
-    study, material = final.study, search.settings.material
-    effect = of_entry(stanza)
-    place = place_of(stanza, effect, study.robot, stanza.effect)
-    trials = [t for t in rest.trials if not t.forbidden]
-    mine = next((t for t in trials if t.candidate.key == (effect.name, place.joint, place.other)), None)
-    rivals = [t for t in trials if t is not mine]
-    # Only candidates that pass in its place reduce the confidence of a finding.
-    serious = [t for t in rest.passing(search.settings) if t is not mine]
-    if mine is not None and effect.undo is not None:
-        # With torques that belong to other positions no loop simulates the arm, and scores mean little: rivals are
-        # those that fit the recordings as well when they are in the model.
-        again = in_loop_of(study, rest.fit, mine.candidate)
-        mine = again if again is not None and again.score > mine.score else mine
-        others = [(t, search.with_trial(rest, t)) for t in serious]
-        serious = [
-            t for t, other in others if other and nearer(other, rest, material) and not nearer(final, other, material)
-        ]
-    # The share refers to rows of the joint itself; a change in rows of other joints does not count.
-    share = 0.0 if mine is None else min(mine.share, 1.0)
-    if mine is not None and effect.undo is not None:
-        was, now = power_put_right(rest, final), power_put_right(final, rest)
-        share = max(share, float(1.0 - now[place.joint] / was[place.joint]))
-    elif mine is not None and final.study.likeness_lost(rest.study, range(study.robot.n), held=True) < ALIKE:
-        # A loop whose motion differs without the effect does not show how much it explains.
-        share = max(share, float(share_explained(final, rest)[place.joint]))
-    scores = [] if mine is None else [mine.score, *(_instead(t, final) for t in serious)]
-    close = [] if mine is None else [score for score in scores if abs(score - mine.score) < CLOSE]
-    # An effect that couples two joints has to explain both.
-    at = (stanza.joint, stanza.other) if effect.scope == "pair" else (stanza.joint,)
-    nameless: dict[str, float] = {}
-    if mine is not None and effect.undo is None:
-        nameless = _nameless(search, rest, final, mine, {study.joints.index(name) for name in at if name})
-    everything = special.logsumexp([*scores, *nameless.values()]) if scores else 0.0
-    alone = 0.0 if mine is None else float(np.exp(mine.score - everything))
-    among = float(np.exp(special.logsumexp(close) - everything)) if close else 0.0
-    remaining = max((d.share for d in left if d.joint in at), default=0.0)
-    # The remaining share refers to the smaller residual with the finding.
-    explained = share / max(share + (1 - share) * remaining, 1e-300) if share > 0 else 0.0
+    addition, report = one.addition, one.confirmation
+    assert report is not None
+    effect, place = of_entry(one.entry), addition.candidate.place
+    # The gap is that of the joint of the effect, or of the joint whose errors it reduces most.
     joint = place.joint
-    foretold_gap = float(foretold_errors(rest, final)[joint])
+    if effect.scope == "arm" or report.share[joint] <= 0.0:
+        joint = int(np.argmax(report.share))
+    chance = min(1.0, one.step.tests * float(np.exp(-addition.gain)))
+    rivals = one.step.rivals(addition)
+    odds = tempered_odds(one.step, addition)
     return Finding(
         effect=effect.name,
-        joint=stanza.joint,
-        other=stanza.other,
+        law=effect.law,
+        joint=final.study.joints[joint] if effect.scope == "arm" else one.entry.joint,
+        other=one.entry.other,
         kind="structure",
-        parameters=stanza.parameters,
-        confidence=alone * explained,
-        alternatives=[
-            Alternative(effect=t.candidate.effect.name, joint=study.joints[t.candidate.place.joint], score=t.score)
-            for t in rivals[:RIVALS]
-        ],
-        gap_before=float(relative_errors(rest.fit, held=True)[1][joint]),
-        gap_after=float(relative_errors(final.fit, held=True)[1][joint]),
+        parameters=dict(parameters),
+        confidence=(1.0 - chance) * (1.0 / (1.0 + sum(odds.values())) if addition.named else 1.0),
+        alternatives=_alternatives(final, addition, rivals),
+        gap_before=float(report.before[joint]),
+        gap_after=float(report.best[joint]),
         evidence={
             "title": effect.title,
             "description": effect.says,
             "reference": effect.reference,
-            "score": None if mine is None else mine.score,
-            "p_value": None if mine is None else mine.p_value,
-            "tests": rest.tests,
-            "share_of_residual": share,
-            "gap_without_derivative_noise": foretold_gap if np.isfinite(foretold_gap) else None,
+            "score": addition.gain,
+            "p_value": report.p_value,
+            "gap_joint": final.study.joints[joint],
+            "gap_at_measured_motion": float(report.after[joint]),
+            "p_value_selection": chance,
+            "tests": one.step.tests,
+            "share_of_residual": float(report.share[joint]),
+            "change_of_torque_pct": addition.material_pct,
             "std": std,
-            "units": _units(effect, study.robot.joints[joint].type == "prismatic"),
-            "confidence_with_ambiguous": among * explained,
-            "ambiguous_with": [
-                t.candidate.effect.name for t in serious if mine and _instead(t, final) > mine.score - CLOSE
-            ],
-            "better_unnamed_dependences": [words for words, score in nameless.items() if mine and score > mine.score],
+            "units": _units(effect, final.robot.joints[place.joint].type == "prismatic"),
+            "ambiguous_with": [key[0] for key, ratio in odds.items() if addition.named and ratio * STRONG > 1.0],
         },
     )
 
 
-def _nameless(search: Search, rest: State, final: State, mine: Trial, joints: Collection[int]) -> dict[str, float]:
-    """Scores of unnamed dependences on other joints in place of a finding, less their scores in the final model."""
-    found = strangers(rest.fit, rest.workshop, joints, search.settings.false_alarms)
-    near = [s for s in found if s.score > mine.score - CLOSE]
-    scores = [s.score - s.beside(final.fit, final.workshop) for s in near]
-    told = [s.disagreement() for s in near]
-    return {f"{d.varies_with} at {d.joint}": score for d, score in zip(told, scores, strict=True)}
+def tempered_odds(step: Step, one: Addition) -> dict[Key, float]:
+    """Return the posterior odds of each other effect in place of one, whatever its law, with equal prior odds.
 
+    Differences of log-likelihood are reduced by the serial correlation that the noise models leave: the gain of the
+    effect with it over that without it.
 
-def _instead(rival: Trial, final: State) -> float:
-    """Score of a rival in place of a finding, less its score in addition to the finding.
-
-    A part that only both together explain counts against neither.
+    Parameters
+    ----------
+    step
+        Step of the selection.
+    one
+        The effect.
     """
-    beside = [t.score for t in final.trials if t.candidate.key == rival.candidate.key and not t.forbidden]
-    return rival.score - max([0.0, *beside])
+    own = one.log_likelihood - step.state.score.log_likelihood
+    factor = float(np.clip(one.gain / own, 0.0, 1.0)) if own > 0.0 else 1.0
+    odds: dict[Key, float] = {}
+    for rival in step.rivals(one):
+        if rival.named:
+            odds.setdefault(rival.family, float(np.exp(min(0.0, factor * (rival.log_likelihood - one.log_likelihood)))))
+    return odds
 
 
-def gap_of(state: State, *, held: bool) -> Gap:
+def _alternatives(final: ModelState, one: Addition, rivals: Sequence[Addition]) -> list[Alternative]:
+    """Best law of each other effect, highest log-likelihood first."""
+    found: dict[Key, Alternative] = {}
+    for rival in rivals:
+        if rival.named:
+            joint = final.study.joints[rival.candidate.place.joint]
+            entry = Alternative(
+                effect=rival.family[0], joint=joint, score=rival.log_likelihood - one.log_likelihood
+            )
+            found.setdefault(rival.family, entry)
+    return list(found.values())[:ALTERNATIVES]
+
+
+def negligible(
+    final: ModelState, selected: Sequence[Selected], step: Step | None, criteria: Criteria
+) -> list[Negligible]:
+    """Return the effects that are significant, and no cause: too small, or within the sampling convention of drives.
+
+    Parameters
+    ----------
+    final
+        Model with the findings.
+    selected
+        Effects of the selection.
+    step
+        Comparison of all effects in it; ``None`` if it was not made.
+    criteria
+        Thresholds.
+    """
+    found: dict[Key, Negligible] = {}
+    small = [one.addition for one in selected if one.conventional(final)]
+    if step is not None:
+        needed = np.log(max(step.tests, 1) / criteria.alpha["selection"])
+        small += [a for a in step.ranked if a.gain > needed and a not in step.passing]
+    for addition in small:
+        if addition.allowed and addition.named:
+            joint = final.study.joints[addition.candidate.place.joint]
+            entry = Negligible(
+                effect=addition.candidate.effect.name,
+                joint=joint,
+                change_of_torque_pct=addition.material_pct,
+                share_of_residual=addition.share,
+            )
+            found.setdefault(addition.family, entry)
+    return list(found.values())
+
+
+def gap_of(state: ModelState, *, held: bool) -> Gap:
     """Relative torque errors of a model.
 
     Parameters
@@ -185,54 +180,64 @@ def gap_of(state: State, *, held: bool) -> Gap:
     )
 
 
-def noise_floor(final: State, left: Sequence[Disagreement]) -> Gap:
-    """Remaining error on the held-out data, less the shares that are known not to be noise.
+def noise_floor(final: ModelState, left: Sequence[Unexplained]) -> Gap:
+    """Return the remaining error on the held-out data, less the shares that are known not to be noise.
 
     Parameters
     ----------
     final
-        The model with the findings.
+        Model with the findings.
     left
         Dependences of its residual.
     """
-    study = final.study
-    _, each = relative_errors(final.fit, held=True)
-    power = np.sum(np.concatenate([s.y for s in study.held]) ** 2, axis=0)
-    known_shares = {name: 0.0 for name in study.joints}
-    for d in left:
-        if d.kind == "frequency":
-            # Its share is one of the working rate, most of which lies beyond the band of the comparison.
-            continue
-        # The share that follows the motion contains the named dependences.
-        own = known_shares[d.joint] + d.share if d.kind != "motion" else max(known_shares[d.joint], d.share)
-        known_shares[d.joint] = min(1.0, own)
-    floor = np.array([e * np.sqrt(1 - known_shares[name]) for e, name in zip(each, study.joints, strict=True)])
-    overall = float(np.sqrt((floor**2) @ power / power.sum()))
-    return Gap(all=overall, by_joint=dict(zip(study.joints, (float(v) for v in floor), strict=True)))
+    gap = gap_of(final, held=True)
+    known_shares = {name: 0.0 for name in gap.by_joint}
+    for entry in left:
+        known_shares[entry.joint] = min(1.0, max(known_shares[entry.joint], entry.share_of_residual))
+    by_joint = {name: error * float(np.sqrt(1.0 - known_shares[name])) for name, error in gap.by_joint.items()}
+    rms = {name: gap.rms[name] * float(np.sqrt(1.0 - known_shares[name])) for name in by_joint}
+    torque = {name: gap.rms[name] / max(gap.by_joint[name], 1e-300) for name in by_joint}
+    total = float(np.sqrt(sum(v**2 for v in rms.values()) / max(sum(v**2 for v in torque.values()), 1e-300)))
+    return Gap(all=total, by_joint=by_joint, rms=rms)
 
 
-def undetectable(state: State) -> list[NotVisible]:
-    """Effects of the catalogue that this motion cannot show at some joint, with the reason."""
+def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
+    """Return the effects of the catalogue that this motion cannot show at some joint, with the reason.
+
+    Parameters
+    ----------
+    state
+        Model as configured.
+    hidden
+        Effects and places that the model contains or the motion does not excite.
+    """
     study = state.study
-    motion = state.workshop.motion(study.train[0], "measured")
-    found: list[NotVisible] = []
+    motion = Workshop(study, state.fit.theta).motion(study.train[0], "measured")
+    found: dict[tuple[str, str], NotVisible] = {}
     for effect in catalogue().values():
-        if effect.rewires or effect.scope == "pair":
+        if effect.rewires or effect.scope in ("pair", "other") or effect.law:
             continue
         for place in places(effect, study.robot.n):
             reason = None if effect.visible is None else effect.visible(motion, place)
             if effect.numbers is not None:
                 reason = "it changes parameters of the model, not its structure: it is visible against a baseline only"
-            elif (effect.name, place.joint, place.other) in state.hidden:
+            elif (effect.key, place.joint, place.other) in hidden:
                 reason = "the motion does not excite it, or the model already contains it"
             if reason is not None:
                 joint = study.joints[place.joint]
-                found.append(NotVisible(effect=effect.name, joint=joint, reason=reason, required_motion=effect.needs))
-    return found
+                entry = NotVisible(effect=effect.name, joint=joint, reason=reason, required_motion=effect.needs)
+                found.setdefault((effect.name, joint), entry)
+    return list(found.values())
 
 
-def outdated(numbers: Sequence[NumbersFinding]) -> list[Finding]:
-    """Changed parameters of a baseline as findings."""
+def changed_parameters(numbers: Sequence[NumbersFinding]) -> list[Finding]:
+    """Return the changed parameters of a baseline as findings.
+
+    Parameters
+    ----------
+    numbers
+        Changes against the baseline.
+    """
     return [
         Finding(
             effect=n.effect,
@@ -257,18 +262,25 @@ def outdated(numbers: Sequence[NumbersFinding]) -> list[Finding]:
 
 
 def experiment_to_separate(findings: Sequence[Finding]) -> str | None:
-    """Experiment that separates a finding from a close rival or raises a low confidence; ``None`` if none is needed."""
-    for finding in findings:
+    """Return the experiment that separates a finding from a close rival or raises a low confidence.
+
+    Parameters
+    ----------
+    findings
+        Findings of a diagnosis.
+
+    Returns
+    -------
+    str or None
+        ``None`` if none is needed.
+    """
+    named = [f for f in findings if f.effect in catalogue()]
+    for finding in named:
         rivals = [known(name) for name in finding.evidence.get("ambiguous_with", [])]
         if rivals:
             return recommended_experiment(known(finding.effect), finding.joint, rivals)
-    doubtful = [f for f in findings if f.kind == "structure" and f.confidence < DOUBTFUL]
+    doubtful = [f for f in named if f.kind == "structure" and f.confidence < DOUBTFUL]
     return recommended_experiment(known(doubtful[0].effect), doubtful[0].joint) if doubtful else None
-
-
-def _terms(state: State) -> list[int]:
-    """Numbers of the effects of the configuration that are terms."""
-    return [k for k, stanza in enumerate(state.study.robot.effects) if not of_recording(stanza)]
 
 
 def _units(effect: Effect, prismatic: bool) -> dict[str, str]:

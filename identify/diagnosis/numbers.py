@@ -18,8 +18,9 @@ from scipy import special, stats
 from armident.identify.diagnosis.baseline import Change, Comparison, cautious, compared
 from armident.identify.diagnosis.candidates import Workshop
 from armident.identify.diagnosis.changes import STRUCTURAL, changes, p_value, ranked
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.precision import variance_of_sum
 from armident.identify.diagnosis.regression import Fit, relative_errors
-from armident.identify.diagnosis.trial import CLOSE, variance_of_sum
 from armident.identify.document import IdentificationDocument
 from armident.identify.effects.effect import Effect
 from armident.identify.regression.multiple_testing import holm
@@ -27,6 +28,7 @@ from armident.identify.regression.multiple_testing import holm
 Array = NDArray[np.float64]
 
 ALTERNATIVES = 3
+CLOSE = Criteria.close
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.identify.diagnosis.candidates import Shapes
+from armident.identify.diagnosis.study import Study
+
 Array = NDArray[np.float64]
 
 OVERSAMPLING = 8
@@ -17,6 +20,10 @@ PADDING = 4
 """Orders searched per independent order."""
 NEIGHBOURS = 32
 """Independent orders from whose median the background is estimated."""
+STANDSTILL = 0.02
+"""Speed over the top speed of a motor below which it counts as standing."""
+SLOW = 0.2
+"""Quantile of the speeds at which the highest order reaches the band of the comparison."""
 PEAKS = 3
 """Most orders returned."""
 
@@ -70,3 +77,52 @@ def strongest_orders(
         found.append((float(orders[inside[k]]), float(own[k] / max(float(np.median(around)), 1e-300))))
         blocked |= np.abs(orders[inside] - orders[inside[k]]) < 1.5 * apart
     return found
+
+
+def motor_orders(study: Study, theta: Array, motor: int) -> tuple[Shapes, ...]:
+    """Return the orders of the strongest ripples of a residual over the angle of a motor, as a grid of an effect.
+
+    Parameters
+    ----------
+    study
+        Data with the model.
+    theta
+        Parameters of the model, (b,).
+    motor
+        Index of the motor, from 0.
+    """
+    ratios = study.robot.transmission_matrix[motor]
+    joint = int(np.argmax(np.abs(ratios)))
+    residual = [s.torque[:, joint] - study.torques(s, "measured", theta)[:, joint] for s in study.train]
+    angles = [s.measured.q @ ratios for s in study.train]
+    speed = np.concatenate([np.abs(s.measured.qd @ ratios) for s in study.train])
+    moving = speed[speed > STANDSTILL * speed.max()]
+    if not moving.size:
+        return ()
+    cutoff = 0.5 / (study.dt * study.decimation.factor)
+    highest = 2 * np.pi * cutoff / float(np.quantile(moving, SLOW))
+    apart = _resolution(study, motor)
+    found = strongest_orders(angles, residual, highest)
+    return tuple((("harmonic", order + k * apart / 4),) for order, _ in found for k in range(-2, 3))
+
+
+def nearby_orders(study: Study, motor: int, order: float) -> tuple[Shapes, ...]:
+    """Return orders close to one order, at a sixteenth of the resolution of the motion.
+
+    Parameters
+    ----------
+    study
+        Data with the model.
+    motor
+        Index of the motor, from 0.
+    order
+        Order, cycles per 2 pi of the angle of the motor.
+    """
+    apart = _resolution(study, motor)
+    return tuple((("harmonic", order + k * apart / 16),) for k in range(-3, 4))
+
+
+def _resolution(study: Study, motor: int) -> float:
+    """Difference of two orders that the motion tells apart, cycles per 2 pi of the angle of a motor."""
+    ratios = study.robot.transmission_matrix[motor]
+    return 2 * np.pi / max(float(np.ptp(np.concatenate([s.measured.q @ ratios for s in study.train]))), 1e-12)

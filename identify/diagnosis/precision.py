@@ -7,43 +7,52 @@ from numpy.typing import NDArray
 
 from armident.identify.diagnosis.candidates import Workshop
 from armident.identify.diagnosis.regression import Fit
-from armident.identify.diagnosis.state import State
-from armident.identify.diagnosis.trial import variance_of_sum
-from armident.identify.effects.terms import Term, effect_terms
+from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.terms import Term
 from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.hac import newey_west
 
 Array = NDArray[np.float64]
 
+NEWEY_WEST_LAGS = 20
 STEP = 0.01
 """Relative change of a nonlinear parameter for its derivative."""
 
 
-def standard_deviations(state: State) -> list[dict[str, float]]:
-    """Standard deviations of all parameters of every term of the model, by their names in the configuration.
+def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
+    """Standard deviations of all parameters of every term of the model, by the number of its entry and their names.
 
     The derivative of the torque with respect to a nonlinear parameter is one more column, so that its uncertainty
     enters that of the linear ones (Gauss-Newton). Parameters from a set of whole numbers count as known. The residual
     is no white noise where an effect is only approximately right. The variances are then those of the residual along
     the influence of each parameter, if they are larger (Newey, West 1987, Econometrica 55(3)).
+
+    Parameters
+    ----------
+    state
+        The model.
     """
     study, fit = state.study, state.fit
+    workshop = Workshop(study, fit.theta)
+    terms = {k: state.term_of(e) for k, e in enumerate(state.robot.effects) if not of_recording(e)}
     slopes: list[Array] = []
     owners: list[tuple[int, str]] = []
-    for k, term in enumerate(effect_terms(study.model)):
-        own = [study.model.base.names.index(name) for name in term.names]
+    for k, term in terms.items():
+        values = term.of_effect(state.values_of(term)[0])
         for name in term.effect.movable(study.robot, term.place, term.shapes):
-            slopes.append(_slope(state.workshop, fit.noise, term, name, term.of_effect(fit.theta[own])))
+            slopes.append(_slope(workshop, fit.noise, term, name, values))
             owners.append((k, name))
     deviations = _deviations(fit, slopes)
     b = fit.theta.size
-    found: list[dict[str, float]] = []
-    for k, term in enumerate(effect_terms(study.model)):
+    found: dict[int, dict[str, float]] = {}
+    for k, term in terms.items():
         own = [study.model.base.names.index(name) for name in term.names]
         std = {p.name: float(deviations[i]) for p, i in zip(term.linear, own, strict=True)}
         for place, (owner, name) in enumerate(owners):
             if owner == k:
                 std[name] = float(deviations[b + place])
-        found.append(std)
+        found[k] = std
     return found
 
 
@@ -84,3 +93,14 @@ def _deviations(fit: Fit, slopes: list[Array]) -> Array:
         variances[k] += (inverse[k, k] - (alone[k, k] if k < b else 0.0)) / scale[k] ** 2
         variances[k] = max(variances[k], variance_of_sum(influence * fit.residual))
     return variances**0.5
+
+
+def variance_of_sum(products: Array) -> float:
+    """Variance of the sum of serially correlated terms (R,), their mean removed.
+
+    Parameters
+    ----------
+    products
+        Terms of the sum, (R,).
+    """
+    return float(newey_west([products - products.mean()], NEWEY_WEST_LAGS))

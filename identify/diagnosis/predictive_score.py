@@ -126,16 +126,19 @@ class PredictiveScore:
         return np.array([float(np.sqrt(np.mean(errors**2))) for errors in self.errors])
 
     @cached_property
-    def log_likelihood(self) -> float:
-        """Log-likelihood of the data under the model's own noise models, less one for each of their coefficients.
+    def log_likelihoods(self) -> Array:
+        """Log-likelihood of the data of each joint under the model's own noise models, (n,).
 
-        The coefficients are not cross-validated; the subtraction is that of Akaike's criterion. Constants that all
-        models of the same data share are omitted.
+        One is subtracted for each coefficient of the noise models, which are not cross-validated (Akaike's criterion).
+        Constants that all models of the same data share are omitted.
         """
-        own = self.innovations(self.fit.noise)
-        rows = self.rows
-        orders = sum(ar.order for ar in self.fit.noise)
-        return float(-0.5 * np.sum(rows * np.log(np.maximum(own, 1e-300))) - orders)
+        own = np.maximum(self.innovations(self.fit.noise), 1e-300)
+        return np.asarray(-0.5 * self.rows * np.log(own) - [ar.order for ar in self.fit.noise])
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log-likelihood of the data of all joints, see `log_likelihoods`."""
+        return float(self.log_likelihoods.sum())
 
     def inflation_over(self, other: "PredictiveScore") -> Array:
         """Variance of the score along the change of prediction over that of white innovations, of each joint, (n,).

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from armident.configs import DataError
 from armident.identify.diagnosis.stretch import Stretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.whitening import ar_models, rows_of_joints, summed_backwards, whitened
@@ -20,6 +21,8 @@ from armident.identify.regression.fir import filter_columns
 Array = NDArray[np.float64]
 
 MAX_AR_ORDER = 30
+SINGULAR = 1e-13
+"""Singular value of the normalised equations over the largest below which they are singular: rounding errors."""
 PASSES = 3
 """Iterations between parameters and noise models; a fourth changes neither visibly."""
 
@@ -51,12 +54,35 @@ class Equations:
 
     Parameters
     ----------
-    train, held
-        Training and held-out equations, one entry per stretch.
+    train
+        Training equations, one entry per stretch.
+    study
+        Data with the model.
+    theta
+        Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
     """
 
     train: tuple[Equation, ...]
-    held: tuple[Equation, ...]
+    study: Study
+    theta: Array | None
+
+    @classmethod
+    def of(cls, study: Study, theta: Array | None) -> "Equations":
+        """Equations of a model.
+
+        Parameters
+        ----------
+        study
+            Data with the model.
+        theta
+            Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+        """
+        return cls(tuple((*regressors(study, s, theta), s.y) for s in study.train), study, theta)
+
+    @cached_property
+    def held(self) -> tuple[Equation, ...]:
+        """Held-out equations, one entry per stretch; computed when they are first used."""
+        return tuple((*regressors(self.study, s, self.theta), s.y) for s in self.study.held)
 
     @cached_property
     def blocks(self) -> tuple["Block", ...]:
@@ -338,7 +364,7 @@ class Fit:
         return float(through @ self.covariance @ through)
 
 
-def fit(study: Study, theta0: Array | None = None) -> Fit:
+def fit(study: Study, theta0: Array | None = None, noise: Sequence[ArModel] | None = None) -> Fit:
     """Alternate instrumental variables and AR noise models (thesis sections 2.3.3 and 6.1.3).
 
     Parameters
@@ -347,24 +373,47 @@ def fit(study: Study, theta0: Array | None = None) -> Fit:
         Data with the model.
     theta0
         Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
+    noise
+        Noise models of a similar model to start from; ``None``: start with white noise.
 
     Raises
     ------
     DataError
         If the training motion leaves parameters undetermined.
     """
-    equations = Equations(
-        tuple((*regressors(study, s, theta0), s.y) for s in study.train),
-        tuple((*regressors(study, s, theta0), s.y) for s in study.held),
-    )
-    flat = np.concatenate([x.reshape(-1, x.shape[-1]) for x, _, _ in equations.train])
-    require_excitation(flat, study.model.base.names)
-    theta = np.linalg.lstsq(flat, np.concatenate([y.reshape(-1) for _, _, y in equations.train]), rcond=None)[0]
-    noise = noise_models([y - x @ theta for x, _, y in equations.train], theta.size, 0)
+    equations = Equations.of(study, theta0)
+    if noise is None:
+        flat = np.concatenate([x.reshape(-1, x.shape[-1]) for x, _, _ in equations.train])
+        require_excitation(flat, study.model.base.names)
+        theta = np.linalg.lstsq(flat, np.concatenate([y.reshape(-1) for _, _, y in equations.train]), rcond=None)[0]
+        noise = noise_models([y - x @ theta for x, _, y in equations.train], theta.size, 0)
+        passes = PASSES
+    else:
+        passes = PASSES - 1
     found = solved(study, equations, noise)
-    for _ in range(PASSES - 1):
-        found = found.renoised(noise_models(found.errors(found.theta, held=False), theta.size, MAX_AR_ORDER))
+    require_solution(found)
+    for _ in range(passes - 1):
+        found = found.renoised(noise_models(found.errors(found.theta, held=False), found.theta.size, MAX_AR_ORDER))
     return found
+
+
+def require_solution(found: Fit) -> None:
+    """Refuse a model whose parameters the motion leaves undetermined.
+
+    Parameters
+    ----------
+    found
+        Fit of the model.
+
+    Raises
+    ------
+    DataError
+        If the instruments do not determine all parameters.
+    """
+    products = found.products
+    values = np.linalg.svd(products.zx / np.outer(products.scale, products.scale), compute_uv=False)
+    if not np.isfinite(found.theta).all() or values[-1] < SINGULAR * values[0]:
+        raise DataError("the motion does not determine all parameters of the model")
 
 
 def solved(
@@ -436,7 +485,7 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
             study.rigid[key] = signals, made
         rigid = study.rigid[key][1]
         if study.model.e:
-            terms = study.decimation(study.terms(stretch, kind, theta))
+            terms = _filtered_terms(study, stretch, kind, theta)
             if out:
                 first = out[0].shape[2] - study.model.e
                 sudden = np.flatnonzero([t.effect.sudden for t in effect_terms(study.model) for _ in t.names])
@@ -444,6 +493,17 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
             rigid = np.concatenate([rigid, terms], axis=2)
         out.append(rigid if stretch.moving is None else rigid * stretch.moving[:, :, None])
     return out[0], out[1]
+
+
+def _filtered_terms(study: Study, stretch: Stretch, kind: str, theta: Array | None) -> Array:
+    """Columns (M, n, e) of the model's terms in the band of the comparison; those of one joint are filtered alone."""
+    columns = study.terms(stretch, kind, theta)
+    acts = np.flatnonzero(np.any(columns, axis=0))
+    flat = columns.reshape(columns.shape[0], -1)[:, acts]
+    band = study.decimation(np.ascontiguousarray(flat))
+    whole = np.zeros((band.shape[0], columns.shape[1] * columns.shape[2]))
+    whole[:, acts] = band
+    return whole.reshape(band.shape[0], *columns.shape[1:])
 
 
 def applied(columns: Array, values: Array) -> Array:

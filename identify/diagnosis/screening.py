@@ -1,19 +1,19 @@
-"""Selection of the candidates for a full test, with noise models that a missing effect does not bias.
+"""Screening of candidates: score statistics on the training data, with noise models that a missing effect does not bias.
 
 An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away. The
-weight of a spring, for example, is forty times too small. So the noise models of the selection come from a residual
-without smooth functions of position, speed and time. The full tests start from them and end with noise models of
-their own.
+weight of a spring, for example, is forty times too small. So the noise models of the screening come from a residual
+without smooth functions of position, speed and time.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize
 
 from armident.identify.diagnosis.candidates import Candidate, Shapes, Workshop
-from armident.identify.diagnosis.maps import hats
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, noise_models
-from armident.identify.diagnosis.shaping import both_ends
-from armident.identify.diagnosis.trial import refined, screened
+from armident.identify.effects.tables import hats
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.robot.motion import Motion
 
@@ -23,45 +23,155 @@ KNOTS = 7
 """Knots of each smooth function."""
 ROWS_PER_COLUMN = 12
 """Least number of equations per column of these functions, against overfitting of short recordings."""
+RANK_TOLERANCE = 1e-3
+"""Relative norm orthogonal to the model below which columns cannot be tested."""
+REFINEMENTS = 12
+"""Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""
 
 
-def shortlist(
-    fit: Fit, workshop: Workshop, every: list[Candidate], most: int
-) -> tuple[list[tuple[Candidate, Shapes]], frozenset[tuple[str, int, int | None]], tuple[ArModel, ...]]:
-    """The candidates that fit the training data best.
+def screened(fit: Fit, candidate: Candidate, workshop: Workshop) -> tuple[float, Shapes] | None:
+    """Best score statistic of a candidate on its grid, by the training data, and the nonlinear parameters there.
 
     Parameters
     ----------
     fit
         Fit of the model.
+    candidate
+        Candidate with its grid.
     workshop
         Cache of the columns of the same fit.
-    every
-        All candidates.
-    most
-        Number of candidates to select.
+    """
+    if not candidate.grid:
+        return None
+    # Columns that depend on theta are useless for the next model, and a grid of them is large.
+    keep = not candidate.effect.predicts
+    columns = workshop.grid(candidate.effect, candidate.place, candidate.grid, fit.noise, keep=keep)
+    statistics = score_statistics(fit, columns, len(candidate.grid))
+    if np.isnan(statistics).all():
+        return None
+    best = int(np.nanargmax(statistics))
+    return float(statistics[best]), candidate.grid[best]
+
+
+def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int) -> Array:
+    """Power of the training residual along groups of instruments orthogonal to the model's own, (G,).
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    columns
+        Whitened instruments (R, G k) of each joint on which they act, with its number, group after group.
+    count
+        Number of groups, G.
 
     Returns
     -------
-    tuple
-        Candidates with their nonlinear parameters, best first, some with two sets; the keys of those that cannot be
-        tested; and the noise models of the selection, one for each joint.
+    ndarray
+        Not a number where the model contains a group.
     """
-    calm = fit.renoised(noise_beyond_shapes(fit, workshop))
-    looks: list[tuple[float, Candidate, Shapes]] = []
-    hidden = set()
-    for candidate in every:
-        look = screened(calm, candidate, workshop)
-        if look is None:
-            hidden.add(candidate.key)
-        else:
-            looks.append((look[0], candidate, look[1]))
-    looks.sort(key=lambda look: len(look[1].effect.linear) - look[0])
-    best: list[tuple[Candidate, Shapes]] = []
-    for score, candidate, shapes in looks[:most]:
-        own = refined(calm, candidate, workshop, (score, shapes))
-        best += [(candidate, ends) for ends in both_ends(calm, candidate, workshop, own)]
-    return best, frozenset(hidden), calm.noise
+    if not columns:
+        return np.full(count, np.nan)
+    size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
+    able = np.isfinite(size) & (size > 0.0)
+    scale = np.where(able, size, np.inf)
+    scaled = [(j, np.where(able, own, 0.0) / scale) for j, own in columns]
+    gram, score = fit.products_beside(scaled, count)
+    power, right = np.linalg.eigh(gram)
+    kept = power > RANK_TOLERANCE**2
+    along = np.einsum("gij,gi->gj", right, score)
+    statistics = np.sum(np.where(kept, along**2 / np.where(kept, power, 1.0), 0.0), axis=1)
+    usable = able.reshape(count, -1).all(axis=1) & kept.any(axis=1)
+    return np.where(usable, statistics, np.nan)
+
+
+def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]]) -> float | None:
+    """Score statistic of one group of instruments; ``None`` if the model contains it.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    columns
+        Whitened instruments (R, k) of each joint on which they act, with its number.
+    """
+    found = float(score_statistics(fit, columns, 1)[0])
+    return None if np.isnan(found) else found
+
+
+def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
+    """Orthonormal directions (R, r) of instruments orthogonal to the model's, and their map (k, r) with scales (k,).
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    instruments
+        Whitened instruments, (R, k).
+    """
+    scale = np.linalg.norm(instruments, axis=0)
+    if np.any(scale == 0) or not np.isfinite(scale).all():
+        return None
+    beside = fit.beside(instruments / scale)
+    # Through the small Gram matrix: candidates have a few columns and many rows.
+    power, right = np.linalg.eigh(beside.T @ beside)
+    kept = power > RANK_TOLERANCE**2
+    if not kept.any():
+        return None
+    right = right[:, kept]
+    return (beside @ right) / np.sqrt(power[kept]), right, scale
+
+
+def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[float, Shapes]) -> Shapes:
+    """Nonlinear parameters between those of the grid, one continuous parameter after the other, on a logarithmic scale.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    candidate
+        Candidate with its grid.
+    workshop
+        Cache of the columns of the same fit.
+    best
+        Score statistic and nonlinear parameters of the grid, the start.
+    """
+    found = best
+    for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
+        values = sorted({grid[k][1] for grid in candidate.grid})
+        if not free or len(values) < 2:
+            continue
+        at = int(np.argmin(np.abs(np.array(values) - found[1][k][1])))
+        low, high = values[max(at - 1, 0)], values[min(at + 1, len(values) - 1)]
+
+        start = found[1]
+
+        def loss(logarithm: float, start: Shapes = start, k: int = k) -> float:
+            shapes = replaced(start, k, float(np.exp(logarithm)))
+            statistic = score_statistic(
+                fit, workshop.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
+            )
+            return 0.0 if statistic is None else -statistic
+
+        result = optimize.minimize_scalar(
+            loss, bounds=(np.log(low), np.log(high)), method="bounded", options={"maxiter": REFINEMENTS}
+        )
+        if -result.fun > found[0]:
+            found = -float(result.fun), replaced(start, k, float(np.exp(result.x)))
+    return found[1]
+
+
+def replaced(shapes: Shapes, k: int, value: float) -> Shapes:
+    """Nonlinear parameters with another value of the k-th.
+
+    Parameters
+    ----------
+    shapes
+        Pairs of name and value.
+    k, value
+        Number of the parameter, and its new value.
+    """
+    return (*shapes[:k], (shapes[k][0], value), *shapes[k + 1 :])
 
 
 def noise_beyond_shapes(fit: Fit, workshop: Workshop) -> list[ArModel]:

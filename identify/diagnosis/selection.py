@@ -1,91 +1,43 @@
 """Stepwise selection of the effects that a model lacks.
 
-Each step adds the candidate with the highest predictive score, if it is significant, material and physically possible:
-
 1. Screening: the score statistic of every candidate at every place, in one factorisation of the model's equations.
 2. Closed loop: each of the best candidates is added to the model, the loop with it is simulated, and all parameters are
    estimated with instruments from that loop.
-3. Ranking by cross-validated log-likelihood (see `armident.identify.diagnosis.predictive_score`).
-4. Admission of the first that is significant, material and physically possible.
-
-Then findings that the later ones made superfluous are removed, and each finding competes once more with all others.
+3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.predictive_score`).
+4. Admission of the best one that is significant, material and physically possible; then the next step.
+5. Findings that later ones made superfluous are removed, and each finding competes with all others once more.
+6. Report part: a finding stays if the data that chose nothing confirm it (`armident.identify.diagnosis.confirmation`).
 """
 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from armident.configs import DataError, RobotConfig
-from armident.identify.diagnosis.candidates import Candidate, Shapes, Workshop, candidates
+from armident.configs.schema.robot import Effect as Entry
+from armident.identify.diagnosis.candidates import Candidate, Key, Shapes, Workshop, candidates, grid
+from armident.identify.diagnosis.confirmation import Confirmation, confirmed
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.lines import residuals
-from armident.identify.diagnosis.order_analysis import strongest_orders
-from armident.identify.diagnosis.predictive_score import PredictiveScore
-from armident.identify.diagnosis.regression import Fit
-from armident.identify.diagnosis.screening import noise_beyond_shapes
+from armident.identify.diagnosis.model_state import ModelState, fitted, with_report_part
+from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
+from armident.identify.diagnosis.screening import noise_beyond_shapes, refined, screened
 from armident.identify.diagnosis.shaping import both_ends
-from armident.identify.diagnosis.state import refit
 from armident.identify.diagnosis.study import Study
-from armident.identify.diagnosis.trial import refined, screened
 from armident.identify.effects.effect import Place
-from armident.identify.effects.registry import known
-from armident.identify.effects.terms import Term, effect_terms, stanza_of
+from armident.identify.effects.friction import TRANSITION
+from armident.identify.effects.registry import known, of_entry
+from armident.identify.effects.terms import stanza_of
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
-WIDTHS = (3.0, 1.5)
-"""Factors by which the width of the smoothed sign is changed, a coarse and a fine step."""
-WIDEST = (0.02, 20.0)
-"""Range of the sharpness of the sign, over that of the joint's top speed (`SATURATION`)."""
-
 Array = NDArray[np.float64]
-Key = tuple[str, int, int | None]
 
-
-@dataclass(frozen=True, eq=False)
-class ModelState:
-    """Model of one step: data with its own closed loop, fit, and predictive score.
-
-    Parameters
-    ----------
-    study
-        Data with the model and the motion of its closed loop.
-    fit
-        Fit of the model.
-    """
-
-    study: Study
-    fit: Fit
-
-    @property
-    def robot(self) -> RobotConfig:
-        """Configuration of the model."""
-        return self.study.robot
-
-    @cached_property
-    def score(self) -> PredictiveScore:
-        """Predictive score on the training data."""
-        return PredictiveScore(self.fit)
-
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """Effects of the model."""
-        return effect_terms(self.study.model)
-
-    def values_of(self, term: Term) -> tuple[Array, Array]:
-        """Linear parameters of a term and their standard deviations, (k,) each.
-
-        Parameters
-        ----------
-        term
-            Term of the model.
-        """
-        own = [self.study.model.base.names.index(name) for name in term.names]
-        return self.fit.theta[own], np.sqrt(np.maximum(np.diag(self.fit.covariance)[own], 0.0))
+FINER = (1.4, 1.2, 1.1)
+"""Factors of the refinement of the velocity of a transition; the grid has factors of 1.9."""
+CLEAR = 3.0
+"""Gain of log-likelihood from which a transition of dry friction is a part of the friction model: odds of 20 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,12 +48,13 @@ class Addition:
     ----------
     candidate, shapes
         The effect with its place, and its nonlinear parameters.
+    entry
+        Entry of the effect in the configuration.
     state
         Model with the effect.
     gain
-        Gain of log-likelihood over the model without it.
-    own_gain
-        The same with each model under its own noise models.
+        Gain of log-likelihood over the model without it: the smaller one of the gains with equal noise models and with
+        each model's own.
     share
         Largest share of the power of a joint's predicted errors that it removes.
     material_pct
@@ -112,9 +65,9 @@ class Addition:
 
     candidate: Candidate
     shapes: Shapes
+    entry: Entry
     state: ModelState
     gain: float
-    own_gain: float
     share: float
     material_pct: float
     allowed: bool
@@ -130,6 +83,84 @@ class Addition:
         place = self.candidate.place
         name = self.candidate.effect.name if self.named else self.candidate.effect.key
         return name, place.joint, place.other
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log-likelihood of the model with the effect."""
+        return self.state.score.log_likelihood
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Candidates that were added to one model, highest log-likelihood first.
+
+    Parameters
+    ----------
+    state
+        Model without them.
+    ranked
+        Candidates in the model.
+    passing
+        Those that are significant, material and physically possible.
+    tests
+        Number of candidates and nonlinear parameters from which they were selected.
+    """
+
+    state: ModelState
+    ranked: tuple[Addition, ...]
+    passing: tuple[Addition, ...]
+    tests: int
+
+    def rivals(self, one: Addition) -> tuple[Addition, ...]:
+        """Physically possible explanations in place of an addition: others that pass, and others of the same joint.
+
+        Parameters
+        ----------
+        one
+            The addition.
+        """
+        joint = one.candidate.place.joint
+        return tuple(
+            a
+            for a in self.ranked
+            if a.allowed and a.family != one.family and (a in self.passing or a.candidate.place.joint == joint)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """An effect that was selected.
+
+    Parameters
+    ----------
+    entry
+        Its entry in the configuration.
+    step
+        Step in which it was compared with the others, without it in the model.
+    addition
+        Test of the effect in that step.
+    confirmation
+        Comparison of the final models with and without it on the report part; ``None`` before that.
+    without
+        Final model without it; ``None`` before the comparison.
+    """
+
+    entry: Entry
+    step: Step
+    addition: Addition
+    confirmation: Confirmation | None = None
+    without: ModelState | None = None
+
+    def conventional(self, state: ModelState) -> bool:
+        """True if the effect is within the sampling convention of drives: a part of the model, and no finding.
+
+        Parameters
+        ----------
+        state
+            Final model.
+        """
+        negligible = self.addition.candidate.effect.negligible
+        return negligible is not None and negligible(state.values_of(state.term_of(self.entry))[0], state.study.sample)
 
 
 @dataclass
@@ -152,60 +183,89 @@ class StepwiseSelection:
     criteria: Criteria = field(default_factory=Criteria)
     progress: Callable[[str], None] = lambda stage: None
     deadline: float = float("inf")
+    stopped: bool = False
+    hidden: frozenset[Key] = frozenset()
     _states: dict[str, ModelState | None] = field(default_factory=dict)
-    steps: list[tuple[Addition, ...]] = field(default_factory=list)
+    _steps: dict[str, Step] = field(default_factory=dict)
 
     def start(self) -> ModelState:
-        """Model as configured."""
-        state = self._state(self.study.robot, None)
-        assert state is not None
-        return state if self.study.sign_given else self._with_sign_widths(state)
+        """Model as configured, with the transition of dry friction at reversals where the configuration leaves it free.
 
-    def _with_sign_widths(self, state: ModelState) -> ModelState:
-        """Model with the width of each joint's sign at which it predicts best: friction near standstill is unknown."""
-        for j in range(state.robot.n):
-            for step in WIDTHS:
-                for factor in (step, 1.0 / step):
-                    while True:
-                        g = list(state.robot.sign_smoothing)
-                        g[j] *= factor
-                        if not WIDEST[0] <= g[j] / self.study.robot.sign_smoothing[j] <= WIDEST[1]:
-                            break
-                        other = self._state(_with_sign(state.robot, g), state)
-                        if other is None or other.score.log_likelihood <= state.score.log_likelihood + 1.0:
-                            break
-                        state = other
-        self.study = replace(self.study, robot=state.robot, sign_given=True)
+        Raises
+        ------
+        DataError
+            If the motion does not determine the parameters of the model.
+        """
+        state = fitted(self.study, self.study.robot, None)
+        if not self.study.sign_given:
+            state = self._with_transitions(state)
+        self.study = replace(self.study, robot=state.robot, model=state.study.model, sign_given=True)
+        self._states[_key(state.robot)] = state
         return state
 
-    def run(self) -> ModelState:
-        """Model after stepwise selection."""
-        state = self.start()
-        own = len(self.study.robot.effects)
-        while len(state.robot.effects) - own < self.criteria.most_findings and time.monotonic() < self.deadline:
-            best = self._best(state)
+    def run(self, first: ModelState) -> tuple[ModelState, tuple[Selected, ...]]:
+        """Select effects.
+
+        Parameters
+        ----------
+        first
+            Model to start from, of `start`.
+
+        Returns
+        -------
+        tuple
+            Model with the effects, and the effects, highest gain first.
+        """
+        state, found = first, ()
+        while len(found) < self.criteria.most_findings and not self._late():
+            step = self.step(state)
+            best = self.admitted(step)
             if best is None:
                 break
-            self.progress(f"adding {best.candidate.effect.name} of {self.study.joints[best.candidate.place.joint]}")
-            state = self._reduced(best.state, own)
-        return state
+            name = self.study.joints[best.candidate.place.joint]
+            self.progress(f"adding {best.candidate.effect.name.replace('_', ' ')} of {name}")
+            found = (*found, Selected(best.entry, step, best))
+            state, found = self._reduced(best.state, found)
+        # Removing a finding changes the comparison of the others.
+        while True:
+            state, found = self._exchanged(state, found)
+            state, kept = self._confirmed(state, found)
+            if len(kept) == len(found):
+                return state, kept
+            found = kept
 
-    def additions(self, state: ModelState) -> tuple[Addition, ...]:
-        """Candidates in the model, each in its own closed loop, highest log-likelihood first.
+    def step(self, state: ModelState) -> Step:
+        """Compare all candidates in a model.
 
         Parameters
         ----------
         state
             Model without them.
         """
-        found = [self._added(state, *one) for one in self._shortlist(state)]
-        able = [a for a in found if a is not None]
-        ranked = tuple(sorted(able, key=lambda a: -a.state.score.log_likelihood))
-        self.steps.append(ranked)
-        return ranked
+        key = _key(state.robot)
+        if key not in self._steps:
+            shortlist, tests = self._shortlist(state)
+            additions = (self._added(state, *one) for one in shortlist)
+            able = [a for a in additions if a is not None]
+            ranked = tuple(sorted(able, key=lambda a: -a.log_likelihood))
+            self._steps[key] = Step(state, ranked, tuple(a for a in ranked if self.passes(a, tests)), tests)
+        return self._steps[key]
+
+    def last(self, state: ModelState) -> Step | None:
+        """Comparison of all candidates in a model, if it has been made.
+
+        Parameters
+        ----------
+        state
+            The model.
+        """
+        return self._steps.get(_key(state.robot))
 
     def passes(self, addition: Addition, tests: int) -> bool:
         """True if an addition is significant, material and physically possible.
+
+        A ratio of likelihoods of ``r`` has at most the probability ``1 / r`` without the effect (Ville 1939), so that
+        no null distribution is needed.
 
         Parameters
         ----------
@@ -214,121 +274,228 @@ class StepwiseSelection:
         tests
             Number of candidates among which it was found.
         """
-        effect = addition.candidate.effect
-        term = addition.state.terms[-1]
-        values, _ = addition.state.values_of(term)
         return (
             addition.allowed
-            and min(addition.gain, addition.own_gain) > np.log(max(tests, 1) / self.criteria.false_alarm_rate)
+            and addition.gain > np.log(max(tests, 1) / self.criteria.alpha["selection"])
             and addition.share >= self.criteria.least_share
             and addition.material_pct >= self.criteria.material_pct
-            and not (effect.negligible is not None and effect.negligible(values, self.study.sample))
         )
 
-    def _best(self, state: ModelState) -> Addition | None:
-        ranked = self.additions(state)
-        tests = len(list(candidates(Workshop(state.study, state.fit.theta))))
-        return next((a for a in ranked if self.passes(a, tests)), None)
+    def admitted(self, step: Step) -> Addition | None:
+        """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
-    def _shortlist(self, state: ModelState) -> list[tuple[Candidate, Shapes]]:
-        """Candidates with the highest score statistics less their numbers of parameters, with nonlinear parameters."""
+        An effect is admitted only if no other explanation of the same joint is clearly better, even one that is too
+        small to be a finding. An effect with a name comes first if it explains most of what the best term without a name does. Of the laws of
+        one effect that predict as well, that with the fewest parameters comes first, and a free shape last.
+
+        Parameters
+        ----------
+        step
+            The step.
+        """
+        able = [a for a in step.passing if not self._superseded(a, step)]
+        if not able:
+            return None
+        best = able[0]
+        if not best.named:
+            named = [a for a in able if a.named and a.gain >= self.criteria.named_share * best.gain]
+            best = named[0] if named else best
+        close = best.log_likelihood - self.criteria.close
+        same = [a for a in able if a.family == best.family and a.log_likelihood > close]
+        return min(same, key=lambda a: (a.candidate.effect.free, len(a.candidate.effect.linear)))
+
+    def _superseded(self, addition: Addition, step: Step) -> bool:
+        """True if an explanation of the same joint that does not pass is clearly better than an addition."""
+        better = (a for a in step.rivals(addition) if a not in step.passing)
+        return any(a.log_likelihood > addition.log_likelihood + self.criteria.close for a in better)
+
+    def _late(self) -> bool:
+        self.stopped = self.stopped or time.monotonic() > self.deadline
+        return self.stopped
+
+    def _with_transitions(self, state: ModelState) -> ModelState:
+        """Model with the transition of dry friction at the reversals of each joint, where it predicts better.
+
+        The smoothed sign of the model approaches its limits slowly. Beside another law of the reversal it looks like
+        friction that depends on the velocity (Stribeck). Each velocity is tried at all joints at once; each joint keeps
+        the one with which its own torque is predicted best.
+        """
+        effect = known(TRANSITION)
+        workshop = Workshop(state.study, state.fit.theta)
+        motion = workshop.motion(state.study.train[0], "measured")
+        present = {e.joint for e in state.robot.effects if e.effect == TRANSITION}
+        places = [Place(j) for j, name in enumerate(self.study.joints) if name not in present]
+        best = {place: (state.score.log_likelihoods[place.joint] + CLEAR, 0.0) for place in places}
+
+        def tried(velocities: Sequence[float]) -> ModelState | None:
+            chosen = [(place, v) for place, v in zip(places, velocities, strict=True) if v > 0.0]
+            entries = [stanza_of(effect, place, state.robot, {"velocity": v}) for place, v in chosen]
+            made = self._state(with_entries(state.robot, entries), state) if entries else None
+            for (place, v), entry in zip(chosen, entries, strict=True) if made else ():
+                score = float(made.score.log_likelihoods[place.joint])
+                if made.values_of(made.term_of(entry))[0][0] > 0.0 and score > best[place][0]:
+                    best[place] = score, v
+            return made
+
+        for shapes in zip(*(grid(effect, motion, place) for place in places), strict=True):
+            tried([dict(one)["velocity"] for one in shapes])
+        for factor in FINER:
+            tried([factor * v for _, v in best.values()])
+            tried([v / factor for _, v in best.values()])
+        made = tried([v for _, v in best.values()])
+        return made if made is not None and made.score.log_likelihood > state.score.log_likelihood else state
+
+    def _shortlist(self, state: ModelState) -> tuple[list[tuple[Candidate, Shapes]], int]:
+        """Candidates with the highest score statistics less their numbers of parameters, and the number of all."""
         workshop = Workshop(state.study, state.fit.theta)
         noise = state.fit.renoised(noise_beyond_shapes(state.fit, workshop))
         looks: list[tuple[float, Candidate, tuple[float, Shapes]]] = []
-        for candidate in self._with_orders(state, candidates(workshop)):
+        tests, hidden = 0, set()
+        for every in candidates(workshop):
+            candidate = every
+            if candidate.effect.order_of == "motor":
+                candidate = replace(candidate, grid=motor_orders(state.study, state.fit.theta, candidate.place.joint))
+            tests += 1
             found = screened(noise, candidate, workshop)
-            if found is not None:
+            if found is None:
+                hidden.add(candidate.key)
+            else:
                 looks.append((found[0] - 2.0 * len(candidate.effect.linear), candidate, found))
-        looks.sort(key=lambda look: -look[0])
+        if not self._steps:
+            self.hidden = frozenset(hidden)
+        # A score statistic is twice the gain of log-likelihood that it promises.
+        least = 2.0 * self.criteria.promising * np.log(max(tests, 1) / self.criteria.alpha["selection"])
+        looks = sorted((look for look in looks if look[2][0] > least), key=lambda look: -look[0])
         named = [x for x in looks if x[1].effect.name != UNNAMED][: self.criteria.shortlist]
         unnamed = [x for x in looks if x[1].effect.name == UNNAMED][: self.criteria.unnamed]
         chosen: list[tuple[Candidate, Shapes]] = []
-        for _, candidate, found in (*named, *unnamed):
+        for _, own, first in (*named, *unnamed):
+            candidate, found = own, first
             if candidate.effect.order_of:
-                candidate = self._finer(state, candidate, found[1][0][1])
+                near = nearby_orders(state.study, candidate.place.joint, found[1][0][1])
+                candidate = replace(candidate, grid=near)
                 found = screened(noise, candidate, workshop) or found
             shapes = refined(noise, candidate, workshop, found)
             chosen += [(candidate, ends) for ends in both_ends(noise, candidate, workshop, shapes)]
-        return chosen
-
-    def _with_orders(self, state: ModelState, every: Sequence[Candidate]) -> list[Candidate]:
-        """Candidates whose order is found by order analysis get the strongest orders of the residual as their grid."""
-        left = residuals(state.study, state.study.train, state.fit.theta)
-        out = []
-        for candidate in every:
-            if candidate.effect.order_of == "motor":
-                grid = tuple((("harmonic", order),) for order in self._orders(state, candidate.place, left))
-                candidate = replace(candidate, grid=grid)
-            out.append(candidate)
-        return out
-
-    def _orders(self, state: ModelState, place: Place, left: Sequence[Array]) -> list[float]:
-        """Orders per radian of the motor of the strongest ripples of a joint's residual."""
-        study, motor = state.study, place.joint
-        ratios = study.robot.transmission_matrix[motor]
-        angles = [s.measured.q @ ratios for s in study.train]
-        speed = np.concatenate([np.abs(s.measured.qd @ ratios) for s in study.train])
-        moving = speed[speed > 0.02 * speed.max()]
-        slow = float(np.quantile(moving, 0.2)) if moving.size else 1.0
-        cutoff = 0.5 / (study.dt * study.decimation.factor)
-        joint = int(np.argmax(np.abs(ratios)))
-        found = strongest_orders(angles, [e[:, joint] for e in left], 2 * np.pi * cutoff / slow)
-        apart = 2 * np.pi / max(float(np.ptp(np.concatenate(angles))), 1e-12)
-        return [order + shift * apart for order, _ in found for shift in (-0.5, -0.25, 0.0, 0.25, 0.5)]
-
-    def _finer(self, state: ModelState, candidate: Candidate, order: float) -> Candidate:
-        """Candidate with orders close to one order, at a sixteenth of the resolution of the motion."""
-        ratios = state.study.robot.transmission_matrix[candidate.place.joint]
-        apart = 2 * np.pi / max(float(np.ptp(np.concatenate([s.measured.q @ ratios for s in state.study.train]))), 1e-12)
-        near = tuple((("harmonic", order + float(k) * apart / 16),) for k in range(-3, 4))
-        return replace(candidate, grid=near)
+        return chosen, tests
 
     def _added(self, state: ModelState, candidate: Candidate, shapes: Shapes) -> Addition | None:
         effect = candidate.effect
         spared = tuple(p.name for p in known(effect.key).linear if p.through is not None)
         entry = stanza_of(effect, candidate.place, state.robot, dict(shapes), spared)
-        made = self._state(state.robot.model_copy(update={"effects": (*state.robot.effects, entry)}), state)
+        made = self._state(with_entries(state.robot, [entry]), state)
         if made is None:
             return None
-        term = made.terms[-1]
+        term = made.term_of(entry)
         values, std = made.values_of(term)
-        allowed = known(effect.key).allows(term.of_effect(values), term.of_effect(std), dict(term.shapes))
+        largest: dict[str, float] = {}
+        for name, value in (pair for one in candidate.grid for pair in one):
+            largest[name] = max(value, largest.get(name, value))
+        allowed = known(effect.key).allows(term.of_effect(values), term.of_effect(std), dict(term.shapes), largest)
         share, changed = materiality(state, made)
-        return Addition(candidate, shapes, made, made.score.gain_over(state.score), made.score.log_likelihood - state.score.log_likelihood, share, changed, allowed)
+        return Addition(candidate, shapes, entry, made, gain(made, state), share, changed, allowed)
 
-    def _state(self, robot: RobotConfig, before: ModelState | None) -> ModelState | None:
+    def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""
-        key = "\n".join([str(robot.sign_smoothing), *(entry.model_dump_json() for entry in robot.effects)])
+        key = _key(robot)
         if key not in self._states:
             try:
-                self._states[key] = ModelState(*refit(self.study, robot, None if before is None else before.fit))
+                self._states[key] = fitted(self.study, robot, before)
             except (DataError, np.linalg.LinAlgError):
                 self._states[key] = None
         return self._states[key]
 
-    def _reduced(self, state: ModelState, own: int) -> ModelState:
-        """Model without findings that are not significant or material beside the others."""
-        while len(state.robot.effects) - own > 1:
-            weakest: tuple[float, ModelState] | None = None
-            for k in range(own, len(state.robot.effects)):
-                effects = (*state.robot.effects[:k], *state.robot.effects[k + 1 :])
-                less = self._state(state.robot.model_copy(update={"effects": effects}), state)
+    def _without(self, state: ModelState, entry: Entry) -> ModelState | None:
+        """The model without one of its effects."""
+        effects = list(state.robot.effects)
+        effects.remove(entry)
+        return self._state(state.robot.model_copy(update={"effects": tuple(effects)}), state)
+
+    def _reduced(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
+        """Model without findings that later ones made insignificant or immaterial."""
+        while len(found) > 1:
+            weak: list[tuple[float, ModelState, Selected]] = []
+            for one in found[:-1]:
+                less = self._without(state, one.entry)
                 if less is None:
                     continue
-                share, _ = materiality(less, state)
-                gain = state.score.gain_over(less.score)
-                if share < self.criteria.least_share or gain < -np.log(self.criteria.false_alarm_rate):
-                    weakest = min(weakest or (gain, less), (gain, less), key=lambda one: one[0])
-            if weakest is None:
-                return state
-            state = weakest[1]
-        return state
+                share, changed = materiality(less, state)
+                gained = gain(state, less)
+                needed = np.log(max(one.step.tests, 1) / self.criteria.alpha["selection"])
+                if gained < needed or share < self.criteria.least_share or changed < self.criteria.material_pct:
+                    weak.append((gained, less, one))
+            if not weak:
+                break
+            _, state, gone = min(weak, key=lambda one: one[0])
+            found = tuple(one for one in found if one is not gone)
+        return state, found
+
+    def _exchanged(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
+        """Model whose findings have competed with all other effects beside the findings made after them."""
+        for one in found:
+            less = None if self._late() else self._without(state, one.entry)
+            if less is None:
+                continue
+            self.progress(f"exchanging {one.entry.effect.replace('_', ' ')} of {one.entry.joint}")
+            step = self.step(less)
+            best = self.admitted(step)
+            if best is None or best.family == one.addition.family:
+                continue
+            if best.log_likelihood > state.score.log_likelihood + self.criteria.close:
+                other = Selected(best.entry, step, best)
+                state, found = best.state, tuple(other if f is one else f for f in found)
+        return state, found
+
+    def _confirmed(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
+        """Model with the findings that the report part confirms, highest gain first."""
+        self.progress("confirmation by the report part")
+        while True:
+            checked: list[Selected] = []
+            for one in found:
+                less = self._without(state, one.entry)
+                if less is not None:
+                    compared = confirmed(with_report_part(state), with_report_part(less))
+                    checked.append(replace(one, confirmation=compared, without=less))
+            failed = [one for one in checked if not self._holds(one)]
+            if not failed:
+                return state, tuple(sorted(checked, key=lambda one: -_gained(state, one)))
+            gone = max(failed, key=lambda one: 1.0 if one.confirmation is None else one.confirmation.p_value)
+            assert gone.without is not None
+            state, found = gone.without, tuple(one for one in found if one.entry is not gone.entry)
+
+    def _holds(self, one: Selected) -> bool:
+        """True if the report part confirms a finding: the change goes the same way, and errors are smaller with it."""
+        report = one.confirmation
+        assert report is not None
+        return report.p_value < self.criteria.confirmation_level and report.smaller
 
 
-def _with_sign(robot: RobotConfig, smoothing: Sequence[float]) -> RobotConfig:
-    """Return the configuration with another smoothing of the sign of each joint."""
-    friction = robot.friction.model_copy(update={"sign_smoothing": tuple(float(g) for g in smoothing)})
-    return robot.model_copy(update={"friction": friction})
+def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
+    """Return a configuration with further effect entries.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    entries
+        Entries to add.
+    """
+    return robot.model_copy(update={"effects": (*robot.effects, *entries)})
+
+
+def gain(with_it: ModelState, without: ModelState) -> float:
+    """Gain of log-likelihood by an effect.
+
+    The smaller one of the gain with the noise models of the model with the effect, and of that with each model's own
+    noise models.
+
+    Parameters
+    ----------
+    with_it, without
+        Models with and without the effect.
+    """
+    own = with_it.score.log_likelihood - without.score.log_likelihood
+    return min(own, with_it.score.gain_over(without.score))
 
 
 def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]:
@@ -344,24 +511,14 @@ def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]
     joint = int(np.argmax(removed / np.maximum(before**2, 1e-300)))
     torque = np.concatenate([s.y[:, joint] for s in without.study.train])
     size = float(np.sqrt(np.mean(torque**2)))
-    return float(removed[joint] / max(before[joint] ** 2, 1e-300)), 100 * float(np.sqrt(removed[joint])) / max(
-        size, 1e-300
-    )
+    share = float(removed[joint] / max(before[joint] ** 2, 1e-300))
+    return share, 100 * float(np.sqrt(removed[joint])) / max(size, 1e-300)
 
 
-def posterior_shares(ranked: Sequence[Addition]) -> dict[Key, float]:
-    """Return the posterior probability of each effect among those tested in one step, whatever its law.
+def _gained(state: ModelState, one: Selected) -> float:
+    return np.inf if one.without is None else gain(state, one.without)
 
-    Parameters
-    ----------
-    ranked
-        Additions to the same model.
-    """
-    best: dict[Key, float] = {}
-    for addition in ranked:
-        if addition.allowed:
-            best[addition.family] = max(best.get(addition.family, -np.inf), addition.state.score.log_likelihood)
-    if not best:
-        return {}
-    total = special.logsumexp(list(best.values()))
-    return {key: float(np.exp(value - total)) for key, value in best.items()}
+
+def _key(robot: RobotConfig) -> str:
+    """Identity of a model: its effects, whatever their order."""
+    return "\n".join(sorted(entry.model_dump_json() for entry in robot.effects))

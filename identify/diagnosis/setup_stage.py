@@ -9,7 +9,7 @@ from armident.configs import DataError, RobotConfig
 from armident.identify.document import Finding, Gap, Unexplained
 from armident.identify.experiment import Experiment
 from armident.identify.setup.check import check_setup
-from armident.identify.setup.result import SetupCheck, SetupFinding
+from armident.identify.setup.result import SetupCheck, SetupFinding, with_torque_shift
 from armident.identify.setup.search import NOT_UNDERSTOOD
 
 SIGNALS = {"position_sign": "position", "torque_sign": "torque"}
@@ -25,7 +25,7 @@ class SetupStage:
     Parameters
     ----------
     training, validation
-        Experiments; their clock is corrected.
+        Experiments; their clock is corrected, and so is a common shift of their torques.
     robot
         Configuration with the corrections.
     findings
@@ -121,6 +121,7 @@ def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], rob
         If nothing moves, or the recordings do not fit together.
     """
     check = check_setup([*training, *validation], robot)
+    shift = check.torque_shift
     for finding in check.findings:
         if finding.kind == "standstill":
             raise DataError(f"{finding.message}; {finding.remedy}")
@@ -128,15 +129,18 @@ def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], rob
     tried = "; ".join(check.tried)
     hint = f"set-up doubtful: the rigid model leaves more than a third of this torque in every set-up tried: {tried}"
     return SetupStage(
-        tuple(replace(e, dt=e.dt * check.clock) for e in training),
-        tuple(replace(e, dt=e.dt * check.clock) for e in validation),
+        tuple(replace(e, dt=e.dt * check.clock) for e in with_torque_shift(training, shift)),
+        tuple(replace(e, dt=e.dt * check.clock) for e in with_torque_shift(validation, shift)),
         corrected,
         tuple(f for finding in check.findings if finding.kind not in REMARKS for f in _findings(finding, check, robot)),
         tuple(
             Unexplained(joint=name, share_of_residual=1.0, varies_with="set-up", hint=hint)
             for name in check.joints_not_understood
         ),
-        tuple(f"{finding.message}: {finding.remedy}" for finding in check.findings if finding.kind in REMARKS),
+        (
+            *(f"{finding.message}: {finding.remedy}" for finding in check.findings if finding.kind in REMARKS),
+            *([shift.remark] if shift is not None and shift.applied else []),
+        ),
         check.relative_error_pct,
     )
 

@@ -13,7 +13,7 @@ from scipy import optimize
 
 from armident.identify.diagnosis.candidates import Candidate, Shapes, Workshop
 from armident.identify.diagnosis.regression import Fit
-from armident.identify.diagnosis.trial import directions_beside, replaced
+from armident.identify.diagnosis.screening import directions_beside, replaced
 from armident.identify.diagnosis.whitening import whitened
 
 Array = NDArray[np.float64]

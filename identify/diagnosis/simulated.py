@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.foretold import foretold
-from armident.identify.diagnosis.state import State
+from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.identification.equations import aligned_torque
 
@@ -28,9 +27,6 @@ class SimulatedErrors:
         Errors of the simulated velocities with the model as configured, and with the findings.
     torque_before, torque_after
         Errors of the simulated torques with both models.
-    torque_without_derivative_noise
-        Error of the model as configured at the measured motion, less the torque that the findings add at the simulated
-        motion: see `armident.identify.diagnosis.foretold`.
     """
 
     joints: tuple[str, ...]
@@ -38,22 +34,15 @@ class SimulatedErrors:
     velocity_after: Array
     torque_before: Array
     torque_after: Array
-    torque_without_derivative_noise: Array
 
     def document(self) -> dict[str, Any] | None:
         """Return the entry ``simulated`` of ``diagnosis.json``."""
-        names = (
-            "velocity_before",
-            "velocity_after",
-            "torque_before",
-            "torque_after",
-            "torque_without_derivative_noise",
-        )
-        told = {name: getattr(self, name) for name in names if np.isfinite(getattr(self, name)).all()}
-        return {name: dict(zip(self.joints, map(float, values), strict=True)) for name, values in told.items()} or None
+        names = ("velocity_before", "velocity_after", "torque_before", "torque_after")
+        finite = {name: getattr(self, name) for name in names if np.isfinite(getattr(self, name)).all()}
+        return {name: dict(zip(self.joints, map(float, values), strict=True)) for name, values in finite.items()} or None
 
 
-def simulated_errors(first: State, final: State) -> SimulatedErrors:
+def simulated_errors(first: ModelState, final: ModelState) -> SimulatedErrors:
     """Errors of the closed loops of two models, simulated along the references.
 
     Parameters
@@ -65,28 +54,10 @@ def simulated_errors(first: State, final: State) -> SimulatedErrors:
     if before is None or after is None:
         unknown = np.full(first.study.robot.n, np.nan)
         before = after = unknown, unknown
-    return SimulatedErrors(
-        tuple(first.study.joints), before[0], after[0], before[1], after[1], foretold_errors(first, final)
-    )
+    return SimulatedErrors(tuple(first.study.joints), before[0], after[0], before[1], after[1])
 
 
-def foretold_errors(first: State, final: State) -> Array:
-    """Held-out torque errors of a model less the change by another one at simulated motion, percent, (n,); or nan.
-
-    Parameters
-    ----------
-    first, final
-        Model as configured, and with the findings.
-    """
-    found = foretold(first.study, first.fit.theta, final.study, final.fit.theta)
-    if found is None:
-        return np.full(first.study.robot.n, np.nan)
-    left, torque = (np.concatenate(part) for part in (found.after, [s.y for s in final.study.held]))
-    shares = np.linalg.norm(left, axis=0) / np.maximum(np.linalg.norm(torque, axis=0), 1e-300)
-    return np.asarray(100 * shares)
-
-
-def _errors(state: State) -> tuple[Array, Array] | None:
+def _errors(state: ModelState) -> tuple[Array, Array] | None:
     study = state.study
     auxiliary: AuxiliaryModel = replace(
         study.auxiliary.fresh(), model=study.model.anchored(state.fit.theta), anchor=None

@@ -1,6 +1,6 @@
 """Data of a diagnosis: training and held-out stretches of motion, with their torques in one band."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,6 +38,10 @@ WORKING_RATE = 20.0
 """Rate at which effects are evaluated, over the frequency up to which model and data are compared."""
 
 
+ROUNDS = 8
+"""Most simulations of a loop with terms: instruments have to follow the arm, not to solve its equations."""
+SETTLED = 0.01
+"""Relative difference of the torque of the terms and the simulated load that ends these simulations."""
 ALIKE = 0.9
 """Indifference ratio of squared closed-loop velocity errors."""
 STIFF_LOOP = 1.5
@@ -214,15 +218,15 @@ class Study:
         rigid = self.model.inverse_dynamics(theta, signals.q, signals.qd, signals.qdd)
         return rigid + self.terms(stretch, kind, theta) @ theta[-self.model.e :] if self.model.e else rigid
 
-    def resimulated(self, theta: Array, *, worse: float = 1.0) -> "Study":
+    def resimulated(self, theta: Array) -> "Study":
         """The study with the motion that the closed loop makes with its model, terms included, at these parameters.
+
+        Experiments that are held out altogether keep their motion, see `with_report_part`.
 
         Parameters
         ----------
         theta
             (b,).
-        worse
-            Squared error of its motion over that of the loop there is up to which it is taken.
 
         Returns
         -------
@@ -230,23 +234,49 @@ class Study:
             The same where that loop diverges, or follows the arm less closely than the one there is: large additions to
             the compiled loop may be too stiff for it (see `armident.identify.robot.relaxation`).
         """
-        auxiliary = replace(self.auxiliary.fresh(), model=self.model.anchored(theta), anchor=None)
-        runs = auxiliary.simulate(theta)
-        if runs is None:
+        motions = self._simulated(theta, sorted({s.experiment for s in self.train}))
+        if motions is None:
             return self
-        dt, factor = auxiliary.dt, self.thinning.factor
-        cut = {s.experiment: s.measured for s in (*self.train, *self.held)}
-        motions = {k: _seen(runs[k].q, measured, dt) for k, measured in cut.items()}
-
-        def moved(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
-            return tuple(s.resimulated(motions[s.experiment], dt, factor) for s in stretches)
-
-        train = moved(self.train)
+        train = self._moved(self.train, motions)
         # A stiff nominal controller follows the motion whatever the arm: its loop must only not get much worse.
-        bound = distances(self.train).sum() * (worse if self.loop in CONTROLLERS else STIFF_LOOP)
+        bound = distances(self.train).sum() * (1.0 if self.loop in CONTROLLERS else STIFF_LOOP)
         if not distances(train).sum() < bound:
             return self
-        return replace(self, train=train, held=moved(self.held))
+        return replace(self, train=train, held=self._moved(self.held, motions))
+
+    def with_report_part(self, theta: Array) -> "Study":
+        """The study with the motion of its loop for the experiments that are held out altogether.
+
+        Parameters
+        ----------
+        theta
+            Parameters of the loop, (b,).
+        """
+        trained = {s.experiment for s in self.train}
+        numbers = sorted({s.experiment for s in self.held} - trained)
+        motions = self._simulated(theta, numbers) if numbers else None
+        if motions is None:
+            return self
+        held = self._moved(self.held, motions)
+        return replace(self, held=held) if distances(held).sum() < STIFF_LOOP * distances(self.held).sum() else self
+
+    def _simulated(self, theta: Array, numbers: Sequence[int]) -> dict[int, Derivatives] | None:
+        """Motion of the closed loop with the model of the study by experiment; ``None`` if it diverges."""
+        auxiliary = replace(
+            self.auxiliary.fresh(), model=self.model.anchored(theta), anchor=None, rounds=ROUNDS, settled=SETTLED
+        )
+        runs = auxiliary.of_experiments(numbers).simulate(theta)
+        if runs is None:
+            return None
+        measured = {s.experiment: s.measured for s in (*self.train, *self.held)}
+        return {k: _seen(run.q, measured[k], auxiliary.dt) for k, run in zip(numbers, runs, strict=True)}
+
+    def _moved(self, stretches: Sequence[Stretch], motions: Mapping[int, Derivatives]) -> tuple[Stretch, ...]:
+        """Stretches with other simulated motions."""
+        dt, factor = self.auxiliary.dt, self.thinning.factor
+        return tuple(
+            s.resimulated(motions[s.experiment], dt, factor) if s.experiment in motions else s for s in stretches
+        )
 
 
 def build_study(
@@ -294,7 +324,7 @@ def build_study(
     train: list[Stretch] = []
     held: list[Stretch] = []
     for k, (e, s, z) in enumerate(zip(experiments, signals, simulated, strict=True)):
-        torque = first(aligned_torque(e.tau))
+        torque = first(aligned_torque(e.tau, e.torque_shift))
         kept = first.instants(e.tau.shape[0])
         pieces = [(train if k < len(training) else held, slice(0, None))]
         if not validation:

@@ -12,6 +12,10 @@ from armident.identify.robot.motion import Motion
 Array = NDArray[np.float64]
 
 
+LEAST = 0.1
+"""Least squared ratio of a recorded torque to the true one in the correction of a saturated report."""
+
+
 def _gain(motion: Motion, place: Place) -> Array:
     return motion.of_motor(place.joint, motion.motor_torque[:, place.joint])
 
@@ -35,7 +39,7 @@ def _unsaturated(recorded: Array, at: Recorded, loss: float) -> Array:
 
     Sample by sample: the saturation acts on the noise that the controller adds, too.
     """
-    given: Array = recorded / np.sqrt(1.0 + 2.0 * max(loss, 0.0) * (recorded / at.limit) ** 2)
+    given: Array = recorded / np.sqrt(np.maximum(1.0 + 2.0 * loss * (recorded / at.limit) ** 2, LEAST))
     return given
 
 
@@ -112,11 +116,12 @@ EFFECTS = (
     ),
     Effect(
         name="drive_gain_saturation",
-        title="a torque constant that falls with current",
-        says="the motor gives less torque per ampere at high current: its iron saturates; gain_loss is the share lost "
-        "at the torque limit of the joint, and grows with the square of the torque",
+        title="a torque that is not proportional to the current",
+        says="the motor gives less torque per ampere at high current because its iron saturates (gain_loss positive), or "
+        "the reported current saturates (negative); gain_loss is the share at the torque limit of the joint, and grows "
+        "with the square of the torque",
         reference="Leonhard 2001, Control of Electrical Drives, chapter 5",
-        linear=(Linear("gain_loss", ("", ""), sign=1),),
+        linear=(Linear("gain_loss", ("", "")),),
         columns=_saturation,
         predicts=True,
         undo=_unsaturated,

@@ -61,6 +61,28 @@ def films(motion: Motion, joint: int) -> Sequence[float]:
     return [float(v) for v in np.geomspace(least, most, 5)] if most > least else [least]
 
 
+TRANSITION = "coulomb_transition"
+"""Name of the transition of dry friction at a reversal: a part of the friction model, and no cause of a gap."""
+
+
+def transitions(motion: Motion, joint: int) -> Sequence[float]:
+    """Return velocities of the transition of dry friction, from 0.06 to 3 % of the joint's top speed, rad/s or m/s.
+
+    Parameters
+    ----------
+    motion
+        Motion of the arm.
+    joint
+        Index of the joint, from 0.
+    """
+    return [float(v) for v in float(motion.top_speed[joint]) * np.geomspace(0.0006, 0.03, 7)]
+
+
+def _transition(motion: Motion, place: Place, *, velocity: float) -> Array:
+    j = place.joint
+    return (np.tanh(motion.qd[:, j] / velocity) - motion.sign[:, j])[:, None]
+
+
 def _stribeck(motion: Motion, place: Place, *, velocity: float, displacement: float = 0.0) -> Array:
     j = place.joint
     # At speeds where the smoothed sign has not saturated yet, the bristle already has.
@@ -247,6 +269,17 @@ def _coupling(motion: Motion, place: Place) -> Array:
 
 
 EFFECTS = (
+    Effect(
+        name=TRANSITION,
+        title="gradual reversal of dry friction",
+        says="dry friction changes its sign over a range of velocities about standstill; a part of the friction model",
+        reference="Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)",
+        linear=(Linear("fct", TORQUE, sign=1),),
+        shapes=(Shape("velocity", ("rad/s", "m/s"), transitions),),
+        columns=_transition,
+        needs="reversals",
+        excitation=("reversals",),
+    ),
     Effect(
         name="asymmetric_viscous_friction",
         title="direction-dependent viscous friction",

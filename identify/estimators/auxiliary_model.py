@@ -14,7 +14,7 @@ from armident.identify.regression.equations import ExperimentEquations, filtered
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.physical import damp_to_physical
-from armident.identify.robot.relaxation import simulate_with_terms
+from armident.identify.robot.relaxation import ROUNDS, SETTLED, simulate_with_terms
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
@@ -88,6 +88,8 @@ class AuxiliaryModel:
         measured ones. ``None``: simulated velocities and accelerations.
     feedback
         True if the controller is that of the drives, through which the noise of their encoders passes.
+    rounds, settled
+        Most simulations of a loop with terms, and the relative difference that ends them; see `simulate_with_terms`.
     """
 
     model: ArmModel
@@ -102,6 +104,8 @@ class AuxiliaryModel:
     starts: Sequence[float] | None = None
     measured: Callable[[NDArray[np.float64], int], Derivatives] | None = None
     feedback: bool = True
+    rounds: int = ROUNDS
+    settled: float = SETTLED
     _last: NDArray[np.float64] | None = None
     _warnings: list[str] = field(default_factory=list)
 
@@ -150,6 +154,21 @@ class AuxiliaryModel:
             max_velocity=self.max_velocity / share,
         )
 
+    def of_experiments(self, numbers: Sequence[int]) -> Self:
+        """The loop of some of the experiments.
+
+        Parameters
+        ----------
+        numbers
+            Numbers of the experiments, from 0.
+        """
+        return replace(
+            self,
+            references=[self.references[k] for k in numbers],
+            initial=[self.initial[k] for k in numbers],
+            starts=[self._start(k) for k in numbers],
+        )
+
     def simulate(
         self, theta: NDArray[np.float64], disturbances: Sequence[NDArray[np.float64]] | None = None
     ) -> list[Simulation] | None:
@@ -175,6 +194,8 @@ class AuxiliaryModel:
                 start=self._start(k),
                 disturbance=None if disturbances is None else disturbances[k],
                 band_hz=FELT * self.band_hz,
+                rounds=self.rounds,
+                settled=self.settled,
                 q0=q0,
                 qd0=qd0,
                 max_velocity=self.max_velocity,

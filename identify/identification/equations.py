@@ -79,11 +79,22 @@ def sufficient(decimation: Decimation, dt: float, samples: Sequence[int], rows: 
     return found
 
 
-def aligned_torque(tau: NDArray[np.float64]) -> NDArray[np.float64]:
+def aligned_torque(tau: NDArray[np.float64], late: float = 0.0) -> NDArray[np.float64]:
     """Mean of the torques held before and after each position sample, shape (N, n).
 
-    Sample k is held over ``[k, k + 1)``, so the torque as recorded belongs half a period after the position.
+    Sample k is held over ``[k, k + 1)``, so the torque as recorded belongs half a period after the position. A torque
+    that is late by some more is interpolated between its samples.
+
+    Parameters
+    ----------
+    tau
+        Torques as recorded, (N, n).
+    late
+        Samples by which they are late, see :class:`~armident.identify.experiment.Experiment`.
     """
+    if late:
+        k = np.arange(tau.shape[0], dtype=np.float64)
+        return np.stack([np.interp(k + late - 0.5, k, column) for column in tau.T], axis=1)
     aligned = tau.copy()
     aligned[1:] = (tau[1:] + tau[:-1]) / 2
     return aligned
@@ -110,7 +121,7 @@ def equations(
     blocks = []
     for experiment, s in zip(experiments, signals, strict=True):
         kept = decimation.instants(s.q.shape[0])
-        y = decimation(aligned_torque(experiment.tau))
+        y = decimation(aligned_torque(experiment.tau, experiment.torque_shift))
         keep = np.ones(y.shape, dtype=np.bool_)
         if threshold is not None:
             keep = np.abs(s.qd[kept]) >= np.asarray(threshold)

@@ -44,6 +44,7 @@ from armident.identify.identification.verdict import Reason, SetupCheck, judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.consistent import nearest_consistent
+from armident.identify.setup.result import with_torque_shift
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate, encoder_resolution
@@ -122,7 +123,7 @@ def _identify(
     clock.enter("model", 0.0)
     moving = moving_joints(experiments, robot, criteria)
     require_motion(experiments, robot, moving)
-    experiments = put_right(experiments, robot)
+    experiments = _with_torque_shift(put_right(experiments, robot), robot, options, setup, notes)
     bandwidth = (
         options.bandwidth_hz or robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], experiments[0].dt)
     )
@@ -203,7 +204,7 @@ def _least_squares(
     factor = options.decimation if isinstance(options.decimation, int) else None
     plain = decimation(None if options.method in PREFILTERED else factor)
     published = model.robot.preprocessing
-    as_published = options.derivatives is None and options.decimation is None and published is not None
+    as_published = _as_published(model.robot, options)
     if as_published and published is not None:
         blocks = published_equations(model, experiments, published)
     else:
@@ -216,6 +217,22 @@ def _least_squares(
             blocks = prepared.equations(plain)
             ls = estimate(blocks)
     return LeastSquares(ls, blocks, plain, factor, as_published)
+
+
+def _as_published(robot: RobotConfig, options: Options) -> bool:
+    """Return True if IDIM-LS uses the filters of a published fit, which takes the torque as recorded."""
+    return options.derivatives is None and options.decimation is None and robot.preprocessing is not None
+
+
+def _with_torque_shift(
+    experiments: list[Experiment], robot: RobotConfig, options: Options, setup: SetupCheck | None, notes: Notes
+) -> list[Experiment]:
+    """Experiments with the common shift of the torques that the check of the set-up found."""
+    shift = None if setup is None else setup.torque_shift
+    if shift is None or not shift.applied or (options.method == "idim-ls" and _as_published(robot, options)):
+        return experiments
+    notes.warnings.append(shift.remark)
+    return with_torque_shift(experiments, shift)
 
 
 def _solve_in_closed_loop(
@@ -332,7 +349,7 @@ def _memory_of_noise(prepared: Prepared, theta: Array, reasons: list[Reason]) ->
     """Decimation factor after which the residuals of IDIM-LS at the full rate are hardly correlated (6.2.3)."""
     model = prepared.model
     errors = [
-        aligned_torque(e.tau)
+        aligned_torque(e.tau, e.torque_shift)
         - model.inverse_dynamics(theta, s.q, s.qd, s.qdd)
         - model.term_regressor(model.motion(s.q, s.qd, s.qdd, e.dt, e.start)) @ theta[theta.size - model.e :]
         for e, s in zip(prepared.experiments, prepared.signals, strict=True)

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
+from armident.identify.setup.result import TorqueShift
+
 Level = Literal["trustworthy", "doubtful", "unusable"]
 LEVELS: tuple[Level, ...] = ("trustworthy", "doubtful", "unusable")
 
@@ -127,6 +129,10 @@ class SetupCheck(Protocol):
     @property
     def tried(self) -> tuple[str, ...]:
         """Hypotheses that were tried, in words."""
+
+    @property
+    def torque_shift(self) -> TorqueShift | None:
+        """Common shift of the torques by less than a sample; ``None``: not estimated."""
 
 
 def judge(reasons: Sequence[Reason], setup: SetupCheck | None = None) -> Verdict:

@@ -54,6 +54,8 @@ def simulate_with_terms(
     start: float = 0.0,
     disturbance: ArrayLike | None = None,
     band_hz: float = np.inf,
+    rounds: int = ROUNDS,
+    settled: float = SETTLED,
     **initial: Any,
 ) -> Simulation:
     """Simulate the closed loop with the terms of the model; see :func:`armident.identify.robot.simulation.simulate`.
@@ -77,6 +79,10 @@ def simulate_with_terms(
     band_hz
         Cut-off frequency of the low-pass for the torque of the terms, Hz. References that arrive in steps, two or
         three times differentiated, would otherwise prevent convergence.
+    rounds
+        Most simulations.
+    settled
+        Relative difference of the torque of the terms and the simulated load that ends the iteration.
     **initial
         Further arguments of ``simulate``: ``q0``, ``qd0``, ``max_velocity``.
 
@@ -97,7 +103,7 @@ def simulate_with_terms(
     inertia: Floats = np.zeros(model.n)
     best: tuple[float, Simulation, Floats] | None = None
     past = _Past()
-    for k in range(ROUNDS):
+    for k in range(rounds):
         pushes = pushed - load @ to_motors
         run = simulate(model, theta, controller, reference, dt, disturbance=pushes, inertia=inertia, **initial)
         if run.diverged_at is not None:
@@ -122,7 +128,7 @@ def simulate_with_terms(
         apart = float(np.linalg.norm(missing)) / max(float(np.linalg.norm(held)), 1e-300)
         if best is None or apart < best[0]:
             best = apart, replace(run, tau=run.tau + load), load
-        if apart < SETTLED:
+        if apart < settled:
             break
         load = past.next(load, missing)
     assert best is not None

@@ -59,6 +59,8 @@ class Segment:
         Recorded torques, (W, n), N m or N.
     dt
         Working period, s.
+    q_ref
+        Reference positions, (W, n), rad or m; ``None``: not recorded.
     """
 
     q: Array
@@ -66,6 +68,7 @@ class Segment:
     qdd: Array
     tau: Array
     dt: float
+    q_ref: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +242,13 @@ class Bench:
         return Rows(x, gravity, physical.reshape(2 * n, -1))
 
 
-def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: NDArray[np.bool_]) -> Bench:
+def make_bench(
+    experiments: Sequence[Experiment],
+    robot: RobotConfig,
+    moving: NDArray[np.bool_],
+    working_rate: float = WORKING_RATE,
+    model: ArmModel | None = None,
+) -> Bench:
     """Filter and differentiate the recordings.
 
     Parameters
@@ -250,6 +259,10 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
         The configuration.
     moving
         Mask (n,) of the joints that move.
+    working_rate
+        Rate of the derivatives over the cut-off of the equations.
+    model
+        Model of another bench of the same robot; ``None``: made.
 
     Raises
     ------
@@ -258,7 +271,7 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
     """
     dt = experiments[0].dt
     cutoff = min(CUTOFF * motion_bandwidth([e.q for e in experiments], dt), 0.45 / dt)
-    first_factor = max(1, int(1.0 / (dt * WORKING_RATE * cutoff)))
+    first_factor = max(1, int(1.0 / (dt * working_rate * cutoff)))
     working = dt * first_factor
     first = design(dt, 0.4 / working, first_factor) if first_factor > 1 else design(dt, 0.5 / dt, 1)
     second = design(working, cutoff, max(1, int(0.5 / (working * cutoff) + 1e-9)))
@@ -269,7 +282,10 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
         q = first(e.q)
         qd = np.gradient(q, working, axis=0)
         qdd = np.gradient(qd, working, axis=0)
-        segments.append(Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, -0.5))), working))
+        q_ref = None if e.q_ref is None else first(e.q_ref)
+        segments.append(
+            Segment(q, qd, qdd, first(_shifted(e.tau, np.full(robot.n, e.torque_shift - 0.5))), working, q_ref)
+        )
     count = sum(second.count(s.q.shape[0]) for s in segments)
     samples = sum(e.q.shape[0] for e in experiments)
     if count < LEAST_ROWS or samples < LEAST_SAMPLES:
@@ -277,8 +293,9 @@ def make_bench(experiments: Sequence[Experiment], robot: RobotConfig, moving: ND
             f"the recordings are too short for a check of the set-up: {samples} samples, {count} after filtering; "
             f"at least {LEAST_SAMPLES} and {LEAST_ROWS} are needed: record longer"
         )
-    generic = robot.model_copy(update={"gravity": tuple(GENERIC), "effects": ()})
-    return Bench(ArmModel.from_config(generic), robot, tuple(segments), second, moving, dt)
+    if model is None:
+        model = ArmModel.from_config(robot.model_copy(update={"gravity": tuple(GENERIC), "effects": ()}))
+    return Bench(model, robot, tuple(segments), second, moving, dt)
 
 
 def _shifted(x: Array, samples: Array) -> Array:

@@ -15,8 +15,9 @@ from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.clipping import clipped_torques
 from armident.identify.setup.describe import described
 from armident.identify.setup.fit import Hypothesis, joint_errors
-from armident.identify.setup.result import SetupCheck, SetupFinding
+from armident.identify.setup.result import SetupCheck, SetupFinding, TorqueShift
 from armident.identify.setup.search import NOT_UNDERSTOOD, STRUCTURED, Search, Step
+from armident.identify.setup.torque_shift import SHIFT_RATE, torque_shift
 
 Array = NDArray[np.float64]
 
@@ -93,15 +94,28 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> SetupCheck:
         tried = tried | again.tried
     findings += signals.rate_findings(experiments, robot)
     findings += _clipped(bench, best, robot, {name for finding in findings for name in finding.joints})
+    lost = _not_understood(bench, best)
     return SetupCheck(
         findings=(*setup_findings, *findings),
         relative_error_pct=before,
         corrected_error_pct=_errors(bench, best.h),
-        joints_not_understood=_not_understood(bench, best),
+        joints_not_understood=lost,
         tried=tuple(words for family, words in TRIED.items() if family in tried),
         corrected_robot=corrected,
         clock=clock,
+        torque_shift=None if lost else _torque_shift(experiments, bench, best),
     )
+
+
+def _torque_shift(experiments: Sequence[Experiment], bench: Bench, best: Step) -> TorqueShift | None:
+    """Return the common shift of the torques; ``None`` with a longer one as a finding, or where none is determined."""
+    if "time_shift" in best.families:
+        return None
+    try:
+        finer = make_bench(experiments, bench.robot, bench.moving, SHIFT_RATE, bench.model)
+        return torque_shift(finer, best.h)
+    except (DataError, np.linalg.LinAlgError):
+        return None
 
 
 def _searched(

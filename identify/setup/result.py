@@ -1,8 +1,22 @@
 """Result of the set-up check."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from armident.configs import RobotConfig
+from armident.identify.experiment import Experiment
+
+SIGNIFICANT = 3.0
+"""Standard deviations from which a shift is significant: one false alarm in 370, as for `torque_delay`."""
+
+LEAST_AGREEMENT = 0.01
+"""Least p-value of the test that all joints have one shift: a refusal by chance in one recording of a hundred."""
+
+LONGEST = 1.0
+"""Longest shift that is corrected without a finding, samples: longer ones are `time_shift`, a mistake of the set-up."""
+
+MOST_UNCERTAIN = 0.25
+"""Largest standard deviation of a shift that is corrected, samples: half a sample is then known by a factor of 2."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +50,53 @@ class SetupFinding:
 
 
 @dataclass(frozen=True)
+class TorqueShift:
+    """Time by which all torques together are late against the positions, beyond the torque held until the next sample.
+
+    Parameters
+    ----------
+    samples, std
+        Common estimate and its standard deviation, samples; negative: early.
+    dt
+        Sampling period, s.
+    by_joint
+        Estimate and standard deviation of every joint that moves, samples.
+    agreement
+        Probability of shifts that differ as much if the joints have one in common, chi-squared test.
+    instrumented
+        True if recorded references gave instruments that no disturbance of the loop affects.
+    """
+
+    samples: float
+    std: float
+    dt: float
+    by_joint: dict[str, tuple[float, float]]
+    agreement: float
+    instrumented: bool
+
+    @property
+    def applied(self) -> bool:
+        """True if the shift is significant, common to the joints and no longer than a sample: it is corrected."""
+        certain = abs(self.samples) > SIGNIFICANT * self.std and self.std <= MOST_UNCERTAIN
+        compared = sum(std <= MOST_UNCERTAIN for _, std in self.by_joint.values())
+        # Disturbances that feed back bias each joint differently: without instruments, two joints must confirm it.
+        agreed = self.agreement >= LEAST_AGREEMENT and (self.instrumented or compared >= 2)
+        return certain and agreed and abs(self.samples) <= LONGEST
+
+    @property
+    def remark(self) -> str:
+        """The correction in one sentence; empty if none is made."""
+        if not self.applied:
+            return ""
+        direction = "late" if self.samples > 0 else "early"
+        return (
+            f"all torques are {abs(self.samples):.2f} +- {self.std:.2f} samples "
+            f"({1000 * abs(self.samples) * self.dt:.3g} ms) {direction} against the positions: identify and diagnose "
+            "align their equations with it"
+        )
+
+
+@dataclass(frozen=True)
 class SetupCheck:
     """Result of `armident.identify.setup.check.check_setup`.
 
@@ -56,6 +117,8 @@ class SetupCheck:
         Configuration with the corrections that a configuration can express; ``None`` if there are none.
     clock
         True over recorded duration: the sampling period has to be multiplied by it.
+    torque_shift
+        Common shift of the torques by less than a sample or two; ``None``: not estimated.
     """
 
     findings: tuple[SetupFinding, ...]
@@ -65,3 +128,19 @@ class SetupCheck:
     tried: tuple[str, ...]
     corrected_robot: RobotConfig | None
     clock: float = 1.0
+    torque_shift: TorqueShift | None = None
+
+
+def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | None) -> list[Experiment]:
+    """Return the experiments with a shift of their torques that the equations of motion allow for.
+
+    Parameters
+    ----------
+    experiments
+        As recorded.
+    shift
+        Common shift; ``None``, or one that is not applied: no change.
+    """
+    if shift is None or not shift.applied:
+        return list(experiments)
+    return [replace(e, torque_shift=e.torque_shift + shift.samples) for e in experiments]

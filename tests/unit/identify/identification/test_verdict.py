@@ -34,6 +34,7 @@ from armident.identify.identification.result_check import (
 from armident.identify.identification.torque_delay import TorqueDelay
 from armident.identify.identification.verdict import Reason, judge
 from armident.identify.regression.equations import Estimate, ExperimentEquations
+from armident.identify.setup.result import TorqueShift
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import differentiate
 from armident.virtual_robot.offline import simulate_recording
@@ -81,6 +82,7 @@ class Setup:
     findings: tuple[Finding, ...] = ()
     joints_not_understood: tuple[str, ...] = ()
     tried: tuple[str, ...] = ("signs", "order")
+    torque_shift: TorqueShift | None = None
 
 
 @pytest.mark.slow

@@ -1,0 +1,98 @@
+"""Confirmation of a finding by the report part of the data, which chose nothing."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.predictive_score import SUMS
+from armident.identify.diagnosis.regression import applied
+from armident.identify.diagnosis.whitening import rows_of_joints, whitened
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """Comparison of two models on the report part.
+
+    Parameters
+    ----------
+    p_value
+        Probability of so large a projection of the errors without the effect on the change by the effect, if the effect
+        is not there.
+    before, after
+        Relative errors without and with the effect, percent, (n,).
+    noiseless
+        Relative errors with the effect whose torque is computed at the simulated motion, percent, (n,): measured
+        positions that are differentiated twice for an effect may add more noise than it has torque.
+    """
+
+    p_value: float
+    before: Array
+    after: Array
+    noiseless: Array
+
+    @property
+    def share(self) -> Array:
+        """Share of the power of the errors of each joint that the effect removes, (n,)."""
+        return np.asarray(1.0 - (self.best / np.maximum(self.before, 1e-300)) ** 2)
+
+    @property
+    def best(self) -> Array:
+        """Relative errors with the effect, at measured or at simulated motion: where they are smaller altogether."""
+        return min(self.after, self.noiseless, key=lambda errors: float(np.sum(np.log(np.maximum(errors, 1e-300)))))
+
+    @property
+    def smaller(self) -> bool:
+        """True if the errors are smaller with the effect: the mean of their logarithms, as joints differ in size."""
+        return float(np.mean(np.log(np.maximum(self.best, 1e-300) / np.maximum(self.before, 1e-300)))) < 0.0
+
+
+def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
+    """Compare two models that differ in one effect on the report part.
+
+    The errors of the model without the effect are projected on the change of the prediction (Clark, West 2007, Journal
+    of Econometrics 138). The change is computed at the simulated motion, which is free of noise. Its variance comes
+    from sums over blocks of time, whatever the serial correlation of the errors.
+
+    Parameters
+    ----------
+    with_it, without
+        Models with and without the effect.
+    """
+    noise = with_it.fit.noise
+    before, after = (state.fit.errors(state.fit.theta, held=True) for state in (without, with_it))
+    if with_it.study.recorded == without.study.recorded:
+        theta = _less(with_it, without)
+        change = [applied(z, theta) for _, z, _ in with_it.fit.equations.held]
+    else:
+        change = [b - a for b, a in zip(before, after, strict=True)]
+    noiseless = [b - c for b, c in zip(before, change, strict=True)]
+    products = whitened(before, noise) * whitened(change, noise)
+    sums = np.zeros(SUMS)
+    for rows in rows_of_joints([e.shape[0] for e in before], noise):
+        sums += [part.sum() for part in np.array_split(products[rows], SUMS)]
+    spread = float(sums.std(ddof=1)) / np.sqrt(SUMS)
+    torque = np.concatenate([s.y for s in with_it.study.held])
+    return Confirmation(
+        float(stats.t.sf(float(sums.mean()) / max(spread, 1e-300), SUMS - 1)),
+        *(_relative(errors, torque) for errors in (before, after, noiseless)),
+    )
+
+
+def _relative(errors: list[Array], torque: Array) -> Array:
+    """Norm of the errors of each joint over that of its torque, percent, (n,)."""
+    size = np.linalg.norm(np.concatenate(errors), axis=0)
+    return np.asarray(100 * size / np.maximum(np.linalg.norm(torque, axis=0), 1e-300))
+
+
+def _less(with_it: ModelState, without: ModelState) -> Array:
+    """Parameters of the model with the effect less those of the model without it, (b,)."""
+    names = with_it.study.model.base.names
+    difference: Array = with_it.fit.theta.copy()
+    for name, value in zip(without.study.model.base.names, without.fit.theta, strict=True):
+        difference[names.index(name)] -= value
+    return difference

@@ -1,0 +1,94 @@
+"""Detection limits: smallest size of each effect that a diagnosis of these recordings would find."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from armident.identify.diagnosis.candidates import Candidate, Shapes, Workshop, candidates
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.precision import variance_of_sum
+from armident.identify.diagnosis.screening import directions_beside
+from armident.identify.diagnosis.selection import Step
+from armident.identify.diagnosis.whitening import rows_of_joints
+from armident.identify.document import DetectionLimit
+from armident.identify.effects.unnamed import NAME as UNNAMED
+
+Array = NDArray[np.float64]
+
+POWER = 0.9
+"""Probability of detection at the detection limit."""
+CONTAINED = 1e-2
+"""Share of a column in the directions orthogonal to the model below which the model contains it."""
+
+
+def detection_limits(state: ModelState, step: Step | None, criteria: Criteria) -> list[DetectionLimit]:
+    """Return the detection limits of the effects that are not in the model.
+
+    Each linear parameter is treated by itself, at the nonlinear parameters that fit best. At the limit, the gain of
+    log-likelihood reaches the threshold of the selection with probability `POWER`, and the error of the joint falls by
+    the share that a finding requires.
+
+    Parameters
+    ----------
+    state
+        Model with all findings.
+    step
+        Comparison of all effects in that model; ``None`` if it was not made.
+    criteria
+        Thresholds.
+    """
+    workshop = Workshop(state.study, state.fit.theta)
+    shapes = {} if step is None else {a.candidate.key: a.shapes for a in reversed(step.ranked)}
+    every = [c for c in candidates(workshop) if c.effect.name != UNNAMED and not c.effect.law and not c.effect.sudden]
+    found: list[DetectionLimit] = []
+    for candidate in every:
+        if candidate.effect.order_of and candidate.key not in shapes:
+            continue
+        middle = candidate.grid[len(candidate.grid) // 2] if candidate.grid else ()
+        sizes = _smallest(state, workshop, candidate, shapes.get(candidate.key, middle), len(every), criteria)
+        if sizes is not None and np.isfinite(sizes).any():
+            found.append(_entry(state, candidate, sizes))
+    return found
+
+
+def _smallest(
+    state: ModelState, workshop: Workshop, candidate: Candidate, shapes: Shapes, tests: int, criteria: Criteria
+) -> Array | None:
+    """Smallest detectable size (k,) of each linear parameter; infinite where it is not detectable."""
+    fit = state.fit
+    z = workshop.instruments(candidate.effect, candidate.place, shapes, fit.noise, keep=False)
+    basis = directions_beside(fit, z)
+    if basis is None:
+        return None
+    u, right, scale = basis
+    able = np.linalg.norm(right, axis=1) > CONTAINED
+    # Coordinates of each column in orthonormal directions beside the model.
+    along = u.T @ z
+    score = np.sqrt(2.0 * np.log(max(tests, 1) / criteria.alpha["selection"])) + float(stats.norm.ppf(POWER))
+    residual = fit.residual
+    rows = rows_of_joints([s.y.shape[0] for s in fit.study.train], fit.noise)
+    sizes = np.full(scale.size, np.inf)
+    for k in np.flatnonzero(able):
+        own = u @ along[:, k]
+        size = float(own @ own)
+        if size == 0.0:
+            continue
+        inflation = max(1.0, variance_of_sum(own * residual) / size)
+        powers = np.array([[float(of[r] @ of[r]) for of in (residual, own)] for r in rows])
+        share = criteria.least_share * float(np.min(powers[:, 0] / np.maximum(powers[:, 1], 1e-300)))
+        sizes[k] = max(score * np.sqrt(inflation / size), np.sqrt(share))
+    return sizes
+
+
+def _entry(state: ModelState, candidate: Candidate, sizes: Array) -> DetectionLimit:
+    joints, place = state.study.joints, candidate.place
+    kind = int(state.study.robot.joints[place.joint].type == "prismatic")
+    finite = [(p, float(v)) for p, v in zip(candidate.effect.linear, sizes, strict=True) if np.isfinite(v)]
+    return DetectionLimit(
+        effect=candidate.effect.name,
+        joint=joints[place.joint],
+        other=None if place.other is None else joints[place.other],
+        limits={p.name: float(f"{v:.2g}") for p, v in finite},
+        units={p.name: p.unit[kind] for p, _ in finite},
+    )

@@ -1,0 +1,173 @@
+"""Model of one step of a diagnosis: the data with its closed loop, the fit, and the predictive score."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs import RobotConfig
+from armident.configs.schema.robot import Effect as Entry
+from armident.identify.diagnosis.predictive_score import PredictiveScore
+from armident.identify.diagnosis.regression import Fit, fit
+from armident.identify.diagnosis.study import Study
+from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.terms import Term, arm_model, effect_terms
+from armident.identify.robot.arm import ArmModel
+
+Array = NDArray[np.float64]
+
+ITERATIONS = 4
+"""Most iterations between terms that scale predicted torques and the torques that the fit predicts."""
+CONVERGED = 0.1
+"""Change of their parameters, in standard deviations, that ends the iterations."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelState:
+    """Model of one step of the selection.
+
+    Parameters
+    ----------
+    study
+        Data with the model and the motion of its closed loop.
+    fit
+        Fit of the model.
+    """
+
+    study: Study
+    fit: Fit
+
+    @property
+    def robot(self) -> RobotConfig:
+        """Configuration of the model."""
+        return self.study.robot
+
+    @cached_property
+    def score(self) -> PredictiveScore:
+        """Predictive score on the training data."""
+        return PredictiveScore(self.fit)
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """Effects of the model."""
+        return effect_terms(self.study.model)
+
+    def values_of(self, term: Term) -> tuple[Array, Array]:
+        """Linear parameters of a term and their standard deviations, (k,) each.
+
+        Parameters
+        ----------
+        term
+            Term of the model.
+        """
+        own = [self.study.model.base.names.index(name) for name in term.names]
+        return self.fit.theta[own], np.sqrt(np.maximum(np.diag(self.fit.covariance)[own], 0.0))
+
+    def term_of(self, entry: Entry) -> Term:
+        """Term of an entry of the configuration.
+
+        Parameters
+        ----------
+        entry
+            Entry that is a term of the model, and no correction of the recordings.
+        """
+        return self.terms[[e for e in self.robot.effects if not of_recording(e)].index(entry)]
+
+    def with_values(self, shapes: Mapping[int, Mapping[str, float]] | None = None) -> RobotConfig:
+        """Configuration with the estimated values in its effect entries.
+
+        Parameters
+        ----------
+        shapes
+            Other nonlinear parameters, by number of the entry and name.
+        """
+        entries: list[Entry] = list(self.robot.effects)
+        for k, entry in enumerate(entries):
+            if of_recording(entry):
+                continue
+            term = self.term_of(entry)
+            values, _ = self.values_of(term)
+            linear = {p.name: float(value) for p, value in zip(term.linear, values, strict=True)}
+            found = {**term.shapes, **linear, **dict((shapes or {}).get(k, {}))}
+            entries[k] = entry.model_copy(update={"parameters": found})
+        return self.robot.model_copy(update={"effects": tuple(entries)})
+
+
+def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> ModelState:
+    """Fit the model of a configuration in the closed loop that it makes.
+
+    Parameters
+    ----------
+    study
+        Data with another model of the same recordings.
+    robot
+        Configuration of the model.
+    before
+        Earlier model, whose rigid parameters predict the torques on which terms depend; ``None``: fit a rigid model
+        first.
+
+    Raises
+    ------
+    DataError
+        If the motion does not determine the parameters of the model.
+    """
+    changed = study.of_robot(robot)
+    model = changed.model
+    theta: Array | None = None
+    if before is not None:
+        theta = padded(before.fit, model)
+    elif any(term.depends_on_torque for term in effect_terms(model)):
+        bare = robot.model_copy(update={"effects": ()})
+        rigid = fit(replace(changed, robot=bare, model=arm_model(bare)))
+        theta = np.concatenate([rigid.theta, np.zeros(model.e)])
+    start = None if before is None else before.fit.noise
+    first = fit(changed, theta, start)
+    moved = changed.resimulated(first.theta)
+    if moved is not changed:
+        first = fit(moved, first.theta if model.e else None, first.noise)
+    if any(term.scales_torque for term in effect_terms(model)):
+        first = _iterated(first)
+    return ModelState(moved, first)
+
+
+def with_report_part(state: ModelState) -> ModelState:
+    """Return a model whose loop is simulated for the report part, too; the selection simulates the training part alone.
+
+    Parameters
+    ----------
+    state
+        Model of the selection.
+    """
+    moved = state.study.with_report_part(state.fit.theta)
+    equations = replace(state.fit.equations, study=moved)
+    return ModelState(moved, replace(state.fit, study=moved, equations=equations))
+
+
+def _iterated(found: Fit) -> Fit:
+    """Fit whose terms scale the torques predicted by the model itself, by iteration.
+
+    A drive that gives half its torque scales another torque than the model without it predicts.
+    """
+    terms = slice(found.study.model.base.b - found.study.model.e, None)
+    for _ in range(ITERATIONS):
+        before, std = found.theta[terms], np.sqrt(np.diag(found.covariance)[terms])
+        found = fit(found.study, found.theta, found.noise)
+        if np.all(np.abs(found.theta[terms] - before) <= CONVERGED * std):
+            break
+    return found
+
+
+def padded(before: Fit, model: ArmModel) -> Array:
+    """Rigid parameters of an earlier fit, zeros for the terms, (b,).
+
+    Parameters
+    ----------
+    before
+        Earlier fit.
+    model
+        Model with terms.
+    """
+    rigid = before.theta[: before.study.model.base.b - before.study.model.e]
+    return np.concatenate([rigid, np.zeros(model.e)])

@@ -1,0 +1,238 @@
+"""Time shift between all torques and the positions, in fractions of a sample, estimated with instruments (thesis 2.33).
+
+Drives and importers differ in when a torque is sampled against the position. At low rates half a sample changes the
+residual of the rigid model as much as an effect does. A recorded torque that is late by ``s`` is, to first order,
+``phi theta - s d(phi theta)/dt``: one more parameter of each joint, beside all others.
+
+Two errors would enter such an estimate, and have terms or instruments of their own:
+
+- A disturbance moves the arm first and the torque of the closed loop afterwards. The instruments are therefore the
+  regressors of the motion that a linear filter makes of the recorded references.
+- Dry friction does not change where the velocity does: a joint stops suddenly, and leaves standstill slowly. The
+  change of the friction with time has free factors, so that inertia and gravity alone determine the shift.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from armident.identify.regression.ar_noise import ArModel, fit_ar
+from armident.identify.setup.bench import Bench
+from armident.identify.setup.fit import Hypothesis
+from armident.identify.setup.result import TorqueShift
+
+Array = NDArray[np.float64]
+Motion = tuple[Array, Array, Array]
+
+SHIFT_RATE = 20.0
+"""Rate of the derivatives over the cut-off: central differences then err by 3 % at the cut-off itself."""
+
+MOST_SAMPLES = 8000
+"""Largest number of samples at the working rate: 20 s of six axes at 400 Hz. The first part of longer recordings."""
+
+MAX_AR_ORDER = 10
+"""Highest order of the noise models after decimation."""
+
+PASSES = 2
+"""Fits with noise models, after the first one without."""
+
+RANK = 1e-6
+"""Singular value of the normalised regressor, relative to the largest, from which a direction counts as excited."""
+
+LAGS = 16
+"""Coefficients of the filter from reference to motion: eight closed-loop periods at the rate of the rows."""
+
+WIDTHS = (0.02, 0.005)
+"""Shares of a joint's largest velocity over which the smoothed signs of its dry friction change."""
+
+BREAKAWAY = 0.1
+"""Share of a joint's largest velocity over which its friction of low velocities decays."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """Regressors of one joint at the rows and at the working rate, for all segments.
+
+    Parameters
+    ----------
+    rows
+        Filtered and decimated, (M, c) per segment.
+    fine
+        At the working rate, (W, c) per segment.
+    """
+
+    rows: list[Array]
+    fine: list[Array]
+
+
+def torque_shift(bench: Bench, h: Hypothesis) -> TorqueShift:
+    """Estimate the common shift of the torques, and its agreement with the shift of every single joint.
+
+    Parameters
+    ----------
+    bench
+        Signals, made with the working rate `SHIFT_RATE`.
+    h
+        Corrections of the signals; its shift is not used.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the motion determines no shift.
+    """
+    segments = _shortened(bench)
+    joints = [int(j) for j in np.flatnonzero(bench.moving)]
+    instrumented = all(s.q_ref is not None for s in segments.segments)
+    measured = _columns(segments, h, [(s.q, s.qd, s.qdd) for s in segments.segments])
+    followed = _columns(segments, h, _followed(segments)) if instrumented else measured
+    y = [bench.decimation(s.tau @ h.torque.T) for s in segments.segments]
+    basis = _excited([np.concatenate(measured[j].rows) for j in joints], [_scale(y, j) for j in joints])
+    noise = [ArModel(np.empty(0), 1.0 / _scale(y, j) ** 2, 0.0) for j in joints]
+    theta, covariance = np.zeros(basis.shape[1]), np.empty((0, 0))
+    for done in range(PASSES + 1):
+        shifts = len(joints) if done else 0
+
+        def block(columns: _Columns, k: int, theta: Array = theta, shifts: int = shifts) -> list[Array]:
+            return [
+                np.hstack([r @ basis, _late(bench, f @ (basis @ theta[: basis.shape[1]]), k, shifts)])
+                for r, f in zip(columns.rows, columns.fine, strict=True)
+            ]
+
+        x = [block(measured[j], k) for k, j in enumerate(joints)]
+        z = [block(followed[j], k) for k, j in enumerate(joints)] if instrumented else x
+        theta, covariance = _solved(z, x, [[v[:, j] for v in y] for j in joints], noise)
+        noise = [
+            fit_ar([v[:, j] - own @ theta for v, own in zip(y, x[k], strict=True)], MAX_AR_ORDER)
+            for k, j in enumerate(joints)
+        ]
+    c, samples = basis.shape[1], segments.period
+    return _common(theta[c:] / samples, covariance[c:, c:] / samples**2, segments, instrumented)
+
+
+def _shortened(bench: Bench) -> Bench:
+    total = sum(s.q.shape[0] for s in bench.segments)
+    if total <= MOST_SAMPLES:
+        return bench
+    least = 2 * bench.decimation.taps.size
+    kept = [max(int(s.q.shape[0] * MOST_SAMPLES / total), least) for s in bench.segments]
+    cut = [
+        replace(s, q=s.q[:k], qd=s.qd[:k], qdd=s.qdd[:k], tau=s.tau[:k], q_ref=None if s.q_ref is None else s.q_ref[:k])
+        for s, k in zip(bench.segments, kept, strict=True)
+    ]
+    return replace(bench, segments=tuple(cut))
+
+
+def _columns(bench: Bench, h: Hypothesis, motions: Sequence[Motion]) -> list[_Columns]:
+    """Regressors of every joint: rigid arm, then the free friction terms of all joints."""
+    n, model = bench.n, bench.model.with_gravity(h.gravity)
+    dry = [bench.column(f"fc{j + 1}") for j in range(n)]
+    top = np.maximum(np.max([np.abs(s.qd @ h.position.T).max(axis=0) for s in bench.segments], axis=0), 1e-12)
+    found = [_Columns([], []) for _ in range(n)]
+    for motion, segment in zip(motions, bench.segments, strict=True):
+        q, qd, qdd = (np.ascontiguousarray(v @ h.position.T) for v in motion)
+        x = model.rigid_regressor(q, qd, qdd)
+        x[:, :, dry] = 0.0
+        filtered = bench.decimation(x)
+        friction = _friction(qd, top, segment.dt)
+        terms, low = friction.shape[2], bench.decimation(friction)
+        for j in range(n):
+            for into, rigid, own in ((found[j].fine, x, friction), (found[j].rows, filtered, low)):
+                columns = np.zeros((rigid.shape[0], bench.rigid + terms * n))
+                columns[:, : bench.rigid] = rigid[:, j]
+                columns[:, bench.rigid + terms * j : bench.rigid + terms * (j + 1)] = own[:, j]
+                into.append(columns)
+    return found
+
+
+def _friction(qd: Array, top: Array, dt: float) -> Array:
+    """Free friction terms (W, n, .): dry, its change with time, asymmetric viscous, quadratic, at low velocity."""
+    u = qd / top
+    signs = [2 / np.pi * np.arctan(u / width) for width in WIDTHS]
+    changes = [np.gradient(sign, dt, axis=0) for sign in signs]
+    others = [np.abs(u), u * np.abs(u), signs[0] * np.exp(-np.abs(u) / BREAKAWAY)]
+    return np.stack([*signs, *changes, *others], axis=2)
+
+
+def _followed(bench: Bench) -> list[Motion]:
+    """Motions that a linear filter makes of the references, with its coefficients fitted to each joint."""
+    step = bench.decimation.factor
+    lagged = []
+    for s in bench.segments:
+        assert s.q_ref is not None
+        padded = np.concatenate([np.repeat(s.q_ref[:1], step * LAGS, axis=0), s.q_ref])
+        parts = [padded[step * (LAGS - k) :][: s.q.shape[0]] for k in range(LAGS)]
+        lagged.append(np.stack([*parts, np.ones_like(s.q)], axis=2))
+    followed = [np.empty_like(s.q) for s in bench.segments]
+    for j in range(bench.n):
+        taps = np.linalg.lstsq(
+            np.concatenate([v[:, j] for v in lagged]),
+            np.concatenate([s.q[:, j] for s in bench.segments]),
+            rcond=1e-8,
+        )[0]
+        for q, v in zip(followed, lagged, strict=True):
+            q[:, j] = v[:, j] @ taps
+    motions = []
+    for q, s in zip(followed, bench.segments, strict=True):
+        qd = np.gradient(q, s.dt, axis=0)
+        motions.append((q, qd, np.gradient(qd, s.dt, axis=0)))
+    return motions
+
+
+def _scale(y: Sequence[Array], j: int) -> float:
+    """One over the rms torque of a joint."""
+    return float(1.0 / max(np.sqrt(np.mean(np.concatenate([v[:, j] for v in y]) ** 2)), 1e-300))
+
+
+def _excited(x: Sequence[Array], scale: Sequence[float]) -> Array:
+    """Combinations of columns, (c, r), that the motion excites."""
+    scaled = np.concatenate([s * v for v, s in zip(x, scale, strict=True)])
+    gram = scaled.T @ scaled
+    norms = np.sqrt(np.diag(gram))
+    used = norms > 1e-12 * norms.max()
+    values, vectors = np.linalg.eigh(gram[np.ix_(used, used)] / np.outer(norms[used], norms[used]))
+    kept = values > max(RANK**2, 1e-14) * values[-1]
+    basis = np.zeros((norms.size, int(kept.sum())))
+    basis[used] = vectors[:, kept] / norms[used, None]
+    return basis
+
+
+def _late(bench: Bench, torque: Array, k: int, shifts: int) -> Array:
+    """Columns (M, shifts) of the delays: that of joint k holds the filtered change of its torque."""
+    columns = np.zeros((bench.decimation.count(torque.shape[0]), shifts))
+    if shifts:
+        columns[:, k] = -bench.decimation(np.gradient(torque, bench.segments[0].dt)[:, None])[:, 0]
+    return columns
+
+
+def _solved(
+    z: Sequence[Sequence[Array]], x: Sequence[Sequence[Array]], y: Sequence[Sequence[Array]], noise: Sequence[ArModel]
+) -> tuple[Array, Array]:
+    """Instrumental-variable estimate (2.33) of rows whitened by their noise, and its covariance."""
+    c = x[0][0].shape[1]
+    left, right, meat, rows = np.zeros((c, c)), np.zeros(c), np.zeros((c, c)), 0
+    for zeta, phi, tau, ar in zip(z, x, y, noise, strict=True):
+        for a, b, t in zip(zeta, phi, tau, strict=True):
+            wb, wt = ar.whiten(b), ar.whiten(t)
+            wa = wb if a is b else ar.whiten(a)
+            left, right, meat, rows = left + wa.T @ wb, right + wa.T @ wt, meat + wa.T @ wa, rows + wt.size
+    inverse = np.linalg.inv(left)
+    covariance = inverse @ meat @ inverse.T * (rows / max(rows - c, 1))
+    return inverse @ right, covariance
+
+
+def _common(samples: Array, covariance: Array, bench: Bench, instrumented: bool) -> TorqueShift:
+    """Weighted mean of the joints' shifts, and the chi-squared test that they are equal."""
+    weights = np.linalg.inv(covariance)
+    variance = 1.0 / float(weights.sum())
+    common = variance * float(weights.sum(axis=0) @ samples)
+    apart = samples - common
+    agreement = float(stats.chi2.sf(apart @ weights @ apart, samples.size - 1)) if samples.size > 1 else 1.0
+    if not (variance > 0 and np.isfinite([common, variance, agreement]).all()):
+        raise np.linalg.LinAlgError("the motion determines no shift of the torques")
+    names = [bench.robot.joints[j].name for j in np.flatnonzero(bench.moving)]
+    std = np.sqrt(np.diag(covariance))
+    each = {name: (float(s), float(d)) for name, s, d in zip(names, samples, std, strict=True)}
+    return TorqueShift(common, float(np.sqrt(variance)), bench.period, each, agreement, instrumented)
