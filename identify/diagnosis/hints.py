@@ -1,6 +1,6 @@
 """Maintenance hints: probable causes of a residual dependence and checks at the machine."""
 
-from armident.identify.diagnosis.maps import Kind
+from armident.identify.diagnosis.free_functions import Kind
 
 HINTS: dict[Kind, str] = {
     "velocity": (
@@ -38,6 +38,10 @@ HINTS: dict[Kind, str] = {
     "time and direction": (
         "friction of {joint} changed during the recording: let the arm warm up, and check that the "
         "lubricant suits the temperature"
+    ),
+    "position of another joint": (
+        "the torque of {joint} follows the position of {other}: look for a cable, a hose or a spring between the "
+        "joints, and for a wrongly placed mass in the model"
     ),
     "velocity of another joint": (
         "the torque of {joint} follows the velocity of {other}: look for a shared gear, belt or hose, and for"
@@ -95,7 +99,7 @@ def unit_of(kind: Kind, joint: str) -> str:
     match kind:
         case "velocity" | "velocity of another joint":
             return f"{length}/s"
-        case "position" | "position and direction" | "motor angle":
+        case "position" | "position and direction" | "motor angle" | "position of another joint":
             return length
         case "acceleration":
             return f"{length}/s^2"

@@ -1,0 +1,244 @@
+"""Free functions of the variables on which a residual may depend, and the dependence with its curve."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.diagnosis.study import Study
+from armident.identify.robot.motion import Motion
+
+Array = NDArray[np.float64]
+
+Kind = Literal[
+    "velocity", "position", "position and direction", "motor angle", "load", "load and direction", "torque",
+    "acceleration", "time", "time and direction", "position of another joint", "velocity of another joint",
+    "torque of another joint", "frequency", "motion", "transients",
+]  # fmt: skip
+"""Variables; those with a direction have the opposite sign in the negative direction. The last two have no free
+functions of their own: a frequency independent of the motion, and all functions of the motion together."""
+
+SIDE = (0.0, 0.05, 0.15, 0.35, 0.65, 1.0)
+"""Speeds of the knots of either direction, over the top speed: close at low speeds, where friction is curved."""
+
+COARSE, FINE, FEW = 8, 24, 6
+"""Knots over the range of a variable: of a wide shape, of a local one, and of one under many."""
+
+HARMONICS = 6
+"""Harmonics of one set of functions of an angle."""
+
+SETS = 4
+"""Sets of functions of an angle: the first has harmonics 1 to `HARMONICS`, the next ones continue."""
+
+POINTS = 121
+"""Points of a curve."""
+
+
+@dataclass(frozen=True)
+class FreeFunction:
+    """Set of basis functions of one variable, for the residual of one joint (thesis 7.3.2).
+
+    Parameters
+    ----------
+    joint
+        Number of the joint of the residual.
+    kind
+        Kind of the variable.
+    other
+        Joint or motor to which the variable belongs, if it is another one.
+    knots
+        Knots of the hat functions, increasing; for an angle the wave numbers; for the time the time constant, s.
+    low, high
+        Range of the curve.
+    """
+
+    joint: int
+    kind: Kind
+    other: int | None
+    knots: tuple[float, ...]
+    low: float
+    high: float
+
+    @property
+    def directed(self) -> bool:
+        """True if the shape changes sign with the direction of motion."""
+        return self.kind.endswith("and direction")
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Key that sets of several joints with the same functions share."""
+        at = self.joint if self.other is None else self.other
+        if self.kind.startswith("time"):
+            at = -1
+        side = self.joint if self.directed else None
+        return self.kind.removesuffix(" of another joint"), at, side, self.knots
+
+    def variable(self, motion: Motion) -> Array:
+        """Values of the variable, (N,).
+
+        Parameters
+        ----------
+        motion
+            Motion of the arm, N samples.
+        """
+        at = self.joint if self.other is None else self.other
+        match self.kind:
+            case "velocity" | "velocity of another joint":
+                return motion.qd[:, at]
+            case "position" | "position and direction" | "position of another joint":
+                return motion.q[:, at]
+            case "motor angle":
+                return motion.motor[:, at]
+            case "load" | "load and direction":
+                return motion.transmitted[:, at]
+            case "torque" | "torque of another joint":
+                return motion.torque[:, at]
+            case "acceleration":
+                return motion.qdd[:, at]
+            case _:
+                return motion.t
+
+    def basis(self, x: Array, side: Array) -> Array:
+        """Basis functions, (N, k).
+
+        Parameters
+        ----------
+        x
+            Values of the variable, (N,).
+        side
+            Smoothed sign of the velocity of the joint, (N,).
+        """
+        if self.kind == "velocity":
+            speed = hats(np.abs(x), self.knots)
+            return np.concatenate([speed * (0.5 + 0.5 * side)[:, None], speed * (0.5 - 0.5 * side)[:, None]], axis=1)
+        if self.kind == "motor angle":
+            angles = x[:, None] * np.array(self.knots)
+            return np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
+        if self.kind.startswith("time"):
+            # A slope and an exponential: they extrapolate beyond the recording.
+            functions = np.stack([x / self.high, -np.expm1(-x / self.knots[0])], axis=1)
+        else:
+            functions = hats(x, self.knots)
+        return functions * side[:, None] if self.directed else functions
+
+    def columns(self, motion: Motion) -> Array:
+        """Basis functions along a motion, without its lead, (N, k).
+
+        Parameters
+        ----------
+        motion
+            Motion of the arm.
+        """
+        return self.basis(self.variable(motion), motion.sign[:, self.joint])[motion.lead :]
+
+    def on_grid(self) -> tuple[Array, Array, list[Array]]:
+        """Points of the curve (G,), the basis there (G, k), and the parts of it that are smooth each, (G', k)."""
+        x = np.linspace(self.low, self.high, POINTS)
+        if self.kind == "velocity":
+            basis = self.basis(x, np.sign(x))
+            # The kink of dry friction at standstill is no roughness.
+            return x, basis, [basis[x <= 0], basis[x >= 0]]
+        basis = self.basis(x, np.ones_like(x))
+        return x, basis, [basis]
+
+
+def hats(x: Array, knots: Sequence[float] | Array) -> Array:
+    """Piecewise linear functions (N, k), one at each knot, constant beyond the outermost.
+
+    Parameters
+    ----------
+    x
+        Values, (N,).
+    knots
+        Increasing knots, (k,).
+    """
+    at = np.asarray(knots, dtype=np.float64)
+    left = np.clip(np.searchsorted(at, x, side="right") - 1, 0, at.size - 2)
+    share = np.clip((x - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)
+    out, rows = np.zeros((x.size, at.size)), np.arange(x.size)
+    out[rows, left] = 1.0 - share
+    out[rows, left + 1] = share
+    return out
+
+
+def free_functions(study: Study, motions: Sequence[Motion], joint: int) -> Iterator[FreeFunction]:
+    """All sets of functions for the residual of one joint.
+
+    Parameters
+    ----------
+    study
+        Data with the robot.
+    motions
+        The training stretches at simulated signals.
+    joint
+        Number of the joint.
+    """
+    top = max(float(np.abs(m.qd[:, joint]).max()) for m in motions)
+    if top > 0:
+        yield FreeFunction(joint, "velocity", None, tuple(top * share for share in SIDE), -top, top)
+    yield from _of_hats(joint, "position", None, motions, COARSE, FINE)
+    yield from _of_hats(joint, "position and direction", None, motions, COARSE)
+    kind: Kind
+    for kind in ("time", "time and direction"):
+        yield FreeFunction(joint, kind, None, (0.2 * study.duration,), 0.0, study.duration)
+    yield from _of_hats(joint, "torque", None, motions, COARSE)
+    yield from _of_hats(joint, "acceleration", None, motions, COARSE)
+    yield from _of_hats(joint, "load", None, motions, COARSE)
+    yield from _of_hats(joint, "load and direction", None, motions, FEW)
+    for motor in np.flatnonzero(study.robot.transmission_matrix[:, joint]):
+        yield from _of_angle(study, joint, int(motor), motions)
+    for other in range(study.robot.n):
+        if other != joint:
+            for kind in ("velocity of another joint", "torque of another joint", "position of another joint"):
+                yield from _of_hats(joint, kind, other, motions, FEW)
+
+
+def _of_hats(
+    joint: int, kind: Kind, other: int | None, motions: Sequence[Motion], *counts: int
+) -> Iterator[FreeFunction]:
+    """Knots at equal distances between the outermost values, so that every shape has the same resolution everywhere."""
+    draft = FreeFunction(joint, kind, other, (0.0,), 0.0, 1.0)
+    values = [draft.variable(m) for m in motions]
+    low, high = min(float(x.min()) for x in values), max(float(x.max()) for x in values)
+    if not high > low:
+        return
+    for count in counts:
+        yield FreeFunction(joint, kind, other, tuple(np.linspace(low, high, count)), low, high)
+
+
+def _of_angle(study: Study, joint: int, motor: int, motions: Sequence[Motion]) -> Iterator[FreeFunction]:
+    """Harmonics of a motor angle; for a prismatic axis, whose pitch may be unknown, wave numbers of its travel."""
+    angles = [m.motor[:, motor] for m in motions]
+    low, high = min(float(x.min()) for x in angles), max(float(x.max()) for x in angles)
+    if not high > low:
+        return
+    # Wave numbers under four half waves of the travel are in the functions of the position already.
+    unit, first = 1.0, 1
+    if study.robot.joints[joint].type == "prismatic":
+        unit, first = np.pi / (high - low), 4
+    else:
+        low, high = 0.0, 2 * np.pi
+    for block in range(SETS):
+        waves = tuple(unit * (first + HARMONICS * block + k) for k in range(HARMONICS))
+        yield FreeFunction(joint, "motor angle", motor, waves, low, high)
+
+
+def in_band(study: Study, motion: Motion, functions: Sequence[FreeFunction]) -> dict[tuple[object, ...], Array]:
+    """Basis functions along a motion in the band of the comparison, (M, k) of every key.
+
+    Parameters
+    ----------
+    study
+        Data with the filter.
+    motion
+        Motion of the arm, at the working rate.
+    functions
+        Sets of functions of all joints.
+    """
+    unique = {f.key: f for f in functions}
+    made = [f.columns(motion) for f in unique.values()]
+    ends = np.cumsum([columns.shape[1] for columns in made])[:-1]
+    # One call of the filter: it is hardly slower for many columns than for one.
+    return dict(zip(unique, np.split(study.decimation(np.concatenate(made, axis=1)), ends, axis=1), strict=True))

@@ -1,0 +1,383 @@
+"""Lack of fit: dependences of the residual of each joint on free functions of the reference motion (thesis 7.3.2).
+
+The residual is that at measured signals; the functions are evaluated at the simulated motion of the closed loop, in
+which measurement noise has no part. They are orthogonal to the regressor of the model, so that errors of its parameters
+cancel. The shape is fitted on the training data, smoothed by likelihood, and tested by its prediction of the held-out
+residual. Noise models come from the residual beyond these functions: an autoregressive model of a residual that
+contains a missing effect takes the effect for noise. Serial correlation beyond the order of that model is contained in
+block sums (Kuensch 1989, Annals of Statistics 17(3)).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.free_functions import FINE, FreeFunction, Kind, free_functions, in_band
+from armident.identify.diagnosis.hints import hint_of, unit_of
+from armident.identify.diagnosis.noise_beyond import noise_beyond
+from armident.identify.diagnosis.projection import JointResidual, Projection
+from armident.identify.diagnosis.regression import Fit
+from armident.identify.diagnosis.spectral_lines import Line, bandwidth_of_motion, lines_of_joints
+from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.whitening import rows_of_joints, whitened
+from armident.identify.robot.motion import Motion
+from armident.identify.signals.periodogram import hann_window, periodogram
+
+Array = NDArray[np.float64]
+
+HELD_OUT_LEVEL = 0.05
+"""Significance level of the held-out data alone: an effect must predict data that did not fit it."""
+
+ROWS_PER_COLUMN = 12
+"""Least number of equations per function of all functions together, against overfitting of short recordings."""
+
+MOST_TAKEN = 3
+"""Most sets of functions taken out of the residual of one joint for its noise model."""
+
+MOST = 2
+"""Most unexplained dependences of one joint."""
+
+OCTAVES = (0.0, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
+"""Edges of the frequencies of the spectrum of a dependence on the motion, over the bandwidth of the motion."""
+
+
+class Fitted(Protocol):
+    """A fitted model: `armident.identify.diagnosis.selection.ModelState`."""
+
+    @property
+    def fit(self) -> Fit:
+        """Fit of the model."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A shape with its uncertainty.
+
+    Parameters
+    ----------
+    x
+        Values of the variable, (G,).
+    value
+        Missing torque of the model there, N m or N, (G,).
+    band
+        Two standard deviations, (G,).
+    """
+
+    x: Array
+    value: Array
+    band: Array
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """Dependence of one joint's residual on one variable.
+
+    Parameters
+    ----------
+    joint
+        Its name.
+    kind, other
+        Variable; the joint or motor to which it belongs, if it is another one.
+    unit
+        Unit of the variable.
+    share
+        Share of the power of the joint's held-out residual that the dependence, fitted on the training data, predicts.
+        For a frequency: share of the residual at the working rate.
+    p_value
+        Probability of so clear a result without the dependence, of this one test.
+    curve
+        Its shape. For a frequency: the spectrum around it. For the motion: the root of the spectral density of the
+        residual, per root of a hertz, with that of the residual without the dependence as band.
+    """
+
+    joint: str
+    kind: Kind
+    other: str | None
+    unit: str
+    share: float
+    p_value: float
+    curve: Curve
+
+    @property
+    def varies_with(self) -> str:
+        """The variable in words."""
+        if self.other is None:
+            return self.kind
+        if self.kind == "motor angle":
+            return f"motor angle of {self.other}"
+        return f"{self.kind.removesuffix(' of another joint')} of {self.other}"
+
+    @property
+    def of_noise(self) -> bool:
+        """True if the band of the curve is the level of noise instead of the uncertainty of the curve."""
+        return self.kind in ("frequency", "motion")
+
+    @property
+    def hint(self) -> str:
+        """Maintenance hint: probable causes and checks at the machine."""
+        height = np.abs(self.curve.value)
+        if self.kind == "motion":
+            height = height / np.maximum(self.curve.band, 1e-300)
+        at = self.curve.x[int(np.argmax(height))]
+        return hint_of(self.kind, self.joint, self.other, f"{at:.3g} {self.unit}")
+
+
+def dependences(state: Fitted, criteria: Criteria | None = None) -> tuple[Dependence, ...]:
+    """Significant dependences of the residual, at most one for each joint and variable, largest share first.
+
+    Parameters
+    ----------
+    state
+        Fitted model.
+    criteria
+        Thresholds.
+    """
+    return LackOfFit(state.fit, criteria or Criteria()).dependences
+
+
+def unexplained(state: Fitted, criteria: Criteria | None = None) -> tuple[Dependence, ...]:
+    """Significant and material dependences, each in addition to the ones before it, largest share first.
+
+    A variable that is merely correlated with a stronger one (speed with torque, for example) is not listed again.
+
+    Parameters
+    ----------
+    state
+        Fitted model.
+    criteria
+        Thresholds.
+    """
+    return LackOfFit(state.fit, criteria or Criteria()).unexplained
+
+
+@dataclass(frozen=True, eq=False)
+class LackOfFit:
+    """All tests of the residual of one fit.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    criteria
+        Thresholds.
+    """
+
+    fit: Fit
+    criteria: Criteria
+
+    @property
+    def level(self) -> float:
+        """Significance level of one test: the false-alarm rate over the number of all tests (Bonferroni)."""
+        return self.criteria.false_alarm_rate / max(self.tests, 1)
+
+    @property
+    def dependences(self) -> tuple[Dependence, ...]:
+        """Significant dependences, at most one for each joint and variable, largest share first."""
+        best: dict[tuple[int, Kind | None, int | None], Projection] = {}
+        for p in sorted(filter(self._significant, self.projections), key=lambda p: p.p_value):
+            at = (p.joint, None, None) if p.function is None else (p.joint, p.function.kind, p.function.other)
+            best.setdefault(at, p)
+        found = [self._dependence(p, self.joints[p.joint]) for p in best.values()]
+        return _by_share([*found, *(self._of_line(*line) for line in self.lines if self._significant(line[1]))])
+
+    @property
+    def unexplained(self) -> tuple[Dependence, ...]:
+        """Significant and material dependences, each in addition to the ones before it, largest share first."""
+        found: list[Dependence] = []
+        for j, own in enumerate(self.joints):
+            mine = [p for p in self.projections if p.joint == j and self._reported(p)]
+            rivals = [p for p in mine if p.function is not None]
+            here: list[Dependence] = []
+            while rivals and len(here) < MOST:
+                best = max(rivals, key=lambda p: p.share)
+                here.append(self._dependence(best, own))
+                own = own.beyond(best.columns)
+                again = [own.projection(p.function, p.columns) for p in rivals if p is not best]
+                rivals = [p for p in again if p is not None and self._reported(p)]
+            named = sum(d.share for d in here)
+            found += here
+            # The motion altogether, where no variable explains the greater part of what it does.
+            found += [self._dependence(p, own) for p in mine if p.function is None and named < 0.5 * p.share]
+            found += [self._of_line(k, line) for k, line in self.lines if k == j and self._reported(line, j)]
+        return _by_share(found)
+
+    def _significant(self, test: Projection | Line) -> bool:
+        return test.p_value < self.level and test.p_held < HELD_OUT_LEVEL and test.share > 0
+
+    def _reported(self, test: Projection | Line, joint: int | None = None) -> bool:
+        """True if a dependence is significant and material."""
+        j = test.joint if isinstance(test, Projection) else joint
+        torque = np.concatenate([s.y[:, j] for s in self.fit.study.train])
+        size = 100.0 * test.size / max(float(np.sqrt(np.mean(torque**2))), 1e-300)
+        material = test.share >= self.criteria.least_share and size >= self.criteria.material_pct
+        return material and self._significant(test)
+
+    def _dependence(self, p: Projection, own: JointResidual) -> Dependence:
+        """Dependence with its curve."""
+        study, share = self.fit.study, min(p.share, 1.0)
+        joint = study.joints[p.joint]
+        if p.function is None:
+            return Dependence(joint, "motion", None, unit_of("motion", ""), share, p.p_value, self._spectrum(p, own))
+        x, basis, _ = p.function.on_grid()
+        band = 2.0 * np.sqrt(np.maximum(np.einsum("gk,kl,gl->g", basis, p.covariance, basis), 0.0))
+        at = p.joint if p.function.other is None else p.function.other
+        return Dependence(
+            joint,
+            p.function.kind,
+            None if p.function.other is None else study.joints[p.function.other],
+            unit_of(p.function.kind, study.robot.joints[at].type),
+            share,
+            p.p_value,
+            Curve(x, basis @ p.values, band),
+        )
+
+    def _of_line(self, joint: int, line: Line) -> Dependence:
+        name, curve = self.fit.study.joints[joint], Curve(line.f, line.amplitude, line.noise)
+        return Dependence(name, "frequency", None, unit_of("frequency", ""), line.share, line.p_value, curve)
+
+    def _spectrum(self, p: Projection, own: JointResidual) -> Curve:
+        """Root of the spectral density of the held-out residual, with that of the rest as band."""
+        study = self.fit.study
+        dt, bandwidth = study.dt * study.decimation.factor, bandwidth_of_motion(study)
+        f = np.fft.rfftfreq(own.errors.size, dt)
+        window = hann_window(own.errors.size)
+        densities = [2.0 * dt * periodogram(window * e) for e in (own.errors, own.errors - p.change)]
+        shown = []
+        for low, high in pairwise(OCTAVES):
+            inside = (f > low * bandwidth) & (f <= high * bandwidth)
+            if inside.any():
+                shown.append((f[inside].mean(), *(np.sqrt(density[inside].mean()) for density in densities)))
+        return Curve(*np.array(shown).T)
+
+    @cached_property
+    def lines(self) -> tuple[tuple[int, Line], ...]:
+        """Strongest spectral line of each joint that has one, with the number of the joint."""
+        return tuple(lines_of_joints(self.fit.study, self.fit.theta))
+
+    @cached_property
+    def projections(self) -> tuple[Projection, ...]:
+        """Tests of all sets of functions of all joints, and of all functions of each joint together."""
+        made = []
+        for own in self.joints:
+            sets = [*zip(self.functions[own.joint], self._sets(own.joint), strict=True)]
+            every = [*sets, (None, self._all_together(own.joint))]
+            made += [own.projection(function, columns) for function, columns in every]
+        return tuple(p for p in made if p is not None)
+
+    @cached_property
+    def functions(self) -> tuple[tuple[FreeFunction, ...], ...]:
+        """Sets of free functions of each joint."""
+        study = self.fit.study
+        motions = [self._motion(s) for s in study.train]
+        return tuple(tuple(free_functions(study, motions, j)) for j in range(study.robot.n))
+
+    @cached_property
+    def joints(self) -> tuple[JointResidual, ...]:
+        """Residual and functions of every joint, whitened by noise models of the residual beyond its dependences."""
+        errors = self.fit.errors(self.fit.theta, held=False)
+        model = [[z[:, j] for _, z, _ in self.fit.equations.train] for j in range(self.fit.study.robot.n)]
+        taken: list[set[int]] = [set() for _ in model]
+        noise = [noise_beyond([e[:, j] for e in errors], z) for j, z in enumerate(model)]
+        while True:
+            joints = self._whitened(self.fit.renoised(noise))
+            changed = False
+            for own, known in zip(joints, taken, strict=True):
+                found = self._clearest(own, known)
+                if found is None or len(known) == MOST_TAKEN:
+                    continue
+                known.add(found)
+                changed = True
+                columns = np.concatenate([self._sets(own.joint)[k] for k in known])
+                functions = [
+                    np.concatenate([z, c[:, columns]], axis=1)
+                    for z, c in zip(model[own.joint], self.columns[0][own.joint], strict=True)
+                ]
+                noise[own.joint] = noise_beyond([e[:, own.joint] for e in errors], functions)
+            if not changed:
+                return joints
+
+    def _clearest(self, own: JointResidual, known: set[int]) -> int | None:
+        """Number of the set of functions with the most significant projection beyond those already taken out."""
+        sets = self._sets(own.joint)
+        for k in known:
+            own = own.beyond(sets[k])
+        every = [
+            (own.projection(f, c), k) for k, (f, c) in enumerate(zip(self.functions[own.joint], sets, strict=True))
+        ]
+        found = [(p.p_value, k) for p, k in every if p is not None and k not in known]
+        p_value, best = min(found, default=(1.0, 0))
+        return best if p_value * self.tests < self.criteria.false_alarm_rate else None
+
+    @cached_property
+    def tests(self) -> int:
+        """Number of all tests: every set of functions, and of each joint all functions together and its spectrum."""
+        return sum(len(own) + 2 for own in self.functions)
+
+    def _whitened(self, fit: Fit) -> tuple[JointResidual, ...]:
+        rows, held_rows = (
+            rows_of_joints([y.shape[0] for _, _, y in part], fit.noise)
+            for part in (fit.equations.train, fit.equations.held)
+        )
+        regressor, instruments = (whitened([row[k] for row in fit.equations.held], fit.noise) for k in range(2))
+        covariance = np.zeros((fit.theta.size,) * 2) if fit.fixed else fit.covariance
+        errors = fit.errors(fit.theta, held=True)
+        out = []
+        for j, (own, unseen) in enumerate(zip(*self.columns, strict=True)):
+            d = np.concatenate([fit.noise[j].whiten(c) for c in own])
+            full = np.zeros((fit.residual.size, d.shape[1]))
+            full[rows[j]] = d
+            away = fit.absorbed(full)
+            change = -instruments @ away
+            change[held_rows[j]] += np.concatenate([fit.noise[j].whiten(c) for c in unseen])
+            band = np.concatenate([c - z[:, j] @ away for c, (_, z, _) in zip(unseen, fit.equations.held, strict=True)])
+            out.append(
+                JointResidual(
+                    j, rows[j], held_rows[j], d, fit.beside(full), change, fit.residual, fit.held_residual, band,
+                    np.concatenate([e[:, j] for e in errors]), held_rows, regressor, covariance,
+                )
+            )  # fmt: skip
+        return tuple(out)
+
+    @cached_property
+    def columns(self) -> tuple[list[list[Array]], list[list[Array]]]:
+        """Functions of each joint in the training and in the held-out data, (M, K) of every stretch."""
+        return self._columns(self.fit.study.train), self._columns(self.fit.study.held)
+
+    def _motion(self, stretch: Stretch) -> Motion:
+        return self.fit.study.motion(stretch, "simulated", self.fit.theta)
+
+    def _columns(self, stretches: Sequence[Stretch]) -> list[list[Array]]:
+        """Functions of each joint at the simulated motion in the band of the comparison, (M, K) of every stretch."""
+        every = [f for own in self.functions for f in own]
+        out: list[list[Array]] = [[] for _ in self.functions]
+        for stretch in stretches:
+            made = in_band(self.fit.study, self._motion(stretch), every)
+            for j, own in enumerate(self.functions):
+                columns = np.concatenate([made[f.key] for f in own], axis=1)
+                out[j].append(columns if stretch.moving is None else columns * stretch.moving[:, j, None])
+        return out
+
+    def _sets(self, joint: int) -> list[NDArray[np.int64]]:
+        """Numbers of the columns of each set of functions of a joint."""
+        sizes = [f.basis(np.zeros(1), np.zeros(1)).shape[1] for f in self.functions[joint]]
+        return [np.arange(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
+
+    def _all_together(self, joint: int) -> NDArray[np.int64]:
+        """Columns of the wide functions of the motion of a joint, as many as the data determine."""
+        left = sum(np.count_nonzero(y[:, joint]) for _, _, y in self.fit.equations.train) // ROWS_PER_COLUMN
+        chosen: list[NDArray[np.int64]] = []
+        for f, own in zip(self.functions[joint], self._sets(joint), strict=True):
+            if f.kind != "motor angle" and len(f.knots) < FINE and own.size <= left:
+                chosen.append(own)
+                left -= own.size
+        return np.concatenate(chosen) if chosen else np.arange(0)
+
+
+def _by_share(found: Sequence[Dependence]) -> tuple[Dependence, ...]:
+    return tuple(sorted(found, key=lambda d: -d.share))

@@ -1,0 +1,83 @@
+"""Noise model of a residual of which regressor and missing effects have been taken out.
+
+An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away. Least
+squares on the functions that the effect follows removes it, and noise with it. The expected autocovariances of that
+noise are added.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from armident.identify.diagnosis.regression import MAX_AR_ORDER
+from armident.identify.regression.ar_noise import ArModel, lagged_sums, levinson_durbin, lowest_aic
+
+Array = NDArray[np.float64]
+
+PASSES = 4
+"""Iterations between the noise model and the noise that the functions take away."""
+
+RANK = 1e-8
+"""Power of a direction, relative to a unit column, below which functions do not span it."""
+
+
+def noise_beyond(errors: Sequence[Array], functions: Sequence[Array]) -> ArModel:
+    """Autoregressive noise model of one joint, of the residual beyond some functions.
+
+    Least squares removes noise in the directions of the functions, which are those of low frequency. The expected
+    autocovariances of this part, by the noise model itself, are added.
+
+    Parameters
+    ----------
+    errors
+        Residual, (M,) of every stretch, zero where the joint stands still.
+    functions
+        Instruments of the model and functions of the effects, (M, k) of every stretch.
+    """
+    span = _orthonormal(functions)
+    inside = sum(q.T @ e for q, e in zip(span, errors, strict=True))
+    left = [e - q @ inside for q, e in zip(span, errors, strict=True)]
+    rows = sum(int(np.count_nonzero(e)) for e in errors)
+    highest = max(0, min(MAX_AR_ORDER, rows // 10, min(e.size for e in left) - 1))
+    sums = np.asarray(sum(lagged_sums(e[:, None], highest) for e in left))
+    if sums[0] <= 0:
+        return ArModel(np.empty(0), np.finfo(np.float64).tiny, -np.inf)
+    noise = lowest_aic(sums / rows, rows)
+    for _ in range(PASSES):
+        covariances = (sums + _taken(noise, span, highest)) / rows
+        # A sum of an observed and an expected part need not be an autocovariance.
+        if not np.all(levinson_durbin(covariances)[1] > 0.0):
+            break
+        noise = lowest_aic(covariances, rows)
+    return noise
+
+
+def _orthonormal(columns: Sequence[Array]) -> list[Array]:
+    """Orthonormal functions with the same span, (M, r) of every stretch."""
+    size = np.sqrt(sum(np.einsum("mk,mk->k", c, c) for c in columns))
+    size = np.where(size > 0, size, np.inf)
+    scaled = [c / size for c in columns]
+    power, right = np.linalg.eigh(sum(c.T @ c for c in scaled))
+    kept = power > RANK
+    return [c @ (right[:, kept] / np.sqrt(power[kept])) for c in scaled]
+
+
+def _taken(noise: ArModel, span: Sequence[Array], highest: int) -> Array:
+    """Expected sums of lagged products, lags 0 to ``highest``, that least squares on a span takes out of noise.
+
+    With the projector P on the span and the covariance matrix W of the noise these are the sums along the diagonals of
+    ``P W + W P - P W P``.
+    """
+    size = fft.next_fast_len(2 * max(q.shape[0] for q in span), real=True)
+    gain = np.fft.rfft(np.append(1.0, noise.coefficients), size)
+    density = noise.variance / np.abs(gain[:, None]) ** 2
+    spectra = [fft.rfft(q, size, axis=0) for q in span]
+    coloured = [fft.irfft(a * density, size, axis=0)[: q.shape[0]] for a, q in zip(spectra, span, strict=True)]
+    gram = sum(q.T @ w for q, w in zip(span, coloured, strict=True))
+    total = np.zeros(size // 2 + 1)
+    for a, q, w in zip(spectra, span, coloured, strict=True):
+        other = fft.rfft(2.0 * w - q @ gram, size, axis=0)
+        total += np.sum((other * a.conj()).real, axis=1)
+    return np.asarray(fft.irfft(total, size)[: highest + 1])

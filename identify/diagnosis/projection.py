@@ -1,0 +1,298 @@
+"""Projection of a joint's residual on free functions of the reference motion, with its significance.
+
+The functions are orthogonal to the regressor of the model, so that errors of its parameters cancel. The shape is fitted
+on the training data, smoothed by likelihood, and tested by its prediction of the held-out residual. Serial correlation
+beyond the order of the noise model is contained in block sums (Kuensch 1989, Annals of Statistics 17(3)).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from armident.identify.diagnosis.free_functions import FreeFunction
+
+Array = NDArray[np.float64]
+
+BLOCKS = 20
+"""Blocks of the block sums, as in `armident.identify.diagnosis.predictive_score`."""
+
+RANK_TOLERANCE = 1e-3
+"""Relative norm orthogonal to the model below which a direction cannot be tested."""
+
+UNPENALISED = 1e-9
+"""Roughness, relative to the roughest direction, below which a direction counts as smooth altogether."""
+
+STRENGTHS = np.geomspace(1e-8, 1e8, 65)
+"""Smoothing strengths tried, relative to the data's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """Projection of a joint's residual on one set of free functions.
+
+    Parameters
+    ----------
+    function, columns
+        Set of functions, ``None`` for all functions of the motion together; numbers of the columns.
+    joint
+        Number of the joint.
+    p_train
+        Probability of so large a projection of the training residual on all directions of the set, from noise alone.
+    p_held
+        The same of the held-out residual along the shape that the training data determined.
+    share
+        Share of the power of the joint's held-out residual that this shape removes.
+    size
+        Root mean square of the torque by which it reduces that residual, N m or N.
+    values, covariance
+        Smoothed coefficients (k,), and their covariance (k, k).
+    change
+        Torque of the shape in the held-out data, beyond the model, (M,), N m or N.
+    """
+
+    function: FreeFunction | None
+    columns: NDArray[np.int64]
+    joint: int
+    p_train: float
+    p_held: float
+    share: float
+    size: float
+    values: Array
+    covariance: Array
+    change: Array
+
+    @property
+    def p_value(self) -> float:
+        """Both parts combined (Fisher's method)."""
+        product = np.log(max(self.p_train, 1e-300)) + np.log(max(self.p_held, 1e-300))
+        return float(stats.chi2.sf(-2.0 * product, 4))
+
+
+@dataclass(frozen=True, eq=False)
+class JointResidual:
+    """Residual of the model and free functions of one joint, whitened unless stated otherwise.
+
+    Parameters
+    ----------
+    joint
+        Number of the joint.
+    rows, held_rows
+        Its rows among those of all joints.
+    d
+        Functions at the simulated motion, its training rows, (R_j, K).
+    z
+        The same orthogonal to the model, training rows of all joints, (R, K).
+    held
+        The same, held-out rows of all joints, (R', K).
+    e, held_e
+        Residuals, (R,) and (R',).
+    band
+        ``held`` at this joint before whitening, (M', K).
+    errors
+        Held-out errors of this joint before whitening, (M',), N m or N.
+    held_joints
+        Held-out rows of every joint.
+    regressor, covariance
+        Held-out regressor of the model, (R', b), and the covariance of its parameters, (b, b).
+    """
+
+    joint: int
+    rows: slice
+    held_rows: slice
+    d: Array
+    z: Array
+    held: Array
+    e: Array
+    held_e: Array
+    band: Array
+    errors: Array
+    held_joints: Sequence[slice]
+    regressor: Array
+    covariance: Array
+
+    def directions(self, columns: NDArray[np.int64]) -> tuple[Array, Array, Array] | None:
+        """Orthonormal directions (R, r) of some functions beyond the model, their coefficients (k, r), and powers (r,).
+
+        Parameters
+        ----------
+        columns
+            Numbers of the functions, (k,).
+        """
+        d, z = self.d[:, columns], self.z[:, columns]
+        scale = np.linalg.norm(d, axis=0)
+        scale = np.where(scale > 0, scale, np.inf)
+        power, right = np.linalg.eigh((z / scale).T @ (z / scale))
+        kept = power > RANK_TOLERANCE**2
+        if not kept.any():
+            return None
+        right, power = right[:, kept], power[kept]
+        u = (z / scale) @ right / np.sqrt(power)
+        # The estimate with the functions as regressors and ``u`` as instruments has unit variance in these directions.
+        through = right @ np.linalg.pinv(u[self.rows].T @ (d / scale) @ right) / scale[:, None]
+        return u, through, power
+
+    def beyond(self, columns: NDArray[np.int64]) -> "JointResidual":
+        """Residual and functions orthogonal to some of the functions, too.
+
+        Parameters
+        ----------
+        columns
+            Numbers of the functions that the model takes in, (k,).
+        """
+        found = self.directions(columns)
+        if found is None:
+            return self
+        u, through, _ = found
+        inside = through @ (u.T @ self.z)
+        values = through @ (u.T @ self.e)
+        # Instruments: z - u c with (z - u c)' d = 0 for the functions taken in.
+        own = u[self.rows].T @ self.d[:, columns] @ through
+        c = np.linalg.lstsq(own.T, through.T @ self.d[:, columns].T @ self.z[self.rows], rcond=None)[0]
+        return replace(
+            self,
+            z=self.z - u @ c,
+            held=self.held - self.held[:, columns] @ inside,
+            band=self.band - self.band[:, columns] @ inside,
+            e=self.e - self.z[:, columns] @ values,
+            held_e=self.held_e - self.held[:, columns] @ values,
+            errors=self.errors - self.band[:, columns] @ values,
+        )
+
+    def projection(self, function: FreeFunction | None, columns: NDArray[np.int64]) -> Projection | None:
+        """Projection of the residual on one set of functions; ``None`` if the model contains it.
+
+        Parameters
+        ----------
+        function
+            Set of functions; ``None`` for all functions of the motion together.
+        columns
+            Numbers of its columns, (k,).
+        """
+        found = self.directions(columns) if columns.size else None
+        if found is None:
+            return None
+        u, through, power = found
+        estimate = u.T @ self.e
+        p_train, inflation = significance(u[self.rows], self.e[self.rows], estimate)
+        weights, axes = smoothing(estimate / np.sqrt(inflation), through, power, function)
+        smooth = through @ axes
+        values = smooth @ (weights * (axes.T @ estimate))
+        covariance = inflation * (smooth * weights) @ smooth.T
+        torque = self.band[:, columns] @ values
+        before = float(self.errors @ self.errors)
+        removed = before - float(np.sum((self.errors - torque) ** 2))
+        size = float(np.sqrt(max(removed, 0.0) / self.errors.size))
+        p_held = self._held_out(self.held[:, columns] @ values)
+        return Projection(
+            function, columns, self.joint, p_train, p_held, removed / max(before, 1e-300), size, values, covariance,
+            torque,
+        )  # fmt: skip
+
+    def _held_out(self, change: Array) -> float:
+        """Probability of so large a projection of the held-out residual on a change of prediction, from noise alone."""
+        if not change.any():
+            return 1.0
+        here, e = change[self.held_rows], self.held_e[self.held_rows]
+        after = e - here * (here @ e) / max(float(here @ here), 1e-300)
+        variance = sum(
+            _mean_square(self.held_e[rows] - change[rows]) * float(change[rows] @ change[rows])
+            for rows in self.held_joints
+        )
+        through = self.regressor.T @ change
+        variance = variance * max(1.0, inflation_of_sums(here, after)) + float(through @ self.covariance @ through)
+        return float(stats.t.sf(float(change @ self.held_e) / np.sqrt(max(variance, 1e-300)), BLOCKS - 1))
+
+
+def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
+    """Probability of so large a projection from noise alone, and the variance of the projection over that of white noise.
+
+    The power of correlated normal variables is approximated by a scaled chi-square (Box 1954, Annals of Mathematical
+    Statistics 25(2)) whose scale comes from block sums.
+
+    Parameters
+    ----------
+    u
+        Directions, (R, r).
+    e
+        Whitened residual, (R,).
+    estimate
+        Projection of the residual on the directions, (r,).
+    """
+    edges = np.arange(BLOCKS + 1) * e.size // BLOCKS
+    sums, white = [], 0.0
+    for begin, end in pairwise(edges):
+        part = u[begin:end]
+        gram = part.T @ part
+        sums.append(part.T @ e[begin:end] - gram @ estimate)
+        white += float(np.trace(gram) - np.sum(gram**2))
+    spread = np.array(sums)
+    covariance = spread.T @ spread
+    r, free = estimate.size, BLOCKS - 1
+    trace = float(np.trace(covariance))
+    squared = free**2 / ((free - 1) * (free + 2)) * (float(np.sum(covariance**2)) - trace**2 / free)
+    equivalent = float(np.clip(trace**2 / max(squared, 1e-300), 1.0, r))
+    inflation = max(1.0, trace / max(white, 1e-300))
+    power = float(estimate @ estimate) / (r * inflation)
+    return float(stats.f.sf(power, equivalent, free * equivalent)), inflation
+
+
+def inflation_of_sums(change: Array, e: Array) -> float:
+    """Variance of block sums of ``change * e`` over that of white noise.
+
+    Parameters
+    ----------
+    change
+        Change of prediction, (R,).
+    e
+        Whitened residual orthogonal to it, (R,).
+    """
+    edges = np.arange(BLOCKS) * e.size // BLOCKS
+    sums, weights = np.add.reduceat(change * e, edges), np.add.reduceat(change**2, edges)
+    total = float(weights.sum())
+    white = _mean_square(e) * (total - float(weights @ weights) / max(total, 1e-300))
+    return float(sums @ sums) / max(white, 1e-300)
+
+
+def _mean_square(e: Array) -> float:
+    """Mean square of the values that are not zero: a joint at rest has none."""
+    return float(e @ e) / max(int(np.count_nonzero(e)), 1)
+
+
+def smoothing(estimate: Array, through: Array, power: Array, function: FreeFunction | None) -> tuple[Array, Array]:
+    """Factor of each coordinate (r,) at the smoothing strength of the largest likelihood, and the coordinates (r, r).
+
+    State-dependent parameters are smoothed as integrated random walks, whose noise-variance ratio is found by maximum
+    likelihood (thesis section 7.3.2; Young, McKenna, Bruun 2001, Int. J. Control 74(18)). That is a spline penalised on
+    its second differences. All functions together are penalised on the size of their coefficients.
+
+    Parameters
+    ----------
+    estimate
+        Estimate of unit variance in every direction, (r,).
+    through
+        Coefficients of the directions, (k, r).
+    power
+        Power of each direction beyond the model over that of the functions, (r,).
+    function
+        Set of functions; ``None`` for all functions of the motion together.
+    """
+    if function is None:
+        roughness, axes = 1.0 / power, np.eye(power.size)
+    else:
+        _, _, pieces = function.on_grid()
+        bends = np.concatenate([np.diff(piece @ through, 2, axis=0) for piece in pieces])
+        roughness, axes = np.linalg.eigh(bends.T @ bends)
+        roughness = np.maximum(roughness, 0.0)
+    seen = (axes.T @ estimate) ** 2
+    rough = roughness > UNPENALISED * max(float(roughness.max()), 1e-300)
+    weight = np.ones_like(seen)
+    if rough.any():
+        relative = roughness[rough] / np.median(roughness[rough])
+        spread = 1.0 + 1.0 / (STRENGTHS[:, None] * relative)
+        loss = np.sum(np.log(spread) + seen[rough] / spread, axis=1)
+        weight[rough] = 1.0 / (1.0 + STRENGTHS[int(np.argmin(loss))] * relative)
+    return weight, axes

@@ -1,0 +1,223 @@
+"""Residual at the working rate, and its spectral lines: torques of a fixed frequency, independent of the motion."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.study import BAND, Study
+from armident.identify.signals.periodogram import hann_window, periodogram
+
+Array = NDArray[np.float64]
+
+BLOCK = 128
+"""Independent frequencies from whose median the spectrum around a line is estimated."""
+
+PADDING = 2
+"""Number of searched frequencies per independent one."""
+
+HIGHEST = 0.35
+"""Highest frequency of the search over the working rate: the first filter begins there."""
+
+PROMINENT = 100.0
+"""Power of a line of the references over that around it."""
+
+MODULATED = 0.1
+"""Width to either side of a line that the motion modulates, over the motion's bandwidth."""
+
+EQUIVALENT = BLOCK / 1.5 * np.log(2) ** 2
+"""Shape of the gamma distribution with the spread of such a median; a Hann window makes 1.5 frequencies one."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """Spectral line of one joint.
+
+    Parameters
+    ----------
+    frequency
+        Frequency, Hz.
+    p_train, p_held
+        Probability of such a line in the training residual at any frequency, and in the held-out one at this frequency,
+        without a line.
+    share
+        Share of the held-out residual's power at the working rate.
+    size
+        Root mean square of the line, N m or N.
+    f, amplitude, noise
+        Frequencies around the line, Hz; amplitudes of the training residual there, N m or N; amplitudes that a residual
+        without a line exceeds at one frequency in twenty, (G,) each.
+    """
+
+    frequency: float
+    p_train: float
+    p_held: float
+    share: float
+    size: float
+    f: Array
+    amplitude: Array
+    noise: Array
+
+    @property
+    def p_value(self) -> float:
+        """Both combined (Fisher's method)."""
+        return float(stats.combine_pvalues([max(p, 1e-300) for p in (self.p_train, self.p_held)]).pvalue)
+
+
+def residuals(study: Study, stretches: Sequence[Stretch], theta: Array) -> list[Array]:
+    """Torques less those of the model at the working rate, (N, n) each, N m or N.
+
+    Parameters
+    ----------
+    study
+        Data with the model.
+    stretches
+        Stretches of the study.
+    theta
+        Parameters of the model, (b,).
+    """
+    return [s.torque - study.torques(s, "measured", theta) for s in stretches]
+
+
+def bandwidth_of_motion(study: Study) -> float:
+    """Bandwidth of the motion, Hz; below it the repeatable part of the residual has lines, too.
+
+    Parameters
+    ----------
+    study
+        Data with the filter of the comparison.
+    """
+    return 0.5 / (study.dt * study.decimation.factor * BAND)
+
+
+def lines_of_joints(study: Study, theta: Array) -> Iterator[tuple[int, Line]]:
+    """Strongest line of each joint above the frequencies of the motion that the references do not contain.
+
+    Parameters
+    ----------
+    study
+        Data with the model.
+    theta
+        Parameters of the model, (b,).
+    """
+    train, held = (residuals(study, part, theta) for part in (study.train, study.held))
+    lowest = bandwidth_of_motion(study)
+    for j in range(study.robot.n):
+        line = strongest_line([e[:, j] for e in train], [e[:, j] for e in held], study.dt, lowest)
+        if line is not None and not (line.p_value < 0.01 and of_references(study, line.frequency)):
+            yield j, line
+
+
+def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, lowest: float) -> Line | None:
+    """Strongest line of one joint's residuals from a frequency on; ``None`` where the recording is too short.
+
+    The power at a frequency over that of its surroundings has an F-distribution if there is no line (its phase may
+    differ from one stretch to the next).
+
+    Parameters
+    ----------
+    train, held
+        Residuals, (N,) each.
+    dt
+        Sampling period, s.
+    lowest
+        Lowest frequency of the search, Hz.
+    """
+    spectra = [_Spectrum.of(e, dt) for e in train]
+    size = max(s.power.size for s in spectra)
+    f = np.linspace(0.0, 0.5 / dt, size)
+    chosen = np.flatnonzero((f >= lowest) & (f <= HIGHEST / dt))
+    if chosen.size < PADDING * BLOCK:
+        return None
+    ratio = np.mean([np.interp(f[chosen], s.f, s.power / s.background) for s in spectra], axis=0)
+    peak = int(np.argmax(ratio))
+    frequency = float(f[chosen[peak]])
+    unseen = [_Spectrum.of(e, dt) for e in held]
+    there = [s.at(frequency) for s in unseen]
+    power = sum(max(p - b, 0.0) * s.to_power for (p, b), s in zip(there, unseen, strict=True)) / len(unseen)
+    total = sum(float(e @ e) for e in held) / sum(e.size for e in held)
+    longest = max(spectra, key=lambda s: s.power.size)
+    around = np.flatnonzero(np.abs(longest.f - frequency) <= 40 * longest.f[1])
+    return Line(
+        frequency,
+        min(1.0, chosen.size * _chance(float(ratio[peak]), len(spectra))),
+        _chance(float(np.mean([p / b for p, b in there])), len(there)),
+        power / max(total, 1e-300),
+        float(np.sqrt(power)),
+        longest.f[around],
+        np.sqrt(2.0 * longest.to_power * longest.power[around]),
+        np.sqrt(2.0 * longest.to_power * longest.background[around] * np.log(20.0)),
+    )
+
+
+def of_references(study: Study, frequency: float) -> bool:
+    """Return true if the references contain the line, too: set points have a rate of their own, and the arm follows them.
+
+    The motion modulates the line, so its width is a share of the bandwidth of the motion.
+
+    Parameters
+    ----------
+    study
+        Data with the references.
+    frequency
+        Frequency of the line, Hz.
+    """
+    wide = MODULATED * bandwidth_of_motion(study)
+    for reference in study.auxiliary.references:
+        for joint in np.diff(reference, 2, axis=0).T:
+            spectrum = _Spectrum.of(joint, study.sample)
+            near = np.abs(spectrum.f - frequency) <= max(wide, 2 * PADDING * spectrum.f[1])
+            if np.any(spectrum.power[near] > PROMINENT * spectrum.background[near]):
+                return True
+    return False
+
+
+def _chance(ratio: float, stretches: int) -> float:
+    """Probability of so large a mean of power over background without a line."""
+    return float(stats.f.sf(ratio, 2 * stretches, 2 * EQUIVALENT * stretches))
+
+
+@dataclass(frozen=True, eq=False)
+class _Spectrum:
+    """Power at frequencies f, and that of the surroundings; ``to_power`` times power is the mean square of a line."""
+
+    f: Array
+    power: Array
+    background: Array
+    to_power: float
+    windowed: Array
+    dt: float
+
+    @classmethod
+    def of(cls, e: Array, dt: float) -> "_Spectrum":
+        """Return the spectrum of a series with a Hann window.
+
+        Parameters
+        ----------
+        e
+            Series, (N,).
+        dt
+            Sampling period, s.
+        """
+        window = hann_window(e.size)
+        windowed = window * (e - e.mean())
+        power = periodogram(windowed, PADDING)
+        parts = np.array_split(np.arange(power.size), max(1, power.size // (PADDING * BLOCK)))
+        level = np.array([np.log(max(np.median(power[part]) / np.log(2), 1e-300)) for part in parts])
+        background = np.exp(np.interp(np.arange(power.size), [part.mean() for part in parts], level))
+        f = np.arange(power.size) / (PADDING * e.size * dt)
+        return cls(f, power, background, 2.0 / float(window.sum()) ** 2, windowed, dt)
+
+    def at(self, frequency: float) -> tuple[float, float]:
+        """Return power and background at any frequency.
+
+        Parameters
+        ----------
+        frequency
+            Frequency, Hz.
+        """
+        turning = np.exp(-2j * np.pi * frequency * self.dt * np.arange(self.windowed.size))
+        return float(np.abs(self.windowed @ turning) ** 2), float(np.interp(frequency, self.f, self.background))
