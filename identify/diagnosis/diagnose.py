@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,8 @@ from armident.identify.diagnosis.findings import (
     noise_floor,
     undetectable,
 )
+from armident.identify.diagnosis.lack_of_fit import Dependence, unexplained
+from armident.identify.diagnosis.lack_of_fit import dependences as dependences_of
 from armident.identify.diagnosis.model_state import ModelState, with_report_part
 from armident.identify.diagnosis.numbers import stale_numbers
 from armident.identify.diagnosis.selection import Selected, StepwiseSelection
@@ -82,8 +83,8 @@ class Diagnosis:
     lacking: tuple[Array | None, ...]
     q: Array
     qd: Array
-    where: tuple[Any, ...]
-    left: tuple[Any, ...]
+    where: tuple[Dependence, ...]
+    left: tuple[Dependence, ...]
     simulated: SimulatedErrors
 
 
@@ -196,7 +197,14 @@ def _diagnose(
     findings = stage.named(named, after)
     lacking = [_lacking(final, selected[places[id(f)]]) if id(f) in places else None for f in findings]
     steps("unexplained dependences")
-    left = stage.left([], after)
+    dependences = unexplained(final, criteria)
+    left = stage.left(
+        [
+            Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
+            for d in dependences
+        ],
+        after,
+    )
     if baseline is not None:
         steps("changed parameters")
         alpha = criteria.alpha["changed_parameters"]
@@ -243,8 +251,8 @@ def _diagnose(
         lacking=(*lacking, *(None for _ in findings[len(lacking) :])),
         q=_sampled(final, "q"),
         qd=_sampled(final, "qd"),
-        where=(),
-        left=(),
+        where=dependences_of(first, criteria),
+        left=dependences,
         simulated=simulated,
     )
 

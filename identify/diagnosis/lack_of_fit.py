@@ -174,7 +174,7 @@ class LackOfFit:
     @property
     def level(self) -> float:
         """Significance level of one test: the false-alarm rate over the number of all tests (Bonferroni)."""
-        return self.criteria.false_alarm_rate / max(self.tests, 1)
+        return self.criteria.alpha["lack_of_fit"] / max(self.tests, 1)
 
     @property
     def dependences(self) -> tuple[Dependence, ...]:
@@ -312,7 +312,7 @@ class LackOfFit:
         ]
         found = [(p.p_value, k) for p, k in every if p is not None and k not in known]
         p_value, best = min(found, default=(1.0, 0))
-        return best if p_value * self.tests < self.criteria.false_alarm_rate else None
+        return best if p_value * self.tests < self.criteria.alpha["lack_of_fit"] else None
 
     @cached_property
     def tests(self) -> int:

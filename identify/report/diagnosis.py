@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.diagnose import Diagnosis
-from armident.identify.diagnosis.where import Disagreement
+from armident.identify.diagnosis.lack_of_fit import Dependence
 from armident.identify.document import DiagnosisDocument, Finding
 from armident.identify.report.glossary import diagnosis_entries
 from armident.identify.report.page import BAND, INK, MEASURED, MODEL, MUTED, RESIDUAL, figure, render
@@ -242,7 +242,7 @@ def _unit(diagnosis: Diagnosis, joint: int) -> str:
     return "N m" if diagnosis.robot.joints[joint].type == "revolute" else "N"
 
 
-def _curve(axis: Any, d: Disagreement, unit: str) -> None:
+def _curve(axis: Any, d: Dependence, unit: str) -> None:
     """Draw a residual dependence with its uncertainty; a spectrum or transients with the noise level."""
     x, value, band = d.curve.x, d.curve.value, d.curve.band
     low, high = (np.zeros_like(band), band) if d.of_noise else (value - band, value + band)
@@ -279,7 +279,7 @@ def _map_figure(diagnosis: Diagnosis, joints: Sequence[str]) -> str | None:
     return picture[0]
 
 
-def _curve_figure(d: Disagreement, unit: str) -> str:
+def _curve_figure(d: Dependence, unit: str) -> str:
     """Return a figure of an unexplained residual dependence, in the unit of the joint's torque."""
     with figure(1, 1, 2.3) as (_, axes, picture):
         _curve(axes[0, 0], d, unit)

@@ -6,7 +6,7 @@ from typing import get_args
 import pytest
 
 from armident.configs import load_robot
-from armident.identify.diagnosis.maps import Kind
+from armident.identify.diagnosis.free_functions import Kind
 from armident.identify.document import (
     EVIDENCE_1,
     BeforeAfter,
