@@ -437,8 +437,15 @@ def solved(
         Given parameters (b,); ``None``: estimate them.
     known
         Products of the same equations under other noise models.
+
+    Raises
+    ------
+    DataError
+        If a parameter has no effect on the torques.
     """
     products = Products.of(equations, noise, known)
+    if not np.any(products.zx, axis=0).all():
+        raise DataError("the motion does not determine all parameters of the model")
     if theta is not None:
         return Fit(study, theta, tuple(noise), equations, products, fixed=True)
     estimate = linalg.lu_solve(products.solver, products.zy / products.scale) / products.scale

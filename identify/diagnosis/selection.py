@@ -54,6 +54,8 @@ class Addition:
         Model with the effect.
     gain
         Gain of log-likelihood over the model without it, see `gain`.
+    own_gain
+        The same with each model under its own noise models.
     share
         Largest share of the power of a joint's predicted errors that it removes.
     material_pct
@@ -67,6 +69,7 @@ class Addition:
     entry: Entry
     state: ModelState
     gain: float
+    own_gain: float
     share: float
     material_pct: float
     allowed: bool
@@ -264,7 +267,8 @@ class StepwiseSelection:
         """True if an addition is significant, material and physically possible.
 
         A ratio of likelihoods of ``r`` has at most the probability ``1 / r`` without the effect (Ville 1939), so that
-        no null distribution is needed.
+        no null distribution is needed. With each model's own noise models, which may take the effect for noise, the
+        ratio must still exceed the number of candidates.
 
         Parameters
         ----------
@@ -276,6 +280,7 @@ class StepwiseSelection:
         return (
             addition.allowed
             and addition.gain > np.log(max(tests, 1) / self.criteria.alpha["selection"])
+            and addition.own_gain > np.log(max(tests, 1))
             and addition.share >= self.criteria.least_share
             and addition.material_pct >= self.criteria.material_pct
         )
@@ -392,7 +397,8 @@ class StepwiseSelection:
             largest[name] = max(value, largest.get(name, value))
         allowed = known(effect.key).allows(term.of_effect(values), term.of_effect(std), dict(term.shapes), largest)
         share, changed = materiality(state, made)
-        return Addition(candidate, shapes, entry, made, gain(made, state), share, changed, allowed)
+        own = made.score.log_likelihood - state.score.log_likelihood
+        return Addition(candidate, shapes, entry, made, gain(made, state), own, share, changed, allowed)
 
     def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""
@@ -483,18 +489,15 @@ def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
 
 
 def gain(with_it: ModelState, without: ModelState) -> float:
-    """Gain of log-likelihood by an effect under the noise models of the model with it.
+    """Gain of log-likelihood by an effect, under the noise models of the model with it.
 
-    The noise models of the model without it may take the effect for noise. They decide its sign only: the effect gains
-    nothing where they explain the errors better than it does.
+    The noise models of the model without it may take the effect for noise.
 
     Parameters
     ----------
     with_it, without
         Models with and without the effect.
     """
-    if with_it.score.log_likelihood < without.score.log_likelihood:
-        return 0.0
     return with_it.score.gain_over(without.score)
 
 

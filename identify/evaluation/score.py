@@ -16,6 +16,8 @@ LEAST_GAP = 0.05
 
 For comparison: a few additional parameters change the error power by half a percent of the noise by chance.
 """
+UNNAMED = "unnamed"
+"""Effect of terms that a diagnosis adds without a cause; they name nothing."""
 LOW_CONFIDENCE = 0.5
 """Confidence below which the diagnosis considers a finding more probably wrong than right."""
 
@@ -82,7 +84,7 @@ def score(case: Case, result: CaseResult, healthy: CaseResult | None) -> Score:
         Result of its healthy twin, which has the torque error of the noise alone; ``None`` where nothing is simulated.
     """
     document = result.diagnosis
-    findings = document.findings
+    findings = [f for f in document.findings if f.effect != UNNAMED]
     matched = [next((f for f in findings if matches(part, f)), None) for part in case.parts]
     known = bool(case.parts) and case.kind != "outside"
     first = second = None

@@ -6,14 +6,12 @@ from typing import Any, Literal, cast
 
 from armident.identify.document import DiagnosisDocument
 from armident.identify.evaluation.cases import Case, InjectedEffect
-from armident.identify.evaluation.score import LOW_CONFIDENCE, closed_share
+from armident.identify.evaluation.score import LOW_CONFIDENCE, UNNAMED, closed_share
 
 Family = Literal["healthy", "effect", "setup", "outside"]
 
 VISIBLE = 1.05
 """Visibility from which an effect counts: the residual of the rigid model is 5 % larger (docs/diagnosis.md)."""
-UNNAMED = "unnamed"
-"""Beginning of the names of terms that the diagnosis adds without a cause; they name nothing."""
 RESCALING = ("gain_error",)
 """Kinds that change the scale of the torques, so that errors with and without them are not comparable."""
 
