@@ -218,7 +218,8 @@ class StepwiseSelection:
         tuple
             Model with the effects, and the effects, largest change of the errors first.
         """
-        state, found = first, ()
+        state = first
+        found: tuple[Selected, ...] = ()
         while len(found) < self.criteria.most_findings and not self._late():
             step = self.step(state)
             best = self.admitted(step)
@@ -289,8 +290,9 @@ class StepwiseSelection:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
         An effect is admitted only if no other explanation of the same joint is clearly better, even one that is too
-        small to be a finding. An effect with a name comes first if it explains most of what the best term without a name does. Of the laws of
-        one effect that predict as well, that with the fewest parameters comes first, and a free shape last.
+        small to be a finding. An effect with a name comes first if it explains most of what the best term without a
+        name does. Of the laws of one effect that predict as well, that with the fewest parameters comes first, and a
+        free shape last.
 
         Parameters
         ----------
@@ -335,7 +337,9 @@ class StepwiseSelection:
             chosen = [(place, v) for place, v in zip(places, velocities, strict=True) if v > 0.0]
             entries = [stanza_of(effect, place, state.robot, {"velocity": v}) for place, v in chosen]
             made = self._state(with_entries(state.robot, entries), state) if entries else None
-            for (place, v), entry in zip(chosen, entries, strict=True) if made else ():
+            if made is None:
+                return None
+            for (place, v), entry in zip(chosen, entries, strict=True):
                 score = float(made.score.log_likelihoods[place.joint])
                 if made.values_of(made.term_of(entry))[0][0] > 0.0 and score > best[place][0]:
                     best[place] = score, v
@@ -463,7 +467,7 @@ class StepwiseSelection:
                     checked.append(replace(one, confirmation=compared, without=less))
             failed = [one for one in checked if not self._holds(one)]
             if not failed:
-                return state, tuple(sorted(checked, key=lambda one: -one.confirmation.change))
+                return state, tuple(sorted(checked, key=_change, reverse=True))
             gone = max(failed, key=lambda one: 1.0 if one.confirmation is None else one.confirmation.p_value)
             assert gone.without is not None
             state, found = gone.without, tuple(one for one in found if one.entry is not gone.entry)
@@ -516,6 +520,11 @@ def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]
     size = float(np.sqrt(np.mean(torque**2)))
     share = float(removed[joint] / max(before[joint] ** 2, 1e-300))
     return share, 100 * float(np.sqrt(removed[joint])) / max(size, 1e-300)
+
+
+def _change(one: Selected) -> float:
+    """Largest change of the error of a joint on the report part by a finding, percent; 0 before the comparison."""
+    return 0.0 if one.confirmation is None else one.confirmation.change
 
 
 def _key(robot: RobotConfig) -> str:

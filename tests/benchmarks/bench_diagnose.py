@@ -9,10 +9,9 @@ from tests.benchmarks.harness import Row
 MEASURE = """
 import json, resource, time
 from armident.configs import config_path, load_robot, load_trajectory
-from armident.identify.diagnosis.candidates import candidates
+from armident.identify.diagnosis.candidates import Workshop, candidates
 from armident.identify.diagnosis.diagnose import diagnose
-from armident.identify.diagnosis.search import Search
-from armident.identify.diagnosis.state import Settings
+from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
@@ -30,8 +29,8 @@ for _ in range(2):
     if best is None or document.timing_s["total"] < best.timing_s["total"]:
         best = document
 memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-start = Search(build_study(experiments, [], robot), Settings()).start()
-tried = sum(len(candidate.grid) for candidate in candidates(start.workshop))
+start = StepwiseSelection(build_study(experiments, [], robot)).start()
+tried = sum(len(candidate.grid) for candidate in candidates(Workshop(start.study, start.fit.theta)))
 seconds = float("inf")
 for _ in range(2):
     begin = time.perf_counter()

@@ -7,8 +7,8 @@ import pytest
 from armident.configs import load_robot
 from armident.identify.diagnosis.diagnose import Diagnosis
 from armident.identify.diagnosis.findings import gap_of
-from armident.identify.diagnosis.search import Search
-from armident.identify.diagnosis.state import Settings
+from armident.identify.diagnosis.model_state import with_report_part
+from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
 from armident.identify.document import Gap
 from tests.fixtures.diagnoses import measured_diagnosis
@@ -33,7 +33,7 @@ def uncoupled_wrist(shared_data: Path) -> Diagnosis:
 def coupled_wrist(shared_data: Path) -> tuple[Gap, Gap]:
     """Errors of the model that knows it, on the same parts of the recording."""
     robot = load_robot("tx40")
-    state = Search(build_study([tx40(shared_data, robot)], [], robot), Settings()).start()
+    state = with_report_part(StepwiseSelection(build_study([tx40(shared_data, robot)], [], robot)).start())
     return gap_of(state, held=False), gap_of(state, held=True)
 
 

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from armident.configs import load_robot
-from armident.configs.schema.robot import Effect
 from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.candidates import Workshop, candidates
-from armident.identify.diagnosis.foretold import foretold
+from armident.identify.diagnosis.model_state import fitted as model_of
 from armident.identify.diagnosis.regression import Fit, Products
-from armident.identify.diagnosis.state import refit
-from armident.identify.diagnosis.study import Study, build_study
-from armident.identify.diagnosis.trial import directions_beside, noise_with, score_statistics
+from armident.identify.diagnosis.screening import directions_beside, score_statistics
+from armident.identify.diagnosis.study import build_study
 from armident.identify.diagnosis.whitening import joints_of
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording
@@ -30,7 +28,7 @@ def fitted() -> Fit:
     hidden = HiddenEffect(effect="time_delay", joint="joint_3", parameters={"delay": DELAY})
     data = recording("tx40", "tx40_excitation", 2, hidden, period=FAST, setpoint_every=1)
     experiments, _ = experiments_from_recording(data, robot)
-    return refit(build_study(experiments, [], robot), robot, None)[1]
+    return model_of(build_study(experiments, [], robot), robot, None).fit
 
 
 @pytest.mark.parametrize(
@@ -72,45 +70,8 @@ def test_products_are_made_anew_only_where_the_noise_is_another(fitted: Fit) -> 
     np.testing.assert_array_equal(known.zy, fresh.zy)
 
 
-def test_the_noise_of_joints_that_a_candidate_leaves_alone_stays(fitted: Fit) -> None:
-    bench = Workshop(fitted.study, fitted.theta)
-    candidate = next(c for c in candidates(bench) if c.effect.name == "joint_spring" and c.place.joint == 5)
-    away = np.zeros(fitted.theta.size)
-    found = noise_with(fitted, candidate, (), bench, np.array([0.5]), away)
-    assert [a is b for a, b in zip(found, fitted.noise, strict=True)] == [True] * 5 + [False]
-    # What the model's own parameters absorb of it changes other joints, too.
-    away[:] = 0.1 * fitted.theta
-    found = noise_with(fitted, candidate, (), bench, np.array([0.5]), away)
-    assert not any(a is b for a, b in zip(found, fitted.noise, strict=True))
-
-
 def test_joints_are_those_with_a_number_that_is_not_zero() -> None:
     columns = np.zeros((50, 4, 2))
     columns[49, 1, 1], columns[0, 3, 0] = 1e-300, np.nan
     assert joints_of(columns) == [1, 3]
     assert joints_of(columns.transpose(0, 1, 2)[:, ::-1]) == [0, 2]
-
-
-def late(study: Study, delay: float, joint: str = "joint_3") -> Study:
-    """Recordings corrected for a delay."""
-    stanza = Effect(effect="time_delay", joint=joint, parameters={"delay": delay})
-    return study.of_robot(study.robot.model_copy(update={"effects": (stanza,)}))
-
-
-def test_putting_a_late_torque_right_foretells_less_error_at_its_joint_only(fitted: Fit) -> None:
-    study, right = refit(fitted.study, late(fitted.study, DELAY).robot, fitted)
-    found = foretold(fitted.study, fitted.theta, study, right.theta)
-    assert found is not None
-    before, after = (np.sum(np.concatenate(part) ** 2, axis=0) for part in (found.before, found.after))
-    assert after[2] < 0.97 * before[2]
-    np.testing.assert_allclose(after[[0, 3, 4, 5]], before[[0, 3, 4, 5]], rtol=0.02)
-    # Twice as late is as wrong on the other side.
-    study, wrong = refit(fitted.study, late(fitted.study, 3.0 * DELAY).robot, fitted)
-    other = foretold(fitted.study, fitted.theta, study, wrong.theta)
-    assert other is not None
-    assert np.sum(np.concatenate(other.after)[:, 2] ** 2) > 0.97 * np.sum(np.concatenate(other.before)[:, 2] ** 2)
-
-
-def test_nothing_is_foretold_of_a_model_that_undoes_what_had_been_put_right(fitted: Fit) -> None:
-    study, right = refit(fitted.study, late(fitted.study, DELAY).robot, fitted)
-    assert foretold(study, right.theta, fitted.study, fitted.theta) is None

@@ -1,8 +1,6 @@
 """Every effect injected into a virtual arm is the best candidate at its joint."""
 
 from dataclasses import dataclass, field
-from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +9,7 @@ from threadpoolctl import threadpool_limits
 from armident.configs import RobotConfig, load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.recording import Recording
-from armident.identify.diagnosis.search import Search
-from armident.identify.diagnosis.state import Settings
+from armident.identify.diagnosis.selection import Step, StepwiseSelection
 from armident.identify.diagnosis.study import build_study
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording
@@ -105,41 +102,40 @@ def known_of(case: Case) -> RobotConfig:
     return robot
 
 
-@cache
-def healthy(robot: str) -> Any:
-    """Trials beside the model of a healthy arm."""
-    experiments, _ = experiments_from_recording(recorded(robot, 7), load_robot(robot))
+def first_step(data: Recording, whole: RobotConfig, known: RobotConfig) -> tuple[StepwiseSelection, Step]:
+    """Comparison of all candidates beside a model that lacks at most one effect."""
+    experiments, _ = experiments_from_recording(data, whole)
     with threadpool_limits(1):  # type: ignore[no-untyped-call]
-        return Search(build_study(experiments, [], load_robot(robot)), Settings()).start()
+        selection = StepwiseSelection(build_study(experiments, [], known))
+        return selection, selection.step(selection.start())
 
 
 @pytest.mark.parametrize(
     "case",
     [pytest.param(c, marks=() if c in SAMPLE else pytest.mark.proof, id=str(c)) for c in (*TX40, STRIBECK, *EMPS)],
 )
-def test_what_is_hidden_comes_out_first(case: Case) -> None:
+def test_an_injected_effect_is_admitted_first(case: Case) -> None:
     hidden = HiddenEffect(effect=case.effect, joint=case.joint, other=case.other, parameters=case.parameters)
-    whole, known = load_robot(case.robot), known_of(case)
+    known = known_of(case)
     data = recorded(case.robot, 1, *([] if case.leave_out else [hidden]))
-    experiments, _ = experiments_from_recording(data, whole)
-    with threadpool_limits(1):  # type: ignore[no-untyped-call]
-        state = Search(build_study(experiments, [], known), Settings()).start()
-    passing = state.passing(Settings())
-    assert passing, [(t.candidate.key, t.score) for t in state.trials[:3]]
+    selection, step = first_step(data, load_robot(case.robot), known)
+    first = selection.admitted(step)
+    assert first is not None, [(a.family, a.gain, a.allowed) for a in step.ranked[:3]]
     names = [joint.name for joint in known.joints]
-    first = passing[0].candidate
-    other = None if first.place.other is None else names[first.place.other]
-    assert (first.effect.name, names[first.place.joint], other) == (case.effect, case.joint, case.other)
-    found = {p.name: k for k, p in enumerate(first.effect.linear)}
+    place = first.candidate.place
+    other = None if place.other is None else names[place.other]
+    assert (first.candidate.effect.name, names[place.joint], other) == (case.effect, case.joint, case.other)
+    term = first.state.term_of(first.entry)
+    values, deviations = first.state.values_of(term)
+    found = {p.name: k for k, p in enumerate(term.linear)}
     for name, truth in case.truth.items():
-        value, std = passing[0].values[found[name]], passing[0].std[found[name]]
+        value, std = values[found[name]], deviations[found[name]]
         assert abs(value - truth) < 4 * std, (name, value, std, truth)
 
 
 @pytest.mark.parametrize("robot", ["tx40", "emps"])
-def test_nothing_passes_beside_the_model_of_a_healthy_arm(robot: str) -> None:
-    state = healthy(robot)
-    assert not state.passing(Settings())
-    # Not by a hair either: no candidate reaches a tenfold rate of false alarms.
-    assert not state.passing(Settings(false_alarms=0.1))
-    assert np.isfinite([t.score for t in state.trials]).all()
+def test_nothing_is_admitted_beside_the_model_of_a_healthy_arm(robot: str) -> None:
+    config = load_robot(robot)
+    selection, step = first_step(recorded(robot, 7), config, config)
+    assert selection.admitted(step) is None
+    assert np.isfinite([a.log_likelihood for a in step.ranked]).all()

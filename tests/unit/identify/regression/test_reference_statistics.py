@@ -11,8 +11,7 @@ from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.sandwich_covariance import S_hac_simple
 from statsmodels.tsa.stattools import levinson_durbin as reference_levinson_durbin
 
-from armident.identify.diagnosis.bursts import _anscombe_glynn
-from armident.identify.diagnosis.lines import Line
+from armident.identify.diagnosis.spectral_lines import Line
 from armident.identify.diagnosis.whitening import ar_models
 from armident.identify.estimators.diagnostics import (
     LAGS_PER_ROOT_SAMPLE,
@@ -158,15 +157,6 @@ def test_fishers_combination_of_two_p_values(train: float, held: float) -> None:
     logarithm = np.log(train) + np.log(held)
     assert combined == pytest.approx(np.exp(logarithm) * (1 - logarithm), rel=1e-9)
     assert combined == pytest.approx(float(stats.chi2.sf(-2 * logarithm, 4)), rel=1e-9)
-
-
-@pytest.mark.parametrize("samples", [20, 50, 333, 5000])
-def test_kurtosis_deviate_is_that_of_scipy(samples: int) -> None:
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        for x in (rng.standard_normal(samples), rng.standard_t(5, samples)):
-            kurtosis = float(stats.kurtosis(x, fisher=False))
-            assert _anscombe_glynn(kurtosis, samples) == pytest.approx(float(stats.kurtosistest(x).statistic), rel=1e-9)
 
 
 @pytest.mark.parametrize("fitted", [0, 3])

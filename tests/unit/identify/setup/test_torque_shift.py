@@ -62,7 +62,8 @@ def test_a_common_shift_of_half_a_sample_is_a_remark_and_no_mistake(
     check = check_setup(late(healthy, np.full(arm.n, samples)), arm)
     found = check.torque_shift
     assert check.findings == ()
-    assert found is not None and found.applied
+    assert found is not None
+    assert found.applied
     assert found.samples == pytest.approx(samples, abs=4 * found.std)
     assert ("late" if samples > 0 else "early") in found.remark
 
