@@ -153,7 +153,7 @@ def test_holm_of_small_families() -> None:
 def test_fishers_combination_of_two_p_values(train: float, held: float) -> None:
     """With four degrees of freedom the chi-square tail is ``x (1 - ln x)``, x the product of the p-values."""
     empty = np.empty(0)
-    combined = Line(10.0, train, held, 0.1, empty, empty, empty).p_value
+    combined = Line(10.0, train, held, 0.1, 1.0, empty, empty, empty).p_value
     logarithm = np.log(train) + np.log(held)
     assert combined == pytest.approx(np.exp(logarithm) * (1 - logarithm), rel=1e-9)
     assert combined == pytest.approx(float(stats.chi2.sf(-2 * logarithm, 4)), rel=1e-9)

@@ -1,0 +1,45 @@
+"""Model of a step: values of its effects, its configuration, and its loop on the report part."""
+
+import numpy as np
+import pytest
+
+from armident.configs.schema.robot import Effect
+from armident.identify.diagnosis.model_state import padded, with_report_part
+from armident.identify.effects.terms import arm_model
+from tests.fixtures.diagnoses import SPRING, selection, with_effects
+
+pytestmark = pytest.mark.slow
+
+TERM = Effect(effect="joint_spring", joint="joint_1")
+
+
+def test_values_of_an_effect_are_right_within_their_uncertainty() -> None:
+    state = with_effects(selection(1, SPRING)[1], TERM)
+    values, std = state.values_of(state.term_of(TERM))
+    assert abs(values[0] - 80.0) < 4.0 * std[0]
+
+
+def test_the_configuration_contains_the_values() -> None:
+    state = with_effects(selection(1, SPRING)[1], TERM)
+    values, _ = state.values_of(state.term_of(TERM))
+    entry = next(e for e in state.with_values().effects if e.effect == "joint_spring")
+    assert entry.parameters["ks"] == pytest.approx(values[0])
+    assert arm_model(state.with_values()).base.names == state.study.model.base.names
+
+
+def test_a_larger_model_begins_with_the_rigid_parameters_of_the_smaller_one() -> None:
+    first = selection(1, SPRING)[1]
+    state = with_effects(first, TERM)
+    start = padded(first.fit, state.study.model)
+    rigid = state.study.model.base.b - state.study.model.e
+    np.testing.assert_array_equal(start[:rigid], first.fit.theta[:rigid])
+    assert not start[rigid:].any()
+
+
+def test_the_report_part_changes_no_parameter() -> None:
+    state = with_effects(selection(1, SPRING)[1], TERM)
+    whole = with_report_part(state)
+    np.testing.assert_array_equal(whole.fit.theta, state.fit.theta)
+    errors = [np.linalg.norm(s.simulated.qd - s.measured.qd) for s in whole.study.held]
+    size = [np.linalg.norm(s.measured.qd) for s in whole.study.held]
+    assert sum(errors) < 0.1 * sum(size)

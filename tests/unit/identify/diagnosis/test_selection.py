@@ -1,0 +1,128 @@
+"""Stepwise selection: effects are added in their own loop, exchanged, removed, and negligible below a limit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armident.configs.schema.robot import Effect
+from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.diagnose import diagnose
+from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.selection import Addition, Selected, Step, StepwiseSelection
+from armident.identify.effects.terms import arm_model
+from armident.identify.identification.from_recording import experiments_from_recording
+from tests.fixtures.arms import FAST, recording
+from tests.fixtures.diagnoses import SPRING, WORN, selection, with_effects
+
+pytestmark = pytest.mark.slow
+
+FRICTION = Effect(effect="asymmetric_viscous_friction", joint="joint_1")
+
+
+def addition_of(step: Step, key: str) -> Addition:
+    """The addition of an effect with a law."""
+    return next(a for a in step.ranked if a.candidate.effect.key == key)
+
+
+def loop_error(state: ModelState) -> float:
+    """Norm of the difference of simulated and measured velocity, m/s."""
+    return float(np.linalg.norm(np.concatenate([s.simulated.qd - s.measured.qd for s in state.study.train])))
+
+
+def test_an_effect_is_tested_in_the_loop_that_it_makes() -> None:
+    steps, first = selection(1, SPRING)
+    best = steps.admitted(steps.step(first))
+    assert best is not None
+    assert best.candidate.effect.name == "joint_spring"
+    assert [e.effect for e in best.state.robot.effects if e not in first.robot.effects] == ["joint_spring"]
+    healthy = selection(1)[1]
+    without, own, noise = (loop_error(state) for state in (first, best.state, healthy))
+    # Without the effect the simulated loop moves otherwise; with it only the noise of the measurement is left.
+    assert without > 1.5 * noise
+    assert own == pytest.approx(noise, rel=0.05)
+
+
+def test_nothing_is_admitted_in_a_healthy_arm() -> None:
+    steps, first = selection(1)
+    final, found = steps.run(first)
+    assert found == ()
+    assert final.robot == first.robot
+
+
+def test_two_effects_are_both_selected_whatever_their_order_and_confirmed() -> None:
+    steps, first = selection(1, SPRING, WORN)
+    _, found = steps.run(first)
+    assert {one.entry.effect for one in found} == {"joint_spring", "asymmetric_viscous_friction"}
+    for one in found:
+        assert one.confirmation is not None
+        assert one.confirmation.smaller
+
+
+def test_a_superfluous_finding_is_removed() -> None:
+    steps, first = selection(1, SPRING)
+    best = steps.admitted(steps.step(first))
+    assert best is not None
+    both = with_effects(best.state, FRICTION)
+    superfluous = Selected(FRICTION, steps.step(first), best)
+    state, kept = steps._reduced(both, (superfluous, Selected(best.entry, steps.step(first), best)))
+    assert [one.entry.effect for one in kept] == ["joint_spring"]
+    assert FRICTION not in state.robot.effects
+
+
+def test_a_wrong_finding_is_exchanged_for_the_right_one() -> None:
+    steps, first = selection(1, SPRING)
+    step = steps.step(first)
+    wrong = addition_of(step, "presliding_friction")
+    state, found = steps._exchanged(wrong.state, (Selected(wrong.entry, step, wrong),))
+    assert [one.entry.effect for one in found] == ["joint_spring"]
+    assert wrong.entry not in state.robot.effects
+
+
+def test_of_two_laws_that_predict_as_well_the_simpler_one_is_preferred() -> None:
+    steps, first = selection(1, SPRING)
+    step = steps.step(first)
+    linear, cubic = addition_of(step, "joint_spring"), addition_of(step, "joint_spring/cubic")
+    assert len(linear.candidate.effect.linear) < len(cubic.candidate.effect.linear)
+    ranked = tuple(sorted((linear, cubic), key=lambda a: -a.log_likelihood))
+    close = StepwiseSelection(steps.study, replace(steps.criteria, close=1e9))
+    admitted = close.admitted(replace(step, ranked=ranked, passing=ranked))
+    assert admitted is linear
+
+
+def test_a_named_effect_that_explains_half_comes_before_a_better_term_without_a_name() -> None:
+    steps, first = selection(1, SPRING)
+    step = steps.step(first)
+    named = addition_of(step, "joint_spring")
+    nameless = replace(
+        named, candidate=replace(named.candidate, effect=replace(named.candidate.effect, name="unnamed", law="time"))
+    )
+    for factor, expected in ((1.9, "joint_spring"), (2.1, "unnamed")):
+        better = replace(nameless, gain=factor * named.gain)
+        both = replace(step, ranked=(better, named), passing=(better, named))
+        admitted = steps.admitted(both)
+        assert admitted is not None
+        assert admitted.candidate.effect.name == expected
+
+
+def test_an_effect_below_the_limit_of_the_user_is_negligible() -> None:
+    _, first = selection(1, SPRING)
+    robot = first.robot
+    experiments, _ = experiments_from_recording(recording("emps", "emps_1", 1, SPRING, period=FAST), robot)
+    document = diagnose(experiments, [], robot, criteria=Criteria(material_pct=50.0)).document
+    assert [f.effect for f in document.findings] == []
+    assert "joint_spring" in {n.effect for n in document.negligible}
+
+
+def test_a_selection_is_deterministic() -> None:
+    steps, first = selection(1, SPRING)
+    again = StepwiseSelection(steps.study)
+    one, other = steps.step(first), again.step(again.start())
+    assert [a.entry for a in one.ranked] == [a.entry for a in other.ranked]
+    np.testing.assert_array_equal([a.gain for a in one.ranked], [a.gain for a in other.ranked])
+
+
+def test_the_selected_model_is_a_model_of_identify() -> None:
+    steps, first = selection(1, SPRING)
+    final, _ = steps.run(first)
+    assert {t.effect.name for t in arm_model(final.with_values()).terms} >= {"joint_spring"}
