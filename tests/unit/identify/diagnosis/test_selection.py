@@ -125,4 +125,4 @@ def test_a_selection_is_deterministic() -> None:
 def test_the_selected_model_is_a_model_of_identify() -> None:
     steps, first = selection(1, SPRING)
     final, _ = steps.run(first)
-    assert {t.effect.name for t in arm_model(final.with_values()).terms} >= {"joint_spring"}
+    assert "ks1" in arm_model(final.with_values()).base.names

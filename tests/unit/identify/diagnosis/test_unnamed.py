@@ -81,8 +81,9 @@ def test_identify_recovers_the_torque_of_a_free_shape(key: str) -> None:
     robot = configured(catalogue()[key])
     motion = moved(robot)
     columns = motion.model.term_regressor(motion)
-    values = np.random.default_rng(5).uniform(-2.0, 2.0, columns.shape[2])
-    added = columns @ values
+    values: Floats = np.asarray(np.random.default_rng(5).uniform(-2.0, 2.0, columns.shape[2]), dtype=np.float64)
+    k = columns.shape[2]
+    added = np.asarray(columns @ values)
     t = np.asarray(np.arange(round(SECONDS / DT)) * DT)
     noise = np.random.default_rng(6)
     tau = arm_model(ROBOT).inverse_dynamics(standard(), *kinematics(t + DT / 2)) + added
@@ -90,14 +91,14 @@ def test_identify_recovers_the_torque_of_a_free_shape(key: str) -> None:
     experiment = Experiment(kinematics(t)[0] + 1e-6 * noise.standard_normal(tau.shape), tau, None, DT)
     plain = identify_experiment([experiment], ROBOT, Options(method="idim-ls"))
     found = identify_experiment([experiment], robot, Options(method="idim-ls"))
-    assert len(found.names) - len(plain.names) == values.size
+    assert len(found.names) - len(plain.names) == k
     # The torque of the shape beside what the rigid parameters absorb of it: that is what a free shape determines.
-    estimate = columns[:, JOINT] @ found.theta[-values.size :]
+    estimate = columns[:, JOINT] @ found.theta[-k:]
     joint = added[:, JOINT]
     rigid = np.column_stack([np.ones_like(joint), motion.qd[:, JOINT], motion.sign[:, JOINT], motion.qdd[:, JOINT]])
     difference = estimate - joint
     difference -= rigid @ np.linalg.lstsq(rigid, difference, rcond=None)[0]
-    own = found.covariance[-values.size :, -values.size :]
+    own = np.asarray(found.covariance)[-k:, -k:]
     # A spring is nearly gravity of the same joint: the covariance contains how little tells them apart.
     spread = np.sqrt(np.einsum("mi,ij,mj->m", columns[:, JOINT], own, columns[:, JOINT]))
     assert np.linalg.norm(difference) < 0.1 * np.linalg.norm(joint - joint.mean()) + 2.0 * np.linalg.norm(spread)
