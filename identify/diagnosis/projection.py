@@ -21,8 +21,8 @@ BLOCKS = 20
 """Blocks of the block sums, as in `armident.identify.diagnosis.predictive_score`."""
 
 RANK_TOLERANCE = 0.1
-"""Relative norm orthogonal to the model below which the model contains a direction: 1 % of its power. Coefficients along
-such directions would have ten times the standard deviation, and distort the curve."""
+"""Relative norm orthogonal to the model below which the model contains a direction: 1 % of its power. Coefficients
+along such directions would have ten times the standard deviation, and distort the curve."""
 
 UNPENALISED = 1e-9
 """Roughness, relative to the roughest direction, below which a direction counts as smooth altogether."""
