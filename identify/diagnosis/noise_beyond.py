@@ -1,8 +1,8 @@
 """Noise model of a residual of which regressor and missing effects have been taken out.
 
-An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away. Least
-squares on the functions that the effect follows removes it, and noise with it. The expected autocovariances of that
-noise are added.
+An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away.
+Least squares on the functions that the effect follows removes it, and noise with it. The expected autocovariances of
+that noise are added.
 """
 
 from collections.abc import Sequence

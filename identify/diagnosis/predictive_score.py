@@ -133,7 +133,14 @@ class PredictiveScore:
         Constants that all models of the same data share are omitted.
         """
         own = np.maximum(self.innovations(self.fit.noise), 1e-300)
-        return np.asarray(-0.5 * self.rows * np.log(own) - [ar.order for ar in self.fit.noise])
+        orders = np.array([ar.order for ar in self.fit.noise])
+        return np.asarray(self.rows * (self.volume - 0.5 * np.log(own)) - orders)
+
+    @property
+    def volume(self) -> Array:
+        """Logarithm of the volume by which corrections of the recordings scale the noise, per row, (n,)."""
+        volume = self.fit.study.volume
+        return np.zeros(len(self.fit.noise)) if volume is None else volume
 
     @property
     def log_likelihood(self) -> float:
@@ -172,7 +179,8 @@ class PredictiveScore:
         """
         own, less = self.innovations(self.fit.noise), other.innovations(self.fit.noise)
         rows = self.rows
-        each = 0.5 * rows * np.log(np.maximum(less, 1e-300) / np.maximum(own, 1e-300))
+        ratio = np.log(np.maximum(less, 1e-300) / np.maximum(own, 1e-300))
+        each = rows * (0.5 * ratio + self.volume - other.volume)
         return float(np.sum(each / self.inflation_over(other)))
 
 

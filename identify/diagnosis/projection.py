@@ -20,8 +20,9 @@ Array = NDArray[np.float64]
 BLOCKS = 20
 """Blocks of the block sums, as in `armident.identify.diagnosis.predictive_score`."""
 
-RANK_TOLERANCE = 1e-3
-"""Relative norm orthogonal to the model below which a direction cannot be tested."""
+RANK_TOLERANCE = 0.1
+"""Relative norm orthogonal to the model below which the model contains a direction: 1 % of its power. Coefficients
+along such directions would have ten times the standard deviation, and distort the curve."""
 
 UNPENALISED = 1e-9
 """Roughness, relative to the roughest direction, below which a direction counts as smooth altogether."""
@@ -208,7 +209,7 @@ class JointResidual:
 
 
 def significance(u: Array, e: Array, estimate: Array) -> tuple[float, float]:
-    """Probability of so large a projection from noise alone, and the variance of the projection over that of white noise.
+    """Return the probability of so large a projection from noise alone, and its variance over that of white noise.
 
     The power of correlated normal variables is approximated by a scaled chi-square (Box 1954, Annals of Mathematical
     Statistics 25(2)) whose scale comes from block sums.

@@ -28,12 +28,15 @@ from armident.identify.diagnosis.shaping import both_ends
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import TRANSITION
+from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import known, of_entry
 from armident.identify.effects.terms import stanza_of
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
 Array = NDArray[np.float64]
 
+CORRECTIONS = 3
+"""Corrections of a recording, each refined by the expansion that remains."""
 FINER = (1.4, 1.2, 1.1)
 """Factors of the refinement of the velocity of a transition; the grid has factors of 1.9."""
 CLEAR = 3.0
@@ -161,8 +164,14 @@ class Selected:
         state
             Final model.
         """
-        negligible = self.addition.candidate.effect.negligible
-        return negligible is not None and negligible(state.values_of(state.term_of(self.entry))[0], state.study.sample)
+        effect = self.addition.candidate.effect
+        if effect.negligible is None:
+            return False
+        if of_recording(self.entry):
+            values = np.array([self.entry.parameters[p.name] for p in effect.linear])
+        else:
+            values = state.values_of(state.term_of(self.entry))[0]
+        return effect.negligible(values, state.study.sample)
 
 
 @dataclass
@@ -400,9 +409,41 @@ class StepwiseSelection:
         for name, value in (pair for one in candidate.grid for pair in one):
             largest[name] = max(value, largest.get(name, value))
         allowed = known(effect.key).allows(term.of_effect(values), term.of_effect(std), dict(term.shapes), largest)
+        if effect.undo is not None and allowed:
+            made, entry = self._corrected(state, made, entry)
         share, changed = materiality(state, made)
         own = made.score.log_likelihood - state.score.log_likelihood
         return Addition(candidate, shapes, entry, made, gain(made, state), own, share, changed, allowed)
+
+    def _corrected(self, state: ModelState, made: ModelState, entry: Entry) -> tuple[ModelState, Entry]:
+        """Model in which the recordings are corrected for an effect, and its entry.
+
+        A torque column is the first-order expansion of such an effect at the model's own torque. The corrected
+        recording is exact, and the part of the expansion that remains refines the value.
+
+        Parameters
+        ----------
+        state
+            Model without the effect.
+        made
+            Model with its expansion.
+        entry
+            Entry of the expansion.
+        """
+        name = of_entry(entry).linear[0].name
+        value = float(made.values_of(made.term_of(entry))[0][0])
+        best, chosen = made, entry
+        for _ in range(CORRECTIONS):
+            right = entry.model_copy(update={"parameters": {**entry.parameters, name: value}})
+            exact = self._state(with_entries(state.robot, [right]), state)
+            if exact is None or gain(exact, state) <= gain(best, state):
+                break
+            best, chosen = exact, right
+            further = self._state(with_entries(exact.robot, [entry]), exact)
+            if further is None:
+                break
+            value += float(further.values_of(further.term_of(entry))[0][0])
+        return best, chosen
 
     def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""

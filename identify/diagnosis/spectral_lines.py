@@ -154,9 +154,10 @@ def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, low
 
 
 def of_references(study: Study, frequency: float) -> bool:
-    """Return true if the references contain the line, too: set points have a rate of their own, and the arm follows them.
+    """Return true if the references contain the line, too.
 
-    The motion modulates the line, so its width is a share of the bandwidth of the motion.
+    Set points have a rate of their own, and the arm follows them. The motion modulates the line, so its width is a
+    share of the bandwidth of the motion.
 
     Parameters
     ----------

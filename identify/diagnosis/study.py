@@ -1,6 +1,6 @@
 """Data of a diagnosis: training and held-out stretches of motion, with their torques in one band."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Stanza
 from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distances, moving_rows, rows_before
+from armident.identify.diagnosis.whitening import ar_models
 from armident.identify.effects.recorded import of_recording, put_right
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model
@@ -42,6 +43,10 @@ ROUNDS = 8
 """Most simulations of a loop with terms: instruments have to follow the arm, not to solve its equations."""
 SETTLED = 0.01
 """Relative difference of the torque of the terms and the simulated load that ends these simulations."""
+PERTURBATION = 1e-3
+"""Noise over the spread of a torque: small enough for a nonlinear correction to be linear."""
+NOISE_ORDER = 10
+"""Highest order of the autoregressive models of corrected noise."""
 ALIKE = 0.9
 """Indifference ratio of squared closed-loop velocity errors."""
 STIFF_LOOP = 1.5
@@ -78,6 +83,11 @@ class Study:
         Derivatives of their positions at the recorded rate.
     warnings
         Lines for the user.
+    sign_given
+        True if the configuration gives the smoothing of the sign.
+    volume
+        Logarithm of the volume by which the corrections of a joint's torques scale its noise, per row, (n,): see
+        `log_volume`.
     rigid
         Cache of the regressors that all models of the study share; see
         `armident.identify.diagnosis.regression.regressors`.
@@ -97,6 +107,7 @@ class Study:
     signals: tuple[Derivatives, ...]
     warnings: tuple[str, ...] = ()
     sign_given: bool = True
+    volume: Array | None = None
     rigid: dict[tuple[int, tuple[str, ...], tuple[float, ...]], tuple[Derivatives, Array]] = field(
         default_factory=dict, repr=False, compare=False
     )
@@ -345,7 +356,43 @@ def build_study(
     return Study(
         robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first,
         (training, validation), tuple(signals), tuple(warnings), given.friction.sign_smoothing is not None,
+        log_volume([*training, *validation], robot, lambda tau: second(first(tau))),
     )  # fmt: skip
+
+
+def log_volume(
+    experiments: Sequence[Experiment], robot: RobotConfig, band: Callable[[Array], Array]
+) -> Array | None:
+    """Return the logarithm of the volume by which corrections scale the noise of each joint's torque, per row, (n,).
+
+    Likelihoods of corrected torques refer to those that were recorded by this determinant: a correction that is a
+    low-pass filter makes noise smaller, and no model better. By the theorem of Szegoe it is the logarithm of the ratio
+    of the innovations of white noise with and without the correction.
+
+    Parameters
+    ----------
+    experiments
+        Recordings without corrections.
+    robot
+        Configuration, with effect entries that correct recordings.
+    band
+        Filter and decimation to the rows of the comparison.
+
+    Returns
+    -------
+    ndarray or None
+        ``None`` without a correction that changes noise.
+    """
+    if not any(of_recording(e) and not known(e.effect).rewires for e in robot.effects):
+        return None
+    rng = np.random.default_rng(0)
+    noise = [PERTURBATION * e.tau.std(axis=0) * rng.standard_normal(e.tau.shape) for e in experiments]
+    disturbed = [replace(e, tau=e.tau + x) for e, x in zip(experiments, noise, strict=True)]
+    pairs = zip(put_right(disturbed, robot), put_right(experiments, robot), strict=True)
+    after = [band(one.tau - other.tau) for one, other in pairs]
+    before = [band(x) for x in noise]
+    innovations = [[ar.variance for ar in ar_models(part, NOISE_ORDER)] for part in (after, before)]
+    return np.asarray(0.5 * np.log(np.array(innovations[0]) / np.array(innovations[1])))
 
 
 def _simulated(
