@@ -150,11 +150,6 @@ def said(found: Diagnosis) -> list[str]:
     torque = found.simulated.torque_before, found.simulated.torque_after
     if np.isfinite(torque).all():
         lines.append("torques of the simulated loop, error by joint " + " -> ".join(_each(t) for t in torque) + " %")
-    lines.append(
-        "held-out error with what is changed at simulated motion "
-        + _each(found.simulated.torque_without_derivative_noise)
-        + " %"
-    )
     for f in document.findings:
         where = f.joint if f.other is None else f"{f.joint} and {f.other}"
         values = ", ".join(
