@@ -220,7 +220,9 @@ class Workshop:
             self.kept.update(made)
         return [made[key(shapes)] if key(shapes) in made else self.kept[key(shapes)] for shapes in grid]
 
-    def _filtered(self, effect: Effect, place: Place, grid: Sequence[Shapes], stretch: Stretch, kind: str) -> list[Kept]:
+    def _filtered(
+        self, effect: Effect, place: Place, grid: Sequence[Shapes], stretch: Stretch, kind: str
+    ) -> list[Kept]:
         """Columns of one stretch in the band of the comparison, of every shape."""
         motion, moving = self.motion(stretch, kind), stretch.moving
         narrow: list[Array] = []

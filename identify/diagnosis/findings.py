@@ -47,9 +47,7 @@ def findings_of(final: ModelState, selected: Sequence[Selected]) -> list[Finding
     return found
 
 
-def _finding(
-    final: ModelState, one: Selected, parameters: Mapping[str, float], std: dict[str, float]
-) -> Finding:
+def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], std: dict[str, float]) -> Finding:
     addition, report = one.addition, one.confirmation
     assert report is not None
     effect, place = of_entry(one.entry), addition.candidate.place
@@ -117,9 +115,7 @@ def _alternatives(final: ModelState, one: Addition, rivals: Sequence[Addition]) 
     for rival in rivals:
         if rival.named:
             joint = final.study.joints[rival.candidate.place.joint]
-            entry = Alternative(
-                effect=rival.family[0], joint=joint, score=rival.log_likelihood - one.log_likelihood
-            )
+            entry = Alternative(effect=rival.family[0], joint=joint, score=rival.log_likelihood - one.log_likelihood)
             found.setdefault(rival.family, entry)
     return list(found.values())[:ALTERNATIVES]
 

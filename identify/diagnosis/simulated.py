@@ -39,7 +39,9 @@ class SimulatedErrors:
         """Return the entry ``simulated`` of ``diagnosis.json``."""
         names = ("velocity_before", "velocity_after", "torque_before", "torque_after")
         finite = {name: getattr(self, name) for name in names if np.isfinite(getattr(self, name)).all()}
-        return {name: dict(zip(self.joints, map(float, values), strict=True)) for name, values in finite.items()} or None
+        return {
+            name: dict(zip(self.joints, map(float, values), strict=True)) for name, values in finite.items()
+        } or None
 
 
 def simulated_errors(first: ModelState, final: ModelState) -> SimulatedErrors:

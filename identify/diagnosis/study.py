@@ -360,9 +360,7 @@ def build_study(
     )  # fmt: skip
 
 
-def log_volume(
-    experiments: Sequence[Experiment], robot: RobotConfig, band: Callable[[Array], Array]
-) -> Array | None:
+def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Callable[[Array], Array]) -> Array | None:
     """Return the logarithm of the volume by which corrections scale the noise of each joint's torque, per row, (n,).
 
     Likelihoods of corrected torques refer to those that were recorded by this determinant: a correction that is a

@@ -180,7 +180,12 @@ def stanza_of(
     """
     other = None if place.other is None else robot.joints[place.other].name
     return Stanza(
-        effect=effect.name, law=effect.law, joint=robot.joints[place.joint].name, other=other, parameters=parameters, without=without
+        effect=effect.name,
+        law=effect.law,
+        joint=robot.joints[place.joint].name,
+        other=other,
+        parameters=parameters,
+        without=without,
     )
 
 
