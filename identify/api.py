@@ -457,8 +457,8 @@ def diagnose(
     >>> found.findings[0]["effect"], found.findings[0]["joint"]
     ('asymmetric_viscous_friction', 'joint_2')
     """
-    from armident.identify.diagnosis.diagnose import diagnose as run
     from armident.identify.diagnosis.criteria import Criteria
+    from armident.identify.diagnosis.diagnose import diagnose as run
 
     read = _read(recordings)
     config = _robot(robot, read)

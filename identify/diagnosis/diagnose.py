@@ -28,7 +28,7 @@ from armident.identify.diagnosis.numbers import stale_numbers
 from armident.identify.diagnosis.selection import Selected, StepwiseSelection
 from armident.identify.diagnosis.setup_stage import set_up
 from armident.identify.diagnosis.simulated import SimulatedErrors, simulated_errors
-from armident.identify.diagnosis.study import Study, build_study
+from armident.identify.diagnosis.study import build_study
 from armident.identify.document import (
     BeforeAfter,
     DiagnosisDocument,

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.candidates import Workshop
-from armident.identify.diagnosis.regression import Fit
 from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.regression import Fit
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.terms import Term
 from armident.identify.regression.ar_noise import ArModel

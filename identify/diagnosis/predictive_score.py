@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 BLOCKS = 10
 """Blocks of the training data: each much longer than the memory of the noise."""
 SUMS = 20
-"""Blocks of the block sums: long beside the memory of the noise, and enough for a variance with 19 degrees of freedom."""
+"""Blocks of the block sums: long beside the memory of the noise, enough for a variance with 19 degrees of freedom."""
 FOLDS = 10
 """Folds of the cross-validation (Hastie, Tibshirani, Friedman 2009, section 7.10)."""
 

@@ -1,4 +1,4 @@
-"""Screening of candidates: score statistics on the training data, with noise models that a missing effect does not bias.
+"""Screening of candidates: score statistics of training data, with noise models that a missing effect does not bias.
 
 An autoregressive model of a residual that contains a missing effect takes the effect for noise and whitens it away. The
 weight of a spring, for example, is forty times too small. So the noise models of the screening come from a residual
