@@ -118,8 +118,9 @@ EFFECTS = (
         name="drive_gain_saturation",
         title="a torque that is not proportional to the current",
         says="the motor gives less torque per ampere at high current because its iron saturates (gain_loss "
-        "positive), or the reported current saturates (negative); gain_loss is the share at the torque limit of the joint, and grows "
-        "with the square of the torque",
+        "positive), or the reported current saturates (negative); "
+        "gain_loss is the share at the torque limit of the joint, and "
+        "grows with the square of the torque",
         reference="Leonhard 2001, Control of Electrical Drives, chapter 5",
         linear=(Linear("gain_loss", ("", "")),),
         columns=_saturation,
