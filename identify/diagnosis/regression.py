@@ -473,6 +473,9 @@ def relative_errors(fit: Fit, theta: Array | None = None, *, held: bool) -> tupl
 def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Array, Array]:
     """Regressor (M, n, b) at measured and at simulated signals, in the band of the comparison.
 
+    Effects that depend on accelerations or torques are computed at simulated signals in both. Effects with jumps, which
+    a simulation does not reproduce to the sample, are computed at measured signals in both.
+
     Parameters
     ----------
     study
@@ -483,6 +486,7 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
         Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
     """
     out: list[Array] = []
+    terms: dict[str, Array] = {}
     for kind in ("measured", "simulated"):
         signals = getattr(stretch, kind)
         key = (id(signals), study.model.base.names[: -study.model.e or None], tuple(study.robot.sign_smoothing))
@@ -492,12 +496,18 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
             study.rigid[key] = signals, made
         rigid = study.rigid[key][1]
         if study.model.e:
-            terms = _filtered_terms(study, stretch, kind, theta)
+            terms[kind] = _filtered_terms(study, stretch, kind, theta)
+            made = terms[kind]
             if out:
+                every = [t.effect for t in effect_terms(study.model) for _ in t.names]
+                sudden = np.flatnonzero([e.sudden for e in every])
+                made[:, :, sudden] = terms["measured"][:, :, sudden]
+                # Measured signals differentiated twice carry more noise than such an effect has torque.
+                dynamic = np.flatnonzero([e.predicts and not e.sudden for e in every])
                 first = out[0].shape[2] - study.model.e
-                sudden = np.flatnonzero([t.effect.sudden for t in effect_terms(study.model) for _ in t.names])
-                terms[:, :, sudden] = out[0][:, :, first + sudden]
-            rigid = np.concatenate([rigid, terms], axis=2)
+                moving = 1.0 if stretch.moving is None else stretch.moving[:, :, None]
+                out[0][:, :, first + dynamic] = made[:, :, dynamic] * moving
+            rigid = np.concatenate([rigid, made], axis=2)
         out.append(rigid if stretch.moving is None else rigid * stretch.moving[:, :, None])
     return out[0], out[1]
 
