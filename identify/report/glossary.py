@@ -9,6 +9,7 @@ from typing import get_args
 from armident.identify.document import DiagnosisDocument, IdentificationDocument, Verdict, write_atomically
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.registry import catalogue
+from armident.identify.effects.tables import KNOTS
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,17 @@ RIGID: tuple[Entry, ...] = (
 """Standard parameters of a link and its joint (thesis equations 2.6, 2.12 and 2.13); the joint number follows."""
 
 _ROTOR = "Rotor inertia that the gear does not transmit, on the joint side; 0 where the model has it as `ia`."
+
+
+def _table_of(prefix: str, value: str, variable: str, end: str = "") -> dict[str, str]:
+    """Return the texts of the parameters of a table over a variable, whose value is zero at the first knot."""
+    texts = {
+        f"{prefix}{k}": f"Change of the {value} from knot 0 to knot {k} of {KNOTS - 1} over the {variable}."
+        for k in range(1, KNOTS)
+    }
+    ends = {end: "Last knot."} if end else {"low": "First knot.", "high": "Last knot."}
+    return texts | ends
+
 
 EFFECT_PARAMETERS: dict[str, dict[str, str]] = {
     "asymmetric_viscous_friction": {
@@ -153,6 +165,48 @@ EFFECT_PARAMETERS: dict[str, dict[str, str]] = {
         "position": "True over recorded position; with another joint, the multiple of its position that is added.",
         "torque": "True over recorded torque; with another joint, the multiple of its torque that is added.",
     },
+    "coulomb_transition": {
+        "fct": "Part of the Coulomb friction that reverses gradually: `fct tanh(qd / velocity)` in place of the "
+        "smoothed sign.",
+        "velocity": "Velocity over which the dry friction reverses.",
+    },
+    "stribeck_friction/exponential": {
+        "fst": "Additional friction torque at low speed: `fst exp(-|qd| / velocity) sign(qd)`.",
+        "velocity": "Velocity at which the additional friction has decreased to 37 %.",
+    },
+    "stribeck_friction/table": {
+        **{
+            f"fst{k}": f"Additional friction torque at {share:.0%} of the speed `top`; between the speeds it is linear."
+            for k, share in enumerate((0.0, 0.05, 0.12, 0.25))
+        },
+        "top": "Highest speed of the joint in the recordings.",
+    },
+    "position_dependent_friction/table": _table_of("fpt", "Coulomb friction", "position"),
+    "friction_drift/work": {
+        "fcdr": "Change of the Coulomb friction after much work.",
+        "fvdr": "Change of the viscous friction after much work.",
+        "decay": "Rate of the change per integral of the squared velocity, which is the work of viscous friction.",
+    },
+    "joint_spring/cubic": {
+        "ks": "Stiffness: torque per joint position.",
+        "ks2": "Change of the stiffness with the position: torque per square of the position.",
+        "ks3": "Stiffening: torque per cube of the position.",
+    },
+    "joint_spring/table": _table_of("kst", "torque of the spring", "position"),
+    "unnamed/velocity": {
+        **{
+            f"u{k}": f"Torque at {share:.0%} of the speed `top`, {way} velocity; between the speeds it is linear."
+            for k, (way, share) in enumerate((w, s) for w in ("positive", "negative") for s in (0.0, 0.04, 0.12, 0.3))
+        },
+        "top": "Highest speed of the joint in the recordings.",
+    },
+    "unnamed/time": _table_of("u", "torque", "time", "duration"),
+    "unnamed/time_and_direction": _table_of("u", "friction", "time", "duration"),
+    "unnamed/torque": _table_of("u", "torque", "torque of the joint"),
+    "unnamed/acceleration": _table_of("u", "torque", "acceleration"),
+    "unnamed/velocity_of_other": _table_of("u", "torque", "velocity of the other joint"),
+    "unnamed/torque_of_other": _table_of("u", "torque", "torque of the other joint"),
+    "unnamed/position_of_other": _table_of("u", "torque", "position of the other joint"),
 }
 """Meaning of every parameter of the effects of this package."""
 
@@ -243,7 +297,12 @@ DIAGNOSIS_TERMS: tuple[Entry, ...] = (
     Entry("p-value", "Probability that a model without the effect shows at least this evidence by chance."),
     Entry("false-alarm rate", "Probability that a diagnosis of a complete model finds anything; option "
           "`--false-alarms`, shared between all tests."),
-    Entry("considered", "Effects that passed the tests but have a confidence below 0.5; they are not in the model."),
+    Entry("considered", "Effects that passed the tests but have a confidence below 0.5, in documents of former "
+          "versions; they are not in the model."),
+    Entry("negligible", "Effects that are significant and change the torque by less than `--material`, or the error by "
+          "less than 2 %. They are no cause, and not in the model."),
+    Entry("unnamed", "A regular torque without a known cause. It is a part of the model, with the variable on which it "
+          "depends."),
     Entry("share of residual", "Share of the power of a joint's residual that a dependence or an effect predicts on "
           "held-out data."),
     Entry("detection limit", "Size of an effect from which nine diagnoses of ten would find it in such recordings. A "
@@ -271,6 +330,7 @@ DEPENDENCES: tuple[Entry, ...] = (
     Entry("time", "Time since the beginning of the recordings: drift."),
     Entry("time and direction", "Time, with the sign of the velocity: drift of friction."),
     Entry("velocity of another joint", "Velocity of another joint: shared gears, cables, wrong geometry."),
+    Entry("position of another joint", "Position of another joint: cables and hoses that it pulls, wrong geometry."),
     Entry("torque of another joint", "Torque of another joint: electrical coupling, elastic structure."),
     Entry("frequency", "A spectral line that is independent of the motion."),
     Entry("motion", "The frequencies of the motion, more than noise has there, with no single variable."),
@@ -294,7 +354,7 @@ def effect_entries(effect: Effect) -> list[Entry]:
     list of Entry
         In the order of the effect: linear, nonlinear; of a wiring error the signals.
     """
-    texts = EFFECT_PARAMETERS.get(effect.name, {})
+    texts = EFFECT_PARAMETERS.get(effect.key, {})
     given = [(p.name, p.unit) for p in effect.linear] + [(s.name, s.unit) for s in effect.shapes]
     if effect.rewires:
         given = [(name, ("", "")) for name in texts]
@@ -351,8 +411,9 @@ def diagnosis_entries(document: DiagnosisDocument) -> list[Entry]:
     found: dict[str, Entry] = {}
     effects = catalogue()
     for finding in document.findings:
-        if finding.effect in effects:
-            for entry in effect_entries(effects[finding.effect]):
+        key = f"{finding.effect}/{finding.law}" if finding.law else finding.effect
+        if key in effects:
+            for entry in effect_entries(effects[key]):
                 if entry.name in finding.parameters:
                     name = f"{entry.name} ({finding.effect.replace('_', ' ')})"
                     found.setdefault(name, Entry(name, entry.text, entry.units))
@@ -382,7 +443,7 @@ def _varies(varies_with: str, kind: str) -> bool:
 
 def markdown() -> str:
     """Return the text of ``docs/glossary.md``."""
-    ours = [effect for effect in catalogue().values() if effect.name in EFFECT_PARAMETERS]
+    ours = [effect for effect in catalogue().values() if effect.key in EFFECT_PARAMETERS]
     parts = [
         "# Glossary",
         "Parameter names of robot configurations and results, and terms of the reports. Written by\n"
@@ -397,7 +458,7 @@ def markdown() -> str:
         "number to linear parameters, for example `fva2`.",
     ]
     for effect in ours:
-        parts += [f"### {effect.name}", f"{effect.says[0].upper()}{effect.says[1:]}.", _table(effect_entries(effect))]
+        parts += [f"### {effect.key}", f"{effect.says[0].upper()}{effect.says[1:]}.", _table(effect_entries(effect))]
     parts += ["## Identification", *_list(IDENTIFICATION_TERMS), "## Diagnosis", *_list(DIAGNOSIS_TERMS)]
     parts += ["## Variables of an unexplained residual", *_list(DEPENDENCES)]
     return "\n\n".join(parts) + "\n"

@@ -34,9 +34,9 @@ def test_every_parameter_of_every_effect_is_explained() -> None:
     text = PAGE.read_text(encoding="utf-8")
     for effect in catalogue().values():
         names = [p.name for p in effect.linear] + [s.name for s in effect.shapes]
-        texts = glossary.EFFECT_PARAMETERS[effect.name]
-        assert set(names) == set(texts) or effect.rewires, effect.name
-        section = text.split(f"### {effect.name}\n")[1].split("\n#")[0]
+        texts = glossary.EFFECT_PARAMETERS[effect.key]
+        assert set(names) == set(texts) or effect.rewires, effect.key
+        section = text.split(f"### {effect.key}\n")[1].split("\n#")[0]
         for name, meaning in texts.items():
             assert f"| `{name}` |" in section
             assert meaning in section
