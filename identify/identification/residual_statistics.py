@@ -141,9 +141,7 @@ def motion_functions(q: Array, qd: Array, limits: tuple[float, float], fastest: 
     """
     place = _hats(q, np.linspace(*limits, POSITION_KNOTS))
     direction = qd / np.hypot(qd, max(DIRECTION * fastest, 1e-300))
-    return np.hstack(
-        [place, place * direction[:, None], _hats(qd, np.linspace(-fastest, fastest, VELOCITY_KNOTS))]
-    )
+    return np.hstack([place, place * direction[:, None], _hats(qd, np.linspace(-fastest, fastest, VELOCITY_KNOTS))])
 
 
 def _hats(x: Array, knots: Array) -> Array:

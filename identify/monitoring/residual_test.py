@@ -62,7 +62,9 @@ class ResidualChange:
         chance = f"p = {self.p_value:.1g}" if self.p_value >= 1e-12 else "p = below 1e-12"
         if self.band_hz is not None:
             low, high = self.band_hz
-            return f"{self.joint}: power of the residuals from {low:.3g} to {high:.3g} Hz x {self.statistic:.3g}, {chance}"
+            return (
+                f"{self.joint}: power of the residuals from {low:.3g} to {high:.3g} Hz x {self.statistic:.3g}, {chance}"
+            )
         of = "position and direction" if self.kind == "position" else "velocity"
         return (
             f"{self.joint}: dependence of the residuals on {of} has changed "
