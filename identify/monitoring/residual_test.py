@@ -17,9 +17,10 @@ from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]
 
-SAME_MOTION = 0.05
+SAME_MOTION = 0.1
 """Largest difference of range and speed of a joint between both runs, as share of them. The model errors of a healthy
-arm cancel in the difference only if the motion is the same."""
+arm cancel in the difference only if the motion is the same.
+A shift of an eighth of the range would be one knot of the functions of position."""
 
 RANK = 1e-3
 """Eigenvalue of the information of normalised functions, relative to the largest, below which a combination of

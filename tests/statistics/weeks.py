@@ -128,6 +128,9 @@ def summary(out: Path) -> bool:
     print(f"{len(compared)} runs compared with the first: {len(alarms)} alarms, {len(failed)} failed; exit code {code}")
     print(f"chi-square {chi.mean():.1f} +- {chi.std():.1f}, greatest {chi.max():.1f}; of chance {degrees} +- ", end="")
     print(f"{np.sqrt(2 * degrees):.1f}; smallest chance of all parameters together {min(p):.2g}")
+    residual = [row["drift"]["p_residuals"] for row in compared if row["drift"]["structure_compared"]]
+    if residual:
+        print(f"residuals compared in {len(residual)} runs; smallest corrected chance {min(residual):.2g}")
     for row in alarms + failed:
         print(f"  {row['recording']}: {row['error'] or '; '.join(row['words'])}")
     worn, code = judge(
