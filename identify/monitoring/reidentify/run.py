@@ -275,6 +275,8 @@ def _unexpected(
 
     The same motion gave a usable baseline. Exchanged signals, for example, leave no usable parameters at all.
     """
+    # The diagnosis decides what the comparison left open.
+    defect = defect.removesuffix(": whether the arm has changed is unknown")
     unknown = DataError(f"{recording.path}: {defect}: whether the arm has changed is unknown (result: {path})")
     if job.baseline.document is None:
         raise unknown
