@@ -23,7 +23,7 @@ from tests.statistics.weeks import WORN, cell_file
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(280)]
 
-QUICK = {"sync": {"period_us": 2000}}
+QUICK: dict[str, Any] = {"sync": {"period_us": 2000}}
 
 
 @contextmanager
