@@ -67,6 +67,24 @@ class Whiteness(Document):
     fraction_outside_2sigma: float
 
 
+class ResidualStatistics(Document):
+    """Statistics of the residuals of a joint, for the comparison with a later run of the same motion.
+
+    ``score`` and ``information`` belong to free functions of position (two thirds of them) and of velocity, estimated
+    beside all parameters; ``band_power`` is the mean square of the residuals between two ``band_edges_hz``, with its
+    degrees of freedom.
+    """
+
+    joint: str
+    position_range: tuple[float, float]
+    velocity_limit: float
+    score: list[float]
+    information: list[list[float]]
+    band_edges_hz: list[float]
+    band_power: list[float]
+    band_degrees: list[float]
+
+
 class VerdictReason(Document):
     """Defect of an identification: its level, the property judged, one sentence, and the next step."""
 
@@ -93,7 +111,7 @@ class IdentificationDocument(Document):
     torque leads the position, and its standard deviation. A drive that reports the torque that it holds until the next
     sample has a lead of 0.5. ``sign_smoothing`` is ``g`` of each joint's ``sign(qd) -> (2/pi) atan(g qd)``, s/rad or
     s/m. ``bias`` is the bias by derivatives, encoder noise and sampling that was subtracted from the parameters, null
-    where it is irrelevant.
+    where it is irrelevant. ``residual_statistics`` is null in documents of former versions.
     """
 
     schema_: Literal["armident/identification/1"] = Field("armident/identification/1", alias="schema")
@@ -124,6 +142,7 @@ class IdentificationDocument(Document):
     bias: dict[str, float] | None = None
     sign_smoothing: dict[str, float] | None = None
     criteria: dict[str, float] | None = None
+    residual_statistics: list[ResidualStatistics] | None = None
 
 
 class Alternative(Document):
@@ -412,6 +431,7 @@ def identification_document(
         bias=None if result.bias is None else dict(zip(result.names, map(float, result.bias), strict=True)),
         sign_smoothing=dict(zip(joints, (float(g) for g in result.sign_smoothing), strict=True)),
         criteria=plain(result.criteria),
+        residual_statistics=[ResidualStatistics(**plain(each)) for each in result.residual_statistics] or None,
     )
 
 

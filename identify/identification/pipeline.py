@@ -30,6 +30,7 @@ from armident.identify.identification.judgement import Judged, Notes, judgement,
 from armident.identify.identification.moving_joints import MOVE, moving_joints, require_motion
 from armident.identify.identification.noise_decimation import decimation_from_noise
 from armident.identify.identification.options import CONTROLLERS, Options
+from armident.identify.identification.residual_statistics import residual_statistics
 from armident.identify.identification.result import (
     Array,
     Identification,
@@ -153,6 +154,8 @@ def _identify(
         clock.enter("statistics", 0.85)
         statistics = _statistics(prepared, found, solution)
         statistics = replace(statistics, interval_warnings=(*statistics.interval_warnings, *doubts))
+        residuals = residual_statistics(prepared, found.blocks, found.estimate)
+        statistics = replace(statistics, residuals=residuals)
         if options.physical:
             clock.enter("physical", 0.95)
             physical = nearest_consistent(model, found.estimate.theta, found.estimate.covariance)

@@ -11,6 +11,7 @@ from armident.configs import RobotConfig
 from armident.identify.estimators.diagnostics import Diagnostics
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.options import Options
+from armident.identify.identification.residual_statistics import JointResidualStatistics
 from armident.identify.identification.torque_delay import TorqueDelay
 from armident.identify.identification.verdict import Verdict
 from armident.identify.regression.ar_noise import whiteness
@@ -90,6 +91,8 @@ class Identification:
         Options of the identification.
     idim_ls, idim_ls_relative_error_pct
         Theta and standard deviations of IDIM-LS on the same data, for comparison, and its relative error, percent.
+    residual_statistics
+        Statistics of the residuals of every joint, for a later comparison; empty: none.
     t, tau_measured, tau_predicted
         Decimated instants (M,), s, and torques (M, n), N m or N, experiments one after the other.
     """
@@ -128,6 +131,7 @@ class Identification:
     tau_predicted: Array
     residual_autocorrelation: Array
     autocorrelation_bound: Array
+    residual_statistics: tuple[JointResidualStatistics, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -191,6 +195,8 @@ class Statistics:
         Reasons why the standard deviations are doubtful.
     bias
         Bias (b,) that was subtracted from the estimate, SI; ``None``: irrelevant.
+    residuals
+        Statistics of the residuals of every joint; empty: none.
     """
 
     essential: NDArray[np.bool_]
@@ -199,6 +205,7 @@ class Statistics:
     physical: ConsistentParameters | None = None
     interval_warnings: tuple[str, ...] = ()
     bias: Array | None = None
+    residuals: tuple[JointResidualStatistics, ...] = ()
 
 
 def make_result(
@@ -279,6 +286,7 @@ def make_result(
         tau_predicted=np.concatenate([b.x @ estimate.theta for b in ls_blocks]),
         residual_autocorrelation=np.stack([test.autocorrelation for test in tests]),
         autocorrelation_bound=np.array([test.bound for test in tests]),
+        residual_statistics=statistics.residuals,
     )
 
 

@@ -1,8 +1,8 @@
-"""Chi-square test of parameter change between two identifications of an arm."""
+"""Test of change between two identifications of an arm: chi-square of parameters, and residuals."""
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy import stats
 
 from armident.configs import DataError
 from armident.identify.document import IdentificationDocument, Parameter
+from armident.identify.monitoring.residual_test import ResidualChange, ResidualTest, compare_residuals
 from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]
@@ -79,10 +80,12 @@ class ParameterChangeTest:
         ``d' C^-1 d`` with the covariance C of the difference, its degrees of freedom, and the probability of a larger
         one without a change.
     false_alarms
-        False-alarm rate; one half is for the joint test, the other for single parameters and groups.
+        False-alarm rate of all tests; `share` is that of each.
     groups
         Friction and masses of each joint: viscous and Coulomb friction are correlated, so that a change may be
         significant in both together and in neither alone.
+    residuals
+        Test of the residuals for a change of structure.
     """
 
     parameters: tuple[Parameter, ...]
@@ -95,23 +98,34 @@ class ParameterChangeTest:
     p_joint: float
     false_alarms: float
     groups: tuple[Group, ...] = ()
+    residuals: ResidualTest = field(default_factory=ResidualTest)
+
+    @property
+    def share(self) -> float:
+        """False-alarm rate of each test: all parameters together; single ones and groups; residuals if compared."""
+        return self.false_alarms / (3 if self.residuals.tests else 2)
+
+    @property
+    def changed_residuals(self) -> tuple[ResidualChange, ...]:
+        """Significant changes of the residuals, the most significant first."""
+        return self.residuals.changed(self.share)
 
     @property
     def changed(self) -> tuple[str, ...]:
         """Names of the parameters with a significant change, the most significant first."""
         order = np.argsort(self.p_values, kind="stable")
-        return tuple(self.parameters[k].name for k in order if self.p_values[k] < self.false_alarms / 2)
+        return tuple(self.parameters[k].name for k in order if self.p_values[k] < self.share)
 
     @property
     def changed_groups(self) -> tuple[Group, ...]:
         """Groups with a significant change, the most significant first."""
-        clear = [group for group in self.groups if group.p_value < self.false_alarms / 2]
+        clear = [group for group in self.groups if group.p_value < self.share]
         return tuple(sorted(clear, key=lambda group: group.p_value))
 
     @property
     def drifted(self) -> bool:
-        """True if a single parameter, a group, or all parameters together changed significantly."""
-        return bool(self.changed or self.changed_groups) or self.p_joint < self.false_alarms / 2
+        """True if a parameter, a group, all parameters together, or the residuals changed significantly."""
+        return bool(self.changed or self.changed_groups or self.changed_residuals) or self.p_joint < self.share
 
     @property
     def entry(self) -> dict[str, object]:
@@ -123,13 +137,24 @@ class ParameterChangeTest:
             "chi_square": self.chi_square,
             "degrees": self.degrees,
             "p_joint": self.p_joint,
+            "structure_compared": bool(self.residuals.tests),
+            "structure_note": self.residuals.reason or None,
+            "changed_residuals": [each.words for each in self.changed_residuals],
+            "p_residuals": min((each.p_value for each in self.residuals.tests), default=None),
+            "alpha": {
+                "all": self.false_alarms,
+                "parameters_together": self.share,
+                "parameters_and_groups": self.share,
+                "residuals": self.share if self.residuals.tests else 0.0,
+            },
         }
 
     @property
     def words(self) -> str:
         """Result in one sentence."""
         if not self.drifted:
-            return f"no change (chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom)"
+            note = f"; {self.residuals.reason}" if self.residuals.reason else ""
+            return f"no change (chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom){note}"
         by_name = {p.name: k for k, p in enumerate(self.parameters)}
         parts = [
             f"{name} {self.before[by_name[name]]:.4g} -> {self.parameters[by_name[name]].value:.4g} "
@@ -140,6 +165,7 @@ class ParameterChangeTest:
         for group in self.changed_groups:
             if not known & set(group.members):
                 parts.append(f"{group.kind} {group.place} ({', '.join(group.members)} together)")
+        parts += [each.words for each in self.changed_residuals[:1]]
         what = ", ".join(parts) or "no single parameter significantly"
         return f"changed: {what} (chi-square {self.chi_square:.1f} of {self.degrees} degrees of freedom)"
 
@@ -162,7 +188,7 @@ def compare(
     Returns
     -------
     ParameterChangeTest
-        Differences, p-values corrected by Holm's method, and the joint test.
+        Differences, p-values corrected by Holm's method, the joint test, and the test of the residuals.
 
     Raises
     ------
@@ -221,6 +247,7 @@ def compare(
         joint,
         false_alarms,
         groups,
+        compare_residuals(baseline, now),
     )
 
 

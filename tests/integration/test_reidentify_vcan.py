@@ -13,6 +13,7 @@ import pytest
 import sqlalchemy as sa
 import yaml
 
+from armident.configs import config_path
 from armident.daq.recording import read_recording
 from armident.drivers.can.frames import Frames, frame, frames
 from armident.drivers.can.socketcan import RawSocket
@@ -22,7 +23,7 @@ from tests.statistics.weeks import WORN, cell_file
 
 pytestmark = [pytest.mark.vcan, pytest.mark.timeout(280)]
 
-QUICK = {"sync": {"period_us": 2000}}
+QUICK: dict[str, Any] = {"sync": {"period_us": 2000}}
 
 
 @contextmanager
@@ -94,6 +95,34 @@ def test_an_unchanged_arm_and_a_worn_arm_are_distinguished(vcan_bus: str, tmp_pa
     assert {row[1] for row in facts} == {"weekly"}
     assert all("started_utc" in json.loads(row[2]) and "samples.rows" in json.loads(row[3]) for row in facts)
     assert [bool(each) for each in verdicts] == [False, True]
+
+
+SCENARIOS = {
+    "tx40_worn_joint2": "joint_2",
+    "tx40_cable_and_cogging": "joint_1",
+    "tx40_gripper_and_loose_belt": "joint_6",
+    "tx40_miswired": "joint_4",
+    "emps_dry_screw": "joint_1",
+}
+"""Scenario and a joint that its findings name."""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("robot", ["tx40", "emps"])
+def test_every_shipped_scenario_is_found_in_one_run(vcan_bus: str, tmp_path: Path, robot: str) -> None:
+    """One healthy run, then one run of each scenario: exit code 4, and the findings name the joint."""
+    assert {path.stem for path in config_path("scenarios/tx40_miswired.yaml").parent.glob("*.yaml")} == SCENARIOS.keys()
+    config = cell_file(tmp_path, vcan_bus, f"scenarios_{robot}", shipped=f"{robot}_cell.yaml")
+    with arm(config, "--seed", "1"):
+        finished(job(config, tmp_path), 0)
+    for seed, (name, joint) in enumerate(SCENARIOS.items(), start=2):
+        if name.startswith(robot):
+            with arm(config, "--seed", str(seed), "--scenario", str(config_path(f"scenarios/{name}.yaml"))):
+                found, err = finished(job(config, tmp_path), 4)
+            assert found["changed"], err
+            print(name, found["words"], found["findings"])
+            assert any(joint in words for words in found["findings"]), (name, found["findings"])
 
 
 def test_an_emcy_in_the_middle_stops_the_arm_within_a_cycle(vcan_bus: str, tmp_path: Path) -> None:

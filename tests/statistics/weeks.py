@@ -38,15 +38,15 @@ WORN = {
 }
 
 
-def cell_file(folder: Path, bus: str, cell: str, **changes: Any) -> Path:
+def cell_file(folder: Path, bus: str, cell: str, shipped: str = "tx40_cell.yaml", **changes: Any) -> Path:
     """The shipped cell on one bus, at the rate of the campaign."""
-    shipped = config_path("tx40_cell.yaml")
-    data = yaml.safe_load(shipped.read_text(encoding="utf-8"))
+    data = yaml.safe_load(config_path(shipped).read_text(encoding="utf-8"))
     data |= {"cell": cell, "robot": str(config_path(data["robot"])), "bus": {"channel": bus}}
     data |= {"sync": {"period_us": PERIOD_US}, "heartbeat_ms": HEARTBEAT_MS}
     for drive in data["drives"]:
         drive["eds"] = str(config_path(drive["eds"]))
-    data["streams"]["demand"]["every"] = 1
+    if "demand" in data["streams"]:
+        data["streams"]["demand"]["every"] = 1
     data["setpoints"] |= {"trajectory": str(config_path(data["setpoints"]["trajectory"])), "every": 1}
     path = folder / f"{cell}.yaml"
     path.write_text(yaml.safe_dump(data | changes), encoding="utf-8")
@@ -128,6 +128,9 @@ def summary(out: Path) -> bool:
     print(f"{len(compared)} runs compared with the first: {len(alarms)} alarms, {len(failed)} failed; exit code {code}")
     print(f"chi-square {chi.mean():.1f} +- {chi.std():.1f}, greatest {chi.max():.1f}; of chance {degrees} +- ", end="")
     print(f"{np.sqrt(2 * degrees):.1f}; smallest chance of all parameters together {min(p):.2g}")
+    residual = [row["drift"]["p_residuals"] for row in compared if row["drift"]["structure_compared"]]
+    if residual:
+        print(f"residuals compared in {len(residual)} runs; smallest corrected chance {min(residual):.2g}")
     for row in alarms + failed:
         print(f"  {row['recording']}: {row['error'] or '; '.join(row['words'])}")
     worn, code = judge(

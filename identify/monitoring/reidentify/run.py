@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a job; ``drift`` is ``None`` for a first run."""
+    """Result of a job; ``drift`` is ``None`` for a first run, and for a changed arm whose run is not usable."""
 
     document: IdentificationDocument
     path: Path
@@ -67,6 +67,12 @@ class Outcome:
     words: tuple[str, ...]
     diagnosis: Path | None = None
     findings: tuple[str, ...] = ()
+    unusable: bool = False
+
+    @property
+    def changed(self) -> bool:
+        """True if the arm has changed: by the tests, or because the diagnosis of an unusable run found why."""
+        return self.unusable or (self.drift is not None and self.drift.drifted)
 
 
 def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
@@ -106,7 +112,7 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
         print(json.dumps(entry(job, outcome), indent=1))
     else:
         show(job, outcome)
-    return DRIFTED if outcome.drift is not None and outcome.drift.drifted else 0
+    return DRIFTED if outcome.changed else 0
 
 
 def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, false_alarms: float) -> Job:
@@ -230,17 +236,18 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
     if document.verdict == "unusable" or not document.converged:
         keep(job.history, recording, document, path, None, None)
         defect = document.reasons[0].message if document.reasons else document.stop_reason
-        raise DataError(
-            f"{recording.path}: the identification is not usable ({defect}): "
-            f"whether the arm has changed is unknown (result: {path})"
+        return _unexpected(
+            job, recording, document, path, f"the identification is not usable ({defect})", announcer, say
         )
     try:
         drift = None if job.baseline.document is None else compare(job.baseline.document, document, job.false_alarms)
     except Inconclusive as error:
         keep(job.history, recording, document, path, None, None)
-        raise DataError(f"{recording.path}: {error} (result: {path})") from error
+        return _unexpected(job, recording, document, path, str(error), announcer, say)
     keep(job.history, recording, document, path, job.baseline.document, drift)
     announcer.result(to_json(document))
+    if drift is not None and drift.residuals.reason:
+        say(f"warning: {drift.residuals.reason}")
     if drift is None:
         outcome = Outcome(document, path, None, (job.baseline.become(document),))
     elif not drift.drifted:
@@ -251,7 +258,35 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
         outcome = _diagnosed(job, recording, Outcome(document, path, drift, tuple(change_lines(drift, job.robot))), say)
         if outcome.diagnosis is not None:
             announcer.diagnosis(outcome.diagnosis.read_text(encoding="utf-8"))
-    announcer.status("done", drifted=drift is not None and drift.drifted, words=list(outcome.words))
+    announcer.status("done", drifted=outcome.changed, words=list(outcome.words), findings=list(outcome.findings))
+    return outcome
+
+
+def _unexpected(
+    job: Job,
+    recording: Recording,
+    document: IdentificationDocument,
+    path: Path,
+    defect: str,
+    announcer: StatusPublisher,
+    say: Say,
+) -> Outcome:
+    """Return the outcome of a run that cannot be compared: changed if the diagnosis against the baseline finds why.
+
+    The same motion gave a usable baseline. Exchanged signals, for example, leave no usable parameters at all.
+    """
+    # The diagnosis decides what the comparison left open.
+    defect = defect.removesuffix(": whether the arm has changed is unknown")
+    unknown = DataError(f"{recording.path}: {defect}: whether the arm has changed is unknown (result: {path})")
+    if job.baseline.document is None:
+        raise unknown
+    say(f"{defect}; diagnosing")
+    announcer.status("diagnosing", words=defect)
+    outcome = _diagnosed(job, recording, Outcome(document, path, None, (defect,), unusable=True), say)
+    if outcome.diagnosis is None or not outcome.findings:
+        raise unknown
+    announcer.diagnosis(outcome.diagnosis.read_text(encoding="utf-8"))
+    announcer.status("done", drifted=True, words=list(outcome.words), findings=list(outcome.findings))
     return outcome
 
 
@@ -305,7 +340,7 @@ def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Ou
         return outcome
     findings = tuple(finding_lines(document))
     path = folder / "diagnosis.json"
-    return Outcome(outcome.document, outcome.path, outcome.drift, outcome.words, path, findings)
+    return replace(outcome, diagnosis=path, findings=findings)
 
 
 def _beside(recording: Recording, out: Path, suffix: str) -> Path:
@@ -329,6 +364,7 @@ def entry(job: Job, outcome: Outcome) -> dict[str, Any]:
         "identification": str(outcome.path),
         "baseline": job.baseline.name,
         "drift": None if drift is None else drift.entry,
+        "changed": outcome.changed,
         "words": list(outcome.words),
         "diagnosis": None if outcome.diagnosis is None else str(outcome.diagnosis),
         "findings": list(outcome.findings),
@@ -344,10 +380,14 @@ def show(job: Job, outcome: Outcome) -> None:
         Inputs and result of the job.
     """
     drift = outcome.drift
-    if drift is None or not drift.drifted:
+    if not outcome.changed:
         print("\n".join(outcome.words))
     else:
-        print(f"changed since the baseline ({job.baseline.name}), {drift.words.rpartition('(')[2].rstrip(')')}:")
+        if drift is None:
+            statistic = "by a run that cannot be compared"
+        else:
+            statistic = f"chi-square {drift.chi_square:.1f} of {drift.degrees} degrees of freedom"
+        print(f"changed since the baseline ({job.baseline.name}), {statistic}:")
         print("\n".join(f"  {line}" for line in outcome.words))
         if outcome.findings:
             print("diagnosis:")

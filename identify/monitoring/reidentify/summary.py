@@ -27,7 +27,7 @@ _MEANINGS = {
 
 
 def change_lines(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
-    """Return one line per changed parameter and group, the most significant first.
+    """Return one line per changed parameter, group, and property of the residuals, the most significant first.
 
     A single line if only all parameters together have changed; none without a change.
 
@@ -46,6 +46,7 @@ def change_lines(drift: ParameterChangeTest, robot: RobotConfig) -> list[str]:
             clear = [name for name in rest if _deviations(drift, name) >= CLEAR] or rest
             values = "; ".join(_line(drift, name, robot).removeprefix(f"{where}: ") for name in clear)
             lines.append(f"{where}: {group.kind} ({values}), together p = {_p_text(group.p_value)}")
+    lines += [each.words for each in drift.changed_residuals]
     if not lines and drift.drifted:
         z = np.abs(drift.difference) / drift.std
         most = ", ".join(drift.parameters[k].name for k in np.argsort(-z)[:3])

@@ -1,0 +1,185 @@
+"""Statistics of the residuals that a later identification of the same arm can be compared with.
+
+Free functions of the motion describe what the model lacks: piecewise linear ones of position, of position with the
+direction of motion, and of velocity. Their coefficients are estimated beside all base parameters, with the serial
+correlation of the noise in the weights, so that a change of parameters does not enter them. The power of the residuals
+in bands of frequency describes the rest, which may be no function of the motion of the joint.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.identification.equations import Prepared
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.equations import (
+    MAX_AR_ORDER,
+    Estimate,
+    ExperimentEquations,
+    noise_models,
+    residuals,
+    weighted_rows,
+)
+
+Array = NDArray[np.float64]
+
+POSITION_KNOTS = 9
+"""Knots of the functions of position over its range: a period of an eighth of the range is still visible."""
+
+VELOCITY_KNOTS = 9
+"""Knots of the functions of velocity between the largest speeds of both directions; one of them is zero."""
+
+DIRECTION = 0.05
+"""Speed at which the direction of motion is smoothed, as share of the largest speed of the joint."""
+
+BANDS = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2)
+"""Limits of the frequency bands, as shares of half the rate of the equations: octaves. The last octave is left out: it
+depends on the smoother of the positions, whose bandwidth is chosen anew from the noise of every run."""
+
+SPEED_QUANTILE = 0.95
+"""Quantile of the speed that is the last knot of velocity: the largest speed of a joint that hardly moves is noise."""
+
+RANK = 1e-10
+"""Eigenvalues of the normal equations, relative to the largest, that count as rounding errors."""
+
+
+@dataclass(frozen=True)
+class JointResidualStatistics:
+    """Statistics of the residuals of one joint.
+
+    Parameters
+    ----------
+    joint
+        Name of the joint.
+    position_range
+        Smallest and largest position, rad or m: first and last knot.
+    velocity_limit
+        Last knot of velocity, `SPEED_QUANTILE` of the speeds, rad/s or m/s.
+    score, information
+        ``P' W e`` (k,) and ``P' W P`` (k, k) of the functions P without their projection on the regressor, with W the
+        inverse covariance of the noise: the coefficients are ``information^-1 score``, their covariance is
+        ``information^-1``. The first ``2 POSITION_KNOTS`` functions are those of position.
+    band_edges_hz
+        Limits of the frequency bands (m + 1,), Hz.
+    band_power
+        Mean square of the residuals in each band (m,), N^2 m^2 or N^2.
+    band_degrees
+        Degrees of freedom of each power as a chi-square variable (m,).
+    """
+
+    joint: str
+    position_range: tuple[float, float]
+    velocity_limit: float
+    score: Array
+    information: Array
+    band_edges_hz: Array
+    band_power: Array
+    band_degrees: Array
+
+
+def residual_statistics(
+    prepared: Prepared, blocks: Sequence[ExperimentEquations], estimate: Estimate
+) -> tuple[JointResidualStatistics, ...]:
+    """Return the statistics of the residuals of every joint.
+
+    Parameters
+    ----------
+    prepared
+        Experiments with the derivatives of their positions.
+    blocks
+        Equations of the estimate.
+    estimate
+        Estimate, whose noise models weigh the residuals; a model is fitted where it has none.
+    """
+    noise: Sequence[ArModel] = estimate.noise
+    if not any(ar.order for ar in noise):
+        noise = noise_models(blocks, estimate.theta, estimate.covariance, MAX_AR_ORDER)
+    dt = prepared.experiments[0].dt
+    at = [np.rint(block.t / dt).astype(np.int64) for block in blocks]
+    keep = [block.keep for block in blocks]
+    errors = residuals(blocks, estimate.theta)
+    x, e = weighted_rows([block.x for block in blocks], keep, noise), weighted_rows(errors, keep, noise)
+    scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
+    values, vectors = np.linalg.eigh((x / scale).T @ (x / scale))
+    regular = values > RANK * values[-1]
+    whole = (x / scale) @ (vectors[:, regular] / np.sqrt(values[regular]))
+    found, first = [], 0
+    for j, joint in enumerate(prepared.model.robot.joints):
+        q = [s.q[k, j] for s, k in zip(prepared.signals, at, strict=True)]
+        qd = [s.qd[k, j] for s, k in zip(prepared.signals, at, strict=True)]
+        limits = min(float(v.min()) for v in q), max(float(v.max()) for v in q)
+        fastest = float(np.quantile(np.abs(np.concatenate(qd)), SPEED_QUANTILE))
+        functions = [motion_functions(a, b, limits, fastest) for a, b in zip(q, qd, strict=True)]
+        ar = noise[j]
+        rows = np.concatenate([ar.whiten(f)[k[ar.order :, j]] for f, k in zip(functions, keep, strict=True)])
+        own = slice(first, first + rows.shape[0])
+        first += rows.shape[0]
+        projection = whole[own].T @ rows
+        score = rows.T @ e[own] - projection.T @ (whole.T @ e)
+        series = [np.where(k[:, j], r[:, j], 0.0) for r, k in zip(errors, keep, strict=True)]
+        rate = 1.0 / float(blocks[0].t[1] - blocks[0].t[0])
+        power, degrees = band_powers(series, ar)
+        edges = 0.5 * rate * np.array(BANDS)
+        information = rows.T @ rows - projection.T @ projection
+        found.append(JointResidualStatistics(joint.name, limits, fastest, score, information, edges, power, degrees))
+    return tuple(found)
+
+
+def motion_functions(q: Array, qd: Array, limits: tuple[float, float], fastest: float) -> Array:
+    """Return the free functions of the motion of a joint at every instant, shape (M, k).
+
+    Parameters
+    ----------
+    q, qd
+        Position and velocity (M,), rad and rad/s, or m and m/s.
+    limits
+        First and last knot of position.
+    fastest
+        Last knot of velocity; the first is its negative.
+    """
+    place = _hats(q, np.linspace(*limits, POSITION_KNOTS))
+    direction = qd / np.hypot(qd, max(DIRECTION * fastest, 1e-300))
+    return np.hstack([place, place * direction[:, None], _hats(qd, np.linspace(-fastest, fastest, VELOCITY_KNOTS))])
+
+
+def _hats(x: Array, knots: Array) -> Array:
+    """Piecewise linear functions, each one at its knot and zero at the others, shape (M, knots)."""
+    width = max(float(knots[1] - knots[0]), 1e-300)
+    inside = np.clip(x, knots[0], knots[-1])
+    return np.maximum(1.0 - np.abs(inside[:, None] - knots) / width, 0.0)
+
+
+def band_powers(series: Sequence[Array], noise: ArModel) -> tuple[Array, Array]:
+    """Return the mean square of residuals in the frequency bands and the degrees of freedom of each.
+
+    Ordinates of a periodogram are independent chi-square variables with two degrees of freedom each, scaled by the
+    spectrum. Satterthwaite's approximation with the spectrum of the noise model gives those of their sum.
+
+    Parameters
+    ----------
+    series
+        Residuals of one joint, one array (M,) per experiment.
+    noise
+        Noise model of the joint.
+    """
+    bands = len(BANDS) - 1
+    power, sums, squares = np.zeros(bands), np.zeros(bands), np.zeros(bands)
+    total = sum(s.size for s in series)
+    for s in series:
+        taper = np.hanning(s.size)
+        ordinates = np.abs(np.fft.rfft(s * taper))[1:] ** 2
+        frequencies = np.arange(1, ordinates.size + 1) / max(ordinates.size, 1)
+        response = 1.0 + np.exp(-1j * np.pi * np.outer(frequencies, np.arange(1, noise.order + 1))) @ noise.coefficients
+        spectrum = 1.0 / np.abs(response) ** 2
+        band = np.searchsorted(BANDS, frequencies, side="left") - 1
+        inside = band < bands
+        band, ordinates, spectrum = band[inside], ordinates[inside], spectrum[inside]
+        power += 2.0 * np.bincount(band, ordinates, bands) / float(taper @ taper) / total
+        # A Hann taper correlates neighbours: the variance of a sum is that of independent ordinates times this factor.
+        correlation = s.size * float(np.sum(taper**4)) / float(taper @ taper) ** 2
+        sums += np.bincount(band, spectrum, bands)
+        squares += correlation * np.bincount(band, spectrum**2, bands)
+    degrees = 2.0 * sums**2 / np.maximum(squares, 1e-300)
+    return power, np.maximum(degrees, 1e-3)

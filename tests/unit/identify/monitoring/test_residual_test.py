@@ -1,0 +1,91 @@
+"""Residuals against those of the baseline: no false alarm, and a change that parameters do not show."""
+
+import numpy as np
+import pytest
+import yaml
+
+from armident.configs import config_path
+from armident.configs.schema.scenario import Scenario
+from armident.identify.document import IdentificationDocument
+from armident.identify.identification.api import identify_recording
+from armident.identify.identification.residual_statistics import band_powers, motion_functions
+from armident.identify.monitoring.change_test import compare
+from armident.identify.monitoring.residual_test import compare_residuals
+from armident.identify.regression.ar_noise import ArModel
+from tests.fixtures.arms import FAST, recording
+from tests.fixtures.store import shared
+
+SEEDS = 40
+"""Healthy EMPS recordings; each is identified in half a second."""
+
+
+@shared
+def healthy(robot: str, seed: int) -> IdentificationDocument:
+    return identify_recording(
+        recording(robot, f"{robot}_excitation", seed, period=FAST, setpoint_every=1), check=None
+    ).document
+
+
+@shared
+def with_scenario(name: str) -> IdentificationDocument:
+    effects = Scenario.model_validate(yaml.safe_load(config_path(f"scenarios/{name}.yaml").read_text())).effects
+    robot = name.partition("_")[0]
+    return identify_recording(
+        recording(robot, f"{robot}_excitation", 50, *effects, period=FAST, setpoint_every=1), check=None
+    ).document
+
+
+def test_functions_of_position_and_velocity_add_to_one() -> None:
+    t = np.linspace(0.0, 7.0, 500)
+    functions = motion_functions(np.sin(t), np.cos(t), (-1.0, 1.0), 1.0)
+    np.testing.assert_allclose(functions[:, :9].sum(axis=1), 1.0)
+    np.testing.assert_allclose(functions[:, 18:].sum(axis=1), 1.0)
+
+
+def test_power_in_bands_has_the_degrees_of_freedom_of_its_scatter() -> None:
+    """400 series of coloured noise: twice the squared mean over the variance, within four standard errors."""
+    rng = np.random.default_rng(1)
+    noise = ArModel(np.array([-0.8]), 1.0, 0.0)
+    powers, degrees = [], np.empty(0)
+    for _ in range(400):
+        e = rng.standard_normal(900)
+        x = np.empty(900)
+        x[0] = e[0] / 0.6
+        for k in range(1, 900):
+            x[k] = 0.8 * x[k - 1] + e[k]
+        power, degrees = band_powers([x], noise)
+        powers.append(power)
+    scatter = 2.0 * np.mean(powers, axis=0) ** 2 / np.var(powers, axis=0)
+    np.testing.assert_allclose(scatter / degrees, 1.0, atol=4 * np.sqrt(2 / 400) + 0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200)
+def test_healthy_arms_have_no_small_p_values() -> None:
+    """The smallest corrected p-value of each run is below 0.1 as often as chance permits."""
+    first = healthy("emps", 1)
+    smallest = [
+        min(t.p_value for t in compare_residuals(first, healthy("emps", seed)).tests) for seed in range(2, SEEDS + 1)
+    ]
+    # Binomial(39, 0.1): more than ten has a probability of 0.0015.
+    assert sum(p < 0.1 for p in smallest) <= 10
+    assert min(smallest) > 1e-4
+
+
+@pytest.mark.parametrize(("name", "joint"), [("tx40_worn_joint2", "joint_2"), ("tx40_cable_and_cogging", "joint_1")])
+def test_a_change_of_structure_is_found_in_the_residuals(name: str, joint: str) -> None:
+    drift = compare(healthy("tx40", 1), with_scenario(name))
+    assert drift.drifted
+    assert joint in {each.joint for each in drift.changed_residuals}
+    assert drift.entry["alpha"] == pytest.approx(
+        {"all": 1e-4, "parameters_together": 1e-4 / 3, "parameters_and_groups": 1e-4 / 3, "residuals": 1e-4 / 3}
+    )
+
+
+def test_a_baseline_without_statistics_is_named_with_the_remedy() -> None:
+    old = healthy("tx40", 1).model_copy(update={"residual_statistics": None})
+    drift = compare(old, healthy("tx40", 2))
+    assert not drift.drifted
+    assert "renew it" in drift.words
+    assert drift.share == pytest.approx(0.5e-4)
+    assert drift.entry["structure_compared"] is False
