@@ -54,7 +54,7 @@ def at_rate(recording: Recording, rate_hz: float) -> Recording:
     if abs(ratio - 1.0) < SAME:
         return recording
     streams = {name: _stream(stream, ratio) for name, stream in recording.streams.items() if stream.sync.size}
-    counters = {}
+    counters: dict[str, int] = {}
     for name, stream in streams.items():
         expected = int(stream.sync[-1] - stream.sync[0]) + 1 if stream.sync.size else 0
         rows = stream.sync.size
