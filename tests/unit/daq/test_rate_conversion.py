@@ -1,4 +1,4 @@
-"""Resampling of a recording: frequencies in the pass band stay, others do not fold back, gaps and marks keep their times."""
+"""Resampling of a recording: pass band and stop band of the filter, times of gaps and marks."""
 
 from dataclasses import replace
 from pathlib import Path
