@@ -1,10 +1,10 @@
 """Predictive score of a model: cross-validated log-likelihood of the torques with serially correlated noise.
 
 The one criterion by which models are ranked, admitted, exchanged and reduced. Errors are those of torques that the
-parameters did not see: the training data are cut into `BLOCKS` blocks of equal length, every `FOLDS`-th block is left
-out in turn, and the instrumental-variable estimate of the other blocks predicts it. The autoregressive noise model
-turns these errors into innovations, which carry all the information about the model that serially correlated errors
-have (Box, Jenkins 1976, chapter 7).
+parameters did not see. The training data are cut into `BLOCKS` blocks of equal length, and every `FOLDS`-th block is
+left out in turn. The instrumental-variable estimate of the other blocks predicts it. The autoregressive noise model
+turns these errors into innovations. They carry all the information that serially correlated errors have about the model
+(Box, Jenkins 1976, chapter 7).
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Stepwise selection of the effects that a model lacks.
 
 1. Screening: the score statistic of every candidate at every place, in one factorisation of the model's equations.
-2. Closed loop: each of the best candidates is added to the model, the loop with it is simulated, and all parameters are
+2. Closed loop: each of the best candidates is added to the model, and the loop with it is simulated. All parameters are
    estimated with instruments from that loop.
 3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.predictive_score`).
 4. Admission of the best one that is significant, material and physically possible; then the next step.
@@ -295,8 +295,8 @@ class StepwiseSelection:
     def admitted(self, step: Step) -> Addition | None:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
-        An effect is admitted only if no other explanation of the same joint is clearly better, even one that is too
-        small to be a finding. An effect with a name comes first if it explains most of what the best term without a
+        An effect is admitted only if no other explanation of the same joint is clearly better. Even one that is too
+        small to be a finding counts. An effect with a name comes first if it explains most of what the best term without a
         name does. Of the laws of one effect that predict as well, that with the fewest parameters comes first, and a
         free shape last.
 
