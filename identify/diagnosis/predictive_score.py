@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.regression import Fit
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, noise_models
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel
 
@@ -124,6 +124,15 @@ class PredictiveScore:
     def rms(self) -> Array:
         """Root mean square of the predicted errors of each joint, N m or N, (n,)."""
         return np.array([float(np.sqrt(np.mean(errors**2))) for errors in self.errors])
+
+    @cached_property
+    def own_log_likelihood(self) -> float:
+        """Log-likelihood of the data of all joints under noise models of the model's own residual.
+
+        One is subtracted for each coefficient of the noise models, which are not cross-validated (Akaike's criterion).
+        """
+        noise = noise_models(self.fit.left, self.fit.theta.size, MAX_AR_ORDER)
+        return self.log_likelihood_under(noise) - sum(ar.order for ar in noise)
 
     @property
     def volume(self) -> Array:

@@ -59,6 +59,8 @@ class Addition:
         Gain of log-likelihood over the model without it, see `gain`.
     raw_gain
         The same if the innovations had no correlation left.
+    own_gain
+        Gain of log-likelihood with each model under noise models of its own residual.
     log_likelihood
         Log-likelihood of the model with the effect under the noise models of the step, which all candidates share.
     share
@@ -75,6 +77,7 @@ class Addition:
     state: ModelState
     gain: float
     raw_gain: float
+    own_gain: float
     log_likelihood: float
     share: float
     material_pct: float
@@ -288,6 +291,7 @@ class StepwiseSelection:
         return (
             addition.allowed
             and addition.gain > np.log(max(tests, 1) / self.criteria.alpha["selection"])
+            and addition.own_gain > np.log(max(tests, 1))
             and addition.share >= self.criteria.least_share
             and addition.material_pct >= self.criteria.material_pct
         )
@@ -296,8 +300,8 @@ class StepwiseSelection:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
         An effect is admitted only if no other explanation of the same joint is clearly better. Even one that is too
-        small to be a finding counts. An effect with a name comes first if it explains most of what the best term without a
-        name does. Of the laws of one effect that predict as well, that with the fewest parameters comes first, and a
+        small to be a finding counts. An effect with a name comes first if it explains most of what the best term
+        without a name does. Of the laws of one effect that predict as well, that with the fewest parameters comes first, and a
         free shape last.
 
         Parameters
@@ -413,8 +417,9 @@ class StepwiseSelection:
             made, entry = self._corrected(state, made, entry)
         share, changed = materiality(state, made)
         before, after = (one.score.log_likelihood_under(state.weights) for one in (state, made))
-        gained = gain(made, state)
-        return Addition(candidate, shapes, entry, made, gained, after - before, after, share, changed, allowed)
+        gained, raw = gain(made, state), after - before
+        own = made.score.own_log_likelihood - state.score.own_log_likelihood
+        return Addition(candidate, shapes, entry, made, gained, raw, own, after, share, changed, allowed)
 
     def _corrected(self, state: ModelState, made: ModelState, entry: Entry) -> tuple[ModelState, Entry]:
         """Model in which the recordings are corrected for an effect, and its entry.
