@@ -299,9 +299,9 @@ class StepwiseSelection:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
         An effect is admitted only if no other explanation of the same joint is clearly better. Even one that is too
-        small to be a finding counts. An effect with a name comes first if it explains most of what the best term without a
-        name does. Of the laws of one effect that predict as well, that with the fewest parameters comes first, and a
-        free shape last.
+        small to be a finding counts. An effect with a name comes first if it explains most of what the best term
+        without a name does. Of the laws of one effect that predict as well, that with the fewest parameters comes
+        first, and a free shape last.
 
         Parameters
         ----------
