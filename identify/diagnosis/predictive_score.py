@@ -125,27 +125,32 @@ class PredictiveScore:
         """Root mean square of the predicted errors of each joint, N m or N, (n,)."""
         return np.array([float(np.sqrt(np.mean(errors**2))) for errors in self.errors])
 
-    @cached_property
-    def log_likelihoods(self) -> Array:
-        """Log-likelihood of the data of each joint under the model's own noise models, (n,).
-
-        One is subtracted for each coefficient of the noise models, which are not cross-validated (Akaike's criterion).
-        Constants that all models of the same data share are omitted.
-        """
-        own = np.maximum(self.innovations(self.fit.noise), 1e-300)
-        orders = np.array([ar.order for ar in self.fit.noise])
-        return np.asarray(self.rows * (self.volume - 0.5 * np.log(own)) - orders)
-
     @property
     def volume(self) -> Array:
         """Logarithm of the volume by which corrections of the recordings scale the noise, per row, (n,)."""
         volume = self.fit.study.volume
         return np.zeros(len(self.fit.noise)) if volume is None else volume
 
-    @property
-    def log_likelihood(self) -> float:
-        """Log-likelihood of the data of all joints, see `log_likelihoods`."""
-        return float(self.log_likelihoods.sum())
+    def log_likelihoods_under(self, noise: Sequence[ArModel]) -> Array:
+        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,).
+
+        Parameters
+        ----------
+        noise
+            Noise model of each joint.
+        """
+        own = np.maximum(self.innovations(noise), 1e-300)
+        return np.asarray(self.rows * (self.volume - 0.5 * np.log(own)))
+
+    def log_likelihood_under(self, noise: Sequence[ArModel]) -> float:
+        """Log-likelihood of the data of all joints, see `log_likelihoods_under`.
+
+        Parameters
+        ----------
+        noise
+            Noise model of each joint.
+        """
+        return float(self.log_likelihoods_under(noise).sum())
 
     def inflation_over(self, other: "PredictiveScore") -> Array:
         """Variance of the score along the change of prediction over that of white innovations, of each joint, (n,).

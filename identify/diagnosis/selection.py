@@ -21,9 +21,9 @@ from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, Key, Shapes, Workshop, candidates, grid
 from armident.identify.diagnosis.confirmation import Confirmation, confirmed
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.model_state import ModelState, fitted, with_report_part
+from armident.identify.diagnosis.model_state import ModelState, fitted, with_own_noise, with_report_part
 from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
-from armident.identify.diagnosis.screening import noise_beyond_shapes, refined, screened
+from armident.identify.diagnosis.screening import refined, screened
 from armident.identify.diagnosis.shaping import both_ends
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.effect import Place
@@ -57,8 +57,10 @@ class Addition:
         Model with the effect.
     gain
         Gain of log-likelihood over the model without it, see `gain`.
-    own_gain
-        The same with each model under its own noise models.
+    raw_gain
+        The same if the innovations had no correlation left.
+    log_likelihood
+        Log-likelihood of the model with the effect under the noise models of the step, which all candidates share.
     share
         Largest share of the power of a joint's predicted errors that it removes.
     material_pct
@@ -72,7 +74,8 @@ class Addition:
     entry: Entry
     state: ModelState
     gain: float
-    own_gain: float
+    raw_gain: float
+    log_likelihood: float
     share: float
     material_pct: float
     allowed: bool
@@ -88,11 +91,6 @@ class Addition:
         place = self.candidate.place
         name = self.candidate.effect.name if self.named else self.candidate.effect.key
         return name, place.joint, place.other
-
-    @property
-    def log_likelihood(self) -> float:
-        """Log-likelihood of the model with the effect."""
-        return self.state.score.log_likelihood
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +241,7 @@ class StepwiseSelection:
             state, found = self._exchanged(state, found)
             state, kept = self._confirmed(state, found)
             if len(kept) == len(found):
-                return state, kept
+                return with_own_noise(state), kept
             found = kept
 
     def step(self, state: ModelState) -> Step:
@@ -290,7 +288,6 @@ class StepwiseSelection:
         return (
             addition.allowed
             and addition.gain > np.log(max(tests, 1) / self.criteria.alpha["selection"])
-            and addition.own_gain > np.log(max(tests, 1))
             and addition.share >= self.criteria.least_share
             and addition.material_pct >= self.criteria.material_pct
         )
@@ -340,7 +337,9 @@ class StepwiseSelection:
         motion = workshop.motion(state.study.train[0], "measured")
         present = {e.joint for e in state.robot.effects if e.effect == TRANSITION}
         places = [Place(j) for j, name in enumerate(self.study.joints) if name not in present]
-        best = {place: (state.score.log_likelihoods[place.joint] + CLEAR, 0.0) for place in places}
+        noise = state.weights
+        before = state.score.log_likelihoods_under(noise)
+        best = {place: (before[place.joint] + CLEAR, 0.0) for place in places}
 
         def tried(velocities: Sequence[float]) -> ModelState | None:
             chosen = [(place, v) for place, v in zip(places, velocities, strict=True) if v > 0.0]
@@ -349,7 +348,7 @@ class StepwiseSelection:
             if made is None:
                 return None
             for (place, v), entry in zip(chosen, entries, strict=True):
-                score = float(made.score.log_likelihoods[place.joint])
+                score = float(made.score.log_likelihoods_under(noise)[place.joint])
                 if made.values_of(made.term_of(entry))[0][0] > 0.0 and score > best[place][0]:
                     best[place] = score, v
             return made
@@ -360,12 +359,13 @@ class StepwiseSelection:
             tried([factor * v for _, v in best.values()])
             tried([v / factor for _, v in best.values()])
         made = tried([v for _, v in best.values()])
-        return made if made is not None and made.score.log_likelihood > state.score.log_likelihood else state
+        better = made is not None and made.score.log_likelihood_under(noise) > float(before.sum())
+        return made if made is not None and better else state
 
     def _shortlist(self, state: ModelState) -> tuple[list[tuple[Candidate, Shapes]], int]:
         """Candidates with the highest score statistics less their numbers of parameters, and the number of all."""
         workshop = Workshop(state.study, state.fit.theta)
-        noise = state.fit.renoised(noise_beyond_shapes(state.fit, workshop))
+        noise = state.fit.renoised(state.weights)
         looks: list[tuple[float, Candidate, tuple[float, Shapes]]] = []
         tests, hidden = 0, set()
         for every in candidates(workshop):
@@ -412,8 +412,9 @@ class StepwiseSelection:
         if effect.undo is not None and allowed:
             made, entry = self._corrected(state, made, entry)
         share, changed = materiality(state, made)
-        own = made.score.log_likelihood - state.score.log_likelihood
-        return Addition(candidate, shapes, entry, made, gain(made, state), own, share, changed, allowed)
+        before, after = (one.score.log_likelihood_under(state.weights) for one in (state, made))
+        gained = gain(made, state)
+        return Addition(candidate, shapes, entry, made, gained, after - before, after, share, changed, allowed)
 
     def _corrected(self, state: ModelState, made: ModelState, entry: Entry) -> tuple[ModelState, Entry]:
         """Model in which the recordings are corrected for an effect, and its entry.
@@ -491,7 +492,7 @@ class StepwiseSelection:
             best = self.admitted(step)
             if best is None or best.family == one.addition.family:
                 continue
-            if best.log_likelihood > state.score.log_likelihood + self.criteria.close:
+            if best.log_likelihood > state.score.log_likelihood_under(step.state.weights) + self.criteria.close:
                 other = Selected(best.entry, step, best)
                 state, found = best.state, tuple(other if f is one else f for f in found)
         return state, found
