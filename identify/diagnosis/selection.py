@@ -275,8 +275,7 @@ class StepwiseSelection:
         """True if an addition is significant, material and physically possible.
 
         A ratio of likelihoods of ``r`` has at most the probability ``1 / r`` without the effect (Ville 1939), so that
-        no null distribution is needed. With each model's own noise models, which may take the effect for noise, the
-        ratio must still exceed the number of candidates.
+        no null distribution is needed.
 
         Parameters
         ----------
