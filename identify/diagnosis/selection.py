@@ -278,8 +278,7 @@ class StepwiseSelection:
         """True if an addition is significant, material and physically possible.
 
         A ratio of likelihoods of ``r`` has at most the probability ``1 / r`` without the effect (Ville 1939), so that
-        no null distribution is needed. With each model's own noise models, which may take the effect for noise, the
-        ratio must still exceed the number of candidates.
+        no null distribution is needed.
 
         Parameters
         ----------
@@ -301,8 +300,8 @@ class StepwiseSelection:
 
         An effect is admitted only if no other explanation of the same joint is clearly better. Even one that is too
         small to be a finding counts. An effect with a name comes first if it explains most of what the best term
-        without a name does. Of the laws of one effect that predict as well, that with the fewest parameters comes first, and a
-        free shape last.
+        without a name does. Of the laws of one effect that predict as well, that with the fewest parameters comes
+        first, and a free shape last.
 
         Parameters
         ----------
