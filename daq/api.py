@@ -11,7 +11,7 @@ from armident.daq.recording import Recording
 
 def import_recording(
     path: str | Path,
-    robot: RobotConfig | str | Path,
+    robot: RobotConfig | str | Path | None = None,
     *,
     effort: str | Path | None = None,
     motor_side: bool = False,
@@ -25,9 +25,11 @@ def import_recording(
     ----------
     path
         CSV with a header line (``t``, ``q1..qn``, ``tau1..taun`` or ``current1..currentn``, optionally ``qr1..qrn``),
-        MAT (up to version 7), NPZ, Parquet, or joint states in an MCAP file of ROS 2.
+        MAT (up to version 7), NPZ, Parquet, or joint states in an MCAP file of ROS 2. A recording of armident is
+        resampled to ``rate_hz`` with an anti-alias filter.
     robot
-        The robot that was measured: a configuration, or the path or shipped name of one.
+        The robot that was measured: a configuration, or the path or shipped name of one; needed except for a
+        recording of armident, which contains it.
     effort
         A second CSV with one effort column per joint; ``path`` then has one position column per joint.
     motor_side
@@ -54,7 +56,7 @@ def import_recording(
     """
     from armident.daq.interchange.importing import import_recording as read
 
-    config = robot if isinstance(robot, RobotConfig) else load_robot(robot)
+    config = robot if robot is None or isinstance(robot, RobotConfig) else load_robot(robot)
     second = None if effort is None else Path(effort)
     return read(Path(path), config, effort=second, motor_side=motor_side, rate_hz=rate_hz, names=names, polled=polled)
 

@@ -62,11 +62,15 @@ def command(
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, rosbag2 (MCAP), or a bus log.")],
-    config: Annotated[
-        str, typer.Option("--config", help="Robot configuration; for a bus log the session configuration.")
-    ],
+    file: Annotated[Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, rosbag2, bus log, or recording.")],
     out: Annotated[Path, typer.Option("--out", help="The recording to write.")],
+    config: Annotated[
+        str | None,
+        typer.Option(
+            "--config",
+            help="Robot configuration; for a bus log the session configuration. [required, except for a recording]",
+        ),
+    ] = None,
     effort: Annotated[
         Path | None, typer.Option("--effort", help="Second CSV file with one effort column per joint.")
     ] = None,
@@ -74,7 +78,8 @@ def import_(
         bool, typer.Option("--motor-side", help="Values are on the motor side, not on the joint side.")
     ] = False,
     rate: Annotated[
-        float | None, typer.Option("--rate", help="Sampling rate, Hz; default: column t.", min=0.001)
+        float | None,
+        typer.Option("--rate", help="Sampling rate, Hz; default: column t. A recording is resampled to it.", min=0.001),
     ] = None,
     names: Annotated[
         str, typer.Option("--map", help="Names in the file: position=qm,voltage=vir,...; demand=- omits it.")
@@ -92,17 +97,22 @@ def import_(
     and Parquet: the same names, or positions, torques, times. ROS 2 bags (.mcap): sensor_msgs/msg/JointState. Logs of
     a bus (candump -l, .asc, .blf, .trc): SYNC and TPDOs, as the session configuration maps them.
 
+    A recording of armident (.mcap) is resampled to --rate, with an anti-alias filter.
+
     Example: armident import DATA_EMPS.mat --config emps.yaml --out emps.mcap
     """
     from armident.configs import ConfigError, load_robot, load_session
     from armident.daq.interchange.bus_log import SUFFIXES, recording_from_log
     from armident.daq.interchange.importing import import_recording
-    from armident.daq.recording import write_recording
+    from armident.daq.recording import is_recording, write_recording
 
+    own = is_recording(file)
+    if config is None and not own:
+        raise ConfigError(f"{file}: --config is missing, the robot configuration")
     if file.suffix.lower() in SUFFIXES:
         if effort is not None or motor_side or rate is not None or names or polled:
             raise ConfigError(f"{file}: a bus log takes no option but --config and --out")
-        session = load_session(config)
+        session = load_session(str(config))
         logged = recording_from_log(file, session, load_robot(session.robot))
         write_recording(logged, out)
         rows, gaps = logged.counters["samples.rows"], logged.counters["samples.in_gaps"]
@@ -115,7 +125,7 @@ def import_(
             raise ConfigError(f"--map: expected QUANTITY=NAME,..., found {key + equals + value!r}")
     recording = import_recording(
         file,
-        load_robot(config),
+        None if config is None else load_robot(config),
         effort=effort,
         motor_side=motor_side,
         rate_hz=rate,

@@ -1,5 +1,6 @@
 """Identification, diagnosis, comparison and trajectory design, as ``import armident`` offers them."""
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -416,6 +417,7 @@ def diagnose(
     baseline: Identification | IdentificationDocument | str | Path | None = None,
     false_alarm_rate: float = 0.01,
     material: float = 0.2,
+    time_limit_s: float | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Find the effects that a model lacks: where it disagrees with the data, which effect is missing, what is left.
@@ -433,7 +435,11 @@ def diagnose(
     false_alarm_rate
         Probability that a diagnosis of a faultless model finds something.
     material
-        Share of the power of a joint's residual from which on an effect is a finding.
+        Least change of a joint's torque by a finding, percent of the root mean square of its torque; effects that
+        change less are listed as ``negligible``.
+    time_limit_s
+        Wall-clock time after which the selection of effects ends with what it has found, s, greater than 0;
+        ``None``: without limit. Confirmation and report of these effects take further seconds.
     progress
         Called with the name of a stage and the share done, 0 to 1.
 
@@ -445,7 +451,7 @@ def diagnose(
     Raises
     ------
     ConfigError
-        If a file does not exist or a configuration is wrong.
+        If a file does not exist, a configuration is wrong, or the time limit is not greater than 0.
     DataError
         If the recordings cannot support a diagnosis, or the baseline is of another robot.
 
@@ -460,6 +466,9 @@ def diagnose(
     from armident.identify.diagnosis.criteria import Criteria
     from armident.identify.diagnosis.diagnose import diagnose as run
 
+    if time_limit_s is not None and not time_limit_s > 0:
+        raise ConfigError(f"--time-limit: expected a time greater than 0 s, found {time_limit_s:g}")
+    begin = time.monotonic()
     read = _read(recordings)
     config = _robot(robot, read)
     numbers = None if baseline is None else _document(baseline)
@@ -475,7 +484,17 @@ def diagnose(
     notes += rest_notes(training, config)
     criteria = Criteria(false_alarm_rate=false_alarm_rate, material_pct=material)
     references = [reference(recording) for recording in read]
-    found = run(training, held_out, config, references, numbers, list(dict.fromkeys(notes)), progress, criteria)
+    found = run(
+        training,
+        held_out,
+        config,
+        references,
+        numbers,
+        list(dict.fromkeys(notes)),
+        progress,
+        criteria,
+        None if time_limit_s is None else time_limit_s - (time.monotonic() - begin),
+    )
     return Diagnosis(found.document, found.robot, config, found)
 
 

@@ -120,8 +120,20 @@ def diagnose(
         float, typer.Option(min=1e-6, max=0.5, help="Probability of a finding with a complete model.")
     ] = 0.01,
     material: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Least share of a joint's residual power of a finding.")
-    ] = 0.01,
+        float,
+        typer.Option(
+            min=0.0,
+            max=100.0,
+            metavar="PCT",
+            help="Least change of a joint's torque by a finding, percent; smaller effects are listed as negligible.",
+        ),
+    ] = 0.2,
+    time_limit: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, metavar="S", help="End the search for effects after this time, s, with what it has found."
+        ),
+    ] = None,
     out: OutDirectory = None,
     json: Json = False,
 ) -> None:
@@ -133,7 +145,7 @@ def diagnose(
     """
     from armident.identify.commands import diagnose_command
 
-    chosen = {"false_alarms": false_alarms, "material": material}
+    chosen = {"false_alarm_rate": false_alarms, "material": material, "time_limit_s": time_limit}
     code = diagnose_command(recordings, config, validate, baseline, chosen, out, as_json=json)
     if code:
         raise typer.Exit(code)

@@ -9,7 +9,7 @@ import numpy as np
 from numba.core import event
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from armident.configs import RobotConfig
@@ -41,7 +41,7 @@ class _Compilation(event.Listener):
 
 @contextmanager
 def progress(what: str) -> Iterator[Report]:
-    """Report stages after two seconds: a bar where stderr is a terminal, otherwise one plain line per stage.
+    """Report stages after two seconds: a bar with the time left where stderr is a terminal, otherwise plain lines.
 
     The first run on a machine also prints that it compiles kernels.
 
@@ -70,6 +70,8 @@ def _stages(what: str, begin: float) -> Iterator[Report]:
         BarColumn(),
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=1.0, visible=False)

@@ -110,7 +110,7 @@ def diagnose_command(
     config: Path | None,
     validate: Path | None,
     baseline: Path | None,
-    chosen: Mapping[str, float],
+    chosen: Mapping[str, Any],
     out: Path | None,
     *,
     as_json: bool,
@@ -128,7 +128,8 @@ def diagnose_command(
     baseline
         Identification whose parameters are tested for change.
     chosen
-        ``false_alarms`` and ``material``, as `armident.identify.api.diagnose` takes them.
+        ``false_alarm_rate``, ``material`` and ``time_limit_s``, as `armident.identify.api.diagnose` takes them; those
+        left out have its defaults.
     out
         Folder of the results; ``None``: beside the first recording.
     as_json
@@ -148,15 +149,7 @@ def diagnose_command(
     from armident.identify.cli_tables import diagnosis_table, progress, warn
 
     with progress("diagnose") as report:
-        found = diagnose(
-            list(paths),
-            config,
-            validate=validate,
-            baseline=baseline,
-            false_alarm_rate=chosen["false_alarms"],
-            material=chosen["material"],
-            progress=report,
-        )
+        found = diagnose(list(paths), config, validate=validate, baseline=baseline, progress=report, **chosen)
     folder = out or _beside(paths[0], "diagnosis")
     document = found.save(folder)
     if as_json:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.configs.yaml_loader import is_file
+from armident.daq.interchange.rate_conversion import at_rate
 from armident.daq.interchange.resample import onto_even_clock
 from armident.daq.interchange.sandbox import error_line, read_in_subprocess
-from armident.daq.recording import Field, Recording, Stream
+from armident.daq.recording import Field, Recording, Stream, is_recording, read_recording
 from armident.daq.recording.model import Quantity, Side
 
 NAMES: Mapping[str, tuple[str, ...]] = {
@@ -77,7 +78,7 @@ class Source:
 
 def import_recording(
     path: Path,
-    robot: RobotConfig,
+    robot: RobotConfig | None,
     *,
     effort: Path | None = None,
     motor_side: bool = False,
@@ -91,8 +92,9 @@ def import_recording(
     ----------
     path
         CSV with a header line, MAT (up to version 7), NPZ, Parquet, or joint states in an MCAP of ROS 2; SI units.
+        A recording of armident is resampled to ``rate_hz`` (`armident.daq.interchange.rate_conversion`).
     robot
-        The robot that was measured.
+        The robot that was measured; ``None`` for a recording: the one inside it.
     effort
         A second CSV with one effort column per joint; ``path`` then has one position column per joint, and
         headers of both are free or absent. A file of a single column has the joints one after the other, sample by
@@ -115,6 +117,12 @@ def import_recording(
         If the content is wrong: missing columns, wrong number of axes, NaN, uneven time, values far outside the limits,
         or a demand that no joint followed.
     """
+    if is_recording(path):
+        if effort is not None or motor_side or names or polled:
+            raise ConfigError(f"{path}: a recording of armident takes no option but --rate, --config and --out")
+        return _resampled(path, robot, rate_hz)
+    if robot is None:
+        raise ConfigError(f"{path}: needs the configuration of the robot")
     names = dict(names or {})
     unknown = sorted(names.keys() - NAMES.keys())
     if unknown:
@@ -167,6 +175,22 @@ def import_recording(
         for what, number in (("expected", stream.sync.size), ("rows", stream.sync.size), ("in_gaps", 0))
     }
     return Recording(None, robot, None, rate, streams, counters=counters, metadata=facts)
+
+
+def _resampled(path: Path, robot: RobotConfig | None, rate_hz: float | None) -> Recording:
+    """Return a recording of armident at another sampling rate, of a configuration with the same joints."""
+    if rate_hz is None:
+        raise ConfigError(f"{path}: a recording already; --rate resamples it")
+    recording = read_recording(path)
+    own = [joint.name for joint in recording.robot.joints]
+    if robot is not None and [joint.name for joint in robot.joints] != own:
+        raise DataError(f"{path}: a recording of joints {', '.join(own)}, the configuration has others")
+    try:
+        made = at_rate(recording, rate_hz)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+    facts = {**made.metadata, "source": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    return replace(made, path=None, robot=robot or recording.robot, metadata=facts)
 
 
 def _rows_with_demand(demand: NDArray[np.float64]) -> slice:

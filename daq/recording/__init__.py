@@ -2,7 +2,7 @@
 
 from armident.daq.recording.layout import StreamLayout
 from armident.daq.recording.model import Field, Gap, Mark, Recording, Stream, join_parts
-from armident.daq.recording.reader import read_recording
+from armident.daq.recording.reader import is_recording, read_recording
 from armident.daq.recording.recovery import Recovered, recover_recording
 from armident.daq.recording.ring_buffer import TriggeredSeries
 from armident.daq.recording.rotation import RecordingSeries
@@ -21,6 +21,7 @@ __all__ = [
     "Stream",
     "StreamLayout",
     "TriggeredSeries",
+    "is_recording",
     "join_parts",
     "read_recording",
     "recover_recording",

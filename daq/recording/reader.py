@@ -30,6 +30,8 @@ from armident.daq.recording.scan import ChunkItem, RecordingScan
 
 _LEAST_ROW, _MOST_RESERVED = 2, 1 << 25
 """Least share of a compressed file that a row takes, bytes, and largest number of rows for which memory is reserved."""
+_HEAD = 4096
+"""Number of bytes at the begin of a recording that contain the name of its first metadata record."""
 _RELEASE_EVERY = 1 << 26
 """Number of bytes read between two releases of the mapped file's pages."""
 
@@ -64,6 +66,21 @@ def read_recording(path: Path | str) -> Recording:
         raise ConfigError(f"{path}: no such recording") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def is_recording(path: Path) -> bool:
+    """Return True if a file begins like a recording of armident, complete or not.
+
+    Parameters
+    ----------
+    path
+        The file.
+    """
+    try:
+        with path.open("rb") as file:
+            return RECORDING.encode() in file.read(_HEAD)
+    except OSError:
+        return False
 
 
 def recovered_words(metadata: dict[str, dict[str, str]]) -> list[str]:

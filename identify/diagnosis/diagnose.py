@@ -120,7 +120,7 @@ def diagnose(
     criteria
         Thresholds; ``None``: the defaults.
     time_limit_s
-        Time after which no further step of the selection begins, s; ``None``: without limit.
+        Wall-clock time after which the selection ends with what it has found, s; ``None``: without limit.
 
     Returns
     -------
@@ -140,12 +140,29 @@ def diagnose(
         )
 
 
+BEGINS = {
+    "set-up": 0.0,
+    "derivatives and closed loop": 0.15,
+    "base fit": 0.2,
+    "unexplained dependences": 0.85,
+    "changed parameters": 0.9,
+    "simulation": 0.9,
+    "detection limits": 0.95,
+}
+"""Share of the time before each stage; the steps of the selection lie between."""
+SELECTION = (0.22, 0.85)
+"""Shares of the time at the begin and at the end of the selection."""
+STEP = 0.4
+"""Share of the remaining selection that one step takes: their number is unknown, and mostly one to six."""
+
+
 class _Steps:
-    """Reports the progress of a search with an unknown number of steps."""
+    """Reports the progress of a search with an unknown number of steps; the share never falls."""
 
     def __init__(self, progress: Progress | None) -> None:
         self._progress = progress or (lambda stage, share: None)
         self._done = 0.0
+        self._step = SELECTION[0], SELECTION[0]
         self._begin = self._since = time.perf_counter()
         self._stage = ""
         self.spent: dict[str, float] = {}
@@ -153,8 +170,20 @@ class _Steps:
     def __call__(self, stage: str) -> None:
         self._note()
         self._stage = stage
-        self._done += 0.15 * (1.0 - self._done)
-        self._progress(stage, self._done)
+        begin = BEGINS.get(stage)
+        if begin is None:
+            begin = self._step[1]
+            self._step = begin, begin + STEP * (SELECTION[1] - begin)
+        self._show(begin)
+
+    def tested(self, share: float) -> None:
+        """Report the share of the candidates of one step of the selection that have been tested."""
+        begin, end = self._step
+        self._show(begin + share * (end - begin))
+
+    def _show(self, share: float) -> None:
+        self._done = max(self._done, share)
+        self._progress(self._stage, self._done)
 
     def finish(self) -> dict[str, float]:
         self._note()
@@ -185,7 +214,7 @@ def _diagnose(
     steps("derivatives and closed loop")
     study = build_study(stage.training, stage.validation, stage.robot)
     steps("base fit")
-    selection = StepwiseSelection(study, criteria, steps, deadline)
+    selection = StepwiseSelection(study, criteria, steps, deadline, steps.tested)
     first = selection.start()
     steps("comparison of effects")
     chosen, every = selection.run(first)
@@ -195,6 +224,7 @@ def _diagnose(
     named = findings_of(final, selected)
     places = {id(f): k for k, f in enumerate(named)}
     findings = stage.named(named, after)
+    stopped = _stopped(selection, len(named))
     lacking = [_lacking(final, selected[places[id(f)]]) if id(f) in places else None for f in findings]
     steps("unexplained dependences")
     dependences = unexplained(final, criteria)
@@ -230,7 +260,7 @@ def _diagnose(
         model=None,
         timing_s=steps.finish(),
         versions=versions(),
-        warnings=[*notes, *stage.warnings, *study.warnings, *_stopped(selection, len(selected))],
+        warnings=[*notes, *stage.warnings, *study.warnings, *stopped],
         not_visible=undetectable(first, selection.hidden),
         detection_limits=limits,
         simulated=simulated.document(),
@@ -261,9 +291,11 @@ def _stopped(selection: StepwiseSelection, findings: int) -> list[str]:
     """Warning of a selection that its time limit ended."""
     if not selection.stopped:
         return []
+    steps, plural = selection.compared, "" if findings == 1 else "s"
     return [
-        f"the time limit ended the selection of effects after {findings} finding{'' if findings == 1 else 's'}; "
-        "there may be more: repeat with a longer --time-limit"
+        f"the time limit ended the selection of effects after {steps} complete comparison{'' if steps == 1 else 's'} "
+        f"and {findings} finding{plural}: other effects were not compared, only the lack of fit was tested; "
+        "repeat with a larger --time-limit"
     ]
 
 

@@ -188,13 +188,16 @@ class StepwiseSelection:
     progress
         Called with the name of each step.
     deadline
-        Time of `time.monotonic` after which no further step begins, s.
+        Time of `time.monotonic` after which no further step begins and the current one is dropped, s.
+    tested
+        Called with the share of a step's candidates that have been tested, 0 to 1.
     """
 
     study: Study
     criteria: Criteria = field(default_factory=Criteria)
     progress: Callable[[str], None] = lambda stage: None
     deadline: float = float("inf")
+    tested: Callable[[float], None] = lambda share: None
     stopped: bool = False
     hidden: frozenset[Key] = frozenset()
     _states: dict[str, ModelState | None] = field(default_factory=dict)
@@ -258,11 +261,21 @@ class StepwiseSelection:
         key = _key(state.robot)
         if key not in self._steps:
             shortlist, tests = self._shortlist(state)
-            additions = (self._added(state, *one) for one in shortlist)
-            able = [a for a in additions if a is not None]
+            able: list[Addition] = []
+            for k, one in enumerate(shortlist):
+                self.tested(k / len(shortlist))
+                if self._late():
+                    # An effect is admitted only against all others.
+                    return Step(state, (), (), tests)
+                able += [a for a in (self._added(state, *one),) if a is not None]
             ranked = tuple(sorted(able, key=lambda a: -a.log_likelihood))
             self._steps[key] = Step(state, ranked, tuple(a for a in ranked if self.passes(a, tests)), tests)
         return self._steps[key]
+
+    @property
+    def compared(self) -> int:
+        """Number of models in which all candidates were compared."""
+        return len(self._steps)
 
     def last(self, state: ModelState) -> Step | None:
         """Comparison of all candidates in a model, if it has been made.

@@ -15,7 +15,7 @@ from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.idim_ls import idim_ls
-from armident.identify.experiment import Experiment
+from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.identification.auxiliary_loop import closed_loop
 from armident.identify.identification.equations import Prepared, aligned_torque, equations, least_rows
 from armident.identify.identification.options import CONTROLLERS, Options
@@ -315,9 +315,8 @@ def build_study(
         If rates differ, or the motion is too short or does not determine the parameters of the model.
     """
     experiments = put_right([*training, *validation], robot)
+    check_one_rate(experiments)
     dt = experiments[0].dt
-    if any(abs(e.dt - dt) > 1e-9 * dt for e in experiments):
-        raise DataError("the recordings have different sampling rates; diagnose them separately")
     experiments = _continued(experiments)
     bandwidth = robot.bandwidth_hz or motion_bandwidth([e.q for e in experiments], dt)
     given, robot = robot, with_sign_smoothing(robot, experiments, bandwidth)

@@ -93,6 +93,7 @@ def _converted(recording: Recording, robot: RobotConfig) -> tuple[list[Experimen
                 q_ref=None if q_ref is None else q_ref[piece],
                 dt=dt,
                 start=float(samples.sync[piece[0]] - samples.sync[0]) * dt,
+                source="" if recording.path is None else str(recording.path),
             )
             for piece in long_enough
         ]

@@ -14,7 +14,7 @@ from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.diagnostics import diagnose_estimate
 from armident.identify.estimators.essential import essential_parameters
 from armident.identify.estimators.idim_ls import idim_ls
-from armident.identify.experiment import Experiment
+from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.identification.auxiliary_loop import RELEVANT, ClosedLoop, closed_loop, velocity_error
 from armident.identify.identification.criteria import IdentificationCriteria
 from armident.identify.identification.equations import (
@@ -433,5 +433,4 @@ def _check(experiments: Sequence[Experiment], robot: RobotConfig) -> None:
             if bad.any():
                 k, j = np.argwhere(bad)[0]
                 raise DataError(f"experiment {number}: {name} of {robot.joints[j].name} is not finite at sample {k}")
-        if e.dt != experiments[0].dt:
-            raise DataError("the experiments have different sampling rates")
+    check_one_rate(experiments)

@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from armident.configs import DataError, RobotConfig
 from armident.identify.effects.recorded import put_right
-from armident.identify.experiment import Experiment
+from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.setup import signals
 from armident.identify.setup.bench import Bench, make_bench
 from armident.identify.setup.clipping import clipped_torques
@@ -170,9 +170,4 @@ def _validate(experiments: Sequence[Experiment], robot: RobotConfig) -> None:
             )
         if not (np.isfinite(e.q).all() and np.isfinite(e.tau).all()):
             raise DataError("positions or torques are not finite")
-    rates = sorted({round(1.0 / e.dt, 6) for e in experiments})
-    if any(abs(e.dt - experiments[0].dt) > 1e-9 * experiments[0].dt for e in experiments):
-        raise DataError(
-            f"the recordings have different sampling rates ({', '.join(f'{r:g}' for r in rates)} Hz): "
-            "check each rate alone, or import them with one --rate"
-        )
+    check_one_rate(experiments)

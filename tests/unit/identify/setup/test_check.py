@@ -250,7 +250,7 @@ def test_a_rate_too_slow_for_the_motion_is_named(arm: RobotConfig) -> None:
 def test_different_rates_and_short_recordings_are_refused_in_one_line(
     healthy: list[Experiment], arm: RobotConfig
 ) -> None:
-    with pytest.raises(DataError, match=r"different sampling rates \(250, 500 Hz\)"):
+    with pytest.raises(DataError, match=r"different sampling rates \(experiment 1 500 Hz, experiment 2 250 Hz\)"):
         check_setup([healthy[0], replace(healthy[1], dt=4e-3)], arm)
     short = replace(healthy[0], q=healthy[0].q[:40], tau=healthy[0].tau[:40])
     with pytest.raises(DataError, match="too short"):
