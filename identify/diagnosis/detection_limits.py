@@ -26,8 +26,8 @@ def detection_limits(state: ModelState, step: Step | None, criteria: Criteria) -
     """Return the detection limits of the effects that are not in the model.
 
     Each linear parameter is treated by itself, at the nonlinear parameters that fit best. At the limit, the gain of
-    log-likelihood reaches the threshold of the selection with probability `POWER`, and the error of the joint falls by
-    the share that a finding requires.
+    log-likelihood reaches the threshold of the selection with probability `POWER`. The error of the joint falls by the
+    share that a finding requires.
 
     Parameters
     ----------

@@ -101,7 +101,7 @@ def tempered_odds(step: Step, one: Addition) -> dict[Key, float]:
     one
         The effect.
     """
-    factor = float(np.clip(one.gain / one.own_gain, 0.0, 1.0)) if one.own_gain > 0.0 else 1.0
+    factor = float(np.clip(one.gain / one.raw_gain, 0.0, 1.0)) if one.raw_gain > 0.0 else 1.0
     odds: dict[Key, float] = {}
     for rival in step.rivals(one):
         if rival.named:

@@ -17,8 +17,9 @@ Kind = Literal[
     "acceleration", "time", "time and direction", "position of another joint", "velocity of another joint",
     "torque of another joint", "frequency", "motion", "transients",
 ]  # fmt: skip
-"""Variables; those with a direction have the opposite sign in the negative direction. The last two have no free
-functions of their own: a frequency independent of the motion, and all functions of the motion together."""
+"""Variables; those with a direction have the opposite sign in the negative direction. The last three have no free
+functions of their own: a frequency independent of the motion, all functions of the motion together, and ``transients``
+of documents of former versions."""
 
 SIDE = (0.0, 0.05, 0.15, 0.35, 0.65, 1.0)
 """Speeds of the knots of either direction, over the top speed: close at low speeds, where friction is curved."""

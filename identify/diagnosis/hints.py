@@ -9,7 +9,7 @@ HINTS: dict[Kind, str] = {
     ),
     "position": (
         "the torque of {joint} has an error that depends on its position, most at {at}: look for a cable or "
-        "hose under tension, an end stop, a spring, a tight spot of the gear, or a wrong mass in the model"
+        "hose under tension, an end stop, a spring, a tight spot of the gear, or a wrong mass"
     ),
     "position and direction": (
         "friction of {joint} depends on the position, with the largest error at {at}: look for a "
@@ -66,7 +66,9 @@ HINTS: dict[Kind, str] = {
         "a loose plug"
     ),
 }
-"""Hint for each kind of dependence; ``joint``, ``other`` and ``at`` (value of the largest error) are filled in."""
+"""Hint for each kind of dependence; ``joint``, ``other`` and ``at`` (value of the largest error) are filled in.
+
+``transients`` is of documents of former versions."""
 
 
 def hint_of(kind: Kind, joint: str, other: str | None, at: str) -> str:

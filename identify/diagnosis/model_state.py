@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
+from armident.identify.diagnosis.candidates import Workshop
 from armident.identify.diagnosis.predictive_score import PredictiveScore
-from armident.identify.diagnosis.regression import Fit, fit
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, noise_models
+from armident.identify.diagnosis.screening import noise_beyond_shapes
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.terms import Term, arm_model, effect_terms
+from armident.identify.regression.ar_noise import ArModel
 from armident.identify.robot.arm import ArmModel
 
 Array = NDArray[np.float64]
@@ -48,6 +51,15 @@ class ModelState:
     def score(self) -> PredictiveScore:
         """Predictive score on the training data."""
         return PredictiveScore(self.fit)
+
+    @cached_property
+    def weights(self) -> tuple[ArModel, ...]:
+        """Noise models of the residual without smooth functions of the motion, one for each joint.
+
+        Noise models of the residual itself would take missing effects for noise. All candidates for this model are
+        fitted and compared under these.
+        """
+        return tuple(noise_beyond_shapes(self.fit, Workshop(self.study, self.fit.theta)))
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -105,8 +117,8 @@ def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> Model
     robot
         Configuration of the model.
     before
-        Earlier model, whose rigid parameters predict the torques on which terms depend; ``None``: fit a rigid model
-        first.
+        Earlier model. Its rigid parameters predict the torques on which terms depend, and its residual gives the noise
+        models. ``None``: fit a rigid model first, and alternate between parameters and noise models.
 
     Raises
     ------
@@ -122,14 +134,26 @@ def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> Model
         bare = robot.model_copy(update={"effects": ()})
         rigid = fit(replace(changed, robot=bare, model=arm_model(bare)))
         theta = np.concatenate([rigid.theta, np.zeros(model.e)])
-    start = None if before is None else before.fit.noise
-    first = fit(changed, theta, start)
+    noise = None if before is None else before.weights
+    first = fit(changed, theta, noise)
     moved = changed.resimulated(first.theta)
     if moved is not changed:
-        first = fit(moved, first.theta if model.e else None, first.noise)
+        first = fit(moved, first.theta if model.e else None, noise or first.noise)
     if any(term.scales_torque for term in effect_terms(model)):
         first = _iterated(first)
     return ModelState(moved, first)
+
+
+def with_own_noise(state: ModelState) -> ModelState:
+    """Return a model fitted with the noise models of its own residual, in which no effect is missing any more.
+
+    Parameters
+    ----------
+    state
+        Model of the selection, fitted with the noise models of an earlier one.
+    """
+    noise = noise_models(state.fit.left, state.fit.theta.size, MAX_AR_ORDER)
+    return replace(state, fit=state.fit.renoised(noise))
 
 
 def with_report_part(state: ModelState) -> ModelState:

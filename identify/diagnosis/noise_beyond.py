@@ -67,8 +67,8 @@ def _orthonormal(columns: Sequence[Array]) -> list[Array]:
 def _taken(noise: ArModel, span: Sequence[Array], highest: int) -> Array:
     """Expected sums of lagged products, lags 0 to ``highest``, that least squares on a span takes out of noise.
 
-    With the projector P on the span and the covariance matrix W of the noise these are the sums along the diagonals of
-    ``P W + W P - P W P``.
+    They are the sums along the diagonals of ``P W + W P - P W P``, with the projector P on the span and the covariance
+    matrix W of the noise.
     """
     size = fft.next_fast_len(2 * max(q.shape[0] for q in span), real=True)
     gain = np.fft.rfft(np.append(1.0, noise.coefficients), size)

@@ -23,8 +23,8 @@ STEP = 0.01
 def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
     """Standard deviations of all parameters of every term of the model, by the number of its entry and their names.
 
-    The derivative of the torque with respect to a nonlinear parameter is one more column, so that its uncertainty
-    enters that of the linear ones (Gauss-Newton). Parameters from a set of whole numbers count as known. The residual
+    The derivative of the torque with respect to a nonlinear parameter is one more column (Gauss-Newton). Its
+    uncertainty thus enters that of the linear ones. Parameters from a set of whole numbers count as known. The residual
     is no white noise where an effect is only approximately right. The variances are then those of the residual along
     the influence of each parameter, if they are larger (Newey, West 1987, Econometrica 55(3)).
 

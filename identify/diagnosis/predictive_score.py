@@ -1,10 +1,10 @@
 """Predictive score of a model: cross-validated log-likelihood of the torques with serially correlated noise.
 
 The one criterion by which models are ranked, admitted, exchanged and reduced. Errors are those of torques that the
-parameters did not see: the training data are cut into `BLOCKS` blocks of equal length, every `FOLDS`-th block is left
-out in turn, and the instrumental-variable estimate of the other blocks predicts it. The autoregressive noise model
-turns these errors into innovations, which carry all the information about the model that serially correlated errors
-have (Box, Jenkins 1976, chapter 7).
+parameters did not see. The training data are cut into `BLOCKS` blocks of equal length, and every `FOLDS`-th block is
+left out in turn. The instrumental-variable estimate of the other blocks predicts it. The autoregressive noise model
+turns these errors into innovations. They carry all the information that serially correlated errors have about the model
+(Box, Jenkins 1976, chapter 7).
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.regression import Fit
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, noise_models
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel
 
@@ -126,15 +126,13 @@ class PredictiveScore:
         return np.array([float(np.sqrt(np.mean(errors**2))) for errors in self.errors])
 
     @cached_property
-    def log_likelihoods(self) -> Array:
-        """Log-likelihood of the data of each joint under the model's own noise models, (n,).
+    def own_log_likelihood(self) -> float:
+        """Log-likelihood of the data of all joints under noise models of the model's own residual.
 
         One is subtracted for each coefficient of the noise models, which are not cross-validated (Akaike's criterion).
-        Constants that all models of the same data share are omitted.
         """
-        own = np.maximum(self.innovations(self.fit.noise), 1e-300)
-        orders = np.array([ar.order for ar in self.fit.noise])
-        return np.asarray(self.rows * (self.volume - 0.5 * np.log(own)) - orders)
+        noise = noise_models(self.fit.left, self.fit.theta.size, MAX_AR_ORDER)
+        return self.log_likelihood_under(noise) - sum(ar.order for ar in noise)
 
     @property
     def volume(self) -> Array:
@@ -142,10 +140,26 @@ class PredictiveScore:
         volume = self.fit.study.volume
         return np.zeros(len(self.fit.noise)) if volume is None else volume
 
-    @property
-    def log_likelihood(self) -> float:
-        """Log-likelihood of the data of all joints, see `log_likelihoods`."""
-        return float(self.log_likelihoods.sum())
+    def log_likelihoods_under(self, noise: Sequence[ArModel]) -> Array:
+        """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,).
+
+        Parameters
+        ----------
+        noise
+            Noise model of each joint.
+        """
+        own = np.maximum(self.innovations(noise), 1e-300)
+        return np.asarray(self.rows * (self.volume - 0.5 * np.log(own)))
+
+    def log_likelihood_under(self, noise: Sequence[ArModel]) -> float:
+        """Log-likelihood of the data of all joints, see `log_likelihoods_under`.
+
+        Parameters
+        ----------
+        noise
+            Noise model of each joint.
+        """
+        return float(self.log_likelihoods_under(noise).sum())
 
     def inflation_over(self, other: "PredictiveScore") -> Array:
         """Variance of the score along the change of prediction over that of white innovations, of each joint, (n,).

@@ -1,7 +1,7 @@
 """Stepwise selection of the effects that a model lacks.
 
 1. Screening: the score statistic of every candidate at every place, in one factorisation of the model's equations.
-2. Closed loop: each of the best candidates is added to the model, the loop with it is simulated, and all parameters are
+2. Closed loop: each of the best candidates is added to the model, and the loop with it is simulated. All parameters are
    estimated with instruments from that loop.
 3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.predictive_score`).
 4. Admission of the best one that is significant, material and physically possible; then the next step.
@@ -21,9 +21,9 @@ from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, Key, Shapes, Workshop, candidates, grid
 from armident.identify.diagnosis.confirmation import Confirmation, confirmed
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.model_state import ModelState, fitted, with_report_part
+from armident.identify.diagnosis.model_state import ModelState, fitted, with_own_noise, with_report_part
 from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
-from armident.identify.diagnosis.screening import noise_beyond_shapes, refined, screened
+from armident.identify.diagnosis.screening import refined, screened
 from armident.identify.diagnosis.shaping import both_ends
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.effect import Place
@@ -57,8 +57,12 @@ class Addition:
         Model with the effect.
     gain
         Gain of log-likelihood over the model without it, see `gain`.
+    raw_gain
+        The same if the innovations had no correlation left.
     own_gain
-        The same with each model under its own noise models.
+        Gain of log-likelihood with each model under noise models of its own residual.
+    log_likelihood
+        Log-likelihood of the model with the effect under the noise models of the step, which all candidates share.
     share
         Largest share of the power of a joint's predicted errors that it removes.
     material_pct
@@ -72,7 +76,9 @@ class Addition:
     entry: Entry
     state: ModelState
     gain: float
+    raw_gain: float
     own_gain: float
+    log_likelihood: float
     share: float
     material_pct: float
     allowed: bool
@@ -88,11 +94,6 @@ class Addition:
         place = self.candidate.place
         name = self.candidate.effect.name if self.named else self.candidate.effect.key
         return name, place.joint, place.other
-
-    @property
-    def log_likelihood(self) -> float:
-        """Log-likelihood of the model with the effect."""
-        return self.state.score.log_likelihood
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +247,7 @@ class StepwiseSelection:
             state, found = self._exchanged(state, found)
             state, kept = self._confirmed(state, found)
             if len(kept) == len(found):
-                return state, kept
+                return with_own_noise(state), kept
             found = kept
 
     def step(self, state: ModelState) -> Step:
@@ -290,8 +291,7 @@ class StepwiseSelection:
         """True if an addition is significant, material and physically possible.
 
         A ratio of likelihoods of ``r`` has at most the probability ``1 / r`` without the effect (Ville 1939), so that
-        no null distribution is needed. With each model's own noise models, which may take the effect for noise, the
-        ratio must still exceed the number of candidates.
+        no null distribution is needed.
 
         Parameters
         ----------
@@ -311,10 +311,10 @@ class StepwiseSelection:
     def admitted(self, step: Step) -> Addition | None:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
-        An effect is admitted only if no other explanation of the same joint is clearly better, even one that is too
-        small to be a finding. An effect with a name comes first if it explains most of what the best term without a
-        name does. Of the laws of one effect that predict as well, that with the fewest parameters comes first, and a
-        free shape last.
+        An effect is admitted only if no other explanation of the same joint is clearly better. Even one that is too
+        small to be a finding counts. An effect with a name comes first if it explains most of what the best term
+        without a name does. Of the laws of one effect that predict as well, that with the fewest parameters comes
+        first, and a free shape last.
 
         Parameters
         ----------
@@ -353,7 +353,9 @@ class StepwiseSelection:
         motion = workshop.motion(state.study.train[0], "measured")
         present = {e.joint for e in state.robot.effects if e.effect == TRANSITION}
         places = [Place(j) for j, name in enumerate(self.study.joints) if name not in present]
-        best = {place: (state.score.log_likelihoods[place.joint] + CLEAR, 0.0) for place in places}
+        noise = state.weights
+        before = state.score.log_likelihoods_under(noise)
+        best = {place: (before[place.joint] + CLEAR, 0.0) for place in places}
 
         def tried(velocities: Sequence[float]) -> ModelState | None:
             chosen = [(place, v) for place, v in zip(places, velocities, strict=True) if v > 0.0]
@@ -362,7 +364,7 @@ class StepwiseSelection:
             if made is None:
                 return None
             for (place, v), entry in zip(chosen, entries, strict=True):
-                score = float(made.score.log_likelihoods[place.joint])
+                score = float(made.score.log_likelihoods_under(noise)[place.joint])
                 if made.values_of(made.term_of(entry))[0][0] > 0.0 and score > best[place][0]:
                     best[place] = score, v
             return made
@@ -373,12 +375,13 @@ class StepwiseSelection:
             tried([factor * v for _, v in best.values()])
             tried([v / factor for _, v in best.values()])
         made = tried([v for _, v in best.values()])
-        return made if made is not None and made.score.log_likelihood > state.score.log_likelihood else state
+        better = made is not None and made.score.log_likelihood_under(noise) > float(before.sum())
+        return made if made is not None and better else state
 
     def _shortlist(self, state: ModelState) -> tuple[list[tuple[Candidate, Shapes]], int]:
         """Candidates with the highest score statistics less their numbers of parameters, and the number of all."""
         workshop = Workshop(state.study, state.fit.theta)
-        noise = state.fit.renoised(noise_beyond_shapes(state.fit, workshop))
+        noise = state.fit.renoised(state.weights)
         looks: list[tuple[float, Candidate, tuple[float, Shapes]]] = []
         tests, hidden = 0, set()
         for every in candidates(workshop):
@@ -425,8 +428,10 @@ class StepwiseSelection:
         if effect.undo is not None and allowed:
             made, entry = self._corrected(state, made, entry)
         share, changed = materiality(state, made)
-        own = made.score.log_likelihood - state.score.log_likelihood
-        return Addition(candidate, shapes, entry, made, gain(made, state), own, share, changed, allowed)
+        before, after = (one.score.log_likelihood_under(state.weights) for one in (state, made))
+        gained, raw = gain(made, state), after - before
+        own = made.score.own_log_likelihood - state.score.own_log_likelihood
+        return Addition(candidate, shapes, entry, made, gained, raw, own, after, share, changed, allowed)
 
     def _corrected(self, state: ModelState, made: ModelState, entry: Entry) -> tuple[ModelState, Entry]:
         """Model in which the recordings are corrected for an effect, and its entry.
@@ -504,7 +509,7 @@ class StepwiseSelection:
             best = self.admitted(step)
             if best is None or best.family == one.addition.family:
                 continue
-            if best.log_likelihood > state.score.log_likelihood + self.criteria.close:
+            if best.log_likelihood > state.score.log_likelihood_under(step.state.weights) + self.criteria.close:
                 other = Selected(best.entry, step, best)
                 state, found = best.state, tuple(other if f is one else f for f in found)
         return state, found

@@ -114,8 +114,8 @@ def lines_of_joints(study: Study, theta: Array) -> Iterator[tuple[int, Line]]:
 def strongest_line(train: Sequence[Array], held: Sequence[Array], dt: float, lowest: float) -> Line | None:
     """Strongest line of one joint's residuals from a frequency on; ``None`` where the recording is too short.
 
-    The power at a frequency over that of its surroundings has an F-distribution if there is no line (its phase may
-    differ from one stretch to the next).
+    Without a line, the power at a frequency over that of its surroundings has an F-distribution. Its phase may differ
+    from one stretch to the next.
 
     Parameters
     ----------

@@ -40,11 +40,10 @@ class Linear:
     bounds
         Lowest and highest plausible value.
     through
-        Nonlinear parameter that this one requires: it is absent where that one is zero. The search first tries the
-        effect without it.
+        Nonlinear parameter that this one requires: it is absent where that one is zero. The diagnosis adds the effect
+        without it.
     replaces
-        Rigid parameter of the joint that this one absorbs. The search adds it where it absorbs all of that parameter
-        and reduces the held-out error.
+        Rigid parameter of the joint that this one absorbs; ``without`` in the configuration keeps that parameter.
     """
 
     name: str
@@ -74,7 +73,7 @@ class Shape:
         Additional values to try once the simulated loop contains the effect: the motion of a rigid arm does not excite
         them.
     movable
-        True if it is refined with the others, although the search takes it from its grid.
+        True if its standard deviation is estimated although its value is one of the grid.
     """
 
     name: str
@@ -152,7 +151,8 @@ class Effect:
         True if the effect permutes signals or changes their signs instead of adding a torque.
         `armident.identify.effects.wiring` corrects the recording, and there are no columns.
     predicts
-        True if the columns depend on the predicted torque, and so on the model's parameters.
+        True if the columns depend on the predicted torque, and so on the model's parameters. They are then computed at
+        the simulated motion, because measured signals that are differentiated twice add more noise than torque.
     share
         True if its linear parameter scales the predicted torque. The fit is then iterated until parameter and torque
         agree.
@@ -162,7 +162,7 @@ class Effect:
         noise.
     sudden
         True if the arm's motion has jumps at instants that a simulation does not reproduce to the sample. The columns
-        at measured signals are then their own instruments, and a higher threshold accounts for the feedback bias.
+        at measured signals are then their own instruments.
     physical
         ``(values, shapes, largest)`` to True if linear parameters (k,) are physically possible at given nonlinear ones,
         beyond signs and bounds; ``largest`` has the largest values of the nonlinear ones in the grid of the motion.

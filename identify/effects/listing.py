@@ -24,6 +24,7 @@ def described(effect: Effect) -> dict[str, Any]:
     """Return the entry of ``armident effects --json`` of an effect."""
     entry = {
         "name": effect.name,
+        "law": effect.law,
         "title": effect.title,
         "description": effect.says,
         "scope": effect.scope,
@@ -78,7 +79,7 @@ def effects_command(name: str | None, *, as_json: bool) -> None:
     for heading in ("effect", "title", "parameters", "scope"):
         table.add_column(heading, overflow="fold")
     for effect in chosen:
-        table.add_row(effect.name, effect.title, ", ".join(_parameters(effect)), effect.scope)
+        table.add_row(effect.key, effect.title, ", ".join(_parameters(effect)), effect.scope)
     console = Console()
     console.print(table)
     print("terms with a key of their own in the robot configuration:")
@@ -87,7 +88,7 @@ def effects_command(name: str | None, *, as_json: bool) -> None:
 
 
 def _one(effect: Effect) -> None:
-    print(f"{effect.name}: {effect.title}\n{effect.says}")
+    print(f"{effect.key}: {effect.title}\n{effect.says}")
     for parameter in _parameters(effect):
         print(f"  {parameter}")
     for linear in effect.linear:
@@ -97,8 +98,10 @@ def _one(effect: Effect) -> None:
     print(f"required motion: {effect.needs}\nsource: {effect.reference}")
     names = [shape.name for shape in effect.shapes] + [parameter.name for parameter in effect.linear]
     values = [f"{parameter}: ..." for parameter in names]
-    other = ", other: joint_2" if effect.scope == "pair" else ""
-    print(f"configuration: {{effect: {effect.name}, joint: joint_1{other}, parameters: {{{', '.join(values)}}}}}")
+    law = f", law: {effect.law}" if effect.law else ""
+    other = ", other: joint_2" if effect.scope in ("pair", "other") else ""
+    place = f"effect: {effect.name}{law}, joint: joint_1{other}"
+    print(f"configuration: {{{place}, parameters: {{{', '.join(values)}}}}}")
 
 
 def _parameters(effect: Effect) -> list[str]:

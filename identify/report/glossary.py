@@ -334,7 +334,8 @@ DEPENDENCES: tuple[Entry, ...] = (
     Entry("torque of another joint", "Torque of another joint: electrical coupling, elastic structure."),
     Entry("frequency", "A spectral line that is independent of the motion."),
     Entry("motion", "The frequencies of the motion, more than noise has there, with no single variable."),
-    Entry("transients", "Short disturbances at times that are independent of the motion, found by their kurtosis."),
+    Entry("transients", "Short disturbances at times that are independent of the motion, in documents of former "
+          "versions."),
 )  # fmt: skip
 """Variables that an unexplained residual may depend on: values of ``varies_with``."""
 

@@ -82,8 +82,10 @@ class TorqueShift:
         """True if the shift is significant, common to the joints and no longer than a sample: it is corrected."""
         certain = abs(self.samples) > SIGNIFICANT * self.std and self.std <= MOST_UNCERTAIN
         compared = sum(std <= MOST_UNCERTAIN for _, std in self.by_joint.values())
-        # Disturbances that feed back bias each joint differently: without instruments, two joints must confirm it.
-        agreed = self.agreement >= LEAST_AGREEMENT and (self.instrumented or compared >= 2)
+        # Of one joint alone, dynamics that the model lacks look the same. Disturbances that feed back bias each joint
+        # differently: without instruments, two joints must confirm the shift.
+        several = len(self.by_joint) >= 2 if self.instrumented else compared >= 2
+        agreed = self.agreement >= LEAST_AGREEMENT and several
         return certain and agreed and SHORTEST <= abs(self.samples) <= LONGEST
 
     @property

@@ -23,7 +23,9 @@ def test_folds_are_blocks_of_equal_length_that_cover_all_rows() -> None:
 def test_the_log_likelihood_favours_the_true_model() -> None:
     _, first = selection(1, SPRING)
     true, false = with_effects(first, TRUE), with_effects(first, FALSE)
-    assert true.score.log_likelihood > false.score.log_likelihood + 100.0
+    common = first.weights
+    assert true.score.log_likelihood_under(common) > false.score.log_likelihood_under(common) + 100.0
+    assert true.score.own_log_likelihood > false.score.own_log_likelihood + 100.0
     assert true.score.gain_over(first.score) > 100.0
     assert true.score.rms[0] < 0.5 * first.score.rms[0]
 
@@ -44,11 +46,10 @@ def test_correlated_innovations_only_increase_the_variance_of_a_gain() -> None:
         assert (score.inflation_over(first.score) >= 1.0).all()
 
 
-def test_each_model_has_its_own_noise_models() -> None:
+def test_candidates_of_a_step_share_the_noise_models_of_the_step() -> None:
     _, first = selection(1, SPRING)
     true = with_effects(first, TRUE)
-    own, other = true.score.innovations(true.fit.noise), true.score.innovations(first.fit.noise)
-    # The noise model of the wrong model predicts the errors of the right one worse.
-    assert own[0] < other[0]
-    expected = -0.5 * true.score.rows * np.log(own) - [ar.order for ar in true.fit.noise]
-    np.testing.assert_allclose(true.score.log_likelihoods, expected)
+    assert list(true.fit.noise) == list(first.weights)
+    own = true.score.innovations(first.weights)
+    expected = -0.5 * true.score.rows * np.log(own)
+    np.testing.assert_allclose(true.score.log_likelihoods_under(first.weights), expected)

@@ -38,7 +38,7 @@ def test_idim_iv_takes_the_bias_from_a_mass_that_noisy_derivatives_make_too_smal
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "armident.identify.identification.equations.aligned_torque", lambda tau: tau
+        "armident.identify.identification.equations.aligned_torque", lambda tau, late=0.0: tau
     )  # force sampled, not held
     model, experiment = axis(seed)
     decimation = design(DT, 40.0)

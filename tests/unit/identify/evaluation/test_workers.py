@@ -233,7 +233,7 @@ def test_results_are_used_with_the_code_that_produced_them_only(tmp_path: Path) 
     line = json.loads(path.read_text(encoding="utf-8").splitlines()[0])
     assert line["document"] == document() | {
         "not_visible": [], "detection_limits": [], "simulated": None, "considered": [],
-        "sign_smoothing": None,
+        "sign_smoothing": None, "transitions": None, "alpha": None, "criteria": None, "negligible": [],
     }  # fmt: skip
 
 

@@ -276,7 +276,7 @@ def test_half_a_sample_between_position_and_sensor_torque_makes_no_difference(
     panda: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held = least_squares([panda], PANDA).relative_error_pct
-    monkeypatch.setattr("armident.identify.identification.equations.aligned_torque", lambda tau: tau)
+    monkeypatch.setattr("armident.identify.identification.equations.aligned_torque", lambda tau, late=0.0: tau)
     assert least_squares([panda], PANDA).relative_error_pct == pytest.approx(held, abs=0.02)
 
 
