@@ -11,6 +11,8 @@ import armident
 from armident.configs import DataError
 from armident.daq.cli import application
 from armident.daq.recording import write_recording
+from armident.identify.commands import FOUND
+from armident.identify.document import DiagnosisDocument, load_document
 from armident.identify.experiment import Experiment, check_one_rate
 from tests.fixtures.arms import FAST, recording
 
@@ -63,8 +65,9 @@ def test_the_command_of_the_line_makes_the_recordings_fit(tmp_path: Path) -> Non
     assert run(*shlex.split(command)[1:]).exit_code == 0
     resampled = tmp_path / "fast_500Hz.mcap"
     found = run("diagnose", str(slow), str(resampled), *out)
-    assert found.exit_code == 0, found.stderr
-    assert "time_delay" not in found.stdout
+    # Exit code 4: a spectral line at 100 Hz, the rate of the set points of the slow recording, may stay unexplained.
+    assert found.exit_code in (0, FOUND), found.stderr
+    assert load_document(tmp_path / "out" / "diagnosis.json", DiagnosisDocument).findings == []
     # The resampled recording identifies the same model.
     before, after = (armident.identify(file, method="idim-iv") for file in (fast, resampled))
     assert np.max(np.abs(after.theta - before.theta) / before.std) < 3.0
