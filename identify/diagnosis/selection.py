@@ -200,6 +200,7 @@ class StepwiseSelection:
     tested: Callable[[float], None] = lambda share: None
     stopped: bool = False
     hidden: frozenset[Key] = frozenset()
+    immaterial: tuple[Addition, ...] = ()
     _states: dict[str, ModelState | None] = field(default_factory=dict)
     _steps: dict[str, Step] = field(default_factory=dict)
 
@@ -529,13 +530,20 @@ class StepwiseSelection:
                 return state, tuple(sorted(checked, key=_change, reverse=True))
             gone = max(failed, key=lambda one: 1.0 if one.confirmation is None else one.confirmation.p_value)
             assert gone.without is not None
+            assert gone.confirmation is not None
+            if not self._material(gone.confirmation):
+                self.immaterial = (*self.immaterial, gone.addition)
             state, found = gone.without, tuple(one for one in found if one.entry is not gone.entry)
 
     def _holds(self, one: Selected) -> bool:
-        """True if the report part confirms a finding: the change goes the same way, and errors are smaller with it."""
+        """True if the report part confirms a finding: the change goes the same way, and is material there, too."""
         report = one.confirmation
         assert report is not None
-        return report.p_value < self.criteria.confirmation_level and report.smaller
+        return report.p_value < self.criteria.confirmation_level and report.smaller and self._material(report)
+
+    def _material(self, report: Confirmation) -> bool:
+        share = float(np.max(report.share))
+        return share >= self.criteria.least_share and report.change >= self.criteria.material_pct
 
 
 def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
@@ -552,9 +560,7 @@ def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
 
 
 def gain(with_it: ModelState, without: ModelState) -> float:
-    """Gain of log-likelihood by an effect, under the noise models of the model with it.
-
-    The noise models of the model without it may take the effect for noise.
+    """Gain of log-likelihood by an effect, under the noise models with which the model with it was fitted.
 
     Parameters
     ----------
