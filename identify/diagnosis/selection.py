@@ -438,7 +438,9 @@ class StepwiseSelection:
         """Model in which the recordings are corrected for an effect, and its entry.
 
         A torque column is the first-order expansion of such an effect at the model's own torque. The corrected
-        recording is exact, and the part of the expansion that remains refines the value.
+        recording is exact, and the part of the expansion that remains refines the value, until it is within its
+        standard deviation. The first value of a large effect can be so far off that its correction predicts worse than
+        the expansion; so the best of all is chosen at the end.
 
         Parameters
         ----------
@@ -455,13 +457,17 @@ class StepwiseSelection:
         for _ in range(CORRECTIONS):
             right = entry.model_copy(update={"parameters": {**entry.parameters, name: value}})
             exact = self._state(with_entries(state.robot, [right]), state)
-            if exact is None or gain(exact, state) <= gain(best, state):
+            if exact is None:
                 break
-            best, chosen = exact, right
+            if gain(exact, state) > gain(best, state):
+                best, chosen = exact, right
             further = self._state(with_entries(exact.robot, [entry]), exact)
             if further is None:
                 break
-            value += float(further.values_of(further.term_of(entry))[0][0])
+            rest, std = (float(x[0]) for x in further.values_of(further.term_of(entry)))
+            if abs(rest) < std:
+                break
+            value += rest
         return best, chosen
 
     def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
