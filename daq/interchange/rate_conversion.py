@@ -28,9 +28,9 @@ def at_rate(recording: Recording, rate_hz: float) -> Recording:
     """Return a recording at another sampling rate.
 
     Positions, velocities and efforts go through a linear-phase low-pass filter (windowed sinc) below the lower of both
-    Nyquist frequencies. An effort is held over its period, so that its filter is centred in the middle of the new
-    period. Demands are interpolated linearly, as a CiA 402 drive does (60C2h), and status words are held. Gaps, marks
-    and pieces between gaps keep their times.
+    Nyquist frequencies. Demands are interpolated linearly, as a CiA 402 drive does (60C2h), and status words are held.
+    Gaps, marks and pieces between gaps keep their times. So does the time from a position to the torque that belongs
+    to it, as in a capture of the same drives at the new rate; in sampling periods it is another number.
 
     Parameters
     ----------
@@ -109,8 +109,7 @@ def _values(quantity: str, raw: NDArray[Any], at: Floats, ratio: float) -> NDArr
     if quantity == "demand":
         rows = np.arange(len(values))
         return np.stack([np.interp(at, rows, column) for column in values.T], axis=1)
-    held = quantity in ("torque", "current", "voltage")
-    return low_passed(values, at + (1.0 / ratio - 1.0) / 2 if held else at, min(1.0, ratio))
+    return low_passed(values, at, min(1.0, ratio))
 
 
 def low_passed(values: Floats, at: Floats, share: float) -> Floats:

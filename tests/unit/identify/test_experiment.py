@@ -64,6 +64,7 @@ def test_the_command_of_the_line_makes_the_recordings_fit(tmp_path: Path) -> Non
     resampled = tmp_path / "fast_500Hz.mcap"
     found = run("diagnose", str(slow), str(resampled), *out)
     assert found.exit_code == 0, found.stderr
+    assert "time_delay" not in found.stdout
     # The resampled recording identifies the same model.
     before, after = (armident.identify(file, method="idim-iv") for file in (fast, resampled))
     assert np.max(np.abs(after.theta - before.theta) / before.std) < 3.0
