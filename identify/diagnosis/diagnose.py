@@ -264,7 +264,7 @@ def _diagnose(
         not_visible=undetectable(first, selection.hidden),
         detection_limits=limits,
         simulated=simulated.document(),
-        negligible=negligible(final, every, last, criteria),
+        negligible=negligible(final, every, last, criteria, selection.immaterial),
         sign_smoothing=dict(zip(study.joints, map(float, first.robot.sign_smoothing), strict=True)),
         transitions={e.joint: e.parameters["velocity"] for e in final.robot.effects if e.effect == TRANSITION},
         criteria=asdict(criteria),

@@ -121,7 +121,11 @@ def _alternatives(final: ModelState, one: Addition, rivals: Sequence[Addition]) 
 
 
 def negligible(
-    final: ModelState, selected: Sequence[Selected], step: Step | None, criteria: Criteria
+    final: ModelState,
+    selected: Sequence[Selected],
+    step: Step | None,
+    criteria: Criteria,
+    immaterial: Sequence[Addition] = (),
 ) -> list[Negligible]:
     """Return the effects that are significant, and no cause: too small, or within the sampling convention of drives.
 
@@ -135,9 +139,11 @@ def negligible(
         Comparison of all effects in it; ``None`` if it was not made.
     criteria
         Thresholds.
+    immaterial
+        Effects that change too little of the report part.
     """
     found: dict[Key, Negligible] = {}
-    small = [one.addition for one in selected if one.conventional(final)]
+    small = [*(one.addition for one in selected if one.conventional(final)), *immaterial]
     if step is not None:
         needed = np.log(max(step.tests, 1) / criteria.alpha["selection"])
         small += [a for a in step.ranked if a.gain > needed and a not in step.passing]

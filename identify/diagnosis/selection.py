@@ -200,6 +200,7 @@ class StepwiseSelection:
     tested: Callable[[float], None] = lambda share: None
     stopped: bool = False
     hidden: frozenset[Key] = frozenset()
+    immaterial: tuple[Addition, ...] = ()
     _states: dict[str, ModelState | None] = field(default_factory=dict)
     _steps: dict[str, Step] = field(default_factory=dict)
 
@@ -437,7 +438,9 @@ class StepwiseSelection:
         """Model in which the recordings are corrected for an effect, and its entry.
 
         A torque column is the first-order expansion of such an effect at the model's own torque. The corrected
-        recording is exact, and the part of the expansion that remains refines the value.
+        recording is exact, and the part of the expansion that remains refines the value, until it is within its
+        standard deviation. The first value of a large effect can be so far off that its correction predicts worse than
+        the expansion; so the best of all is chosen at the end.
 
         Parameters
         ----------
@@ -454,13 +457,17 @@ class StepwiseSelection:
         for _ in range(CORRECTIONS):
             right = entry.model_copy(update={"parameters": {**entry.parameters, name: value}})
             exact = self._state(with_entries(state.robot, [right]), state)
-            if exact is None or gain(exact, state) <= gain(best, state):
+            if exact is None:
                 break
-            best, chosen = exact, right
+            if gain(exact, state) > gain(best, state):
+                best, chosen = exact, right
             further = self._state(with_entries(exact.robot, [entry]), exact)
             if further is None:
                 break
-            value += float(further.values_of(further.term_of(entry))[0][0])
+            rest, std = (float(x[0]) for x in further.values_of(further.term_of(entry)))
+            if abs(rest) < std:
+                break
+            value += rest
         return best, chosen
 
     def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
@@ -529,13 +536,20 @@ class StepwiseSelection:
                 return state, tuple(sorted(checked, key=_change, reverse=True))
             gone = max(failed, key=lambda one: 1.0 if one.confirmation is None else one.confirmation.p_value)
             assert gone.without is not None
+            assert gone.confirmation is not None
+            if not self._material(gone.confirmation):
+                self.immaterial = (*self.immaterial, gone.addition)
             state, found = gone.without, tuple(one for one in found if one.entry is not gone.entry)
 
     def _holds(self, one: Selected) -> bool:
-        """True if the report part confirms a finding: the change goes the same way, and errors are smaller with it."""
+        """True if the report part confirms a finding: the change goes the same way, and is material there, too."""
         report = one.confirmation
         assert report is not None
-        return report.p_value < self.criteria.confirmation_level and report.smaller
+        return report.p_value < self.criteria.confirmation_level and report.smaller and self._material(report)
+
+    def _material(self, report: Confirmation) -> bool:
+        share = float(np.max(report.share))
+        return share >= self.criteria.least_share and report.change >= self.criteria.material_pct
 
 
 def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
@@ -552,9 +566,7 @@ def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
 
 
 def gain(with_it: ModelState, without: ModelState) -> float:
-    """Gain of log-likelihood by an effect, under the noise models of the model with it.
-
-    The noise models of the model without it may take the effect for noise.
+    """Gain of log-likelihood by an effect, under the noise models with which the model with it was fitted.
 
     Parameters
     ----------
