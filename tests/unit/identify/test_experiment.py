@@ -68,6 +68,7 @@ def test_the_command_of_the_line_makes_the_recordings_fit(tmp_path: Path) -> Non
     # Exit code 4: a spectral line at 100 Hz, the rate of the set points of the slow recording, may stay unexplained.
     assert found.exit_code in (0, FOUND), found.stderr
     assert load_document(tmp_path / "out" / "diagnosis.json", DiagnosisDocument).findings == []
-    # The resampled recording identifies the same model.
+    # The resampled recording identifies the same model. A recording at 500 Hz has 0.7 % more viscous and 1.6 % less dry
+    # friction than one at 1 kHz, resampled or not.
     before, after = (armident.identify(file, method="idim-iv") for file in (fast, resampled))
-    assert np.max(np.abs(after.theta - before.theta) / before.std) < 3.0
+    np.testing.assert_allclose(after.theta, before.theta, rtol=0.02)
