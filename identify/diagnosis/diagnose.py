@@ -41,6 +41,7 @@ from armident.identify.document import (
     versions,
 )
 from armident.identify.effects.friction import TRANSITION
+from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.experiment import Experiment
 
@@ -64,6 +65,9 @@ class Diagnosis:
     lacking
         Torques (M, n) of the model with all findings but one, for each finding of the document; ``None`` for a finding
         that is not a part of the model (wiring, parameter changes).
+    own
+        Torques (M, n) of each finding itself, in the model with all; ``None`` for a finding that is no term of it.
+        They differ from ``after - lacking``, where the other parameters compensate for the finding.
     q, qd
         Held-out joint positions and velocities (M, n), rad and rad/s, or m and m/s.
     where
@@ -81,6 +85,7 @@ class Diagnosis:
     before: Array
     after: Array
     lacking: tuple[Array | None, ...]
+    own: tuple[Array | None, ...]
     q: Array
     qd: Array
     where: tuple[Dependence, ...]
@@ -225,7 +230,7 @@ def _diagnose(
     places = {id(f): k for k, f in enumerate(named)}
     findings = stage.named(named, after)
     stopped = _stopped(selection, len(named))
-    lacking = [_lacking(final, selected[places[id(f)]]) if id(f) in places else None for f in findings]
+    chosen_for = [selected[places[id(f)]] if id(f) in places else None for f in findings]
     steps("unexplained dependences")
     dependences = unexplained(final, criteria)
     left = stage.left(
@@ -278,7 +283,8 @@ def _diagnose(
         measured=np.concatenate([s.y for s in held]),
         before=_beside(final, first),
         after=_predicted(final),
-        lacking=(*lacking, *(None for _ in findings[len(lacking) :])),
+        lacking=_of_findings(_lacking, final, chosen_for, len(findings)),
+        own=_of_findings(_own, final, chosen_for, len(findings)),
         q=_sampled(final, "q"),
         qd=_sampled(final, "qd"),
         where=dependences_of(first, criteria),
@@ -321,6 +327,25 @@ def _beside(final: ModelState, state: ModelState) -> Array:
 def _lacking(final: ModelState, one: Selected) -> Array | None:
     """Torques (M, n) of the model without one finding."""
     return None if one.without is None else _beside(final, one.without)
+
+
+def _own(final: ModelState, one: Selected) -> Array | None:
+    """Torques (M, n) of a finding that is a term of the model."""
+    if of_recording(one.entry):
+        return None
+    own = [final.study.model.base.names.index(name) for name in final.term_of(one.entry).names]
+    return np.concatenate([x[:, :, own] @ final.fit.theta[own] for x, _, _ in final.fit.equations.held])
+
+
+def _of_findings(
+    curve: Callable[[ModelState, Selected], Array | None],
+    final: ModelState,
+    selected: Sequence[Selected | None],
+    count: int,
+) -> tuple[Array | None, ...]:
+    """Curves of all findings: those of the set-up and changed parameters, which come last, have none."""
+    made = [None if one is None else curve(final, one) for one in selected]
+    return (*made, *(None for _ in range(count - len(made))))
 
 
 def _sampled(state: ModelState, name: str) -> Array:

@@ -1,5 +1,6 @@
 """D-optimality objective of a trajectory for an effect of the catalogue, or for the separation of two."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -186,10 +187,18 @@ def _locations(effect: Effect, robot: RobotConfig, joint: int | None, motion: Mo
         elsewhere = joint is not None and effect.scope != "arm" and joint not in (place.joint, place.other)
         if elsewhere or (effect.visible is not None and effect.visible(motion, place) is not None):
             continue
-        every = grid(effect, motion, place)
-        chosen = sorted({round(share * (len(every) - 1)) for share in TYPICAL})
-        found.append(EffectLocation(effect, place, tuple(every[k] for k in chosen)))
+        found.append(EffectLocation(effect, place, _typical(grid(effect, motion, place))))
     return found
+
+
+def _typical(every: Sequence[Shapes]) -> tuple[Shapes, ...]:
+    """Return the nonlinear parameters of a grid at the positions `TYPICAL` of the values of each.
+
+    Positions in the list of all combinations would depend on how many values the last parameter has.
+    """
+    values = [[(name, value) for value in dict.fromkeys(dict(one)[name] for one in every)] for name, _ in every[0]]
+    chosen = (tuple(own[round(share * (len(own) - 1))] for own in values) for share in TYPICAL)
+    return tuple(dict.fromkeys(chosen))
 
 
 def _meet(one: EffectLocation, two: EffectLocation) -> bool:

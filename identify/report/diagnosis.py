@@ -58,9 +58,9 @@ def diagnosis_report(diagnosis: Diagnosis, document: DiagnosisDocument) -> str:
                 "sure": certainty(finding),
                 "closed": closed_share(finding, document),
                 "rows": _rows(finding),
-                "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking),
+                "picture": _finding_figure(diagnosis, joints.index(finding.joint), lacking, own),
             }
-            for finding, lacking in zip(document.findings, diagnosis.lacking, strict=True)
+            for finding, lacking, own in zip(document.findings, diagnosis.lacking, diagnosis.own, strict=True)
         ],
         gaps=_gap_figure(document),
         map=_map_figure(diagnosis, joints),
@@ -143,7 +143,7 @@ def _gap_figure(document: DiagnosisDocument) -> str:
     return picture[0]
 
 
-def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None) -> str:
+def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None, own: Array | None) -> str:
     """Return a figure of the joint's held-out residual without and with a finding, over time and over its variable.
 
     Parameters
@@ -155,6 +155,8 @@ def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None) -> 
     lacking
         Torques (M, n) of the model without the finding; ``None`` compares the model as configured with that of all
         findings.
+    own
+        Torques (M, n) of the finding itself, which depend on its variable alone; ``None`` if it is no term.
     """
     name, unit = diagnosis.robot.joints[joint].name, _unit(diagnosis, joint)
     seen = [d for d in diagnosis.where if d.joint == name]
@@ -175,7 +177,8 @@ def _finding_figure(diagnosis: Diagnosis, joint: int, lacking: Array | None) -> 
         if lacking is None and seen:
             _curve(over_cause, seen[0], unit)
         else:
-            _over_cause(over_cause, rest, added, followed_variable(diagnosis, joint, added), unit)
+            cause = followed_variable(diagnosis, joint, added if own is None else own[:, joint])
+            _over_cause(over_cause, rest, added, cause, unit)
         over_cause.axhline(0, color=MUTED, linewidth=0.6)
     return picture[0]
 
@@ -201,7 +204,7 @@ def followed_variable(diagnosis: Diagnosis, joint: int, added: Array) -> tuple[s
     joint
         Index of the joint.
     added
-        Torque (M,) that the finding adds, N m or N.
+        Torque (M,) of the finding, N m or N.
     """
     way = "m" if diagnosis.robot.joints[joint].type == "prismatic" else "rad"
     for name, unit, x in (

@@ -56,9 +56,9 @@ def test_a_loop_that_diverges_leaves_out_its_table_and_nothing_else(diagnosis: D
 @pytest.mark.slow
 def test_a_finding_is_drawn_over_what_it_follows(diagnosis: Diagnosis) -> None:
     over = {}
-    for finding, lacking in zip(diagnosis.document.findings, diagnosis.lacking, strict=True):
-        assert lacking is not None
-        name, unit, _ = followed_variable(diagnosis, 0, (diagnosis.after - lacking)[:, 0])
+    for finding, own in zip(diagnosis.document.findings, diagnosis.own, strict=True):
+        assert own is not None
+        name, unit, _ = followed_variable(diagnosis, 0, own[:, 0])
         over[finding.effect] = (name, unit)
     assert over == {
         "asymmetric_viscous_friction": ("joint speed", "m/s"),
