@@ -214,7 +214,7 @@ class StepwiseSelection:
         """
         state = fitted(self.study, self.study.robot, None)
         if not self.study.sign_given:
-            state = self._with_transitions(state)
+            state = with_own_noise(self._with_transitions(state))
         self.study = replace(self.study, robot=state.robot, model=state.study.model, sign_given=True)
         self._states[_key(state.robot)] = state
         return state
@@ -248,7 +248,7 @@ class StepwiseSelection:
             state, found = self._exchanged(state, found)
             state, kept = self._confirmed(state, found)
             if len(kept) == len(found):
-                return with_own_noise(state), kept
+                return (with_own_noise(state) if kept else first), kept
             found = kept
 
     def step(self, state: ModelState) -> Step:
