@@ -11,7 +11,7 @@ from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Workshop
 from armident.identify.diagnosis.predictive_score import PredictiveScore
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, noise_models
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, noise_models, safe
 from armident.identify.diagnosis.screening import noise_beyond_shapes
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.recorded import of_recording
@@ -153,7 +153,7 @@ def with_own_noise(state: ModelState) -> ModelState:
         Model of the selection, fitted with the noise models of an earlier one.
     """
     noise = noise_models(state.fit.left, state.fit.theta.size, MAX_AR_ORDER)
-    return replace(state, fit=state.fit.renoised(noise))
+    return replace(state, fit=safe(state.fit.renoised(noise)))
 
 
 def with_report_part(state: ModelState) -> ModelState:

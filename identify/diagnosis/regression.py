@@ -1,7 +1,7 @@
 """Instrumental-variable regression of a diagnosis, whitened joint by joint (thesis 2.3.3 and 6.1.3)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +26,8 @@ SINGULAR = 1e-13
 MOST_WEIGHTED = 1.5
 """Largest ratio of the errors with weighted equations to those with white weights: efficient weights change an estimate
 by less than its standard deviation, and the errors by a few percent."""
+LOWER_ORDERS = (10, 3, 1)
+"""Highest orders of noise models in turn, where those of higher order make the instruments weak."""
 PASSES = 3
 """Iterations between parameters and noise models; a fourth changes neither visibly."""
 
@@ -395,22 +397,34 @@ def fit(study: Study, theta0: Array | None = None, noise: Sequence[ArModel] | No
         passes = 1
     found = solved(study, equations, noise)
     require_solution(found)
-    if passes == 1:
-        return _safe(found)
     for _ in range(passes - 1):
         found = found.renoised(noise_models(found.errors(found.theta, held=False), found.theta.size, MAX_AR_ORDER))
-    return found
+    return safe(found)
 
 
-def _safe(found: Fit) -> Fit:
-    """The fit, or that with white weights if its errors are much larger than with these.
+def safe(found: Fit) -> Fit:
+    """Return the fit, or one with noise models of lower order if its errors are much larger than with white weights.
 
     Weights of a strongly coloured noise emphasise frequencies at which the simulated and the measured motion may have
     little in common. The instruments are weak there, and the estimate is far from any that fits the data.
+
+    Parameters
+    ----------
+    found
+        The fit.
     """
     white = found.renoised([ArModel(np.empty(0), ar.variance, 0.0) for ar in found.noise])
-    own, other = (np.sqrt(np.mean(np.concatenate(one.left) ** 2, axis=0)) for one in (found, white))
-    return found if np.all(own <= MOST_WEIGHTED * other) else replace(white, noise=found.noise)
+    most = MOST_WEIGHTED * _rms(white)
+    for order in (*LOWER_ORDERS, 0):
+        if np.all(_rms(found) <= most):
+            break
+        found = found.renoised(noise_models(white.left, white.theta.size, order))
+    return found
+
+
+def _rms(found: Fit) -> Array:
+    """Root mean square of the residual of each joint, N m or N, (n,)."""
+    return np.asarray(np.sqrt(np.mean(np.concatenate(found.left) ** 2, axis=0)))
 
 
 def require_solution(found: Fit) -> None:
