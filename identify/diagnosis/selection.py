@@ -248,7 +248,7 @@ class StepwiseSelection:
             state, found = self._exchanged(state, found)
             state, kept = self._confirmed(state, found)
             if len(kept) == len(found):
-                return (with_own_noise(state) if kept else first), kept
+                return self._finished(state, kept) if kept else (first, ())
             found = kept
 
     def step(self, state: ModelState) -> Step:
@@ -540,6 +540,17 @@ class StepwiseSelection:
             if not self._material(gone.confirmation):
                 self.immaterial = (*self.immaterial, gone.addition)
             state, found = gone.without, tuple(one for one in found if one.entry is not gone.entry)
+
+    def _finished(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
+        """Final model under the noise models of its own residual, and its findings compared with the same."""
+        final = with_own_noise(state)
+        held = with_report_part(final)
+        compared: list[Selected] = []
+        for one in found:
+            assert one.without is not None
+            less = with_own_noise(one.without)
+            compared.append(replace(one, confirmation=confirmed(held, with_report_part(less)), without=less))
+        return final, tuple(sorted(compared, key=_change, reverse=True))
 
     def _holds(self, one: Selected) -> bool:
         """True if the report part confirms a finding: the change goes the same way, and is material there, too."""
