@@ -76,7 +76,7 @@ class Columns:
 
 
 @dataclass
-class Workshop:
+class ColumnCache:
     """Cache of the columns of candidates.
 
     Parameters
@@ -94,7 +94,7 @@ class Workshop:
     kept: dict[Cached, tuple[Kept, ...]] = field(default_factory=dict)
     _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
 
-    def with_theta(self, study: Study, theta: Array) -> "Workshop":
+    def with_theta(self, study: Study, theta: Array) -> "ColumnCache":
         """Cache after a refit; columns that depend neither on theta nor on another simulation stay.
 
         Parameters
@@ -110,7 +110,7 @@ class Workshop:
             for key, value in self.kept.items()
             if not _predicts(key[0]) and not (moved and key[5] == "simulated")
         }
-        return Workshop(study, theta, still)
+        return ColumnCache(study, theta, still)
 
     def instruments(
         self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel], *, keep: bool = True
@@ -268,14 +268,14 @@ def _predicts(name: str) -> bool:
     return effect is None or effect.predicts
 
 
-def candidates(workshop: Workshop) -> Iterator[Candidate]:
+def candidates(column_cache: ColumnCache) -> Iterator[Candidate]:
     """All effects of the catalogue at all places of the robot that it does not have there already.
 
     Left out are effects that only change parameters, exchanges of signals, and effects that this motion does not
     excite.
     """
-    study = workshop.study
-    motion = workshop.motion(study.train[0], "measured")
+    study = column_cache.study
+    motion = column_cache.motion(study.train[0], "measured")
     names = study.joints
     present: dict[tuple[str, int, int | None], list[Shapes]] = {}
     for term in effect_terms(study.model):

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 
 from armident.identify.diagnosis.baseline import Change, Comparison
-from armident.identify.diagnosis.candidates import Workshop, places
+from armident.identify.diagnosis.candidates import ColumnCache, places
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.effects.registry import catalogue
 
@@ -43,18 +43,18 @@ class Standing:
     score: float
 
 
-def changes(comparison: Comparison, workshop: Workshop) -> Iterator[Change]:
+def changes(comparison: Comparison, column_cache: ColumnCache) -> Iterator[Change]:
     """All effects that change parameters of the model, at all their places.
 
     Parameters
     ----------
     comparison
         Fit and baseline.
-    workshop
+    column_cache
         Cache of the columns of the same study.
     """
     fit = comparison.fit
-    motion = workshop.motion(fit.study.train[0], "measured")
+    motion = column_cache.motion(fit.study.train[0], "measured")
     rigid = fit.theta.size - fit.study.model.e
     for effect in catalogue().values():
         if effect.numbers is None and effect.name not in STRUCTURAL:
@@ -67,7 +67,7 @@ def changes(comparison: Comparison, workshop: Workshop) -> Iterator[Change]:
             elif effect.name == "gravity_direction" and effect.visible is not None and effect.visible(motion, place):
                 continue
             else:
-                directions = fit.absorbed(workshop.columns(effect, place, (), fit.noise).x)
+                directions = fit.absorbed(column_cache.columns(effect, place, (), fit.noise).x)
             directions = directions[comparison.known]
             if directions.any():
                 yield Change(effect, place, directions)

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from armident.identify.diagnosis.candidates import Candidate, Shapes, Workshop, candidates
+from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes, candidates
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.precision import variance_of_sum
@@ -38,26 +38,28 @@ def detection_limits(state: ModelState, step: Step | None, criteria: Criteria) -
     criteria
         Thresholds.
     """
-    workshop = Workshop(state.study, state.fit.theta)
+    column_cache = ColumnCache(state.study, state.fit.theta)
     shapes = {} if step is None else {a.candidate.key: a.shapes for a in reversed(step.ranked)}
-    every = [c for c in candidates(workshop) if c.effect.name != UNNAMED and not c.effect.law and not c.effect.sudden]
+    every = [
+        c for c in candidates(column_cache) if c.effect.name != UNNAMED and not c.effect.law and not c.effect.sudden
+    ]
     found: list[DetectionLimit] = []
     for candidate in every:
         if candidate.effect.order_of and candidate.key not in shapes:
             continue
         middle = candidate.grid[len(candidate.grid) // 2] if candidate.grid else ()
-        sizes = _smallest(state, workshop, candidate, shapes.get(candidate.key, middle), len(every), criteria)
+        sizes = _smallest(state, column_cache, candidate, shapes.get(candidate.key, middle), len(every), criteria)
         if sizes is not None and np.isfinite(sizes).any():
             found.append(_entry(state, candidate, sizes))
     return found
 
 
 def _smallest(
-    state: ModelState, workshop: Workshop, candidate: Candidate, shapes: Shapes, tests: int, criteria: Criteria
+    state: ModelState, column_cache: ColumnCache, candidate: Candidate, shapes: Shapes, tests: int, criteria: Criteria
 ) -> Array | None:
     """Smallest detectable size (k,) of each linear parameter; infinite where it is not detectable."""
     fit = state.fit
-    z = workshop.instruments(candidate.effect, candidate.place, shapes, fit.noise, keep=False)
+    z = column_cache.instruments(candidate.effect, candidate.place, shapes, fit.noise, keep=False)
     basis = directions_beside(fit, z)
     if basis is None:
         return None

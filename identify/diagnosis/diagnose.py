@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from armident.configs import RobotConfig
-from armident.identify.diagnosis.candidates import Workshop
+from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.detection_limits import detection_limits
 from armident.identify.diagnosis.findings import (
@@ -243,8 +243,8 @@ def _diagnose(
     if baseline is not None:
         steps("changed parameters")
         alpha = criteria.alpha["changed_parameters"]
-        workshop = Workshop(final.study, final.fit.theta)
-        findings += changed_parameters(stale_numbers(final.fit, workshop, baseline, alpha))
+        column_cache = ColumnCache(final.study, final.fit.theta)
+        findings += changed_parameters(stale_numbers(final.fit, column_cache, baseline, alpha))
     steps("simulation")
     simulated = simulated_errors(first, final)
     steps("detection limits")

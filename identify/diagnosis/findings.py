@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.candidates import Key, Workshop, places
+from armident.identify.diagnosis.candidates import ColumnCache, Key, places
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.experiment import recommended_experiment
 from armident.identify.diagnosis.model_state import ModelState
@@ -213,7 +213,7 @@ def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
         Effects and places that the model contains or the motion does not excite.
     """
     study = state.study
-    motion = Workshop(study, state.fit.theta).motion(study.train[0], "measured")
+    motion = ColumnCache(study, state.fit.theta).motion(study.train[0], "measured")
     found: dict[tuple[str, str], NotVisible] = {}
     for effect in catalogue().values():
         if effect.rewires or effect.scope in ("pair", "other") or effect.law:

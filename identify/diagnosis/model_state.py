@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.diagnosis.candidates import Workshop
+from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.predictive_score import PredictiveScore
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, noise_models, safe
 from armident.identify.diagnosis.screening import noise_beyond_shapes
@@ -59,7 +59,7 @@ class ModelState:
         Noise models of the residual itself would take missing effects for noise. All candidates for this model are
         fitted and compared under these.
         """
-        return tuple(noise_beyond_shapes(self.fit, Workshop(self.study, self.fit.theta)))
+        return tuple(noise_beyond_shapes(self.fit, ColumnCache(self.study, self.fit.theta)))
 
     @property
     def terms(self) -> tuple[Term, ...]:

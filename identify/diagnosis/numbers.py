@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import special, stats
 
 from armident.identify.diagnosis.baseline import Change, Comparison, cautious, compared
-from armident.identify.diagnosis.candidates import Workshop
+from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.changes import STRUCTURAL, changes, p_value, ranked
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.precision import variance_of_sum
@@ -72,7 +72,7 @@ class NumbersFinding:
 
 
 def stale_numbers(
-    fit: Fit, workshop: Workshop, baseline: IdentificationDocument, alpha: float = 0.01
+    fit: Fit, column_cache: ColumnCache, baseline: IdentificationDocument, alpha: float = 0.01
 ) -> list[NumbersFinding]:
     """Changes of the plant since a baseline was identified.
 
@@ -80,7 +80,7 @@ def stale_numbers(
     ----------
     fit
         Fit of the model with all findings in structure.
-    workshop
+    column_cache
         Cache of the columns of the same study.
     baseline
         Result of an earlier identification of the same robot.
@@ -95,7 +95,7 @@ def stale_numbers(
     comparison = compared(cautious(fit), baseline)
     if not _stale(comparison, alpha):
         return []
-    pool = list(changes(comparison, workshop))
+    pool = list(changes(comparison, column_cache))
     found: list[Change] = []
     barred: list[Change] = []
     while True:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.candidates import Workshop
+from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.regression import Fit
 from armident.identify.effects.recorded import of_recording
@@ -34,14 +34,14 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
         The model.
     """
     study, fit = state.study, state.fit
-    workshop = Workshop(study, fit.theta)
+    column_cache = ColumnCache(study, fit.theta)
     terms = {k: state.term_of(e) for k, e in enumerate(state.robot.effects) if not of_recording(e)}
     slopes: list[Array] = []
     owners: list[tuple[int, str]] = []
     for k, term in terms.items():
         values = term.of_effect(state.values_of(term)[0])
         for name in term.effect.movable(study.robot, term.place, term.shapes):
-            slopes.append(_slope(workshop, fit.noise, term, name, values))
+            slopes.append(_slope(column_cache, fit.noise, term, name, values))
             owners.append((k, name))
     deviations = _deviations(fit, slopes)
     b = fit.theta.size
@@ -56,12 +56,12 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
     return found
 
 
-def _slope(workshop: Workshop, noise: Sequence[ArModel], term: Term, name: str, values: Array) -> Array:
+def _slope(column_cache: ColumnCache, noise: Sequence[ArModel], term: Term, name: str, values: Array) -> Array:
     """Derivative of a term's whitened torque at the simulated signals with respect to a nonlinear parameter, (R,)."""
 
     def torque(shapes: Mapping[str, float]) -> Array:
         key = tuple((shape.name, shapes[shape.name]) for shape in term.effect.shapes)
-        rows: Array = workshop.instruments(term.effect, term.place, key, noise, keep=False) @ values
+        rows: Array = column_cache.instruments(term.effect, term.place, key, noise, keep=False) @ values
         return rows
 
     step = STEP * term.shapes[name]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from armident.identify.diagnosis.candidates import Candidate, Shapes, Workshop
+from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, noise_models
 from armident.identify.effects.tables import hats
 from armident.identify.regression.ar_noise import ArModel
@@ -29,7 +29,7 @@ REFINEMENTS = 12
 """Evaluations of the golden-section search of a continuous shape between its neighbours on the grid."""
 
 
-def screened(fit: Fit, candidate: Candidate, workshop: Workshop) -> tuple[float, Shapes] | None:
+def screened(fit: Fit, candidate: Candidate, column_cache: ColumnCache) -> tuple[float, Shapes] | None:
     """Best score statistic of a candidate on its grid, by the training data, and the nonlinear parameters there.
 
     Parameters
@@ -38,14 +38,14 @@ def screened(fit: Fit, candidate: Candidate, workshop: Workshop) -> tuple[float,
         Fit of the model.
     candidate
         Candidate with its grid.
-    workshop
+    column_cache
         Cache of the columns of the same fit.
     """
     if not candidate.grid:
         return None
     # Columns that depend on theta are useless for the next model, and a grid of them is large.
     keep = not candidate.effect.predicts
-    columns = workshop.grid(candidate.effect, candidate.place, candidate.grid, fit.noise, keep=keep)
+    columns = column_cache.grid(candidate.effect, candidate.place, candidate.grid, fit.noise, keep=keep)
     statistics = score_statistics(fit, columns, len(candidate.grid))
     if np.isnan(statistics).all():
         return None
@@ -122,7 +122,7 @@ def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array
     return (beside @ right) / np.sqrt(power[kept]), right, scale
 
 
-def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[float, Shapes]) -> Shapes:
+def refined(fit: Fit, candidate: Candidate, column_cache: ColumnCache, best: tuple[float, Shapes]) -> Shapes:
     """Nonlinear parameters between those of the grid, one continuous parameter after the other, on a logarithmic scale.
 
     Parameters
@@ -131,7 +131,7 @@ def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[floa
         Fit of the model.
     candidate
         Candidate with its grid.
-    workshop
+    column_cache
         Cache of the columns of the same fit.
     best
         Score statistic and nonlinear parameters of the grid, the start.
@@ -149,7 +149,7 @@ def refined(fit: Fit, candidate: Candidate, workshop: Workshop, best: tuple[floa
         def loss(logarithm: float, start: Shapes = start, k: int = k) -> float:
             shapes = replaced(start, k, float(np.exp(logarithm)))
             statistic = score_statistic(
-                fit, workshop.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
+                fit, column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
             )
             return 0.0 if statistic is None else -statistic
 
@@ -174,19 +174,19 @@ def replaced(shapes: Shapes, k: int, value: float) -> Shapes:
     return (*shapes[:k], (shapes[k][0], value), *shapes[k + 1 :])
 
 
-def noise_beyond_shapes(fit: Fit, workshop: Workshop) -> list[ArModel]:
+def noise_beyond_shapes(fit: Fit, column_cache: ColumnCache) -> list[ArModel]:
     """Noise models of the residual without smooth functions of each joint's own motion.
 
     Parameters
     ----------
     fit
         Fit of the model.
-    workshop
+    column_cache
         Cache of the columns of the same fit.
     """
     errors = fit.errors(fit.theta, held=False)
     columns = [
-        _smooth_functions(workshop, workshop.motion(s, "measured"), sum(e.shape[0] for e in errors))
+        _smooth_functions(column_cache, column_cache.motion(s, "measured"), sum(e.shape[0] for e in errors))
         for s in fit.study.train
     ]
     left = [e.copy() for e in errors]
@@ -200,7 +200,7 @@ def noise_beyond_shapes(fit: Fit, workshop: Workshop) -> list[ArModel]:
     return noise_models(left, fit.theta.size + used, MAX_AR_ORDER)
 
 
-def _smooth_functions(workshop: Workshop, motion: Motion, rows: int) -> list[Array]:
+def _smooth_functions(column_cache: ColumnCache, motion: Motion, rows: int) -> list[Array]:
     """Hat functions of position, of position by direction, of velocity and of time, (M, k) for each joint."""
     knots = max(3, min(KNOTS, rows // (4 * ROWS_PER_COLUMN)))
     out = []
@@ -209,7 +209,7 @@ def _smooth_functions(workshop: Workshop, motion: Motion, rows: int) -> list[Arr
         place = _hats(q, knots)
         when = _hats(motion.t, knots)
         out.append(
-            workshop.study.decimation(
+            column_cache.study.decimation(
                 np.concatenate([place, place * side, _hats(qd, knots), when, when * side], axis=1)
             )
         )

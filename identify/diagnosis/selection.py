@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.diagnosis.candidates import Candidate, Key, Shapes, Workshop, candidates, grid
+from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates, grid
 from armident.identify.diagnosis.confirmation import Confirmation, confirmed
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState, fitted, with_own_noise, with_report_part
@@ -350,8 +350,8 @@ class StepwiseSelection:
         the one with which its own torque is predicted best.
         """
         effect = known(TRANSITION)
-        workshop = Workshop(state.study, state.fit.theta)
-        motion = workshop.motion(state.study.train[0], "measured")
+        column_cache = ColumnCache(state.study, state.fit.theta)
+        motion = column_cache.motion(state.study.train[0], "measured")
         present = {e.joint for e in state.robot.effects if e.effect == TRANSITION}
         places = [Place(j) for j, name in enumerate(self.study.joints) if name not in present]
         noise = state.weights
@@ -381,16 +381,16 @@ class StepwiseSelection:
 
     def _shortlist(self, state: ModelState) -> tuple[list[tuple[Candidate, Shapes]], int]:
         """Candidates with the highest score statistics less their numbers of parameters, and the number of all."""
-        workshop = Workshop(state.study, state.fit.theta)
+        column_cache = ColumnCache(state.study, state.fit.theta)
         noise = state.fit.renoised(state.weights)
         looks: list[tuple[float, Candidate, tuple[float, Shapes]]] = []
         tests, hidden = 0, set()
-        for every in candidates(workshop):
+        for every in candidates(column_cache):
             candidate = every
             if candidate.effect.order_of == "motor":
                 candidate = replace(candidate, grid=motor_orders(state.study, state.fit.theta, candidate.place.joint))
             tests += 1
-            found = screened(noise, candidate, workshop)
+            found = screened(noise, candidate, column_cache)
             if found is None:
                 hidden.add(candidate.key)
             else:
@@ -408,9 +408,9 @@ class StepwiseSelection:
             if candidate.effect.order_of:
                 near = nearby_orders(state.study, candidate.place.joint, found[1][0][1])
                 candidate = replace(candidate, grid=near)
-                found = screened(noise, candidate, workshop) or found
-            shapes = refined(noise, candidate, workshop, found)
-            chosen += [(candidate, ends) for ends in both_ends(noise, candidate, workshop, shapes)]
+                found = screened(noise, candidate, column_cache) or found
+            shapes = refined(noise, candidate, column_cache, found)
+            chosen += [(candidate, ends) for ends in both_ends(noise, candidate, column_cache, shapes)]
         return chosen, tests
 
     def _added(self, state: ModelState, candidate: Candidate, shapes: Shapes) -> Addition | None:

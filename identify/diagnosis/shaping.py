@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from armident.identify.diagnosis.candidates import Candidate, Shapes, Workshop
+from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
 from armident.identify.diagnosis.regression import Fit
 from armident.identify.diagnosis.screening import directions_beside, replaced
 from armident.identify.diagnosis.whitening import whitened
@@ -24,7 +24,7 @@ REFINEMENTS = 8
 """Evaluations of that refinement."""
 
 
-def both_ends(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Shapes) -> tuple[Shapes, ...]:
+def both_ends(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> tuple[Shapes, ...]:
     """Nonlinear parameters by measured signals and by simulated ones, where these differ; either may be wrong.
 
     Simulated signals are those of a loop without the effect, and measured ones contain noise that it amplifies.
@@ -35,16 +35,16 @@ def both_ends(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Shapes
         Fit of the model.
     candidate
         Candidate with its grid.
-    workshop
+    column_cache
         Cache of the columns of the same fit.
     shapes
         Nonlinear parameters by simulated signals.
     """
-    found = instrumented(fit, candidate, workshop, shapes)
+    found = instrumented(fit, candidate, column_cache, shapes)
     return (shapes,) if found == shapes else (found, shapes)
 
 
-def instrumented(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Shapes) -> Shapes:
+def instrumented(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> Shapes:
     """Continuous nonlinear parameters, one after the other, between their neighbours on the grid.
 
     Those of effects that depend on the motion alone stay. That motion is simulated well, and measured velocities are
@@ -56,7 +56,7 @@ def instrumented(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Sha
         Fit of the model.
     candidate
         Candidate with its grid.
-    workshop
+    column_cache
         Cache of the columns of the same fit.
     shapes
         Start: the best values at simulated signals.
@@ -70,18 +70,18 @@ def instrumented(fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Sha
             continue
         at = int(np.argmin(np.abs(np.log(values / found[k][1]))))
         low, high = float(values[max(at - 1, 0)]), float(values[min(at + 1, values.size - 1)])
-        explained = _explained(fit, candidate, workshop, found, k, (low, found[k][1], high))
+        explained = _explained(fit, candidate, column_cache, found, k, (low, found[k][1], high))
         if explained is not None:
             found = replaced(found, k, _highest(explained, low, high))
     return found
 
 
 def _explained(
-    fit: Fit, candidate: Candidate, workshop: Workshop, shapes: Shapes, k: int, probes: tuple[float, ...]
+    fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes, k: int, probes: tuple[float, ...]
 ) -> Callable[[float], float] | None:
     """Power of the training residual that measured columns explain along the directions of simulated ones."""
     effect, place = candidate.effect, candidate.place
-    instruments = [workshop.instruments(effect, place, replaced(shapes, k, v), fit.noise) for v in probes]
+    instruments = [column_cache.instruments(effect, place, replaced(shapes, k, v), fit.noise) for v in probes]
     basis = directions_beside(fit, np.concatenate(instruments, axis=1))
     if basis is None:
         return None
@@ -89,7 +89,7 @@ def _explained(
     score = u.T @ fit.residual
 
     def explained(value: float) -> float:
-        band = workshop.band(effect, place, replaced(shapes, k, value), "train", "measured", keep=False)
+        band = column_cache.band(effect, place, replaced(shapes, k, value), "train", "measured", keep=False)
         along = u.T @ whitened(band, fit.noise)
         coefficients = np.linalg.lstsq(along, score, rcond=None)[0]
         return float(score @ (along @ coefficients))

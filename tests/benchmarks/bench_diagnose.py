@@ -9,7 +9,7 @@ from tests.benchmarks.harness import Row
 MEASURE = """
 import json, resource, time
 from armident.configs import config_path, load_robot, load_trajectory
-from armident.identify.diagnosis.candidates import Workshop, candidates
+from armident.identify.diagnosis.candidates import ColumnCache, candidates
 from armident.identify.diagnosis.diagnose import diagnose
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
@@ -30,7 +30,7 @@ for _ in range(2):
         best = document
 memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 start = StepwiseSelection(build_study(experiments, [], robot)).start()
-tried = sum(len(candidate.grid) for candidate in candidates(Workshop(start.study, start.fit.theta)))
+tried = sum(len(candidate.grid) for candidate in candidates(ColumnCache(start.study, start.fit.theta)))
 seconds = float("inf")
 for _ in range(2):
     begin = time.perf_counter()

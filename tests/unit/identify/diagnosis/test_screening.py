@@ -7,7 +7,7 @@ import pytest
 
 from armident.configs import load_robot
 from armident.configs.schema.scenario import HiddenEffect
-from armident.identify.diagnosis.candidates import Workshop, candidates
+from armident.identify.diagnosis.candidates import ColumnCache, candidates
 from armident.identify.diagnosis.model_state import fitted as model_of
 from armident.identify.diagnosis.regression import Fit, Products
 from armident.identify.diagnosis.screening import directions_beside, score_statistics
@@ -36,7 +36,7 @@ def fitted() -> Fit:
 )
 def test_every_shape_of_a_grid_gets_the_statistic_that_it_has_by_itself(fitted: Fit, name: str) -> None:
     """By the projection of the residual on the instruments beside the model, made for one shape alone."""
-    bench = Workshop(fitted.study, fitted.theta)
+    bench = ColumnCache(fitted.study, fitted.theta)
     candidate = next(c for c in candidates(bench) if c.effect.name == name)
     grid = candidate.grid[:6]
     columns = bench.grid(candidate.effect, candidate.place, grid, fitted.noise)
