@@ -52,6 +52,14 @@ class ModelState:
         """Predictive score on the training data."""
         return PredictiveScore(self.fit)
 
+    def release(self) -> None:
+        """Free the memory of the equations; predictive score, parameters and simulated motion stay.
+
+        A selection compares hundreds of models, of which it uses few again.
+        """
+        self.score.keep_errors()
+        self.fit.release()
+
     @cached_property
     def weights(self) -> tuple[ArModel, ...]:
         """Noise models of the residual without smooth functions of the motion, one for each joint.
@@ -165,7 +173,7 @@ def with_report_part(state: ModelState) -> ModelState:
         Model of the selection.
     """
     moved = state.study.with_report_part(state.fit.theta)
-    equations = replace(state.fit.equations, study=moved)
+    equations = state.fit.equations.with_held(moved)
     return ModelState(moved, replace(state.fit, study=moved, equations=equations))
 
 

@@ -81,6 +81,10 @@ class PredictiveScore:
             at += len(term.names)
         return inverse
 
+    def keep_errors(self) -> None:
+        """Compute the predicted errors, which need the equations, before these are freed."""
+        _ = self._parts
+
     @cached_property
     def errors(self) -> tuple[Array, ...]:
         """Predicted errors of each joint before whitening, stretch after stretch, N m or N, (M,) each."""

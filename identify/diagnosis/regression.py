@@ -28,6 +28,9 @@ MOST_WEIGHTED = 1.5
 by less than its standard deviation, and the errors by a few percent."""
 LOWER_ORDERS = (10, 3, 1)
 """Highest orders of noise models in turn, where those of higher order make the instruments weak."""
+RIGID_KEPT = 32
+"""Rigid regressors kept, one per stretch and kind of signal. Limits the memory, changes no result: measured signals of
+up to eight recordings and the latest simulations stay."""
 PASSES = 3
 """Iterations between parameters and noise models; a fourth changes neither visibly."""
 
@@ -55,44 +58,49 @@ Equation = tuple[Array, Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Equations in the band of the comparison.
+    """Equations in the band of the comparison, computed when they are first used.
 
     Parameters
     ----------
-    train
-        Training equations, one entry per stretch.
     study
         Data with the model.
     theta
         Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
     """
 
-    train: tuple[Equation, ...]
     study: Study
     theta: Array | None
 
-    @classmethod
-    def of(cls, study: Study, theta: Array | None) -> "Equations":
-        """Equations of a model.
-
-        Parameters
-        ----------
-        study
-            Data with the model.
-        theta
-            Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
-        """
-        return cls(tuple((*regressors(study, s, theta), s.y) for s in study.train), study, theta)
+    @cached_property
+    def train(self) -> tuple[Equation, ...]:
+        """Training equations, one entry per stretch."""
+        return tuple((*regressors(self.study, s, self.theta), s.y) for s in self.study.train)
 
     @cached_property
     def held(self) -> tuple[Equation, ...]:
-        """Held-out equations, one entry per stretch; computed when they are first used."""
+        """Held-out equations, one entry per stretch."""
         return tuple((*regressors(self.study, s, self.theta), s.y) for s in self.study.held)
 
     @cached_property
     def blocks(self) -> tuple["Block", ...]:
         """The training rows joint by joint, without the columns that are zero there."""
         return tuple(Block.of(self.train, j) for j in range(self.train[0][2].shape[1]))
+
+    def with_held(self, study: Study) -> "Equations":
+        """Equations of the same training part with another held-out part.
+
+        Parameters
+        ----------
+        study
+            Data with the same training stretches.
+        """
+        other = Equations(study, self.theta)
+        other.__dict__.update({name: self.__dict__[name] for name in ("train", "blocks") if name in self.__dict__})
+        return other
+
+    def release(self) -> None:
+        """Free the equations; they are computed again, with the same values, when they are next used."""
+        _forget(self, "train", "held", "blocks")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +137,18 @@ class Block:
         return cls(x, z, parts)
 
 
+def _white(block: Block, ar: ArModel) -> Array:
+    """Rows of a block, whitened by the noise model of its joint."""
+    taps = np.append(1.0, ar.coefficients) / np.sqrt(ar.variance)
+    return np.concatenate([filter_columns(taps, part) for part in block.parts])
+
+
+def _forget(owner: object, *names: str) -> None:
+    """Remove cached properties of an object."""
+    for name in names:
+        owner.__dict__.pop(name, None)
+
+
 @dataclass(frozen=True, eq=False)
 class Products:
     """Whitened rows of all joints, and their products.
@@ -137,8 +157,8 @@ class Products:
     ----------
     noise
         Noise models that whiten the rows.
-    rows
-        ``[X, Z, y]`` of every joint's block, whitened.
+    equations
+        Equations of all stretches.
     parts
         ``Z' [X, Z, y]`` of every joint's block.
     zx, zz, zy
@@ -146,7 +166,7 @@ class Products:
     """
 
     noise: tuple[ArModel, ...]
-    rows: tuple[Array, ...]
+    equations: Equations
     parts: tuple[Array, ...]
     zx: Array
     zz: Array
@@ -172,15 +192,21 @@ class Products:
             if known is not None and known.noise[j] is ar:
                 white, through = known.rows[j], known.parts[j]
             else:
-                taps = np.append(1.0, ar.coefficients) / np.sqrt(ar.variance)
-                white = np.concatenate([filter_columns(taps, part) for part in block.parts])
+                white = _white(block, ar)
                 through = white[:, block.x.size : -1].T @ white
             zx[np.ix_(block.z, block.x)] += through[:, : block.x.size]
             zz[np.ix_(block.z, block.z)] += through[:, block.x.size : -1]
             zy[block.z] += through[:, -1]
             rows.append(white)
             parts.append(through)
-        return cls(tuple(noise), tuple(rows), tuple(parts), zx, zz, zy)
+        made = cls(tuple(noise), equations, tuple(parts), zx, zz, zy)
+        made.__dict__["rows"] = tuple(rows)
+        return made
+
+    @cached_property
+    def rows(self) -> tuple[Array, ...]:
+        """``[X, Z, y]`` of every joint's block, whitened."""
+        return tuple(_white(block, ar) for block, ar in zip(self.equations.blocks, self.noise, strict=True))
 
     @cached_property
     def scale(self) -> Array:
@@ -220,6 +246,13 @@ class Fit:
     equations: Equations
     products: Products
     fixed: bool = False
+
+    def release(self) -> None:
+        """Free the equations and whitened rows; they are computed again, with the same values, when next used."""
+        self.equations.release()
+        _forget(self.products, "rows")
+        self.products.equations.release()
+        _forget(self, "left", "train", "held", "residual", "held_residual")
 
     def renoised(self, noise: Sequence[ArModel]) -> "Fit":
         """The fit with other noise models; a given theta stays."""
@@ -386,7 +419,7 @@ def fit(study: Study, theta0: Array | None = None, noise: Sequence[ArModel] | No
     DataError
         If the training motion leaves parameters undetermined.
     """
-    equations = Equations.of(study, theta0)
+    equations = Equations(study, theta0)
     if noise is None:
         flat = np.concatenate([x.reshape(-1, x.shape[-1]) for x, _, _ in equations.train])
         require_excitation(flat, study.model.base.names)
@@ -520,11 +553,16 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
     for kind in ("measured", "simulated"):
         signals = getattr(stretch, kind)
         key = (id(signals), study.model.base.names[: -study.model.e or None], tuple(study.robot.sign_smoothing))
-        if key not in study.rigid:
-            made = study.decimation(study.model.rigid_regressor(signals.q, signals.qd, signals.qdd))
-            # Kept with the signals: their identity is the key only while they exist.
-            study.rigid[key] = signals, made
-        rigid = study.rigid[key][1]
+        # Kept with the signals: their identity is the key only while they exist.
+        kept = study.rigid.pop(key, None) or (
+            signals,
+            study.decimation(study.model.rigid_regressor(signals.q, signals.qd, signals.qdd)),
+        )
+        study.rigid[key] = kept
+        while len(study.rigid) > RIGID_KEPT:
+            # The one that was not used for the longest time: a simulation of a model that was rejected.
+            del study.rigid[next(iter(study.rigid))]
+        rigid = kept[1]
         if study.model.e:
             terms[kind] = _filtered_terms(study, stretch, kind, theta)
             made = terms[kind]

@@ -269,9 +269,17 @@ class StepwiseSelection:
                     # An effect is admitted only against all others.
                     return Step(state, (), (), tests)
                 able += [a for a in (self._added(state, *one),) if a is not None]
+                self._release(state)
             ranked = tuple(sorted(able, key=lambda a: -a.log_likelihood))
+            self._release(None)
             self._steps[key] = Step(state, ranked, tuple(a for a in ranked if self.passes(a, tests)), tests)
         return self._steps[key]
+
+    def _release(self, used: ModelState | None) -> None:
+        """Free the equations of all models but one: hundreds are compared, and few are used again."""
+        for state in self._states.values():
+            if state is not None and state is not used:
+                state.release()
 
     @property
     def compared(self) -> int:
