@@ -2,15 +2,19 @@
 
 ``python -m tests.statistics.measured`` diagnoses every recording of ``../shared/data`` (``ARMIDENT_SHARED_DATA`` names
 another folder) and prints what it states, how far the held-out error falls, and what it leaves unexplained; with names
-(``tx40 panda``) only those.
+(``tx40 panda``) only those. Each runs in its own process. A table gives CPU time, memory and flags; ``--json OUT``
+writes the same. The exit code is 1 if a flag is set.
 """
 
 import argparse
+import json
+import multiprocessing
 import os
+import resource
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +32,13 @@ from tests.conftest import REPOSITORY
 FORCE_PER_VOLT = 35.15065
 STANDSTILL_S = 7.5
 TX40_DT = 2e-4
+
+MOST_CPU_S = 60.0
+"""Most CPU time of a diagnosis, s: design page of the diagnosis, principle 9."""
+MOST_MEMORY_GB = 2.0
+"""Most memory of a diagnosis, GB: the same."""
+CERTAIN = 0.9
+"""Confidence above which a finding has to take more of its joint's error power than it leaves (issue 21, part D)."""
 
 MOTOR = """
 schema: armident/robot/1
@@ -169,22 +180,131 @@ def _each(values: NDArray[np.float64]) -> str:
     return " ".join(f"{v:.2f}" for v in values)
 
 
+@dataclass(frozen=True)
+class Row:
+    """Result of one machine.
+
+    Parameters
+    ----------
+    name, title
+        Name and title of the machine.
+    cpu_s
+        CPU time of user and system, all of the process, s.
+    memory_gb
+        Largest resident memory of the process, GB.
+    before, after
+        Held-out error of all joints without and with the findings, percent.
+    flags
+        Limits that it exceeds.
+    lines
+        Lines that tell the diagnosis.
+    """
+
+    name: str
+    title: str
+    cpu_s: float
+    memory_gb: float
+    before: float
+    after: float
+    flags: tuple[str, ...]
+    lines: tuple[str, ...]
+
+
+def flags_of(found: Diagnosis, cpu_s: float, memory_gb: float) -> tuple[str, ...]:
+    """Limits that a diagnosis exceeds.
+
+    Parameters
+    ----------
+    found
+        The diagnosis.
+    cpu_s
+        Its CPU time, s.
+    memory_gb
+        Its largest memory, GB.
+    """
+    flags = []
+    if cpu_s > MOST_CPU_S:
+        flags.append(f"over {MOST_CPU_S:.0f} s")
+    if memory_gb > MOST_MEMORY_GB:
+        flags.append(f"over {MOST_MEMORY_GB:.0f} GB")
+    # Powers are squares of errors: a finding takes before^2 - after^2 and leaves after^2.
+    flags += [
+        f"{f.effect} of {f.joint} leaves more than it takes"
+        for f in found.document.findings
+        if f.confidence > CERTAIN and f.gap_before**2 - f.gap_after**2 < f.gap_after**2
+    ]
+    return tuple(flags)
+
+
+def measured(name: str, data: Path) -> Row:
+    """Diagnose one machine; meant for a process of its own.
+
+    Parameters
+    ----------
+    name
+        Name of the machine.
+    data
+        Folder of the recordings.
+    """
+    title, load = MACHINES[name]
+    found = load(data).diagnosed()
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    cpu_s, memory_gb = used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9
+    gap = found.document.gap.validation
+    flags = flags_of(found, cpu_s, memory_gb)
+    return Row(name, title, cpu_s, memory_gb, gap.before.all, gap.after.all, flags, tuple(said(found)))
+
+
+def alone(name: str, data: Path) -> Row:
+    """Diagnose one machine in a new process, so that memory and time are its own.
+
+    Parameters
+    ----------
+    name
+        Name of the machine.
+    data
+        Folder of the recordings.
+    """
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(measured, name, data).result()
+
+
+def table(rows: list[Row]) -> str:
+    """Markdown table of the results.
+
+    Parameters
+    ----------
+    rows
+        Results of the machines.
+    """
+    lines = ["| machine | CPU, s | memory, GB | held-out error, % | flags |", "| --- | --- | --- | --- | --- |"]
+    lines += [
+        f"| {r.title} | {r.cpu_s:.0f} | {r.memory_gb:.2f} | {r.before:.2f} -> {r.after:.2f} | {'; '.join(r.flags)} |"
+        for r in rows
+    ]
+    return "\n".join(lines)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.statistics.measured", description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*MACHINES, []], help="machines; default: all")
-    names = parser.parse_args().names or list(MACHINES)
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write the results to this file")
+    options = parser.parse_args()
+    names = options.names or list(MACHINES)
     data = Path(os.environ.get("ARMIDENT_SHARED_DATA") or REPOSITORY.parent / "shared" / "data")
     if not data.is_dir():
         print(f"the measured data are not here (looked in {data}; ARMIDENT_SHARED_DATA names another folder)")
         return 2
-    for name in names:
-        title, load = MACHINES[name]
-        machine = load(data)
-        begin = time.process_time()
-        found = machine.diagnosed()
-        print(f"{name}: {title} ({time.process_time() - begin:.0f} s of CPU)", flush=True)
-        print("\n".join(f"  {line}" for line in said(found)), flush=True)
-    return 0
+    rows = []
+    for k, name in enumerate(names):
+        row = alone(name, data)
+        rows.append(row)
+        print(f"[{k + 1}/{len(names)}] {name}: {row.title} ({row.cpu_s:.0f} s of CPU, {row.memory_gb:.2f} GB)")
+        print("\n".join(f"  {line}" for line in (*row.lines, *(f"FLAG: {flag}" for flag in row.flags))), flush=True)
+        if options.json:
+            options.json.write_text(json.dumps([asdict(one) for one in rows], indent=2) + "\n")
+    print(table(rows))
+    return int(any(row.flags for row in rows))
 
 
 if __name__ == "__main__":
