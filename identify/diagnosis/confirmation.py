@@ -9,7 +9,6 @@ from scipy import stats
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.predictive_score import SUMS
 from armident.identify.diagnosis.regression import applied
-from armident.identify.diagnosis.whitening import rows_of_joints, whitened
 
 Array = NDArray[np.float64]
 
@@ -46,9 +45,9 @@ class Confirmation:
         return min(self.after, self.noiseless, key=lambda errors: float(np.sum(np.log(np.maximum(errors, 1e-300)))))
 
     @property
-    def change(self) -> float:
-        """Largest change of the error of a joint, percent of its torque."""
-        return float(np.sqrt(np.max(np.maximum(self.before**2 - self.best**2, 0.0))))
+    def change(self) -> Array:
+        """Change of the error of each joint where it falls, percent of its torque, (n,)."""
+        return np.asarray(np.sqrt(np.maximum(self.before**2 - self.best**2, 0.0)))
 
     @property
     def smaller(self) -> bool:
@@ -60,15 +59,15 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
     """Compare two models that differ in one effect on the report part.
 
     The errors of the model without the effect are projected on the change of the prediction (Clark, West 2007, Journal
-    of Econometrics 138). The change is computed at the simulated motion, which is free of noise. Its variance comes
-    from sums over blocks of time, whatever the serial correlation of the errors.
+    of Econometrics 138). The change is computed at the simulated motion, which is free of noise. The variance of the
+    coefficient comes from what the projection leaves, summed over blocks of time: whatever the serial correlation, and
+    also if the effect is strong in a part of the recording only.
 
     Parameters
     ----------
     with_it, without
         Models with and without the effect.
     """
-    noise = with_it.fit.noise
     before, after = (state.fit.errors(state.fit.theta, held=True) for state in (without, with_it))
     if with_it.study.recorded == without.study.recorded:
         theta = _less(with_it, without)
@@ -76,14 +75,15 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
     else:
         change = [b - a for b, a in zip(before, after, strict=True)]
     noiseless = [b - c for b, c in zip(before, change, strict=True)]
-    products = whitened(before, noise) * whitened(change, noise)
-    sums = np.zeros(SUMS)
-    for rows in rows_of_joints([e.shape[0] for e in before], noise):
-        sums += [part.sum() for part in np.array_split(products[rows], SUMS)]
-    spread = float(sums.std(ddof=1)) / np.sqrt(SUMS)
+    # In units of the errors of each joint, as the errors themselves are compared.
+    errors, along = (np.concatenate([x / with_it.score.rms for x in parts]) for parts in (before, change))
+    coefficient = float(np.sum(along * errors)) / max(float(np.sum(along**2)), 1e-300)
+    products = np.sum(along * (errors - coefficient * along), axis=1)
+    sums = np.array([part.sum() for part in np.array_split(products, SUMS)])
+    spread = float(sums.std(ddof=1)) * np.sqrt(SUMS) / max(float(np.sum(along**2)), 1e-300)
     torque = np.concatenate([s.y for s in with_it.study.held])
     return Confirmation(
-        float(stats.t.sf(float(sums.mean()) / max(spread, 1e-300), SUMS - 1)),
+        float(stats.t.sf(coefficient / max(spread, 1e-300), SUMS - 1)),
         *(_relative(errors, torque) for errors in (before, after, noiseless)),
     )
 
