@@ -283,7 +283,7 @@ def candidates(column_cache: ColumnCache) -> Iterator[Candidate]:
         present.setdefault(here, []).append(tuple(term.shapes.items()))
     coupled = {frozenset(names.index(j) for j in c.joints) for c in study.robot.couplings}
     for effect in catalogue().values():
-        if effect.rewires or effect.numbers is not None or effect.name == TRANSITION:
+        if effect.rewires or effect.numbers is not None or (effect.name == TRANSITION and study.sign_given):
             continue
         right = {names.index(stanza.joint) for stanza in study.recorded if stanza.effect == effect.name}
         for place in places(effect, study.robot.n):

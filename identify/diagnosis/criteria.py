@@ -23,8 +23,8 @@ class Criteria:
         Significance level of the report part alone, for a finding that the training part has made significant. It
         guards against findings that hold for one recording only, and adds nothing to the false-alarm rate.
     named_share
-        Least gain of log-likelihood of an effect with a name over that of the best term without one. The name explains
-        most of the regularity then, and the rest is found beside it.
+        Least share of the errors' power that an effect with a name removes, over that of the best term without one.
+        The name explains most of the regularity then, and the rest is found beside it.
     close
         Difference of log-likelihood below which two explanations are ambiguous: odds of 20 to 1.
     set_up_doubtful_pct

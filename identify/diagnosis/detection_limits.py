@@ -5,11 +5,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes, candidates
+from armident.identify.diagnosis.comparison import Step
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.precision import variance_of_sum
 from armident.identify.diagnosis.screening import directions_beside
-from armident.identify.diagnosis.selection import Step
 from armident.identify.diagnosis.whitening import rows_of_joints
 from armident.identify.document import DetectionLimit
 from armident.identify.effects.unnamed import NAME as UNNAMED

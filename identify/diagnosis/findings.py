@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.candidates import ColumnCache, Key, places
+from armident.identify.diagnosis.comparison import Addition, Step
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.experiment import recommended_experiment
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.numbers import NumbersFinding
 from armident.identify.diagnosis.precision import standard_deviations
 from armident.identify.diagnosis.regression import relative_errors
-from armident.identify.diagnosis.selection import Addition, Selected, Step
+from armident.identify.diagnosis.selection import Selected
 from armident.identify.document import Alternative, Finding, Gap, Negligible, NotVisible, Unexplained
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.registry import catalogue, known, of_entry

@@ -69,6 +69,31 @@ class ModelState:
         """
         return tuple(noise_beyond_shapes(self.fit, ColumnCache(self.study, self.fit.theta)))
 
+    @cached_property
+    def own_noise(self) -> tuple[ArModel, ...]:
+        """Noise models of the residual, one for each joint."""
+        return tuple(noise_models(self.fit.left, self.fit.theta.size, MAX_AR_ORDER))
+
+    def under(self, noise: tuple[ArModel, ...]) -> "ModelState":
+        """The model fitted under given noise models, so that it can be compared with another one fitted under them.
+
+        Parameters
+        ----------
+        noise
+            Noise model of each joint.
+        """
+        if all(one is own for one, own in zip(noise, self.fit.noise, strict=True)):
+            return self
+        key = tuple(id(one) for one in noise)
+        if key not in self._under:
+            # The fit keeps the noise models, so that their identities stay theirs.
+            self._under[key] = replace(self, fit=safe(self.fit.renoised(noise)))
+        return self._under[key]
+
+    @cached_property
+    def _under(self) -> dict[tuple[int, ...], "ModelState"]:
+        return {}
+
     @property
     def terms(self) -> tuple[Term, ...]:
         """Effects of the model."""
@@ -160,8 +185,7 @@ def with_own_noise(state: ModelState) -> ModelState:
     state
         Model of the selection, fitted with the noise models of an earlier one.
     """
-    noise = noise_models(state.fit.left, state.fit.theta.size, MAX_AR_ORDER)
-    return replace(state, fit=safe(state.fit.renoised(noise)))
+    return replace(state, fit=safe(state.fit.renoised(state.own_noise)))
 
 
 def with_report_part(state: ModelState) -> ModelState:

@@ -130,13 +130,25 @@ class PredictiveScore:
         return np.array([float(np.sqrt(np.mean(errors**2))) for errors in self.errors])
 
     @cached_property
-    def own_log_likelihood(self) -> float:
-        """Log-likelihood of the data of all joints under noise models of the model's own residual.
+    def own_noise(self) -> tuple[ArModel, ...]:
+        """Noise models of the predicted errors, one for each joint."""
+        return tuple(
+            one for parts in self._parts for one in noise_models([part[:, None] for part in parts], 0, MAX_AR_ORDER)
+        )
+
+    @cached_property
+    def own_log_likelihoods(self) -> Array:
+        """Log-likelihood of the data of each joint under noise models of the model's own predicted errors, (n,).
 
         One is subtracted for each coefficient of the noise models, which are not cross-validated (Akaike's criterion).
         """
-        noise = noise_models(self.fit.left, self.fit.theta.size, MAX_AR_ORDER)
-        return self.log_likelihood_under(noise) - sum(ar.order for ar in noise)
+        orders = np.array([float(ar.order) for ar in self.own_noise])
+        return np.asarray(self.log_likelihoods_under(self.own_noise) - orders)
+
+    @property
+    def own_log_likelihood(self) -> float:
+        """Log-likelihood of the data of all joints, see `own_log_likelihoods`."""
+        return float(self.own_log_likelihoods.sum())
 
     @property
     def volume(self) -> Array:
@@ -165,7 +177,7 @@ class PredictiveScore:
         """
         return float(self.log_likelihoods_under(noise).sum())
 
-    def inflation_over(self, other: "PredictiveScore") -> Array:
+    def inflation_over(self, other: "PredictiveScore", noise: Sequence[ArModel]) -> Array:
         """Variance of the score along the change of prediction over that of white innovations, of each joint, (n,).
 
         Noise that changes slowly leaves correlation in the innovations which an autoregressive model of limited order
@@ -175,9 +187,11 @@ class PredictiveScore:
         ----------
         other
             Score of the model without the effect in question.
+        noise
+            Noise model of each joint.
         """
         found = []
-        for ar, own, less in zip(self.fit.noise, self._parts, other._parts, strict=True):
+        for ar, own, less in zip(noise, self._parts, other._parts, strict=True):
             e1 = np.concatenate([ar.whiten(part) for part in own])
             change = np.concatenate([ar.whiten(part) for part in less]) - e1
             sums = np.array([part.sum() for part in np.array_split(change * e1, SUMS)])
@@ -185,21 +199,22 @@ class PredictiveScore:
             found.append(max(1.0, float(np.sum((sums - sums.mean()) ** 2)) * SUMS / (SUMS - 1) / max(naive, 1e-300)))
         return np.array(found)
 
-    def gain_over(self, other: "PredictiveScore") -> float:
-        """Gain of log-likelihood over another model, both under the noise models of this one.
-
-        Noise models of the other one would take what it lacks for noise.
+    def gain_over(self, other: "PredictiveScore", noise: Sequence[ArModel]) -> float:
+        """Gain of log-likelihood over another model, both under the same noise models.
 
         Parameters
         ----------
         other
             Score of the model without the effect in question.
+        noise
+            Noise model of each joint: of a model in which nothing is missing, as far as known. Others would take what
+            is missing for noise.
         """
-        own, less = self.innovations(self.fit.noise), other.innovations(self.fit.noise)
+        own, less = self.innovations(noise), other.innovations(noise)
         rows = self.rows
         ratio = np.log(np.maximum(less, 1e-300) / np.maximum(own, 1e-300))
         each = rows * (0.5 * ratio + self.volume - other.volume)
-        return float(np.sum(each / self.inflation_over(other)))
+        return float(np.sum(each / self.inflation_over(other, noise)))
 
 
 def fold_of(rows: int) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 MAX_AR_ORDER = 30
 SINGULAR = 1e-13
 """Singular value of the normalised equations over the largest below which they are singular: rounding errors."""
-MOST_WEIGHTED = 1.5
+MOST_WEIGHTED = 1.1
 """Largest ratio of the errors with weighted equations to those with white weights: efficient weights change an estimate
 by less than its standard deviation, and the errors by a few percent."""
 LOWER_ORDERS = (10, 3, 1)

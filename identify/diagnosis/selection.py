@@ -3,7 +3,7 @@
 1. Screening: the score statistic of every candidate at every place, in one factorisation of the model's equations.
 2. Closed loop: each of the best candidates is added to the model, and the loop with it is simulated. All parameters are
    estimated with instruments from that loop.
-3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.predictive_score`).
+3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.comparison`).
 4. Admission of the best one that is significant, material and physically possible; then the next step.
 5. Findings that later ones made superfluous are removed, and each finding competes with all others once more.
 6. Report part: a finding stays if the data that chose nothing confirm it (`armident.identify.diagnosis.confirmation`).
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates, grid
+from armident.identify.diagnosis.comparison import Addition, Made, Step, compared, gain, materiality
 from armident.identify.diagnosis.confirmation import Confirmation, confirmed
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState, fitted, with_own_noise, with_report_part
@@ -37,100 +38,10 @@ Array = NDArray[np.float64]
 
 CORRECTIONS = 3
 """Corrections of a recording, each refined by the expansion that remains."""
-FINER = (1.4, 1.2, 1.1)
+FINER = (1.4, 1.2, 1.1, 1.05, 1.02)
 """Factors of the refinement of the velocity of a transition; the grid has factors of 1.9."""
 CLEAR = 3.0
 """Gain of log-likelihood from which a transition of dry friction is a part of the friction model: odds of 20 to 1."""
-
-
-@dataclass(frozen=True, eq=False)
-class Addition:
-    """A candidate in the model, tested in the closed loop that it makes.
-
-    Parameters
-    ----------
-    candidate, shapes
-        The effect with its place, and its nonlinear parameters.
-    entry
-        Entry of the effect in the configuration.
-    state
-        Model with the effect.
-    gain
-        Gain of log-likelihood over the model without it, see `gain`.
-    raw_gain
-        The same if the innovations had no correlation left.
-    own_gain
-        Gain of log-likelihood with each model under noise models of its own residual.
-    log_likelihood
-        Log-likelihood of the model with the effect under the noise models of the step, which all candidates share.
-    share
-        Largest share of the power of a joint's predicted errors that it removes.
-    material_pct
-        Change of that joint's torque, percent of the root mean square of its torque.
-    allowed
-        False if a linear parameter has a sign or a size that physics does not allow.
-    """
-
-    candidate: Candidate
-    shapes: Shapes
-    entry: Entry
-    state: ModelState
-    gain: float
-    raw_gain: float
-    own_gain: float
-    log_likelihood: float
-    share: float
-    material_pct: float
-    allowed: bool
-
-    @property
-    def named(self) -> bool:
-        """True if the effect has a name."""
-        return self.candidate.effect.name != UNNAMED
-
-    @property
-    def family(self) -> Key:
-        """Name of the effect, whatever its law, and its place."""
-        place = self.candidate.place
-        name = self.candidate.effect.name if self.named else self.candidate.effect.key
-        return name, place.joint, place.other
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """Candidates that were added to one model, highest log-likelihood first.
-
-    Parameters
-    ----------
-    state
-        Model without them.
-    ranked
-        Candidates in the model.
-    passing
-        Those that are significant, material and physically possible.
-    tests
-        Number of candidates and nonlinear parameters from which they were selected.
-    """
-
-    state: ModelState
-    ranked: tuple[Addition, ...]
-    passing: tuple[Addition, ...]
-    tests: int
-
-    def rivals(self, one: Addition) -> tuple[Addition, ...]:
-        """Physically possible explanations in place of an addition: others that pass, and others of the same joint.
-
-        Parameters
-        ----------
-        one
-            The addition.
-        """
-        joint = one.candidate.place.joint
-        return tuple(
-            a
-            for a in self.ranked
-            if a.allowed and a.family != one.family and (a in self.passing or a.candidate.place.joint == joint)
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +114,7 @@ class StepwiseSelection:
     immaterial: tuple[Addition, ...] = ()
     _states: dict[str, ModelState | None] = field(default_factory=dict)
     _steps: dict[str, Step] = field(default_factory=dict)
+    _visited: set[str] = field(default_factory=set)
 
     def start(self) -> ModelState:
         """Model as configured, with the transition of dry friction at reversals where the configuration leaves it free.
@@ -215,7 +127,7 @@ class StepwiseSelection:
         state = fitted(self.study, self.study.robot, None)
         if not self.study.sign_given:
             state = with_own_noise(self._with_transitions(state))
-        self.study = replace(self.study, robot=state.robot, model=state.study.model, sign_given=True)
+        self.study = replace(self.study, robot=state.robot, model=state.study.model)
         self._states[_key(state.robot)] = state
         return state
 
@@ -262,17 +174,17 @@ class StepwiseSelection:
         key = _key(state.robot)
         if key not in self._steps:
             shortlist, tests = self._shortlist(state)
-            able: list[Addition] = []
+            made: list[Made] = []
             for k, one in enumerate(shortlist):
                 self.tested(k / len(shortlist))
                 if self._late():
                     # An effect is admitted only against all others.
-                    return Step(state, (), (), tests)
-                able += [a for a in (self._added(state, *one),) if a is not None]
-                self._release(state)
-            ranked = tuple(sorted(able, key=lambda a: -a.log_likelihood))
+                    return Step(state, (), (), (), tests)
+                made += [m for m in (self._made(state, *one),) if m is not None]
+            step = compared(state, made, tests, self.passes)
+            exact = [self._corrected(state, m) if any(a.made is m for a in step.passing) else m for m in made]
+            self._steps[key] = step if exact == made else compared(state, exact, tests, self.passes)
             self._release(None)
-            self._steps[key] = Step(state, ranked, tuple(a for a in ranked if self.passes(a, tests)), tests)
         return self._steps[key]
 
     def _release(self, used: ModelState | None) -> None:
@@ -312,7 +224,6 @@ class StepwiseSelection:
         return (
             addition.allowed
             and addition.gain > np.log(max(tests, 1) / self.criteria.alpha["selection"])
-            and addition.own_gain > np.log(max(tests, 1))
             and addition.share >= self.criteria.least_share
             and addition.material_pct >= self.criteria.material_pct
         )
@@ -335,7 +246,7 @@ class StepwiseSelection:
             return None
         best = able[0]
         if not best.named:
-            named = [a for a in able if a.named and a.gain >= self.criteria.named_share * best.gain]
+            named = [a for a in able if a.named and a.share >= self.criteria.named_share * best.share]
             best = named[0] if named else best
         close = best.log_likelihood - self.criteria.close
         same = [a for a in able if a.family == best.family and a.log_likelihood > close]
@@ -366,24 +277,34 @@ class StepwiseSelection:
         before = state.score.log_likelihoods_under(noise)
         best = {place: (before[place.joint] + CLEAR, 0.0) for place in places}
 
-        def tried(velocities: Sequence[float]) -> ModelState | None:
+        def tried(velocities: Sequence[float], scores: Callable[[ModelState], Array]) -> ModelState | None:
             chosen = [(place, v) for place, v in zip(places, velocities, strict=True) if v > 0.0]
             entries = [stanza_of(effect, place, state.robot, {"velocity": v}) for place, v in chosen]
             made = self._state(with_entries(state.robot, entries), state) if entries else None
             if made is None:
                 return None
             for (place, v), entry in zip(chosen, entries, strict=True):
-                score = float(made.score.log_likelihoods_under(noise)[place.joint])
+                score = float(scores(made)[place.joint])
                 if made.values_of(made.term_of(entry))[0][0] > 0.0 and score > best[place][0]:
                     best[place] = score, v
             return made
 
+        def common(made: ModelState) -> Array:
+            return made.score.log_likelihoods_under(noise)
+
+        def own(made: ModelState) -> Array:
+            return made.score.own_log_likelihoods
+
         for shapes in zip(*(grid(effect, motion, place) for place in places), strict=True):
-            tried([dict(one)["velocity"] for one in shapes])
+            tried([dict(one)["velocity"] for one in shapes], common)
+        # Common noise models decide whether there is a transition; those of each model itself refine its velocity.
+        best = {place: (-np.inf, v) for place, (_, v) in best.items()}
+        tried([v for _, v in best.values()], own)
         for factor in FINER:
-            tried([factor * v for _, v in best.values()])
-            tried([v / factor for _, v in best.values()])
-        made = tried([v for _, v in best.values()])
+            centre = [v for _, v in best.values()]
+            tried([factor * v for v in centre], own)
+            tried([v / factor for v in centre], own)
+        made = tried([v for _, v in best.values()], own)
         better = made is not None and made.score.log_likelihood_under(noise) > float(before.sum())
         return made if made is not None and better else state
 
@@ -421,7 +342,7 @@ class StepwiseSelection:
             chosen += [(candidate, ends) for ends in both_ends(noise, candidate, column_cache, shapes)]
         return chosen, tests
 
-    def _added(self, state: ModelState, candidate: Candidate, shapes: Shapes) -> Addition | None:
+    def _made(self, state: ModelState, candidate: Candidate, shapes: Shapes) -> Made | None:
         effect = candidate.effect
         spared = tuple(p.name for p in known(effect.key).linear if p.through is not None)
         entry = stanza_of(effect, candidate.place, state.robot, dict(shapes), spared)
@@ -434,16 +355,10 @@ class StepwiseSelection:
         for name, value in (pair for one in candidate.grid for pair in one):
             largest[name] = max(value, largest.get(name, value))
         allowed = known(effect.key).allows(term.of_effect(values), term.of_effect(std), dict(term.shapes), largest)
-        if effect.undo is not None and allowed:
-            made, entry = self._corrected(state, made, entry)
-        share, changed = materiality(state, made)
-        before, after = (one.score.log_likelihood_under(state.weights) for one in (state, made))
-        gained, raw = gain(made, state), after - before
-        own = made.score.own_log_likelihood - state.score.own_log_likelihood
-        return Addition(candidate, shapes, entry, made, gained, raw, own, after, share, changed, allowed)
+        return Made(candidate, shapes, entry, made, allowed)
 
-    def _corrected(self, state: ModelState, made: ModelState, entry: Entry) -> tuple[ModelState, Entry]:
-        """Model in which the recordings are corrected for an effect, and its entry.
+    def _corrected(self, state: ModelState, made: Made) -> Made:
+        """Model in which the recordings are corrected for an effect, if it is one that changes what was recorded.
 
         A torque column is the first-order expansion of such an effect at the model's own torque. The corrected
         recording is exact, and the part of the expansion that remains refines the value, until it is within its
@@ -456,19 +371,19 @@ class StepwiseSelection:
             Model without the effect.
         made
             Model with its expansion.
-        entry
-            Entry of the expansion.
         """
+        if made.candidate.effect.undo is None:
+            return made
+        entry, best = made.entry, made
         name = of_entry(entry).linear[0].name
-        value = float(made.values_of(made.term_of(entry))[0][0])
-        best, chosen = made, entry
+        value = float(made.state.values_of(made.state.term_of(entry))[0][0])
         for _ in range(CORRECTIONS):
             right = entry.model_copy(update={"parameters": {**entry.parameters, name: value}})
             exact = self._state(with_entries(state.robot, [right]), state)
             if exact is None:
                 break
-            if gain(exact, state) > gain(best, state):
-                best, chosen = exact, right
+            if gain(exact, state) > gain(best.state, state):
+                best = replace(made, state=exact, entry=right)
             further = self._state(with_entries(exact.robot, [entry]), exact)
             if further is None:
                 break
@@ -476,7 +391,7 @@ class StepwiseSelection:
             if abs(rest) < std:
                 break
             value += rest
-        return best, chosen
+        return best
 
     def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""
@@ -514,7 +429,11 @@ class StepwiseSelection:
         return state, found
 
     def _exchanged(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Model whose findings have competed with all other effects beside the findings made after them."""
+        """Model whose findings have competed with all other effects beside the findings made after them.
+
+        No exchange returns to an earlier model: the noise models of two steps differ, and each could prefer its own.
+        """
+        self._visited.add(_key(state.robot))
         for one in found:
             less = None if self._late() else self._without(state, one.entry)
             if less is None:
@@ -522,11 +441,13 @@ class StepwiseSelection:
             self.progress(f"exchanging {one.entry.effect.replace('_', ' ')} of {one.entry.joint}")
             step = self.step(less)
             best = self.admitted(step)
-            if best is None or best.family == one.addition.family:
+            if best is None or best.family == one.addition.family or _key(best.state.robot) in self._visited:
                 continue
-            if best.log_likelihood > state.score.log_likelihood_under(step.state.weights) + self.criteria.close:
+            present = state.under(step.state.fit.noise).score.log_likelihood_under(step.noise)
+            if best.log_likelihood > present + self.criteria.close:
                 other = Selected(best.entry, step, best)
                 state, found = best.state, tuple(other if f is one else f for f in found)
+                self._visited.add(_key(state.robot))
         return state, found
 
     def _confirmed(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
@@ -567,8 +488,9 @@ class StepwiseSelection:
         return report.p_value < self.criteria.confirmation_level and report.smaller and self._material(report)
 
     def _material(self, report: Confirmation) -> bool:
-        share = float(np.max(report.share))
-        return share >= self.criteria.least_share and report.change >= self.criteria.material_pct
+        """True if the errors of one joint fall by enough, relative to them and to its torque."""
+        enough = (report.share >= self.criteria.least_share) & (report.change >= self.criteria.material_pct)
+        return bool(enough.any())
 
 
 def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
@@ -584,37 +506,9 @@ def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
     return robot.model_copy(update={"effects": (*robot.effects, *entries)})
 
 
-def gain(with_it: ModelState, without: ModelState) -> float:
-    """Gain of log-likelihood by an effect, under the noise models with which the model with it was fitted.
-
-    Parameters
-    ----------
-    with_it, without
-        Models with and without the effect.
-    """
-    return with_it.score.gain_over(without.score)
-
-
-def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]:
-    """Return the largest share of a joint's error power that an effect removes, and its torque in percent there.
-
-    Parameters
-    ----------
-    without, with_it
-        Models without and with the effect.
-    """
-    before, after = without.score.rms, with_it.score.rms
-    removed = np.maximum(before**2 - after**2, 0.0)
-    joint = int(np.argmax(removed / np.maximum(before**2, 1e-300)))
-    torque = np.concatenate([s.y[:, joint] for s in without.study.train])
-    size = float(np.sqrt(np.mean(torque**2)))
-    share = float(removed[joint] / max(before[joint] ** 2, 1e-300))
-    return share, 100 * float(np.sqrt(removed[joint])) / max(size, 1e-300)
-
-
 def _change(one: Selected) -> float:
-    """Largest change of the error of a joint on the report part by a finding, percent; 0 before the comparison."""
-    return 0.0 if one.confirmation is None else one.confirmation.change
+    """Change of the torque of a joint when the finding was admitted, percent: findings may overlap."""
+    return one.addition.material_pct
 
 
 def _key(robot: RobotConfig) -> str:

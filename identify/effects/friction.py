@@ -123,8 +123,11 @@ def tops(motion: Motion, joint: int) -> Sequence[float]:
 
 
 def _higher_at_rest(values: Array, shapes: Mapping[str, float], largest: Mapping[str, float]) -> bool:
-    """Return True if friction is highest at the lowest speeds."""
-    return bool(values[0] > 0.0 and values[0] >= values[-1])
+    """Return True if friction falls with the speed.
+
+    The value at rest is not judged alone: there the curve also contains the transition of dry friction at reversals.
+    """
+    return bool(values[1] > 0.0 and values[1] >= values[-1] and values[0] + values[1] > 0.0)
 
 
 def bristles(motion: Motion, joint: int) -> Sequence[float]:
@@ -159,6 +162,11 @@ def _load_dependent(motion: Motion, place: Place, *, rotor: float = 0.0) -> Arra
 def _presliding(motion: Motion, place: Place, *, displacement: float) -> Array:
     j = place.joint
     return (motion.sign[:, j] - dahl(motion.q[:, j], displacement))[:, None]
+
+
+def _part_of_the_model(values: Array, sample: float) -> bool:
+    """Return True: every model of dry friction has some transition, so that it is no missing effect."""
+    return True
 
 
 @compiled
@@ -281,6 +289,7 @@ EFFECTS = (
         columns=_transition,
         needs="reversals",
         excitation=("reversals",),
+        negligible=_part_of_the_model,
     ),
     Effect(
         name="asymmetric_viscous_friction",

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from armident.configs.schema.robot import Effect
+from armident.identify.diagnosis.comparison import gain
 from armident.identify.diagnosis.predictive_score import BLOCKS, FOLDS, fold_of
 from tests.fixtures.diagnoses import SPRING, selection, with_effects
 
@@ -26,7 +27,7 @@ def test_the_log_likelihood_favours_the_true_model() -> None:
     common = first.weights
     assert true.score.log_likelihood_under(common) > false.score.log_likelihood_under(common) + 100.0
     assert true.score.own_log_likelihood > false.score.own_log_likelihood + 100.0
-    assert true.score.gain_over(first.score) > 100.0
+    assert true.score.gain_over(first.score, true.score.own_noise) > 100.0
     assert true.score.rms[0] < 0.5 * first.score.rms[0]
 
 
@@ -34,7 +35,7 @@ def test_a_parameter_that_the_arm_does_not_have_gains_nothing() -> None:
     gains = []
     for seed in range(1, 5):
         _, first = selection(seed)
-        gains.append(with_effects(first, TRUE).score.gain_over(first.score))
+        gains.append(gain(with_effects(first, TRUE), first))
     # A parameter without effect gains half a chi-square number less its cost: 8 is exceeded once in 10,000.
     assert max(gains) < 8.0
 
@@ -43,13 +44,21 @@ def test_correlated_innovations_only_increase_the_variance_of_a_gain() -> None:
     for effects in ((), (SPRING,)):
         _, first = selection(1, *effects)
         score = with_effects(first, TRUE).score
-        assert (score.inflation_over(first.score) >= 1.0).all()
+        assert (score.inflation_over(first.score, score.own_noise) >= 1.0).all()
 
 
-def test_candidates_of_a_step_share_the_noise_models_of_the_step() -> None:
-    _, first = selection(1, SPRING)
-    true = with_effects(first, TRUE)
-    assert list(true.fit.noise) == list(first.weights)
-    own = true.score.innovations(first.weights)
-    expected = -0.5 * true.score.rows * np.log(own)
-    np.testing.assert_allclose(true.score.log_likelihoods_under(first.weights), expected)
+def test_models_of_a_step_are_estimated_and_scored_alike() -> None:
+    steps, first = selection(1, SPRING)
+    step = steps.step(first)
+    best = step.ranked[0]
+    for state in (step.state, best.state):
+        assert all(a is b for a, b in zip(state.fit.noise, best.state.fit.noise, strict=True))
+    assert best.log_likelihood == best.state.score.log_likelihood_under(step.noise)
+    assert best.gain == best.state.score.gain_over(step.state.score, step.noise)
+
+
+def test_noise_models_of_a_step_do_not_take_the_effect_for_noise() -> None:
+    steps, first = selection(1, SPRING)
+    (of_step,), (of_first,) = steps.step(first).noise, first.score.own_noise
+    assert steps.step(first).ranked[0].state.score.rms[0] < 0.5 * first.score.rms[0]
+    assert of_step.variance < of_first.variance

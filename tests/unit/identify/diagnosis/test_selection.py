@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from armident.configs.schema.robot import Effect
+from armident.identify.diagnosis.comparison import Addition, Step
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.diagnose import diagnose
 from armident.identify.diagnosis.model_state import ModelState
-from armident.identify.diagnosis.selection import Addition, Selected, Step, StepwiseSelection
+from armident.identify.diagnosis.selection import Selected, StepwiseSelection
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording
@@ -79,6 +80,17 @@ def test_a_wrong_finding_is_exchanged_for_the_right_one() -> None:
     assert wrong.entry not in state.robot.effects
 
 
+def test_no_exchange_returns_to_an_earlier_model() -> None:
+    steps, first = selection(1, SPRING)
+    step = steps.step(first)
+    wrong, right = addition_of(step, "presliding_friction"), addition_of(step, "joint_spring")
+    again = StepwiseSelection(steps.study)
+    again._exchanged(right.state, ())
+    state, found = again._exchanged(wrong.state, (Selected(wrong.entry, step, wrong),))
+    assert state is wrong.state
+    assert [one.entry for one in found] == [wrong.entry]
+
+
 def test_of_two_laws_that_predict_as_well_the_simpler_one_is_preferred() -> None:
     steps, first = selection(1, SPRING)
     step = steps.step(first)
@@ -94,11 +106,10 @@ def test_a_named_effect_that_explains_half_comes_before_a_better_term_without_a_
     steps, first = selection(1, SPRING)
     step = steps.step(first)
     named = addition_of(step, "joint_spring")
-    nameless = replace(
-        named, candidate=replace(named.candidate, effect=replace(named.candidate.effect, name="unnamed", law="time"))
-    )
+    effect = replace(named.candidate.effect, name="unnamed", law="time")
+    nameless = replace(named, made=replace(named.made, candidate=replace(named.candidate, effect=effect)))
     for factor, expected in ((1.9, "joint_spring"), (2.1, "unnamed")):
-        better = replace(nameless, gain=factor * named.gain)
+        better = replace(nameless, share=factor * named.share)
         both = replace(step, ranked=(better, named), passing=(better, named))
         admitted = steps.admitted(both)
         assert admitted is not None

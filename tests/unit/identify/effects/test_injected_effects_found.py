@@ -9,7 +9,8 @@ from threadpoolctl import threadpool_limits
 from armident.configs import RobotConfig, load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.daq.recording import Recording
-from armident.identify.diagnosis.selection import Step, StepwiseSelection
+from armident.identify.diagnosis.comparison import Step
+from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import build_study
 from armident.identify.effects.recorded import of_recording
 from armident.identify.identification.from_recording import experiments_from_recording
@@ -58,6 +59,7 @@ TX40 = (
     Case("tx40", "time_delay", "joint_2", {"delay": 0.004}, {"delay": 0.004}),
     Case("tx40", "actuator_bandwidth", "joint_1", {"time_constant": 0.005}, {"lag": 0.005}),
 )
+MISSED = pytest.mark.xfail(strict=True, reason="the stepwise selection misses it: docs/diagnosis.md, What is missed")
 STRIBECK = Case("tx40", "stribeck_friction", "joint_5", {"extra": 1.2, "velocity": 0.36})
 EMPS = (
     Case("emps", "asymmetric_viscous_friction", "joint_1", {"ratio": 0.05}),
@@ -113,7 +115,10 @@ def first_step(data: Recording, whole: RobotConfig, known: RobotConfig) -> tuple
 
 @pytest.mark.parametrize(
     "case",
-    [pytest.param(c, marks=() if c in SAMPLE else pytest.mark.proof, id=str(c)) for c in (*TX40, STRIBECK, *EMPS)],
+    [
+        *(pytest.param(c, marks=() if c in SAMPLE else pytest.mark.proof, id=str(c)) for c in (*TX40, *EMPS)),
+        pytest.param(STRIBECK, marks=MISSED, id=str(STRIBECK)),
+    ],
 )
 def test_an_injected_effect_is_admitted_first(case: Case) -> None:
     hidden = HiddenEffect(effect=case.effect, joint=case.joint, other=case.other, parameters=case.parameters)
