@@ -8,9 +8,13 @@ import functools
 import importlib.metadata
 import logging
 import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -92,8 +96,9 @@ def _reported(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def command(*args: Any, **kwargs: Any) -> None:
         level = logging.DEBUG if os.environ.get(DEBUG_VARIABLE) else logging.INFO
+        interrupts: list[int] = []
         try:
-            with log_to(StderrHandler("armident"), level):
+            with log_to(StderrHandler("armident"), level), _noted(interrupts):
                 function(*args, **kwargs)
         except (typer.Exit, typer.Abort, typer.BadParameter, BrokenPipeError):
             raise
@@ -102,6 +107,9 @@ def _reported(function: Callable[..., Any]) -> Callable[..., Any]:
         except Exception as error:
             from armident.configs.errors import ArmidentError
 
+            if interrupts:
+                # A compiler or a callback in C can turn the interrupt into another error.
+                raise typer.Exit(INTERRUPTED) from None
             if os.environ.get(DEBUG_VARIABLE):
                 traceback.print_exc()
             if isinstance(error, ArmidentError):
@@ -112,6 +120,25 @@ def _reported(function: Callable[..., Any]) -> Callable[..., Any]:
             raise typer.Exit(1) from None
 
     return command
+
+
+@contextmanager
+def _noted(interrupts: list[int]) -> Iterator[None]:
+    """Append SIGINT to a list when it arrives, beside its usual effect; a handler of somebody else stays."""
+
+    def note(number: int, frame: FrameType | None) -> None:
+        interrupts.append(number)
+        signal.default_int_handler(number, frame)
+
+    usual = threading.current_thread() is threading.main_thread()
+    usual = usual and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if usual:
+        signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        if usual and signal.getsignal(signal.SIGINT) is note:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _one_line(error: BaseException) -> str:

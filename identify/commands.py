@@ -12,13 +12,10 @@ from armident.identify.document import to_json
 from armident.identify.identification.options import parse_decimation, parse_nvr
 
 UNUSABLE = DataError.exit_code
-"""Exit code: the data do not support an identification, and the result says why."""
+"""Exit code: the data cannot support the request as they are configured, and the result says why."""
 
 FOUND = 4
 """Exit code: done, with findings or an unexplained residual."""
-
-UNUSABLE = 3
-"""Exit code: the data cannot support the request as they are configured."""
 
 
 def identify_command(

@@ -1,7 +1,7 @@
 """Candidate effects with their places, and the columns that they add to the regressor."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations, permutations, product
 
 import numpy as np
@@ -47,33 +47,6 @@ class Candidate:
         """Name and place."""
         return self.effect.key, self.place.joint, self.place.other
 
-    def closer(self) -> "Candidate":
-        """The candidate for a loop that contains it, with the additional values that are useful there."""
-        shapes = self.effect.shapes
-        axes = [sorted({tried[k][1] for tried in self.grid} | {*s.closer}) for k, s in enumerate(shapes)]
-        if not any(shape.closer for shape in shapes):
-            return self
-        named = ([(s.name, value) for value in axis] for s, axis in zip(shapes, axes, strict=True))
-        return replace(self, grid=tuple(product(*named)))
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Whitened columns of a candidate.
-
-    Parameters
-    ----------
-    x, z
-        Training rows at measured and at simulated signals, (R, k).
-    held_x, held_z
-        Held-out rows at measured and at simulated signals, (R', k).
-    """
-
-    x: Array
-    z: Array
-    held_x: Array
-    held_z: Array
-
 
 @dataclass
 class ColumnCache:
@@ -94,24 +67,6 @@ class ColumnCache:
     kept: dict[Cached, tuple[Kept, ...]] = field(default_factory=dict)
     _motions: dict[tuple[int, str], Motion] = field(default_factory=dict)
 
-    def with_theta(self, study: Study, theta: Array) -> "ColumnCache":
-        """Cache after a refit; columns that depend neither on theta nor on another simulation stay.
-
-        Parameters
-        ----------
-        study
-            The stretches after the refit.
-        theta
-            New parameters, shape (b,).
-        """
-        moved = any(a.simulated is not b.simulated for a, b in zip(study.train, self.study.train, strict=True))
-        still = {
-            key: value
-            for key, value in self.kept.items()
-            if not _predicts(key[0]) and not (moved and key[5] == "simulated")
-        }
-        return ColumnCache(study, theta, still)
-
     def instruments(
         self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel], *, keep: bool = True
     ) -> Array:
@@ -127,23 +82,6 @@ class ColumnCache:
             True to keep the columns in the cache.
         """
         return whitened(self.band(effect, place, shapes, "train", "simulated", keep=keep), noise)
-
-    def columns(self, effect: Effect, place: Place, shapes: Shapes, noise: Sequence[ArModel]) -> Columns:
-        """Whitened columns of an effect.
-
-        Parameters
-        ----------
-        effect, place, shapes
-            Effect, its place and nonlinear parameters.
-        noise
-            Noise model of each joint.
-        """
-        parts = (
-            whitened(self.band(effect, place, shapes, part, kind), noise)
-            for part in ("train", "held")
-            for kind in ("measured", "simulated")
-        )
-        return Columns(*parts)
 
     def motion(self, stretch: Stretch, kind: str) -> Motion:
         """Signals of a stretch on which the columns of effects depend.
@@ -261,11 +199,6 @@ class ColumnCache:
         whole = np.zeros((self.study.robot.n, *columns.shape))
         whole[place.joint] = columns
         return whole.transpose(1, 0, 2)
-
-
-def _predicts(name: str) -> bool:
-    effect = catalogue().get(name)
-    return effect is None or effect.predicts
 
 
 def candidates(column_cache: ColumnCache) -> Iterator[Candidate]:

@@ -9,6 +9,7 @@ from scipy import stats
 from armident.identify.diagnosis.baseline import Change, Comparison
 from armident.identify.diagnosis.candidates import ColumnCache, places
 from armident.identify.diagnosis.criteria import Criteria
+from armident.identify.diagnosis.whitening import whitened
 from armident.identify.effects.registry import catalogue
 
 STRUCTURAL = {
@@ -67,7 +68,8 @@ def changes(comparison: Comparison, column_cache: ColumnCache) -> Iterator[Chang
             elif effect.name == "gravity_direction" and effect.visible is not None and effect.visible(motion, place):
                 continue
             else:
-                directions = fit.absorbed(column_cache.columns(effect, place, (), fit.noise).x)
+                columns = column_cache.band(effect, place, (), "train", "measured")
+                directions = fit.absorbed(whitened(columns, fit.noise))
             directions = directions[comparison.known]
             if directions.any():
                 yield Change(effect, place, directions)

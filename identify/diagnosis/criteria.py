@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armident.identify.setup.search import NOT_UNDERSTOOD
+
 
 @dataclass(frozen=True)
 class Criteria:
@@ -45,7 +47,7 @@ class Criteria:
     confirmation_level: float = 0.2
     named_share: float = 0.5
     close: float = float(np.log(20.0))
-    set_up_doubtful_pct: float = 100.0 / 3.0
+    set_up_doubtful_pct: float = 100.0 * NOT_UNDERSTOOD
     most_findings: int = 8
     promising: float = 0.25
     shortlist: int = 10

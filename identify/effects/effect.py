@@ -69,9 +69,6 @@ class Shape:
         a turn is an integer; the pitch of a prismatic axis is unknown.
     default
         Value where the configuration gives none; ``None``: the configuration must give one.
-    closer
-        Additional values to try once the simulated loop contains the effect: the motion of a rigid arm does not excite
-        them.
     movable
         True if its standard deviation is estimated although its value is one of the grid.
     """
@@ -81,7 +78,6 @@ class Shape:
     grid: Callable[[Motion, int], Sequence[float]]
     continuous: tuple[bool, bool] = (True, True)
     default: float | None = None
-    closer: tuple[float, ...] = ()
     movable: bool = False
 
 

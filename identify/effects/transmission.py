@@ -15,9 +15,6 @@ Array = NDArray[np.float64]
 DAMPINGS = (0.1, 0.7)
 """Damping ratios of an elastic joint: by its own damping, and with damping by the controlled motor."""
 
-LEAST_DAMPING = 0.02
-"""Damping ratio of an elastic joint of steel; visible where the motion contains its oscillation."""
-
 LEAST_INERTIA = 0.1
 """Lower bound of the link inertia, over its maximum along the motion: a fit may make it negative."""
 
@@ -227,7 +224,7 @@ EFFECTS = (
         linear=(Linear("compliance", ("rad/(N m)", "m/N"), sign=1),),
         shapes=(
             Shape("frequency", ("Hz", "Hz"), frequencies),
-            Shape("damping", ("", ""), lambda motion, joint: DAMPINGS, default=DAMPINGS[-1], closer=(LEAST_DAMPING,)),
+            Shape("damping", ("", ""), lambda motion, joint: DAMPINGS, default=DAMPINGS[-1]),
             ROTOR,
         ),
         columns=_elasticity,

@@ -1,8 +1,12 @@
 """Root of the command line: finds commands, imports only the one called, one line for every error."""
 
 import importlib.metadata
+import os
+import signal
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -37,9 +41,17 @@ def greet(name: Annotated[str, typer.Option(help="Whom to greet.")] = "arm") -> 
     print(f"hello {name}")
 
 
+def compile_while_interrupted() -> None:
+    """Lose an interrupt in a callback, as a compiler does, and fail for that reason."""
+    with suppress(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(1.0)
+    raise RuntimeError("no compiled object yet")
+
+
 ENTRIES = [
     importlib.metadata.EntryPoint(name, f"{__name__}:{function}", GROUP)
-    for name, function in [("refuse", "refuse"), ("greet", "greet")]
+    for name, function in [("refuse", "refuse"), ("greet", "greet"), ("compile", "compile_while_interrupted")]
 ]
 ABSENT = importlib.metadata.EntryPoint("absent", "daq.no_such_module:absent", GROUP)
 
@@ -64,6 +76,11 @@ def call(*words: str) -> tuple[int, str, str]:
 )
 def test_an_expected_error_is_one_line_on_stderr_and_its_own_exit_code(kind: str, code: int, line: str) -> None:
     assert call("refuse", kind) == (code, "", line + "\n")
+
+
+def test_an_error_because_of_an_interrupt_is_an_interrupt() -> None:
+    assert call("compile") == (130, "", "")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_an_unforeseen_error_is_one_line_and_exit_code_1() -> None:
