@@ -7,7 +7,7 @@ import numpy as np
 
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, Key, Shapes
-from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.model_state import ModelState, acted_on
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.regression.ar_noise import ArModel
 
@@ -187,13 +187,15 @@ def gain(with_it: ModelState, without: ModelState) -> float:
 def materiality(without: ModelState, with_it: ModelState) -> tuple[float, float]:
     """Return the largest share of a joint's error power that an effect removes, and its torque in percent there.
 
+    Errors of joints on which the effect does not act may change, too, with the other parameters. They do not count.
+
     Parameters
     ----------
     without, with_it
         Models without and with the effect.
     """
     before, after = without.score.rms, with_it.score.rms
-    removed = np.maximum(before**2 - after**2, 0.0)
+    removed = np.where(acted_on(with_it, without), np.maximum(before**2 - after**2, 0.0), 0.0)
     joint = int(np.argmax(removed / np.maximum(before**2, 1e-300)))
     torque = np.concatenate([s.y[:, joint] for s in without.study.train])
     size = float(np.sqrt(np.mean(torque**2)))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from armident.identify.diagnosis.model_state import ModelState
+from armident.identify.diagnosis.model_state import ModelState, acted_on
 from armident.identify.diagnosis.predictive_score import SUMS
 from armident.identify.diagnosis.regression import applied
 
@@ -27,12 +27,15 @@ class Confirmation:
     noiseless
         Relative errors with the effect whose torque is computed at the simulated motion, percent, (n,): measured
         positions that are differentiated twice for an effect may add more noise than it has torque.
+    acts
+        True for the joints on whose torques the effect acts, (n,).
     """
 
     p_value: float
     before: Array
     after: Array
     noiseless: Array
+    acts: NDArray[np.bool_]
 
     @property
     def share(self) -> Array:
@@ -84,7 +87,10 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
     torque = np.concatenate([s.y for s in with_it.study.held])
     return Confirmation(
         float(stats.t.sf(coefficient / max(spread, 1e-300), SUMS - 1)),
-        *(_relative(errors, torque) for errors in (before, after, noiseless)),
+        _relative(before, torque),
+        _relative(after, torque),
+        _relative(noiseless, torque),
+        acted_on(with_it, without),
     )
 
 

@@ -201,6 +201,22 @@ def with_report_part(state: ModelState) -> ModelState:
     return ModelState(moved, replace(state.fit, study=moved, equations=equations))
 
 
+def acted_on(with_it: ModelState, without: ModelState) -> NDArray[np.bool_]:
+    """Return the joints on whose torques the terms act that a model has and another one has not, (n,).
+
+    All joints if the models differ in corrections of the recordings alone.
+
+    Parameters
+    ----------
+    with_it, without
+        Models with and without an effect.
+    """
+    known = set(without.study.model.base.names)
+    added = [k for k, name in enumerate(with_it.study.model.base.names) if name not in known]
+    blocks = with_it.fit.equations.blocks
+    return np.array([not added or bool(np.isin(added, block.x).any()) for block in blocks])
+
+
 def _iterated(found: Fit) -> Fit:
     """Fit whose terms scale the torques predicted by the model itself, by iteration.
 

@@ -160,7 +160,7 @@ class StepwiseSelection:
             state, found = self._exchanged(state, found)
             state, kept = self._confirmed(state, found)
             if len(kept) == len(found):
-                return self._finished(state, kept) if kept else (first, ())
+                return (with_own_noise(state), kept) if kept else (first, ())
             found = kept
 
     def step(self, state: ModelState) -> Step:
@@ -451,35 +451,30 @@ class StepwiseSelection:
         return state, found
 
     def _confirmed(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Model with the findings that the report part confirms, largest change of the errors first."""
+        """Model with the findings that the report part confirms, largest change first.
+
+        The models are compared as they are reported: each estimated under the noise models of its own residual.
+        """
         self.progress("confirmation by the report part")
         while True:
-            checked: list[Selected] = []
+            held = with_report_part(with_own_noise(state))
+            checked: list[tuple[Selected, ModelState]] = []
             for one in found:
                 less = self._without(state, one.entry)
                 if less is not None:
-                    compared = confirmed(with_report_part(state), with_report_part(less))
-                    checked.append(replace(one, confirmation=compared, without=less))
-            failed = [one for one in checked if not self._holds(one)]
+                    final = with_own_noise(less)
+                    compared = confirmed(held, with_report_part(final))
+                    checked.append((replace(one, confirmation=compared, without=final), less))
+            failed = [(one, less) for one, less in checked if not self._holds(one)]
             if not failed:
-                return state, tuple(sorted(checked, key=_change, reverse=True))
-            gone = max(failed, key=lambda one: 1.0 if one.confirmation is None else one.confirmation.p_value)
-            assert gone.without is not None
+                return state, tuple(sorted((one for one, _ in checked), key=_change, reverse=True))
+            gone, state = max(
+                failed, key=lambda one: 1.0 if one[0].confirmation is None else one[0].confirmation.p_value
+            )
             assert gone.confirmation is not None
             if not self._material(gone.confirmation):
                 self.immaterial = (*self.immaterial, gone.addition)
-            state, found = gone.without, tuple(one for one in found if one.entry is not gone.entry)
-
-    def _finished(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Final model under the noise models of its own residual, and its findings compared with the same."""
-        final = with_own_noise(state)
-        held = with_report_part(final)
-        compared: list[Selected] = []
-        for one in found:
-            assert one.without is not None
-            less = with_own_noise(one.without)
-            compared.append(replace(one, confirmation=confirmed(held, with_report_part(less)), without=less))
-        return final, tuple(sorted(compared, key=_change, reverse=True))
+            found = tuple(one for one in found if one.entry is not gone.entry)
 
     def _holds(self, one: Selected) -> bool:
         """True if the report part confirms a finding: the change goes the same way, and is material there, too."""
@@ -488,9 +483,9 @@ class StepwiseSelection:
         return report.p_value < self.criteria.confirmation_level and report.smaller and self._material(report)
 
     def _material(self, report: Confirmation) -> bool:
-        """True if the errors of one joint fall by enough, relative to them and to its torque."""
+        """True if the errors of one joint on which it acts fall by enough, relative to them and to its torque."""
         enough = (report.share >= self.criteria.least_share) & (report.change >= self.criteria.material_pct)
-        return bool(enough.any())
+        return bool((enough & report.acts).any())
 
 
 def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
