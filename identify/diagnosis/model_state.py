@@ -59,6 +59,8 @@ class ModelState:
         """
         self.score.keep_errors()
         self.fit.release()
+        for other in self._under.values():
+            other.release()
 
     @cached_property
     def weights(self) -> tuple[ArModel, ...]:

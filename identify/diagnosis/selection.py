@@ -184,13 +184,13 @@ class StepwiseSelection:
             step = compared(state, made, tests, self.passes)
             exact = [self._corrected(state, m) if any(a.made is m for a in step.passing) else m for m in made]
             self._steps[key] = step if exact == made else compared(state, exact, tests, self.passes)
-            self._release(None)
+            self._release()
         return self._steps[key]
 
-    def _release(self, used: ModelState | None) -> None:
-        """Free the equations of all models but one: hundreds are compared, and few are used again."""
+    def _release(self) -> None:
+        """Free the equations of all models: hundreds are compared, and few are used again."""
         for state in self._states.values():
-            if state is not None and state is not used:
+            if state is not None:
                 state.release()
 
     @property
@@ -463,8 +463,8 @@ class StepwiseSelection:
                 less = self._without(state, one.entry)
                 if less is not None:
                     final = with_own_noise(less)
-                    compared = confirmed(held, with_report_part(final))
-                    checked.append((replace(one, confirmation=compared, without=final), less))
+                    report = confirmed(held, with_report_part(final))
+                    checked.append((replace(one, confirmation=report, without=final), less))
             failed = [(one, less) for one, less in checked if not self._holds(one)]
             if not failed:
                 return state, tuple(sorted((one for one, _ in checked), key=_change, reverse=True))
