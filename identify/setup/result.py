@@ -7,10 +7,13 @@ from armident.configs import RobotConfig
 from armident.identify.experiment import Experiment
 
 SIGNIFICANT = 3.0
-"""Standard deviations from which a shift is significant: one false alarm in 370, as for `torque_delay`."""
+"""Standard deviations between a shift and a convention from which they differ: one false alarm in 370."""
 
-LEAST_AGREEMENT = 0.01
-"""Least p-value of the test that all joints have one shift: a refusal by chance in one recording of a hundred."""
+CONVENTIONS = (0.0, 0.5)
+"""Shifts of the two ways in which drives report a torque, samples: held until the next sample; that of the instant."""
+
+SUBSTANTIAL = 3.2
+"""Least odds of the torque of the instant over the held one: "substantial" evidence (Jeffreys 1961, appendix B)."""
 
 SHORTEST = 0.1
 """Shortest shift that is corrected, samples: derivatives and interpolation err by some hundredths."""
@@ -64,8 +67,8 @@ class TorqueShift:
         Sampling period, s.
     by_joint
         Estimate and standard deviation of every joint that moves, samples.
-    agreement
-        Probability of shifts that differ as much if the joints have one in common, chi-squared test.
+    odds
+        Likelihood of a torque of the instant of the sample over that of a torque held until the next sample.
     instrumented
         True if recorded references gave instruments that no disturbance of the loop affects.
     """
@@ -74,30 +77,43 @@ class TorqueShift:
     std: float
     dt: float
     by_joint: dict[str, tuple[float, float]]
-    agreement: float
+    odds: float
     instrumented: bool
 
     @property
-    def applied(self) -> bool:
-        """True if the shift is significant, common to the joints and no longer than a sample: it is corrected."""
-        certain = abs(self.samples) > SIGNIFICANT * self.std and self.std <= MOST_UNCERTAIN
+    def correction(self) -> float:
+        """Shift that is corrected, samples; 0 for none, and if the estimate is too uncertain.
+
+        It is that of a sampling convention, if one agrees with the estimate: no estimate is as exact. Otherwise it is
+        the estimate, if that is no longer than a sample.
+        """
         compared = sum(std <= MOST_UNCERTAIN for _, std in self.by_joint.values())
         # Of one joint alone, dynamics that the model lacks look the same. Disturbances that feed back bias each joint
         # differently: without instruments, two joints must confirm the shift.
         several = len(self.by_joint) >= 2 if self.instrumented else compared >= 2
-        agreed = self.agreement >= LEAST_AGREEMENT and several
-        return certain and agreed and SHORTEST <= abs(self.samples) <= LONGEST
+        if not several or self.std > MOST_UNCERTAIN:
+            return 0.0
+        if any(abs(self.samples - shift) <= SIGNIFICANT * self.std for shift in CONVENTIONS):
+            return CONVENTIONS[self.odds > SUBSTANTIAL]
+        return self.samples if SHORTEST <= abs(self.samples) <= LONGEST else 0.0
+
+    @property
+    def applied(self) -> bool:
+        """True if a shift is corrected."""
+        return self.correction != 0.0
 
     @property
     def remark(self) -> str:
         """The correction in one sentence; empty if none is made."""
         if not self.applied:
             return ""
-        direction = "late" if self.samples > 0 else "early"
+        late, by_convention = self.correction, self.correction in CONVENTIONS
+        size = f"{abs(late):.2f} samples ({1000 * abs(late) * self.dt:.3g} ms)"
+        reason = "torques of the instant of the sample" if by_convention else "their own sampling instant"
         return (
-            f"all torques are {abs(self.samples):.2f} +- {self.std:.2f} samples "
-            f"({1000 * abs(self.samples) * self.dt:.3g} ms) {direction} against the positions: identify and diagnose "
-            "align their equations with it"
+            f"all torques are {size} {'late' if late > 0 else 'early'} against torques held until the next sample "
+            f"({reason}; estimated: {self.samples:.2f} +- {self.std:.2f} samples): identify and diagnose align their "
+            "equations with it"
         )
 
 
@@ -148,4 +164,4 @@ def with_torque_shift(experiments: Sequence[Experiment], shift: TorqueShift | No
     """
     if shift is None or not shift.applied:
         return list(experiments)
-    return [replace(e, torque_shift=e.torque_shift + shift.samples) for e in experiments]
+    return [replace(e, torque_shift=e.torque_shift + shift.correction) for e in experiments]

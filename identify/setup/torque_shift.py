@@ -17,12 +17,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from armident.identify.regression.ar_noise import ArModel, fit_ar
 from armident.identify.setup.bench import Bench
 from armident.identify.setup.fit import Hypothesis
-from armident.identify.setup.result import TorqueShift
+from armident.identify.setup.result import CONVENTIONS, TorqueShift
 
 Array = NDArray[np.float64]
 Motion = tuple[Array, Array, Array]
@@ -44,6 +43,18 @@ RANK = 1e-6
 
 LAGS = 16
 """Coefficients of the filter from reference to motion: eight closed-loop periods at the rate of the rows."""
+
+RANGE = 5.0
+"""Largest shift, samples: longer ones are mistakes of the set-up."""
+
+STEPS = 2001
+"""Values of the shift between these limits: a two-hundredth of a sample apart."""
+
+OWN_CAUSE = 0.2
+"""Prior share of joints whose apparent shift has a cause of its own: at most one joint in five lacks an effect."""
+
+LARGE = 700.0
+"""Largest logarithm of odds that is a finite number."""
 
 WIDTHS = (0.02, 0.005)
 """Shares of a joint's largest velocity over which the smoothed signs of its dry friction change."""
@@ -69,7 +80,7 @@ class _Columns:
 
 
 def torque_shift(bench: Bench, h: Hypothesis) -> TorqueShift:
-    """Estimate the common shift of the torques, and its agreement with the shift of every single joint.
+    """Estimate the common shift of the torques, and that of every joint.
 
     Parameters
     ----------
@@ -224,15 +235,22 @@ def _solved(
 
 
 def _common(samples: Array, covariance: Array, bench: Bench, instrumented: bool) -> TorqueShift:
-    """Weighted mean of the joints' shifts, and the chi-squared test that they are equal."""
-    weights = np.linalg.inv(covariance)
-    variance = 1.0 / float(weights.sum())
-    common = variance * float(weights.sum(axis=0) @ samples)
-    apart = samples - common
-    agreement = float(stats.chi2.sf(apart @ weights @ apart, samples.size - 1)) if samples.size > 1 else 1.0
-    if not (variance > 0 and np.isfinite([common, variance, agreement]).all()):
-        raise np.linalg.LinAlgError("the motion determines no shift of the torques")
-    names = [bench.robot.joints[j].name for j in np.flatnonzero(bench.moving)]
+    """Common shift of the joints; some have effects of their own that look like a shift, such as a slow actuator."""
     std = np.sqrt(np.diag(covariance))
+    if not (np.isfinite(samples).all() and np.isfinite(std).all()):
+        raise np.linalg.LinAlgError("the motion determines no shift of the torques")
+
+    def log_likelihood(shift: Array) -> Array:
+        apart = (samples - shift[:, None]) / std
+        common = np.exp(-0.5 * apart**2) / (std * np.sqrt(2 * np.pi))
+        return np.asarray(np.log((1.0 - OWN_CAUSE) * common + OWN_CAUSE / (2 * RANGE)).sum(axis=1))
+
+    grid = np.linspace(-RANGE, RANGE, STEPS)
+    density = np.exp(log_likelihood(grid) - log_likelihood(grid).max())
+    density /= density.sum()
+    mean = float(density @ grid)
+    held, instant = log_likelihood(np.array(CONVENTIONS))
+    names = [bench.robot.joints[j].name for j in np.flatnonzero(bench.moving)]
     each = {name: (float(s), float(d)) for name, s, d in zip(names, samples, std, strict=True)}
-    return TorqueShift(common, float(np.sqrt(variance)), bench.period, each, agreement, instrumented)
+    spread = float(np.sqrt(density @ (grid - mean) ** 2))
+    return TorqueShift(mean, spread, bench.period, each, float(np.exp(min(instant - held, LARGE))), instrumented)

@@ -64,14 +64,25 @@ def test_a_common_shift_of_half_a_sample_is_a_remark_and_no_mistake(
     assert check.findings == ()
     assert found is not None
     assert found.applied
-    assert found.samples == pytest.approx(samples, abs=4 * found.std)
+    assert found.correction == pytest.approx(samples, abs=4 * found.std)
     assert ("late" if samples > 0 else "early") in found.remark
 
 
-def test_the_delay_of_one_joint_is_left_to_the_diagnosis(healthy: list[Experiment], arm: RobotConfig) -> None:
-    found = estimate(late(healthy, np.array([0.0, 3.0, 0.0, 0.0])), arm)
-    assert found.agreement < 0.01
-    assert not found.applied
+@pytest.mark.parametrize("common", [0.0, LATE])
+def test_the_delay_of_one_joint_is_left_to_the_diagnosis(
+    healthy: list[Experiment], arm: RobotConfig, common: float
+) -> None:
+    found = estimate(late(healthy, np.array([0.0, 3.0, 0.0, 0.0]) + common), arm)
+    assert found.correction == common
+
+
+def test_a_shift_that_is_less_certain_than_the_convention_is_that_of_the_convention() -> None:
+    joints = {"axis_1": (0.30, 0.26), "axis_2": (0.57, 0.65), "axis_3": (0.51, 0.4)}
+    unclear = TorqueShift(0.4, 0.21, 4e-3, joints, 1.0, instrumented=True)
+    assert not unclear.applied
+    assert replace(unclear, odds=9.0).correction == LATE
+    neither = replace(unclear, samples=0.25, std=0.02, odds=9.0)
+    assert neither.correction == 0.25
 
 
 def test_a_shift_that_was_applied_is_not_found_again(healthy: list[Experiment], arm: RobotConfig) -> None:
@@ -123,12 +134,12 @@ def test_aligned_torques_are_interpolated_at_the_instants_of_the_positions() -> 
 
 def test_without_references_one_joint_alone_confirms_no_shift() -> None:
     of_joints = {"axis_1": (0.5, 0.05), "axis_2": (0.4, 3.0)}
-    alone = TorqueShift(0.5, 0.05, 4e-3, of_joints, 0.97, instrumented=False)
+    alone = TorqueShift(0.5, 0.05, 4e-3, of_joints, 1e9, instrumented=False)
     assert not alone.applied
     assert replace(alone, instrumented=True).applied
     assert replace(alone, by_joint={"axis_1": (0.5, 0.05), "axis_2": (0.4, 0.2)}).applied
 
 
 def test_a_shift_longer_than_a_sample_is_left_to_the_findings() -> None:
-    shift = TorqueShift(1.2, 0.05, 4e-3, {"axis_1": (1.2, 0.07), "axis_2": (1.2, 0.07)}, 0.5, instrumented=True)
+    shift = TorqueShift(1.2, 0.05, 4e-3, {"axis_1": (1.2, 0.07), "axis_2": (1.2, 0.07)}, 1e9, instrumented=True)
     assert not shift.applied
