@@ -37,8 +37,12 @@ SLOW = 0.02
 BREAKAWAY = 0.1
 """Share of a joint's largest velocity over which the free friction term of low velocities decays."""
 
-FRICTION_TERMS = 4
-"""Free terms of every joint beside the rigid model: spring, asymmetric, quadratic and low-velocity friction."""
+SPRING_TERMS = 2
+"""Springs of every joint beside the rigid model: linear and cubic. Without the cubic one a spring that stiffens looks
+like another direction of gravity."""
+
+FREE_TERMS = SPRING_TERMS + 3
+"""Free terms of every joint beside the rigid model: springs, asymmetric, quadratic and low-velocity friction."""
 
 POSTURES = 40
 """Postures over which moments of inertia are averaged."""
@@ -216,20 +220,21 @@ class Bench:
         still = np.zeros_like(q)
         postures = np.ascontiguousarray(q[:: max(1, q.shape[0] // POSTURES)])
         weightless = self.model.with_gravity(np.zeros(3))
-        x = np.zeros((q.shape[0], n, b + FRICTION_TERMS * n))
+        x = np.zeros((q.shape[0], n, b + FREE_TERMS * n))
         x[:, :, :b] = weightless.rigid_regressor(q, qd, qdd)
         at_rest = weightless.rigid_regressor(q, still, still)
         along = [self.model.with_gravity(axis).rigid_regressor(q, still, still) for axis in np.eye(3)]
         gravity = np.stack(along) - at_rest
         physical = np.zeros((2, n, x.shape[2]))
-        spring = q - q.mean(axis=0)
+        stroke = q - q.mean(axis=0)
+        springs = np.stack([stroke, stroke**3 / np.maximum(np.abs(stroke).max(axis=0), 1e-12) ** 2], axis=2)
         for j in range(n):
             dry = self.column(f"fc{j + 1}")
             x[:, :, dry] = 0.0
             x[:, j, dry] = free[:, j, 0]
-            own = b + FRICTION_TERMS * j + np.arange(FRICTION_TERMS)
-            x[:, j, own[0]] = spring[:, j]
-            x[:, j, own[1:]] = free[:, j, 1:]
+            own = b + FREE_TERMS * j + np.arange(FREE_TERMS)
+            x[:, j, own[:SPRING_TERMS]] = springs[:, j]
+            x[:, j, own[SPRING_TERMS:]] = free[:, j, 1:]
             push = np.zeros_like(postures)
             push[:, j] = 1.0
             motionless = np.zeros_like(postures)
@@ -237,7 +242,7 @@ class Bench:
                 postures, motionless, motionless
             )
             physical[0, j, :b] = unit[:, j].mean(axis=0)
-            columns = [self.column(f"fv{j + 1}"), dry, *own[1:]]
+            columns = [self.column(f"fv{j + 1}"), dry, *own[SPRING_TERMS:]]
             physical[1, j, columns] = (x[:, j, columns] * qd[:, j, None]).mean(axis=0)
         return Rows(x, gravity, physical.reshape(2 * n, -1))
 
