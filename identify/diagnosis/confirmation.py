@@ -29,6 +29,8 @@ class Confirmation:
         positions that are differentiated twice for an effect may add more noise than it has torque.
     acts
         True for the joints on whose torques the effect acts, (n,).
+    whole_before, whole_after
+        Norms of the errors of all joints over that of their torques without and with the effect, percent.
     """
 
     p_value: float
@@ -36,6 +38,8 @@ class Confirmation:
     after: Array
     noiseless: Array
     acts: NDArray[np.bool_]
+    whole_before: float
+    whole_after: float
 
     @property
     def share(self) -> Array:
@@ -54,8 +58,12 @@ class Confirmation:
 
     @property
     def smaller(self) -> bool:
-        """True if the errors are smaller with the effect: the mean of their logarithms, as joints differ in size."""
-        return float(np.mean(np.log(np.maximum(self.best, 1e-300) / np.maximum(self.before, 1e-300)))) < 0.0
+        """True if the errors are smaller with the effect: the mean of their logarithms, and those of the whole arm.
+
+        Joints differ in size, so that the norm of all alone would judge the largest.
+        """
+        ratios = np.maximum(self.best, 1e-300) / np.maximum(self.before, 1e-300)
+        return float(np.mean(np.log(ratios))) < 0.0 and self.whole_after < self.whole_before
 
 
 def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
@@ -91,6 +99,8 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
         _relative(after, torque),
         _relative(noiseless, torque),
         acted_on(with_it, without),
+        _whole(before, torque),
+        _whole(after, torque),
     )
 
 
@@ -98,6 +108,11 @@ def _relative(errors: list[Array], torque: Array) -> Array:
     """Norm of the errors of each joint over that of its torque, percent, (n,)."""
     size = np.linalg.norm(np.concatenate(errors), axis=0)
     return np.asarray(100 * size / np.maximum(np.linalg.norm(torque, axis=0), 1e-300))
+
+
+def _whole(errors: list[Array], torque: Array) -> float:
+    """Norm of the errors of all joints over that of their torques, percent, as `Gap.all`."""
+    return float(100 * np.linalg.norm(np.concatenate(errors)) / max(float(np.linalg.norm(torque)), 1e-300))
 
 
 def _less(with_it: ModelState, without: ModelState) -> Array:

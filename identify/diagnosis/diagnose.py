@@ -219,7 +219,7 @@ def _diagnose(
     steps("derivatives and closed loop")
     study = build_study(stage.training, stage.validation, stage.robot)
     steps("base fit")
-    selection = StepwiseSelection(study, criteria, steps, deadline, steps.tested)
+    selection = StepwiseSelection(study, criteria, steps, deadline, steps.tested, shifts=stage.shifts)
     first = selection.start()
     steps("comparison of effects")
     chosen, every = selection.run(first)
@@ -265,7 +265,7 @@ def _diagnose(
         model=None,
         timing_s=steps.finish(),
         versions=versions(),
-        warnings=[*notes, *stage.warnings, *study.warnings, *stopped],
+        warnings=[*notes, *stage.warnings, *selection.study.warnings, *stopped],
         not_visible=undetectable(first, selection.hidden),
         detection_limits=limits,
         simulated=simulated.document(),

@@ -360,7 +360,7 @@ class LackOfFit:
             made = in_band(self.fit.study, self._motion(stretch), every)
             for j, own in enumerate(self.functions):
                 columns = np.concatenate([made[f.key] for f in own], axis=1)
-                out[j].append(columns if stretch.moving is None else columns * stretch.moving[:, j, None])
+                out[j].append(columns * stretch.moving[:, j, None])
         return out
 
     def _sets(self, joint: int) -> list[NDArray[np.int64]]:

@@ -182,12 +182,17 @@ def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> Model
 def with_own_noise(state: ModelState) -> ModelState:
     """Return a model fitted with the noise models of its own residual, in which no effect is missing any more.
 
+    If something is missing all the same, they take it for noise. The model stays as it is if it predicts with smaller
+    errors: the mean of their logarithms, as joints differ in size.
+
     Parameters
     ----------
     state
         Model of the selection, fitted with the noise models of an earlier one.
     """
-    return replace(state, fit=safe(state.fit.renoised(state.own_noise)))
+    own = replace(state, fit=safe(state.fit.renoised(state.own_noise)))
+    sizes = (float(np.log(np.maximum(one.score.rms, 1e-300)).sum()) for one in (own, state))
+    return own if next(sizes) < next(sizes) else state
 
 
 def with_report_part(state: ModelState) -> ModelState:

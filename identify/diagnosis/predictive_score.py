@@ -153,8 +153,7 @@ class PredictiveScore:
     @property
     def volume(self) -> Array:
         """Logarithm of the volume by which corrections of the recordings scale the noise, per row, (n,)."""
-        volume = self.fit.study.volume
-        return np.zeros(len(self.fit.noise)) if volume is None else volume
+        return self.fit.study.volume
 
     def log_likelihoods_under(self, noise: Sequence[ArModel]) -> Array:
         """Log-likelihood of the data of each joint under noise models, without constants of these data, (n,).

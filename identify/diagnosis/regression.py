@@ -573,10 +573,10 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
                 # Measured signals differentiated twice carry more noise than such an effect has torque.
                 dynamic = np.flatnonzero([e.predicts and not e.sudden for e in every])
                 first = out[0].shape[2] - study.model.e
-                moving = 1.0 if stretch.moving is None else stretch.moving[:, :, None]
+                moving = stretch.moving[:, :, None]
                 out[0][:, :, first + dynamic] = made[:, :, dynamic] * moving
             rigid = np.concatenate([rigid, made], axis=2)
-        out.append(rigid if stretch.moving is None else rigid * stretch.moving[:, :, None])
+        out.append(rigid * stretch.moving[:, :, None])
     return out[0], out[1]
 
 

@@ -9,6 +9,7 @@
 6. Report part: a finding stays if the data that chose nothing confirm it (`armident.identify.diagnosis.confirmation`).
 """
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,7 +42,8 @@ CORRECTIONS = 3
 FINER = (1.4, 1.2, 1.1, 1.05, 1.02)
 """Factors of the refinement of the velocity of a transition; the grid has factors of 1.9."""
 CLEAR = 3.0
-"""Gain of log-likelihood from which a transition of dry friction is a part of the friction model: odds of 20 to 1."""
+"""Gain of log-likelihood from which a transition of dry friction is a part of the friction model, and another shift of
+all torques is chosen: odds of 20 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +104,8 @@ class StepwiseSelection:
         Time of `time.monotonic` after which no further step begins and the current one is dropped, s.
     tested
         Called with the share of a step's candidates that have been tested, 0 to 1.
+    shifts
+        Common shifts of all torques between which the check of the set-up could not decide, samples.
     """
 
     study: Study
@@ -109,6 +113,7 @@ class StepwiseSelection:
     progress: Callable[[str], None] = lambda stage: None
     deadline: float = float("inf")
     tested: Callable[[float], None] = lambda share: None
+    shifts: tuple[float, ...] = ()
     stopped: bool = False
     hidden: frozenset[Key] = frozenset()
     immaterial: tuple[Addition, ...] = ()
@@ -124,7 +129,8 @@ class StepwiseSelection:
         DataError
             If the motion does not determine the parameters of the model.
         """
-        state = fitted(self.study, self.study.robot, None)
+        state = self._aligned(fitted(self.study, self.study.robot, None))
+        self.study = state.study
         if not self.study.sign_given:
             state = with_own_noise(self._with_transitions(state))
         self.study = replace(self.study, robot=state.robot, model=state.study.model)
@@ -160,8 +166,15 @@ class StepwiseSelection:
             state, found = self._exchanged(state, found)
             state, kept = self._confirmed(state, found)
             if len(kept) == len(found):
-                return (with_own_noise(state), kept) if kept else (first, ())
+                return (self._final(state), kept) if kept else (first, ())
             found = kept
+
+    def _final(self, state: ModelState) -> ModelState:
+        """Model with noise models of its own residual, and with the controller that its corrected torques identify."""
+        if state.study.recorded != self.study.recorded:
+            with contextlib.suppress(DataError):
+                state = fitted(state.study.with_own_controller(), state.robot, state)
+        return with_own_noise(state)
 
     def step(self, state: ModelState) -> Step:
         """Compare all candidates in a model.
@@ -182,10 +195,24 @@ class StepwiseSelection:
                     return Step(state, (), (), (), tests)
                 made += [m for m in (self._made(state, *one),) if m is not None]
             step = compared(state, made, tests, self.passes)
-            exact = [self._corrected(state, m) if any(a.made is m for a in step.passing) else m for m in made]
+            exact = [self._corrected(state, m) if m in self._to_correct(step) else m for m in made]
             self._steps[key] = step if exact == made else compared(state, exact, tests, self.passes)
             self._release()
         return self._steps[key]
+
+    def _to_correct(self, step: Step) -> tuple[Made, ...]:
+        """Effects on what was recorded whose expansion promises to be admitted when the recording is corrected for it.
+
+        What the expansion leaves is correlated with the effect, so that the gain counts as if the noise were white.
+        """
+        able = [a for a in step.ranked if a.allowed]
+        most = max((a.raw_gain for a in able), default=0.0)
+        least = max(self._needed(step.tests), self.criteria.promising * most)
+        return tuple(a.made for a in able if a.candidate.effect.undo is not None and a.raw_gain > least)
+
+    def _needed(self, tests: int) -> float:
+        """Gain of log-likelihood of a significant effect, found among a number of candidates."""
+        return float(np.log(max(tests, 1) / self.criteria.alpha["selection"]))
 
     def _release(self) -> None:
         """Free the equations of all models: hundreds are compared, and few are used again."""
@@ -223,7 +250,7 @@ class StepwiseSelection:
         """
         return (
             addition.allowed
-            and addition.gain > np.log(max(tests, 1) / self.criteria.alpha["selection"])
+            and addition.gain > self._needed(tests)
             and addition.share >= self.criteria.least_share
             and addition.material_pct >= self.criteria.material_pct
         )
@@ -260,6 +287,27 @@ class StepwiseSelection:
     def _late(self) -> bool:
         self.stopped = self.stopped or time.monotonic() > self.deadline
         return self.stopped
+
+    def _aligned(self, state: ModelState) -> ModelState:
+        """Model with the common shift of the torques with which the base fit predicts clearly better.
+
+        A joint may have an effect that looks like a shift: the evidence of each is limited. A loop that follows the
+        measured motion contains disturbances, whose feedback looks like a shift, too.
+        """
+        if state.study.loop == "nominal" or not self.shifts:
+            return state
+        models = [fitted(state.study.with_torque_shift(shift), state.robot, state) for shift in self.shifts]
+        scores = np.array([model.score.log_likelihoods_under(state.weights) for model in models])
+        evidence = np.clip(scores - scores[0], -CLEAR, CLEAR).sum(axis=1)
+        best = int(np.argmax(evidence))
+        if evidence[best] <= CLEAR:
+            return state
+        line = (
+            f"all torques are late by {self.shifts[best]:.2f} samples against torques held until the next sample: the "
+            "base fit shows it, the check of the set-up does not decide; the diagnosis aligns its equations with it"
+        )
+        study = models[best].study
+        return replace(models[best], study=replace(study, warnings=(*study.warnings, line)))
 
     def _with_transitions(self, state: ModelState) -> ModelState:
         """Model with the transition of dry friction at the reversals of each joint, where it predicts better.
@@ -327,7 +375,7 @@ class StepwiseSelection:
         if not self._steps:
             self.hidden = frozenset(hidden)
         # A score statistic is twice the gain of log-likelihood that it promises.
-        least = 2.0 * self.criteria.promising * np.log(max(tests, 1) / self.criteria.alpha["selection"])
+        least = 2.0 * self.criteria.promising * self._needed(tests)
         looks = sorted((look for look in looks if look[2][0] > least), key=lambda look: -look[0])
         named = [x for x in looks if x[1].effect.name != UNNAMED][: self.criteria.shortlist]
         unnamed = [x for x in looks if x[1].effect.name == UNNAMED][: self.criteria.unnamed]
@@ -419,8 +467,11 @@ class StepwiseSelection:
                     continue
                 share, changed = materiality(less, state)
                 gained = gain(state, less)
-                needed = np.log(max(one.step.tests, 1) / self.criteria.alpha["selection"])
-                if gained < needed or share < self.criteria.least_share or changed < self.criteria.material_pct:
+                if (
+                    gained < self._needed(one.step.tests)
+                    or share < self.criteria.least_share
+                    or changed < self.criteria.material_pct
+                ):
                     weak.append((gained, less, one))
             if not weak:
                 break

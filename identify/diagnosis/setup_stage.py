@@ -9,7 +9,7 @@ from armident.configs import DataError, RobotConfig
 from armident.identify.document import Finding, Gap, Unexplained
 from armident.identify.experiment import Experiment
 from armident.identify.setup.check import check_setup
-from armident.identify.setup.result import SetupCheck, SetupFinding, with_torque_shift
+from armident.identify.setup.result import CONVENTIONS, SetupCheck, SetupFinding, with_torque_shift
 from armident.identify.setup.search import NOT_UNDERSTOOD
 
 SIGNALS = {"position_sign": "position", "torque_sign": "torque"}
@@ -36,6 +36,8 @@ class SetupStage:
         Remarks on the recordings.
     errors
         Relative error of the rigid model in the set-up as configured by joint, percent, (n,).
+    shifts
+        Common shifts of the torques between which the check could not decide, samples; the diagnosis compares them.
     """
 
     training: tuple[Experiment, ...]
@@ -45,6 +47,7 @@ class SetupStage:
     unexplained: tuple[Unexplained, ...]
     warnings: tuple[str, ...]
     errors: tuple[float, ...]
+    shifts: tuple[float, ...] = ()
 
     def as_configured(self, gap: Gap) -> Gap:
         """Gap of the model in the set-up as configured, from that in the corrected one.
@@ -142,6 +145,7 @@ def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], rob
             *([shift.remark] if shift is not None and shift.applied else []),
         ),
         check.relative_error_pct,
+        CONVENTIONS if shift is not None and shift.undetermined else (),
     )
 
 

@@ -41,7 +41,7 @@ class Stretch:
         Measured and simulated motion before the stretch, where the experiment starts earlier. Effects with internal
         states start there.
     moving
-        False where a joint stands still at an instant of ``y``, (M, n); ``None``: it never does.
+        False where a joint stands still at an instant of ``y``, (M, n).
     """
 
     measured: Derivatives
@@ -52,8 +52,8 @@ class Stretch:
     experiment: int
     rows: NDArray[np.int64]
     span: slice
+    moving: NDArray[np.bool_]
     before: tuple[Derivatives, Derivatives] | None = None
-    moving: NDArray[np.bool_] | None = None
 
     def resimulated(self, motion: Derivatives, dt: float, factor: int) -> "Stretch":
         """Stretch with another simulation of the whole experiment.

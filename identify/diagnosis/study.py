@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import signal
 
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Stanza
@@ -17,7 +18,7 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.experiment import Experiment, check_one_rate
 from armident.identify.identification.auxiliary_loop import closed_loop
-from armident.identify.identification.equations import Prepared, aligned_torque, equations, least_rows
+from armident.identify.identification.equations import Prepared, equations, least_rows
 from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
 from armident.identify.identification.solvers import decimation_of
@@ -39,7 +40,7 @@ WORKING_RATE = 20.0
 """Rate at which effects are evaluated, over the frequency up to which model and data are compared."""
 
 
-ROUNDS = 8
+ROUNDS = 4
 """Most simulations of a loop with terms: instruments have to follow the arm, not to solve its equations."""
 SETTLED = 0.01
 """Relative difference of the torque of the terms and the simulated load that ends these simulations."""
@@ -47,6 +48,10 @@ PERTURBATION = 1e-3
 """Noise over the spread of a torque: small enough for a nonlinear correction to be linear."""
 NOISE_ORDER = 10
 """Highest order of the autoregressive models of corrected noise."""
+REACH = 16
+"""Samples to either side from which torques are interpolated between samples."""
+KAISER = 6.0
+"""Shape of the window of that interpolation: errors below 0.1 % up to 0.4 times the sampling rate."""
 ALIKE = 0.9
 """Indifference ratio of squared closed-loop velocity errors."""
 STIFF_LOOP = 1.5
@@ -105,9 +110,9 @@ class Study:
     thinning: Decimation
     sources: tuple[Sequence[Experiment], Sequence[Experiment]]
     signals: tuple[Derivatives, ...]
+    volume: Array
     warnings: tuple[str, ...] = ()
     sign_given: bool = True
-    volume: Array | None = None
     rigid: dict[tuple[int, tuple[str, ...], tuple[float, ...]], tuple[Derivatives, Array]] = field(
         default_factory=dict, repr=False, compare=False
     )
@@ -120,16 +125,54 @@ class Study:
     def of_robot(self, robot: RobotConfig) -> "Study":
         """The same recordings for another model, corrected again where its effect entries require other corrections.
 
+        Other corrections of torques leave the controller and the simulated motion as they are: instruments need not be
+        exact. Other wiring is another arm.
+
         Raises
         ------
         DataError
-            If no closed loop can be simulated with them.
+            If no closed loop can be simulated with other wiring.
         """
         changed = replace(self, robot=robot, model=arm_model(robot))
         if changed.recorded == self.recorded:
             return changed
         wiring = [[s for s in study.recorded if known(s.effect).rewires] for study in (self, changed)]
-        return build_study(*self.sources, robot, self.signals if wiring[0] == wiring[1] else None)
+        return changed._with_torques(self.sources) if wiring[0] == wiring[1] else build_study(*self.sources, robot)
+
+    def with_torque_shift(self, samples: float) -> "Study":
+        """The study with torques that are late by another time.
+
+        Parameters
+        ----------
+        samples
+            Shift of all torques, see `armident.identify.experiment.Experiment`.
+        """
+        training, validation = ([replace(e, torque_shift=samples) for e in part] for part in self.sources)
+        return self._with_torques((training, validation))
+
+    def with_own_controller(self) -> "Study":
+        """The study with the controller that its corrected torques identify, and the loop that this makes.
+
+        Raises
+        ------
+        DataError
+            If no closed loop can be simulated with it.
+        """
+        return build_study(*self.sources, self.robot, self.signals)
+
+    def _with_torques(self, sources: tuple[Sequence[Experiment], Sequence[Experiment]]) -> "Study":
+        """The study with torques of the same motion that were recorded or corrected otherwise."""
+        experiments = [*sources[0], *sources[1]]
+        torques = [self.thinning(_aligned(e)) for e in put_right(experiments, self.robot)]
+
+        def of(s: Stretch) -> Stretch:
+            torque = torques[s.experiment][s.span]
+            return replace(s, torque=torque, y=np.where(s.moving, self.decimation(torque), 0.0))
+
+        return replace(
+            self, sources=sources, train=tuple(map(of, self.train)), held=tuple(map(of, self.held)),
+            volume=log_volume(experiments, self.robot, lambda tau: self.decimation(self.thinning(tau))),
+        )  # fmt: skip
 
     def moves_more_like_the_arm_than(self, other: "Study", *, held: bool) -> bool:
         """True if the simulated loop follows the arm better than that of another study of the same recordings.
@@ -334,7 +377,7 @@ def build_study(
     train: list[Stretch] = []
     held: list[Stretch] = []
     for k, (e, s, z) in enumerate(zip(experiments, signals, simulated, strict=True)):
-        torque = first(aligned_torque(e.tau, e.torque_shift))
+        torque = first(_aligned(e))
         kept = first.instants(e.tau.shape[0])
         pieces = [(train if k < len(training) else held, slice(0, None))]
         if not validation:
@@ -350,16 +393,17 @@ def build_study(
             at = second.instants(rows.size)
             moving = moving_rows(measured.qd, slowest, second.factor, at)
             y = np.where(moving, y, 0.0)
-            into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span, before, moving))
+            into.append(Stretch(measured, noiseless, y, torque[span], t, k, rows, span, moving, before))
     duration = max(e.start + dt * e.q.shape[0] for e in experiments)
     return Study(
         robot, model, second, dt * factor, duration, tuple(train), tuple(held), loop, auxiliary, first,
-        (training, validation), tuple(signals), tuple(warnings), given.friction.sign_smoothing is not None,
+        (training, validation), tuple(signals),
         log_volume([*training, *validation], robot, lambda tau: second(first(tau))),
+        tuple(warnings), given.friction.sign_smoothing is not None,
     )  # fmt: skip
 
 
-def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Callable[[Array], Array]) -> Array | None:
+def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Callable[[Array], Array]) -> Array:
     """Return the logarithm of the volume by which corrections scale the noise of each joint's torque, per row, (n,).
 
     Likelihoods of corrected torques refer to those that were recorded by this determinant: a correction that is a
@@ -374,14 +418,9 @@ def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Call
         Configuration, with effect entries that correct recordings.
     band
         Filter and decimation to the rows of the comparison.
-
-    Returns
-    -------
-    ndarray or None
-        ``None`` without a correction that changes noise.
     """
     if not any(of_recording(e) and not known(e.effect).rewires for e in robot.effects):
-        return None
+        return np.zeros(robot.n)
     rng = np.random.default_rng(0)
     noise = [PERTURBATION * e.tau.std(axis=0) * rng.standard_normal(e.tau.shape) for e in experiments]
     disturbed = [replace(e, tau=e.tau + x) for e, x in zip(experiments, noise, strict=True)]
@@ -390,6 +429,18 @@ def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Call
     before = [band(x) for x in noise]
     innovations = [[ar.variance for ar in ar_models(part, NOISE_ORDER)] for part in (after, before)]
     return np.asarray(0.5 * np.log(np.array(innovations[0]) / np.array(innovations[1])))
+
+
+def _aligned(e: Experiment) -> Array:
+    """Torques (N, n) at the instants of the positions, N m or N.
+
+    A torque that is held until the next sample belongs half a sample later. Unlike the mean of two samples, the
+    interpolation (windowed sinc) keeps all frequencies up to half the sampling rate, whatever the shift.
+    """
+    k = np.arange(-REACH, REACH + 1)
+    taps = np.sinc(k - (e.torque_shift - 0.5)) * np.kaiser(k.size, KAISER)
+    padded = np.pad(e.tau, ((REACH, REACH), (0, 0)), mode="edge")
+    return np.asarray(signal.oaconvolve(padded, taps[::-1, None] / taps.sum(), mode="valid", axes=0))
 
 
 def _simulated(

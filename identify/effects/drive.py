@@ -26,6 +26,12 @@ def _alone(motion: Motion, place: Place) -> str | None:
     return None
 
 
+def _rescaled(recorded: Array, at: Recorded, gain_error: float) -> Array:
+    """Return the true torques (N,) of recorded ones."""
+    true: Array = recorded / (1.0 + gain_error)
+    return true
+
+
 def _saturation(motion: Motion, place: Place) -> Array:
     """Return the cubic term of an odd torque curve: the share lost grows with the square of the torque."""
     torque = motion.motor_torque[:, place.joint]
@@ -110,6 +116,7 @@ EFFECTS = (
         visible=_alone,
         predicts=True,
         share=True,
+        undo=_rescaled,
         needs="several joints that carry the same link; for a single axis a baseline",
         scope="motor",
         excitation=("load", "accelerations"),

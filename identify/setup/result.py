@@ -98,6 +98,11 @@ class TorqueShift:
         return self.samples if SHORTEST <= abs(self.samples) <= LONGEST else 0.0
 
     @property
+    def undetermined(self) -> bool:
+        """True if several joints move, and their shifts do not tell the conventions apart."""
+        return len(self.by_joint) >= 2 and self.std > MOST_UNCERTAIN
+
+    @property
     def applied(self) -> bool:
         """True if a shift is corrected."""
         return self.correction != 0.0

@@ -1,0 +1,86 @@
+"""Data of a diagnosis: torques that are corrected or shifted, with the same motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armident.configs.schema.robot import Effect
+from armident.identify.diagnosis.selection import StepwiseSelection
+from armident.identify.diagnosis.study import Study, _aligned, build_study
+from armident.identify.effects.recorded import put_right
+from armident.identify.experiment import Experiment
+from tests.fixtures import setups
+
+LATE = 0.5
+DT = 4e-3
+
+
+@pytest.fixture(scope="module")
+def experiments() -> list[Experiment]:
+    return setups.record(setups.random_arm(3, 4), 0, noise=0.003, dt=DT)
+
+
+@pytest.fixture(scope="module")
+def study(experiments: list[Experiment]) -> Study:
+    return build_study(experiments, [], setups.random_arm(3, 4))
+
+
+def reported(experiments: list[Experiment], joint: int, gain_error: float) -> list[Experiment]:
+    """Experiments in which one drive reports torques with a wrong gain."""
+    gains = np.ones(experiments[0].tau.shape[1])
+    gains[joint] += gain_error
+    return [replace(e, tau=e.tau * gains) for e in experiments]
+
+
+def test_a_torque_correction_gives_the_equations_of_corrected_recordings(experiments: list[Experiment]) -> None:
+    robot = setups.random_arm(3, 4)
+    entry = Effect(effect="drive_gain_error", joint=robot.joints[1].name, parameters={"gain_error": 0.25})
+    wrong = build_study(reported(experiments, 1, 0.25), [], robot)
+    corrected = wrong.of_robot(robot.model_copy(update={"effects": (entry,)}))
+    right = build_study(experiments, [], robot)
+    for found, expected in zip((*corrected.train, *corrected.held), (*right.train, *right.held), strict=True):
+        np.testing.assert_allclose(found.y, expected.y, atol=1e-9 * np.abs(expected.y).max())
+        np.testing.assert_allclose(found.torque, expected.torque, atol=1e-9 * np.abs(expected.torque).max())
+    # White noise of the corrected joint is 1 / 1.25 of that of the recorded one.
+    np.testing.assert_allclose(corrected.volume, [0.0, -np.log(1.25), 0.0, 0.0], atol=0.01)
+
+
+def test_the_gain_of_a_drive_that_reports_too_much_is_put_right(experiments: list[Experiment]) -> None:
+    robot = setups.random_arm(3, 4)
+    entry = Effect(effect="drive_gain_error", joint=robot.joints[2].name, parameters={"gain_error": -0.3})
+    found = put_right(reported(experiments, 2, -0.3), robot.model_copy(update={"effects": (entry,)}))
+    for own, true in zip(found, experiments, strict=True):
+        np.testing.assert_allclose(own.tau, true.tau, rtol=1e-12)
+
+
+def test_torques_are_interpolated_without_loss_of_high_frequencies() -> None:
+    t = DT * np.arange(2000)
+    for w in (2 * np.pi, 2 * np.pi * 0.35 / DT):
+        wave = np.sin(w * t)
+        one = Experiment(t[:, None], wave[:, None], None, DT)
+        # A held torque belongs half a sample later: at a position it is that of half a sample before.
+        expected = np.sin(w * (t - 0.5 * DT))
+        np.testing.assert_allclose(_aligned(one)[50:-50, 0], expected[50:-50], atol=2e-3)
+        np.testing.assert_allclose(_aligned(replace(one, torque_shift=LATE))[50:-50, 0], wave[50:-50], atol=1e-9)
+
+
+def test_the_base_fit_decides_a_shift_that_the_check_leaves_open(study: Study) -> None:
+    sampled = replace(study, loop="followed").with_torque_shift(-LATE)
+    # Relative to these the torques of the study are half a sample late.
+    states = {
+        shifts: StepwiseSelection(sampled, shifts=shifts).start() for shifts in ((), (-LATE, 0.0), (-LATE, -2 * LATE))
+    }
+    shifted = states[-LATE, 0.0]
+    assert shifted.study.sources[0][0].torque_shift == 0.0
+    assert np.all(shifted.score.rms < states[()].score.rms)
+    assert any("late by 0.00 samples" in line for line in shifted.study.warnings)
+    for shifts in ((), (-LATE, -2 * LATE)):
+        assert states[shifts].study.sources[0][0].torque_shift == -LATE
+        assert not any("late by" in line for line in states[shifts].study.warnings)
+
+
+def test_a_loop_that_contains_disturbances_decides_no_shift(study: Study) -> None:
+    sampled = replace(study, loop="nominal").with_torque_shift(-LATE)
+    state = StepwiseSelection(sampled, shifts=(-LATE, 0.0)).start()
+    assert state.study.sources[0][0].torque_shift == -LATE
