@@ -58,7 +58,7 @@ def test_torques_are_interpolated_without_loss_of_high_frequencies() -> None:
     t = DT * np.arange(2000)
     for w in (2 * np.pi, 2 * np.pi * 0.35 / DT):
         wave = np.sin(w * t)
-        one = Experiment(t[:, None], wave[:, None], None, DT)
+        one = Experiment(t[:, None].astype(np.float64), wave[:, None].astype(np.float64), None, DT)
         # A held torque belongs half a sample later: at a position it is that of half a sample before.
         expected = np.sin(w * (t - 0.5 * DT))
         np.testing.assert_allclose(_aligned(one)[50:-50, 0], expected[50:-50], atol=2e-3)
