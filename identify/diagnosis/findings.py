@@ -44,7 +44,7 @@ def findings_of(final: ModelState, selected: Sequence[Selected]) -> list[Finding
     found = []
     for one in selected:
         number = entries.index(one.entry)
-        found.append(_finding(final, one, values[number].parameters, deviations.get(number, {})))
+        found.append(_finding(final, one, values[number].parameters, deviations[number]))
     return found
 
 

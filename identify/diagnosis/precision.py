@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.regression import Fit
-from armident.identify.effects.recorded import of_recording
+from armident.identify.effects.effect import Place
+from armident.identify.effects.recorded import of_recording, relative_slope
+from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import Term
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.hac import newey_west
@@ -21,10 +23,11 @@ STEP = 0.01
 
 
 def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
-    """Standard deviations of all parameters of every term of the model, by the number of its entry and their names.
+    """Standard deviations of all parameters of every effect of the model, by the number of its entry and their names.
 
     The derivative of the torque with respect to a nonlinear parameter is one more column (Gauss-Newton). Its
-    uncertainty thus enters that of the linear ones. Parameters from a set of whole numbers count as known. The residual
+    uncertainty thus enters that of the linear ones. The value of a correction of the recordings has the column of its
+    first-order term. Parameters from a set of whole numbers count as known. The residual
     is no white noise where an effect is only approximately right. The variances are then those of the residual along
     the influence of each parameter, if they are larger (Newey, West 1987, Econometrica 55(3)).
 
@@ -43,16 +46,22 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
         for name in term.effect.movable(study.robot, term.place, term.shapes):
             slopes.append(_slope(column_cache, fit.noise, term, name, values))
             owners.append((k, name))
+    experiments = [e for part in study.sources for e in part]
+    for k, entry in enumerate(state.robot.effects):
+        effect = of_entry(entry)
+        if of_recording(entry) and not effect.rewires:
+            place = Place(study.joints.index(entry.joint))
+            column = column_cache.instruments(effect, place, (), fit.noise, keep=False)[:, 0]
+            slopes.append(column * relative_slope(experiments, state.robot, entry))
+            owners.append((k, effect.linear[0].name))
     deviations = _deviations(fit, slopes)
     b = fit.theta.size
-    found: dict[int, dict[str, float]] = {}
+    found: dict[int, dict[str, float]] = {k: {} for k in range(len(state.robot.effects))}
     for k, term in terms.items():
         own = [study.model.base.names.index(name) for name in term.names]
-        std = {p.name: float(deviations[i]) for p, i in zip(term.linear, own, strict=True)}
-        for place, (owner, name) in enumerate(owners):
-            if owner == k:
-                std[name] = float(deviations[b + place])
-        found[k] = std
+        found[k] = {p.name: float(deviations[i]) for p, i in zip(term.linear, own, strict=True)}
+    for number, (owner, name) in enumerate(owners):
+        found[owner][name] = float(deviations[b + number])
     return found
 
 
@@ -80,7 +89,7 @@ def _deviations(fit: Fit, slopes: list[Array]) -> Array:
     """
     b, e = fit.theta.size, fit.study.model.e
     variances: Array = np.concatenate([np.diag(fit.covariance), np.zeros(len(slopes))])
-    if not e:
+    if not e and not slopes:
         return variances**0.5
     z = np.column_stack([fit.train.z, *slopes])
     scale = np.linalg.norm(z, axis=0)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Stanza
@@ -53,3 +54,36 @@ def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Exp
             done.append(replace(e, tau=np.ascontiguousarray(at_motors @ robot.transmission_matrix)))
         experiments = done
     return list(experiments)
+
+
+STEP = 0.01
+"""Relative change of the value of a correction for its derivative."""
+
+
+def relative_slope(experiments: Sequence[Experiment], robot: RobotConfig, stanza: Stanza) -> float:
+    """Change of the corrected torques by a change of a correction's value, over that by a further small correction.
+
+    One for corrections that add up, such as delays; ``1 / (1 + gain_error)`` for a gain.
+
+    Parameters
+    ----------
+    experiments
+        As recorded.
+    robot
+        Configuration with the entry of the correction.
+    stanza
+        The entry; its one linear parameter has a value.
+    """
+    name = of_entry(stanza).linear[0].name
+    step = STEP * stanza.parameters[name]
+    others = [entry for entry in robot.effects if entry is not stanza]
+
+    def corrected(*values: float) -> NDArray[np.float64]:
+        own = [stanza.model_copy(update={"parameters": {**stanza.parameters, name: value}}) for value in values]
+        found = put_right(experiments, robot.model_copy(update={"effects": (*others, *own)}))
+        return np.concatenate([e.tau for e in found])
+
+    value = stanza.parameters[name]
+    before = corrected(value)
+    changed, further = corrected(value + step) - before, corrected(value, step) - before
+    return float(np.vdot(changed, further) / max(float(np.vdot(further, further)), 1e-300))

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from armident.configs.schema.robot import Effect
+from armident.identify.diagnosis.model_state import ModelState, fitted
+from armident.identify.diagnosis.precision import standard_deviations
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import Study, _aligned, build_study
-from armident.identify.effects.recorded import put_right
+from armident.identify.effects.recorded import put_right, relative_slope
 from armident.identify.experiment import Experiment
 from tests.fixtures import setups
 
@@ -52,6 +54,37 @@ def test_the_gain_of_a_drive_that_reports_too_much_is_put_right(experiments: lis
     found = put_right(reported(experiments, 2, -0.3), robot.model_copy(update={"effects": (entry,)}))
     for own, true in zip(found, experiments, strict=True):
         np.testing.assert_allclose(own.tau, true.tau, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("effect", "name", "value", "slope"),
+    [("drive_gain_error", "gain_error", 0.25, 0.8), ("time_delay", "delay", 2 * DT, 1.0)],
+)
+def test_a_change_of_a_correction_is_a_further_correction(
+    experiments: list[Experiment], effect: str, name: str, value: float, slope: float
+) -> None:
+    robot = setups.random_arm(3, 4)
+    entry = Effect(effect=effect, joint=robot.joints[2].name, parameters={name: value})
+    corrected = robot.model_copy(update={"effects": (entry,)})
+    assert relative_slope(experiments, corrected, entry) == pytest.approx(slope, rel=0.02)
+
+
+def test_the_standard_deviation_of_a_correction_is_that_of_its_likelihood(experiments: list[Experiment]) -> None:
+    robot = setups.random_arm(3, 4)
+    wrong = build_study(reported(experiments, 1, 0.25), [], robot)
+
+    def state_at(value: float) -> ModelState:
+        entry = Effect(effect="drive_gain_error", joint=robot.joints[1].name, parameters={"gain_error": value})
+        exact = robot.model_copy(update={"effects": (entry,)})
+        return fitted(wrong.of_robot(exact), exact, None)
+
+    best = state_at(0.25)
+    std = standard_deviations(best)[0]["gain_error"]
+    noise = best.own_noise
+    lower, upper = (state_at(0.25 + k * std).score.log_likelihood_under(noise) for k in (-6.0, 6.0))
+    curvature = 2.0 * best.score.log_likelihood_under(noise) - lower - upper
+    # The serial correlation of the residual (Newey, West) and the noise models of each fit differ from the likelihood.
+    assert 0.5 < 6.0 / np.sqrt(curvature) < 2.0
 
 
 def test_torques_are_interpolated_without_loss_of_high_frequencies() -> None:
