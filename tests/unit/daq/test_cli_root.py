@@ -79,8 +79,13 @@ def test_an_expected_error_is_one_line_on_stderr_and_its_own_exit_code(kind: str
 
 
 def test_an_error_because_of_an_interrupt_is_an_interrupt() -> None:
-    assert call("compile") == (130, "", "")
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    # A shell starts its background jobs with SIGINT ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert call("compile") == (130, "", "")
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_an_unforeseen_error_is_one_line_and_exit_code_1() -> None:
