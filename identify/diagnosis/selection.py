@@ -258,17 +258,17 @@ class StepwiseSelection:
     def admitted(self, step: Step) -> Addition | None:
         """Addition that the step admits: the best law of the best effect; ``None`` if there is none.
 
-        An effect is admitted only if no other explanation of the same joint is clearly better. Even one that is too
-        small to be a finding counts. An effect with a name comes first if it explains most of what the best term
-        without a name does. Of the laws of one effect that predict as well, that with the fewest parameters comes
-        first, and a free shape last.
+        An effect with a name is admitted only if no other explanation of the same joint is clearly better. Even one
+        that is too small to be a finding counts. A term without a name claims no cause. An effect with a name comes
+        first if it explains most of what the best term without a name does. Of the laws of one effect that predict as
+        well, that with the fewest parameters comes first, and a free shape last.
 
         Parameters
         ----------
         step
             The step.
         """
-        able = [a for a in step.passing if not self._superseded(a, step)]
+        able = [a for a in step.passing if not (a.named and self._superseded(a, step))]
         if not able:
             return None
         best = able[0]
