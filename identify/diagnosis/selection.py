@@ -195,7 +195,8 @@ class StepwiseSelection:
                     return Step(state, (), (), (), tests)
                 made += [m for m in (self._made(state, *one),) if m is not None]
             step = compared(state, made, tests, self.passes)
-            exact = [self._corrected(state, m) if m in self._to_correct(step) else m for m in made]
+            to_correct = self._to_correct(step)
+            exact = [self._corrected(state, m) if m in to_correct else m for m in made]
             self._steps[key] = step if exact == made else compared(state, exact, tests, self.passes)
             self._release()
         return self._steps[key]
@@ -406,7 +407,7 @@ class StepwiseSelection:
         return Made(candidate, shapes, entry, made, allowed)
 
     def _corrected(self, state: ModelState, made: Made) -> Made:
-        """Model in which the recordings are corrected for an effect, if it is one that changes what was recorded.
+        """Model in which the recordings are corrected for an effect that changes what was recorded.
 
         A torque column is the first-order expansion of such an effect at the model's own torque. The corrected
         recording is exact, and the part of the expansion that remains refines the value, until it is within its
@@ -420,8 +421,6 @@ class StepwiseSelection:
         made
             Model with its expansion.
         """
-        if made.candidate.effect.undo is None:
-            return made
         entry, best = made.entry, made
         name = of_entry(entry).linear[0].name
         value = float(made.state.values_of(made.state.term_of(entry))[0][0])

@@ -52,8 +52,6 @@ REACH = 16
 """Samples to either side from which torques are interpolated between samples."""
 KAISER = 6.0
 """Shape of the window of that interpolation: errors below 0.1 % up to 0.4 times the sampling rate."""
-ALIKE = 0.9
-"""Indifference ratio of squared closed-loop velocity errors."""
 STIFF_LOOP = 1.5
 """Ratio of squared velocity errors, with over without terms, allowed in the loop of a stiff nominal controller."""
 
@@ -173,44 +171,6 @@ class Study:
             self, sources=sources, train=tuple(map(of, self.train)), held=tuple(map(of, self.held)),
             volume=log_volume(experiments, self.robot, lambda tau: self.decimation(self.thinning(tau))),
         )  # fmt: skip
-
-    def moves_more_like_the_arm_than(self, other: "Study", *, held: bool) -> bool:
-        """True if the simulated loop follows the arm better than that of another study of the same recordings.
-
-        A loop with an identified controller counts as better than a stiff nominal one, which follows the measured
-        motion whatever the arm.
-
-        Parameters
-        ----------
-        other
-            Study to compare with.
-        held
-            True for the held-out data, false for the training data.
-        """
-        ours, theirs = self.loop in CONTROLLERS, other.loop in CONTROLLERS
-        if ours != theirs:
-            return ours
-        one, two = (study.held if held else study.train for study in (self, other))
-        return bool(distances(one).sum() < distances(two).sum())
-
-    def likeness_lost(self, other: "Study", joints: Sequence[int], *, held: bool) -> float:
-        """Ratio of squared velocity errors of this simulated loop and another one, at some joints.
-
-        Infinite where only one of the two has an identified controller: a stiff nominal controller follows any motion.
-
-        Parameters
-        ----------
-        other
-            Study to compare with.
-        joints
-            Numbers of the joints.
-        held
-            True for the held-out data, false for the training data.
-        """
-        if (self.loop in CONTROLLERS) != (other.loop in CONTROLLERS):
-            return float("inf")
-        one, two = (distances(study.held if held else study.train)[list(joints)].sum() for study in (self, other))
-        return float(one / max(two, 1e-300))
 
     @property
     def sample(self) -> float:

@@ -1,4 +1,4 @@
-"""Correction of recordings for effects on signals: wiring, delayed or saturated torques."""
+"""Correction of recordings for effects on signals: wiring; torques that are scaled, delayed or saturated."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,21 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
-from armident.configs.schema.robot import Effect as Stanza
+from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import Recorded, motor_limit
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.wiring import rewired
 from armident.identify.experiment import Experiment
 
 
-def of_recording(stanza: Stanza) -> bool:
+def of_recording(entry: Entry) -> bool:
     """Return True if an effect entry corrects the recordings instead of being a term of the model.
 
-    Wiring errors always do. A torque correction (delay, lag, saturation) does if the entry gives its value; otherwise
-    the value is a parameter of the model and estimated with the rest.
+    Wiring errors always do. A torque correction (gain, delay, lag, saturation) does if the entry gives its value;
+    otherwise the value is a parameter of the model and estimated with the rest.
     """
-    effect = of_entry(stanza)
-    return effect.rewires or (effect.undo is not None and bool(stanza.parameters.get(effect.linear[0].name)))
+    effect = of_entry(entry)
+    return effect.rewires or (effect.undo is not None and bool(entry.parameters.get(effect.linear[0].name)))
 
 
 def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Experiment]:
@@ -41,11 +41,11 @@ def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Exp
     """
     experiments = rewired(experiments, robot)
     names = [joint.name for joint in robot.joints]
-    for stanza in robot.effects:
-        effect = of_entry(stanza)
-        if effect.undo is None or not of_recording(stanza):
+    for entry in robot.effects:
+        effect = of_entry(entry)
+        if effect.undo is None or not of_recording(entry):
             continue
-        motor, value = names.index(stanza.joint), stanza.parameters[effect.linear[0].name]
+        motor, value = names.index(entry.joint), entry.parameters[effect.linear[0].name]
         done = []
         for e in experiments:
             at_motors = e.tau @ np.linalg.inv(robot.transmission_matrix)
@@ -60,7 +60,7 @@ STEP = 0.01
 """Relative change of the value of a correction for its derivative."""
 
 
-def relative_slope(experiments: Sequence[Experiment], robot: RobotConfig, stanza: Stanza) -> float:
+def relative_slope(experiments: Sequence[Experiment], robot: RobotConfig, entry: Entry) -> float:
     """Change of the corrected torques by a change of a correction's value, over that by a further small correction.
 
     One for corrections that add up, such as delays; ``1 / (1 + gain_error)`` for a gain.
@@ -71,19 +71,19 @@ def relative_slope(experiments: Sequence[Experiment], robot: RobotConfig, stanza
         As recorded.
     robot
         Configuration with the entry of the correction.
-    stanza
+    entry
         The entry; its one linear parameter has a value.
     """
-    name = of_entry(stanza).linear[0].name
-    step = STEP * stanza.parameters[name]
-    others = [entry for entry in robot.effects if entry is not stanza]
+    name = of_entry(entry).linear[0].name
+    step = STEP * entry.parameters[name]
+    others = [other for other in robot.effects if other is not entry]
 
     def corrected(*values: float) -> NDArray[np.float64]:
-        own = [stanza.model_copy(update={"parameters": {**stanza.parameters, name: value}}) for value in values]
+        own = [entry.model_copy(update={"parameters": {**entry.parameters, name: value}}) for value in values]
         found = put_right(experiments, robot.model_copy(update={"effects": (*others, *own)}))
         return np.concatenate([e.tau for e in found])
 
-    value = stanza.parameters[name]
+    value = entry.parameters[name]
     before = corrected(value)
     changed, further = corrected(value + step) - before, corrected(value, step) - before
     return float(np.vdot(changed, further) / max(float(np.vdot(further, further)), 1e-300))
