@@ -55,21 +55,32 @@ def test_every_parameter_of_the_public_api_is_documented(
 
 
 @cache
-def functions() -> tuple[tuple[str, ast.FunctionDef], ...]:
-    """Top-level functions and methods of every package, with their places."""
+def functions() -> tuple[tuple[str, ast.FunctionDef, set[str]], ...]:
+    """Top-level functions and methods of every package, with their places and what base classes document of them."""
     return tuple(_functions())
 
 
-def _functions() -> Iterator[tuple[str, ast.FunctionDef]]:
-    for package in PACKAGES:
-        for path in sorted(
-            (ROOT / package).glob("**/*.py") if package != "src/armident" else (ROOT / package).glob("*.py")
-        ):
-            module = ast.parse(path.read_text(encoding="utf-8"))
-            classes = [node for node in module.body if isinstance(node, ast.ClassDef)]
-            for node in [*module.body, *(member for one in classes for member in one.body)]:
-                if isinstance(node, ast.FunctionDef):
-                    yield f"{path.relative_to(ROOT)}:{node.lineno} {node.name}", node
+def _functions() -> Iterator[tuple[str, ast.FunctionDef, set[str]]]:
+    modules = {
+        path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8")).body
+        for package in PACKAGES
+        for path in sorted((ROOT / package).glob("**/*.py" if package != "src/armident" else "*.py"))
+    }
+    classes = {node.name: node for body in modules.values() for node in body if isinstance(node, ast.ClassDef)}
+
+    def inherited(one: ast.ClassDef, method: str) -> set[str]:
+        found: set[str] = set()
+        for base in (classes[b.id] for b in one.bases if isinstance(b, ast.Name) and b.id in classes):
+            own = [m for m in base.body if isinstance(m, ast.FunctionDef) and m.name == method]
+            found |= inherited(base, method).union(*(documented(ast.get_docstring(m)) for m in own))
+        return found
+
+    for path, body in modules.items():
+        for node in body:
+            for member in node.body if isinstance(node, ast.ClassDef) else [node]:
+                if isinstance(member, ast.FunctionDef):
+                    above = inherited(node, member.name) if isinstance(node, ast.ClassDef) else set()
+                    yield f"{path}:{member.lineno} {member.name}", member, above
 
 
 def commands() -> dict[str, Callable[..., Any]]:
@@ -81,13 +92,13 @@ def commands() -> dict[str, Callable[..., Any]]:
 def test_every_parameter_of_a_public_function_is_documented() -> None:
     of_commands = {f"{value.partition(':')[0].replace('.', '/')} {value.partition(':')[2]}" for value in commands()}
     lacking = []
-    for place, node in functions():
+    for place, node, inherited in functions():
         path, _, rest = place.partition(":")
         if f"armident/{path.removesuffix('.py')} {rest.partition(' ')[2]}" in of_commands:
             continue
         names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
         names = [name for name in names if name not in ("self", "cls")]
-        missing = set(names) - documented(ast.get_docstring(node))
+        missing = set(names) - documented(ast.get_docstring(node)) - inherited
         if len(names) > 1 and not node.name.startswith("_") and missing:
             lacking.append(f"{place}: {', '.join(sorted(missing))}")
     assert not lacking, "\n".join(lacking)
@@ -105,5 +116,5 @@ def test_every_parameter_of_a_command_has_a_help_text() -> None:
 
 
 def test_no_docstring_begins_with_a_question_word() -> None:
-    found = [place for place, node in functions() if RIDDLE.match(ast.get_docstring(node) or "")]
+    found = [place for place, node, _ in functions() if RIDDLE.match(ast.get_docstring(node) or "")]
     assert not found, "\n".join(found)
