@@ -117,7 +117,7 @@ class EffectTable(Table):
                 effect.name,
                 effect.title,
                 effect.scope,
-                ", ".join([p.name for p in effect.linear] + [s.name for s in effect.shapes]),
+                ", ".join(effect.units),
                 effect.needs,
                 effect.reference,
             )

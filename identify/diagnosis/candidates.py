@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations, permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from armident.identify.diagnosis.stretch import Stretch
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.whitening import joints_of, whitened
 from armident.identify.effects.effect import Effect, Place
+from armident.identify.effects.effect import Shapes as Shapes
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import effect_terms
@@ -18,7 +18,6 @@ from armident.identify.regression.ar_noise import ArModel
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
-Shapes = tuple[tuple[str, float], ...]
 Key = tuple[str, int, int | None]
 """Name of an effect and its place."""
 Cached = tuple[str, int, int | None, Shapes, str, str]
@@ -146,7 +145,7 @@ class ColumnCache:
         self, effect: Effect, place: Place, grid: Sequence[Shapes], part: str, kind: str, *, keep: bool
     ) -> list[tuple[Kept, ...]]:
         """Columns of a grid in the band of the comparison, of every shape and every stretch."""
-        kind = "measured" if effect.sudden else kind
+        kind = effect.instrument_signals if kind == "simulated" else kind
 
         def key(shapes: Shapes) -> Cached:
             return (effect.key, place.joint, place.other, shapes, part, kind)
@@ -166,7 +165,7 @@ class ColumnCache:
         narrow: list[Array] = []
         out: list[Kept] = []
         for shapes in grid:
-            columns = effect.columns(motion, place, **dict(shapes))[motion.lead :]
+            columns = effect.columns(motion, place, dict(shapes))[motion.lead :]
             if columns.ndim == 3:
                 wide = self._decimated(columns)
                 out.append((wide if moving is None else wide * moving[:, :, None], False))
@@ -214,55 +213,11 @@ def candidates(column_cache: ColumnCache) -> Iterator[Candidate]:
     for term in effect_terms(study.model):
         here = (term.effect.name, term.place.joint, term.place.other)
         present.setdefault(here, []).append(tuple(term.shapes.items()))
-    coupled = {frozenset(names.index(j) for j in c.joints) for c in study.robot.couplings}
     for effect in catalogue().values():
-        if effect.rewires or effect.numbers is not None or (effect.name == TRANSITION and study.sign_given):
+        if effect.name == TRANSITION and study.sign_given:
             continue
         right = {names.index(stanza.joint) for stanza in study.recorded if stanza.effect == effect.name}
-        for place in places(effect, study.robot.n):
-            if place.joint in right:
-                continue
-            if effect.scope == "pair" and frozenset((place.joint, place.other)) in coupled:
-                continue
+        for place in effect.places(study.robot.n):
             there = present.get((effect.name, place.joint, place.other), [])
-            if there and not effect.together:
-                continue
-            if effect.visible is not None and effect.visible(motion, place) is not None:
-                continue
-            yield Candidate(effect.essence, place, tuple(s for s in grid(effect, motion, place) if s not in there))
-
-
-def places(effect: Effect, n: int) -> list[Place]:
-    """Possible places of an effect in an arm.
-
-    Parameters
-    ----------
-    effect
-        Effect of one joint, of a pair of joints, or of the arm.
-    n
-        Number of joints.
-    """
-    if effect.scope == "pair":
-        return [Place(i, j) for i, j in combinations(range(n), 2)]
-    if effect.scope == "other":
-        return [Place(i, j) for i, j in permutations(range(n), 2)]
-    if effect.scope == "arm":
-        return [Place(0)]
-    return [Place(j) for j in range(n)]
-
-
-def grid(effect: Effect, motion: Motion, place: Place) -> tuple[Shapes, ...]:
-    """All combinations of nonlinear parameters to try.
-
-    Parameters
-    ----------
-    effect
-        Effect with its nonlinear parameters.
-    motion
-        Motion that determines the ranges.
-    place
-        Place of the effect.
-    """
-    where = (place.joint, place.other) if effect.scope == "other" else (place.joint,)
-    axes = [[(shape.name, float(v)) for v in shape.grid(motion, *where)] for shape in effect.shapes]
-    return tuple(product(*axes))
+            if place.joint not in right and effect.may_be_added(motion, place, there):
+                yield Candidate(effect.minimal, place, tuple(s for s in effect.grid(motion, place) if s not in there))

@@ -7,21 +7,14 @@ import numpy as np
 from scipy import stats
 
 from armident.identify.diagnosis.baseline import Change, Comparison
-from armident.identify.diagnosis.candidates import ColumnCache, places
+from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.whitening import whitened
+from armident.identify.effects.numbers import ParameterChange
 from armident.identify.effects.registry import catalogue
 
-STRUCTURAL = {
-    "drive_gain_error": "torque constant changed since the baseline",
-    "gravity_direction": "gravity direction changed since the baseline",
-    "rotor_inertia": "motor inertia changed since the baseline",
-}
-"""Effects of the model structure that base parameters absorb in part, with the words for a change (of either sign)
-against a baseline."""
-
 USUAL = Criteria.close
-"""Prior log-odds of common changes (friction, loads, offsets) against rare ones (`STRUCTURAL`): where the torque of a
+"""Prior log-odds of common changes (friction, loads, offsets) against rare ones of the structure: where the torque of a
 joint is nearly all friction, more friction and another torque constant are ambiguous."""
 
 
@@ -58,15 +51,13 @@ def changes(comparison: Comparison, column_cache: ColumnCache) -> Iterator[Chang
     motion = column_cache.motion(fit.study.train[0], "measured")
     rigid = fit.theta.size - fit.study.model.e
     for effect in catalogue().values():
-        if effect.numbers is None and effect.name not in STRUCTURAL:
+        if not isinstance(effect, ParameterChange) and not effect.change_title:
             continue
-        for place in places(effect, fit.study.robot.n):
-            if effect.numbers is not None:
-                exact = effect.numbers(motion, place)
+        for place in effect.places(fit.study.robot.n):
+            if isinstance(effect, ParameterChange):
+                exact = effect.change(motion, place)
                 directions = np.zeros((fit.theta.size, exact.shape[1]))
                 directions[:rigid] = exact[:rigid]
-            elif effect.name == "gravity_direction" and effect.visible is not None and effect.visible(motion, place):
-                continue
             else:
                 columns = column_cache.band(effect, place, (), "train", "measured")
                 directions = fit.absorbed(whitened(columns, fit.noise))
@@ -112,6 +103,6 @@ def ranked(comparison: Comparison, found: Sequence[Change], pool: Sequence[Chang
         _, _, _, after, free_after = comparison.solved([*found, change])
         if free_before > free_after:
             gain, size = before - after, free_before - free_after
-            score = 0.5 * gain - size + (0.0 if change.effect.name in STRUCTURAL else USUAL)
+            score = 0.5 * gain - size + (USUAL if isinstance(change.effect, ParameterChange) else 0.0)
             standings.append(Standing(change, float(stats.chi2.sf(gain, size)), score))
     return sorted(standings, key=lambda standing: -standing.score)

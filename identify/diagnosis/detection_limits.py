@@ -12,6 +12,7 @@ from armident.identify.diagnosis.precision import variance_of_sum
 from armident.identify.diagnosis.screening import directions_beside
 from armident.identify.diagnosis.whitening import rows_of_joints
 from armident.identify.document import DetectionLimit
+from armident.identify.effects.transmission import MotorOrder
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
 Array = NDArray[np.float64]
@@ -40,12 +41,11 @@ def detection_limits(state: ModelState, step: Step | None, criteria: Criteria) -
     """
     column_cache = ColumnCache(state.study, state.fit.theta)
     shapes = {} if step is None else {a.candidate.key: a.shapes for a in reversed(step.ranked)}
-    every = [
-        c for c in candidates(column_cache) if c.effect.name != UNNAMED and not c.effect.law and not c.effect.sudden
-    ]
+    named = [c for c in candidates(column_cache) if c.effect.name != UNNAMED and not c.effect.law]
+    every = [c for c in named if c.effect.instrument_signals == "simulated"]
     found: list[DetectionLimit] = []
     for candidate in every:
-        if candidate.effect.order_of and candidate.key not in shapes:
+        if isinstance(candidate.effect, MotorOrder) and candidate.key not in shapes:
             continue
         middle = candidate.grid[len(candidate.grid) // 2] if candidate.grid else ()
         sizes = _smallest(state, column_cache, candidate, shapes.get(candidate.key, middle), len(every), criteria)

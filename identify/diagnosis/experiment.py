@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from armident.identify.effects.effect import Effect
+from armident.identify.effects.wiring import Wiring
 
 CONTAINS = {
     "slow": "slow moves, under a twentieth of the joint's top speed",
@@ -33,12 +34,12 @@ def recommended_experiment(effect: Effect, joint: str, rivals: Sequence[Effect] 
     parts = [CONTAINS.get(tag, tag) for tag in kinds]
     contents = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])}, and {parts[-1]}"
     if not others:
-        if effect.rewires:
+        if isinstance(effect, Wiring):
             return f"Check the wiring and the configuration of {joint}, then record the same motion again."
         return f"To confirm {effect.title} at {joint}, record {contents}: {_command(effect, joint)}"
     rival = others[0]
     text = f"To separate {effect.title} from {rival.title} at {joint}, record {contents}"
-    if effect.rewires or rival.rewires:
+    if isinstance(effect, Wiring) or isinstance(rival, Wiring):
         return f"{text}, after checking the wiring."
     return f"{text}: {_command(effect, joint)} --against {rival.name}"
 

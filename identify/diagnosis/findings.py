@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.candidates import ColumnCache, Key, places
+from armident.identify.diagnosis.candidates import ColumnCache, Key
 from armident.identify.diagnosis.comparison import Addition, Step
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.experiment import recommended_experiment
@@ -16,7 +16,9 @@ from armident.identify.diagnosis.regression import relative_errors
 from armident.identify.diagnosis.selection import Selected
 from armident.identify.document import Alternative, Finding, Gap, Negligible, NotVisible, Unexplained
 from armident.identify.effects.effect import Effect
+from armident.identify.effects.numbers import ParameterChange
 from armident.identify.effects.registry import catalogue, known, of_entry
+from armident.identify.effects.wiring import Wiring
 
 Array = NDArray[np.float64]
 
@@ -217,11 +219,11 @@ def undetectable(state: ModelState, hidden: frozenset[Key]) -> list[NotVisible]:
     motion = ColumnCache(study, state.fit.theta).motion(study.train[0], "measured")
     found: dict[tuple[str, str], NotVisible] = {}
     for effect in catalogue().values():
-        if effect.rewires or effect.scope in ("pair", "other") or effect.law:
+        if isinstance(effect, Wiring) or effect.two_joints or effect.law:
             continue
-        for place in places(effect, study.robot.n):
-            reason = None if effect.visible is None else effect.visible(motion, place)
-            if effect.numbers is not None:
+        for place in effect.places(study.robot.n):
+            reason = effect.invisible(motion, place)
+            if isinstance(effect, ParameterChange):
                 reason = "it changes parameters of the model, not its structure: it is visible against a baseline only"
             elif (effect.key, place.joint, place.other) in hidden:
                 reason = "the motion does not excite it, or the model already contains it"
@@ -286,5 +288,4 @@ def experiment_to_separate(findings: Sequence[Finding]) -> str | None:
 
 
 def _units(effect: Effect, prismatic: bool) -> dict[str, str]:
-    of_linear = {p.name: p.unit[int(prismatic)] for p in effect.linear}
-    return of_linear | {shape.name: shape.unit[int(prismatic)] for shape in effect.shapes}
+    return {name: unit[int(prismatic)] for name, unit in effect.units.items()}

@@ -17,12 +17,11 @@ from scipy import special, stats
 
 from armident.identify.diagnosis.baseline import Change, Comparison, cautious, compared
 from armident.identify.diagnosis.candidates import ColumnCache
-from armident.identify.diagnosis.changes import STRUCTURAL, changes, p_value, ranked
+from armident.identify.diagnosis.changes import changes, p_value, ranked
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.precision import variance_of_sum
 from armident.identify.diagnosis.regression import Fit, relative_errors
 from armident.identify.document import IdentificationDocument
-from armident.identify.effects.effect import Effect
 from armident.identify.regression.multiple_testing import holm
 
 Array = NDArray[np.float64]
@@ -191,7 +190,7 @@ def _described(
         confidence=share * (1.0 - p),
         ambiguous_with=tuple(s.change.effect.name for s in rivals if s.score > own_score - CLOSE),
         alternatives=tuple((s.change.effect.name, _joint(fit, s.change), s.score) for s in rivals[:ALTERNATIVES]),
-        words=_words(change.effect, joint, told, std),
+        words=change.effect.change_in_words(joint, told, std),
     )
 
 
@@ -205,21 +204,6 @@ def _gap(fit: Fit, theta: Array, change: Change) -> float:
     """Relative torque error on held-out data, percent, of the joint or of all."""
     overall, each = relative_errors(fit, theta, held=True)
     return overall if change.effect.scope == "arm" else float(each[change.place.joint])
-
-
-def _words(effect: Effect, joint: str, values: dict[str, float], std: dict[str, float]) -> str:
-    if effect.name == "payload" and "mp" in values:
-        mass = values["mp"]
-        words = f"{abs(mass):.3g} kg (standard deviation {std['mp']:.2g} kg) {'more' if mass > 0 else 'less'}"
-        words += " on the flange than in the baseline"
-        moments = [values.get(f"m{axis}p") for axis in "xyz"]
-        if mass > 3 * std["mp"] and None not in moments:
-            at = ", ".join(f"{moment / mass:.3f}" for moment in moments if moment is not None)
-            words += f", centre of mass at ({at}) m in the frame of the last link"
-        return words
-    told = ", ".join(f"{name} {value:+.3g} (standard deviation {std[name]:.2g})" for name, value in values.items())
-    title = STRUCTURAL.get(effect.name, effect.title)
-    return f"{title} at {joint}: {told}" if told else f"{title} at {joint}"
 
 
 def _rest(comparison: Comparison, found: Sequence[Change], alpha: float) -> list[NumbersFinding]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.regression import Fit
+from armident.identify.effects.drive import Correction
 from armident.identify.effects.effect import Place
 from armident.identify.effects.recorded import of_recording, relative_slope
 from armident.identify.effects.registry import of_entry
@@ -49,7 +50,7 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
     experiments = [e for part in study.sources for e in part]
     for k, entry in enumerate(state.robot.effects):
         effect = of_entry(entry)
-        if of_recording(entry) and not effect.rewires:
+        if of_recording(entry) and isinstance(effect, Correction):
             place = Place(study.joints.index(entry.joint))
             column = column_cache.instruments(effect, place, (), fit.noise, keep=False)[:, 0]
             slopes.append(column * relative_slope(experiments, state.robot, entry))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, noise_models
+from armident.identify.effects.tables import FreeShape
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel
 
@@ -75,7 +76,7 @@ class PredictiveScore:
         errors = np.concatenate(self.fit.left)
         at = inverse.size - study.model.e
         for term in effect_terms(study.model):
-            if term.effect.free:
+            if isinstance(term.effect, FreeShape):
                 size = float(np.mean(errors[:, term.place.joint] ** 2))
                 inverse[at : at + len(term.names)] = 1.0 / max(size, 1e-300)
             at += len(term.names)

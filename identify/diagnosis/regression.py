@@ -568,10 +568,10 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
             made = terms[kind]
             if out:
                 every = [t.effect for t in effect_terms(study.model) for _ in t.names]
-                sudden = np.flatnonzero([e.sudden for e in every])
+                sudden = np.flatnonzero([e.instrument_signals == "measured" for e in every])
                 made[:, :, sudden] = terms["measured"][:, :, sudden]
                 # Measured signals differentiated twice carry more noise than such an effect has torque.
-                dynamic = np.flatnonzero([e.predicts and not e.sudden for e in every])
+                dynamic = np.flatnonzero([e.regressor_signals == "simulated" for e in every])
                 first = out[0].shape[2] - study.model.e
                 moving = stretch.moving[:, :, None]
                 out[0][:, :, first + dynamic] = made[:, :, dynamic] * moving

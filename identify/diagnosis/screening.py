@@ -44,7 +44,7 @@ def screened(fit: Fit, candidate: Candidate, column_cache: ColumnCache) -> tuple
     if not candidate.grid:
         return None
     # Columns that depend on theta are useless for the next model, and a grid of them is large.
-    keep = not candidate.effect.predicts
+    keep = not candidate.effect.depends_on_torque
     columns = column_cache.grid(candidate.effect, candidate.place, candidate.grid, fit.noise, keep=keep)
     statistics = score_statistics(fit, columns, len(candidate.grid))
     if np.isnan(statistics).all():

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates, grid
+from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates
 from armident.identify.diagnosis.comparison import Addition, Made, Step, compared, gain, materiality
 from armident.identify.diagnosis.confirmation import Confirmation, confirmed
 from armident.identify.diagnosis.criteria import Criteria
@@ -28,11 +28,14 @@ from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orde
 from armident.identify.diagnosis.screening import refined, screened
 from armident.identify.diagnosis.shaping import both_ends
 from armident.identify.diagnosis.study import Study
+from armident.identify.effects.drive import Correction
 from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import known, of_entry
+from armident.identify.effects.tables import FreeShape
 from armident.identify.effects.terms import stanza_of
+from armident.identify.effects.transmission import MotorOrder
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
 Array = NDArray[np.float64]
@@ -79,13 +82,11 @@ class Selected:
             Final model.
         """
         effect = self.addition.candidate.effect
-        if effect.negligible is None:
-            return False
         if of_recording(self.entry):
             values = np.array([self.entry.parameters[p.name] for p in effect.linear])
         else:
             values = state.values_of(state.term_of(self.entry))[0]
-        return effect.negligible(values, state.study.sample)
+        return effect.is_convention(values, state.study.sample)
 
 
 @dataclass
@@ -209,7 +210,7 @@ class StepwiseSelection:
         able = [a for a in step.ranked if a.allowed]
         most = max((a.raw_gain for a in able), default=0.0)
         least = max(self._needed(step.tests), self.criteria.promising * most)
-        return tuple(a.made for a in able if a.candidate.effect.undo is not None and a.raw_gain > least)
+        return tuple(a.made for a in able if isinstance(a.candidate.effect, Correction) and a.raw_gain > least)
 
     def _needed(self, tests: int) -> float:
         """Gain of log-likelihood of a significant effect, found among a number of candidates."""
@@ -278,7 +279,7 @@ class StepwiseSelection:
             best = named[0] if named else best
         close = best.log_likelihood - self.criteria.close
         same = [a for a in able if a.family == best.family and a.log_likelihood > close]
-        return min(same, key=lambda a: (a.candidate.effect.free, len(a.candidate.effect.linear)))
+        return min(same, key=lambda a: (isinstance(a.candidate.effect, FreeShape), len(a.candidate.effect.linear)))
 
     def _superseded(self, addition: Addition, step: Step) -> bool:
         """True if an explanation of the same joint that does not pass is clearly better than an addition."""
@@ -344,7 +345,7 @@ class StepwiseSelection:
         def own(made: ModelState) -> Array:
             return made.score.own_log_likelihoods
 
-        for shapes in zip(*(grid(effect, motion, place) for place in places), strict=True):
+        for shapes in zip(*(effect.grid(motion, place) for place in places), strict=True):
             tried([dict(one)["velocity"] for one in shapes], common)
         # Common noise models decide whether there is a transition; those of each model itself refine its velocity.
         best = {place: (-np.inf, v) for place, (_, v) in best.items()}
@@ -365,7 +366,7 @@ class StepwiseSelection:
         tests, hidden = 0, set()
         for every in candidates(column_cache):
             candidate = every
-            if candidate.effect.order_of == "motor":
+            if isinstance(candidate.effect, MotorOrder):
                 candidate = replace(candidate, grid=motor_orders(state.study, state.fit.theta, candidate.place.joint))
             tests += 1
             found = screened(noise, candidate, column_cache)
@@ -383,7 +384,7 @@ class StepwiseSelection:
         chosen: list[tuple[Candidate, Shapes]] = []
         for _, own, first in (*named, *unnamed):
             candidate, found = own, first
-            if candidate.effect.order_of:
+            if isinstance(candidate.effect, MotorOrder):
                 near = nearby_orders(state.study, candidate.place.joint, found[1][0][1])
                 candidate = replace(candidate, grid=near)
                 found = screened(noise, candidate, column_cache) or found
@@ -392,8 +393,8 @@ class StepwiseSelection:
         return chosen, tests
 
     def _made(self, state: ModelState, candidate: Candidate, shapes: Shapes) -> Made | None:
-        effect = candidate.effect
-        spared = tuple(p.name for p in known(effect.key).linear if p.through is not None)
+        effect, whole = candidate.effect, known(candidate.effect.key)
+        spared = tuple(p.name for p in whole.linear if p not in effect.linear)
         entry = stanza_of(effect, candidate.place, state.robot, dict(shapes), spared)
         made = self._state(with_entries(state.robot, [entry]), state)
         if made is None:
@@ -403,7 +404,7 @@ class StepwiseSelection:
         largest: dict[str, float] = {}
         for name, value in (pair for one in candidate.grid for pair in one):
             largest[name] = max(value, largest.get(name, value))
-        allowed = known(effect.key).allows(term.of_effect(values), term.of_effect(std), dict(term.shapes), largest)
+        allowed = whole.allows(term.of_effect(values), term.of_effect(std), dict(term.shapes), largest)
         return Made(candidate, shapes, entry, made, allowed)
 
     def _corrected(self, state: ModelState, made: Made) -> Made:

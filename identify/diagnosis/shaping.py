@@ -62,7 +62,7 @@ def instrumented(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shap
         Start: the best values at simulated signals.
     """
     found = shapes
-    if not candidate.effect.predicts:
+    if not candidate.effect.depends_on_torque:
         return found
     for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
         values = np.array(sorted({grid[k][1] for grid in candidate.grid}))

@@ -11,9 +11,11 @@ from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Stanza
 from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distances, moving_rows, rows_before
 from armident.identify.diagnosis.whitening import ar_models
+from armident.identify.effects.drive import Correction
 from armident.identify.effects.recorded import of_recording, put_right
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model
+from armident.identify.effects.wiring import Wiring
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.idim_ls import idim_ls
 from armident.identify.experiment import Experiment, check_one_rate
@@ -134,7 +136,7 @@ class Study:
         changed = replace(self, robot=robot, model=arm_model(robot))
         if changed.recorded == self.recorded:
             return changed
-        wiring = [[s for s in study.recorded if known(s.effect).rewires] for study in (self, changed)]
+        wiring = [[s for s in study.recorded if isinstance(known(s.effect), Wiring)] for study in (self, changed)]
         return changed._with_torques(self.sources) if wiring[0] == wiring[1] else build_study(*self.sources, robot)
 
     def with_torque_shift(self, samples: float) -> "Study":
@@ -379,7 +381,7 @@ def log_volume(experiments: Sequence[Experiment], robot: RobotConfig, band: Call
     band
         Filter and decimation to the rows of the comparison.
     """
-    if not any(of_recording(e) and not known(e.effect).rewires for e in robot.effects):
+    if not any(of_recording(e) and isinstance(known(e.effect), Correction) for e in robot.effects):
         return np.zeros(robot.n)
     rng = np.random.default_rng(0)
     noise = [PERTURBATION * e.tau.std(axis=0) * rng.standard_normal(e.tau.shape) for e in experiments]

@@ -1,18 +1,22 @@
-"""Entry of the catalogue: `Effect`, its linear parameters (`Linear`) and nonlinear ones (`Shape`)."""
+"""Base classes of the catalogue: `Effect`, its linear parameters (`Linear`) and nonlinear ones (`Shape`)."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations, product
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
+from armident.configs.schema.robot import Effect as Entry
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
+Shapes = tuple[tuple[str, float], ...]
+"""Nonlinear parameters as pairs of name and value."""
 
 Scope = Literal["joint", "motor", "pair", "other", "arm"]
 """Location of an effect: one joint, one motor, a pair of joints, a joint with a variable of another one, or the arm.
@@ -21,8 +25,18 @@ A coupled transmission makes the effect of a motor act on several joints. The en
 the first joint in the configuration, that of a payload the last one.
 """
 
+Signals = Literal["measured", "simulated"]
+Trials = tuple[Sequence[float] | Array, ...]
+"""Values to try of each nonlinear parameter."""
+
 SIGN_TOLERANCE = 2.0
 """Standard deviations by which a parameter must violate its sign or bounds to be rejected."""
+
+# Units at a revolute and at a prismatic joint.
+POSITION = ("rad", "m")
+VELOCITY = ("rad/s", "m/s")
+TORQUE = ("N m", "N")
+VISCOUS = ("N m s/rad", "N s/m")
 
 
 @dataclass(frozen=True)
@@ -39,10 +53,9 @@ class Linear:
         +1 or -1 where physics determines the sign, 0 otherwise.
     bounds
         Lowest and highest plausible value.
-    through
-        Nonlinear parameter that this one requires: it is absent where that one is zero. The diagnosis adds the effect
-        without it.
-    replaces
+    requires
+        Nonlinear parameter without which this one is absent: where that one is zero.
+    absorbs
         Rigid parameter of the joint that this one absorbs; ``without`` in the configuration keeps that parameter.
     """
 
@@ -50,8 +63,8 @@ class Linear:
     unit: tuple[str, str]
     sign: int = 0
     bounds: tuple[float, float] = (-math.inf, math.inf)
-    through: str | None = None
-    replaces: str = ""
+    requires: str | None = None
+    absorbs: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,8 +75,6 @@ class Shape:
     ----------
     name, unit
         Name in the robot configuration; units at a revolute and at a prismatic joint.
-    grid
-        ``(motion, joint)`` to the increasing values to try, in the unit of the parameter.
     continuous
         For a revolute and for a prismatic joint: True if values between those of the grid are meaningful. A harmonic of
         a turn is an integer; the pitch of a prismatic axis is unknown.
@@ -75,125 +86,197 @@ class Shape:
 
     name: str
     unit: tuple[str, str]
-    grid: Callable[[Motion, int], Sequence[float]]
     continuous: tuple[bool, bool] = (True, True)
     default: float | None = None
     movable: bool = False
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """Recorded torque of a motor.
+class Place:
+    """Location of an effect in an arm.
 
     Parameters
     ----------
-    dt
-        Sampling period, s.
-    limit
-        Largest torque, N m or N.
+    joint
+        Index of the joint, from 0.
+    other
+        Index of the second joint of a pair, or ``None``.
     """
 
-    dt: float
-    limit: float
+    joint: int
+    other: int | None = None
+
+    @property
+    def second(self) -> int:
+        """Index of the second joint of a pair."""
+        assert self.other is not None
+        return self.other
 
 
-def motor_limit(robot: RobotConfig, motor: int) -> float:
-    """Return the largest torque of a motor at its shaft, N m or N.
+class Effect(ABC):
+    """Effect of the catalogue; its torque in the reported torques is ``columns(motion, place, shapes) @ linear``.
 
-    Parameters
-    ----------
-    robot
-        Configuration with the limits of the joints and the transmission.
-    motor
-        Index of the motor, from 0.
-    """
-    return float(robot.joints[motor].limits.torque / np.abs(robot.transmission_matrix[motor]).max())
+    Each effect is a subclass, and so is each further law of it. Its attributes and `columns` are required; the other
+    methods have usual answers.
 
-
-@dataclass(frozen=True)
-class Effect:
-    """Effect of the catalogue; its torque in the reported torques is ``columns(motion, place, **shapes) @ linear``.
-
-    Parameters
+    Attributes
     ----------
     name
         Name in ``diagnosis.json`` and in the ``effects`` of a robot configuration.
+    law
+        Formula of the same dependence that differs from the first one in the catalogue; empty for the first one.
+        ``table`` is a free shape.
     title, says
         Short name and description for a plant engineer.
     reference
         Source of the functional form.
-    linear
-        Linear parameters, one per column.
-    columns
-        ``(motion, place, **shapes)`` to the torques per unit of the linear parameters, N m or N: an array (N, k) for
-        joint ``place.joint``, or (N, n, k) for all joints.
     needs
         Motion or data that make the effect visible, in words.
-    shapes
-        Nonlinear parameters.
+    excitation
+        Keywords of the motion that excites the effect, see `armident.identify.diagnosis.experiment`.
     scope
         See `Scope`.
-    visible
-        ``(motion, place)`` to the reason for which the motion cannot show the effect at any size, or ``None``. The
-        motion is the simulated one.
-    numbers
-        Jacobian (b, k) of the base parameters with respect to the linear ones, for an effect that only changes
-        parameters of the same model. It is visible against a baseline only; ``columns`` follow from the Jacobian.
-    together
-        True if several instances at one joint make one finding (harmonics of a periodic torque).
-    excitation
-        Keywords of the motion that excites the effect, see `armident.identify.excitation.design`.
-    rewires
-        True if the effect permutes signals or changes their signs instead of adding a torque.
-        `armident.identify.effects.wiring` corrects the recording, and there are no columns.
-    predicts
-        True if the columns depend on the predicted torque, and so on the model's parameters. They are then computed at
-        the simulated motion, because measured signals that are differentiated twice add more noise than torque.
-    share
-        True if its linear parameter scales the predicted torque. The fit is then iterated until parameter and torque
-        agree.
-    undo
-        ``(recorded, at, value)`` to the true torque (N,) of a motor, for the one linear parameter. The columns are its
-        first-order expansion, whose noise at measured signals exceeds the effect; the corrected recording has no added
-        noise.
-    sudden
-        True if the arm's motion has jumps at instants that a simulation does not reproduce to the sample. The columns
-        at measured signals are then their own instruments.
-    physical
-        ``(values, shapes, largest)`` to True if linear parameters (k,) are physically possible at given nonlinear ones,
-        beyond signs and bounds; ``largest`` has the largest values of the nonlinear ones in the grid of the motion.
-    negligible
-        ``(values, dt)`` to True if linear parameters (k,) are within the sampling convention at the sampling period
-        ``dt``, s; ``None``: never.
-    law
-        Formula of the same dependence that differs from the first one in the catalogue; empty for the first one.
-        ``table`` is a free shape.
-    order_of
-        ``motor`` if its nonlinear parameter is an order of the motor angle, found by order analysis of the residual.
+    linear
+        Linear parameters, one per column.
+    shapes
+        Nonlinear parameters.
+    depends_on_torque
+        True if the columns depend on the torque that the model predicts, and so on its parameters.
+    scales_torque
+        True if the linear parameter scales the predicted torque. The fit is then iterated until both agree.
+    regressor_signals, instrument_signals
+        Signals at which the columns of the regressor and its instruments are computed.
+    change_title
+        Words for a change against a baseline, if base parameters absorb a part of the effect.
     """
 
     name: str
+    law: str = ""
     title: str
     says: str
     reference: str
-    linear: tuple[Linear, ...]
-    columns: Callable[..., Array]
     needs: str
-    shapes: tuple[Shape, ...] = ()
+    excitation: tuple[str, ...] = ("reversals", "speeds")
     scope: Scope = "joint"
-    visible: Callable[[Motion, "Place"], str | None] | None = None
-    numbers: Callable[[Motion, "Place"], Array] | None = None
-    together: bool = False
-    excitation: tuple[str, ...] = field(default=("reversals", "speeds"))
-    rewires: bool = False
-    predicts: bool = False
-    share: bool = False
-    undo: Callable[[Array, Recorded, float], Array] | None = None
-    sudden: bool = False
-    physical: Callable[[Array, Mapping[str, float], Mapping[str, float]], bool] | None = None
-    negligible: Callable[[Array, float], bool] | None = None
-    law: str = ""
-    order_of: str = ""
+    linear: tuple[Linear, ...]
+    shapes: tuple[Shape, ...] = ()
+    depends_on_torque: bool = False
+    scales_torque: bool = False
+    regressor_signals: Signals = "measured"
+    instrument_signals: Signals = "simulated"
+    change_title: str = ""
+
+    @abstractmethod
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return the torques per unit of the linear parameters, N m or N.
+
+        Parameters
+        ----------
+        motion
+            The motion, N samples.
+        place
+            Location of the effect.
+        shapes
+            All nonlinear parameters by name.
+
+        Returns
+        -------
+        ndarray
+            Torques of the joint ``place.joint``, (N, k), or of all joints, (N, n, k).
+        """
+
+    def trial_values(self, motion: Motion, place: Place) -> Trials:
+        """Return the values of each nonlinear parameter to try, increasing, in its unit.
+
+        Parameters
+        ----------
+        motion
+            Motion that determines the ranges.
+        place
+            Location of the effect.
+        """
+        return ()
+
+    def invisible(self, motion: Motion, place: Place) -> str | None:
+        """Return the reason for which a motion cannot show the effect at any size, or ``None``.
+
+        Parameters
+        ----------
+        motion
+            The motion.
+        place
+            Location of the effect.
+        """
+        return None
+
+    def may_be_added(self, motion: Motion, place: Place, present: Sequence[Shapes]) -> bool:
+        """Return True if a diagnosis may add the effect to a model.
+
+        Parameters
+        ----------
+        motion
+            Motion of the model.
+        place
+            Location of the effect.
+        present
+            Nonlinear parameters of the instances that the model has there.
+        """
+        return not present and self.invisible(motion, place) is None
+
+    def possible(self, values: Array, shapes: Mapping[str, float], largest: Mapping[str, float]) -> bool:
+        """Return True if linear parameters are physically possible, beyond their signs and bounds.
+
+        Parameters
+        ----------
+        values
+            Linear parameters, (k,).
+        shapes
+            Nonlinear parameters by name.
+        largest
+            Largest value of each nonlinear parameter in the grid of the motion.
+        """
+        return True
+
+    def is_convention(self, values: Array, dt: float) -> bool:
+        """Return True if the effect is a part of every model at these values, and no finding.
+
+        Parameters
+        ----------
+        values
+            Linear parameters, (k,).
+        dt
+            Sampling period, s.
+        """
+        return False
+
+    def corrects(self, entry: Entry) -> bool:
+        """Return True if an entry of the configuration corrects the recordings instead of being a term of the model.
+
+        Parameters
+        ----------
+        entry
+            Entry of this effect.
+        """
+        return False
+
+    def change_in_words(self, joint: str, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+        """Return the description of a change against a baseline.
+
+        Parameters
+        ----------
+        joint
+            Name of the joint.
+        values, std
+            Estimable linear parameters by name, and their standard deviations.
+        """
+        told = ", ".join(f"{name} {value:+.3g} (standard deviation {std[name]:.2g})" for name, value in values.items())
+        words = f"{self.change_title or self.title} at {joint}"
+        return f"{words}: {told}" if told else words
+
+    @property
+    def minimal(self) -> "Effect":
+        """The effect as a diagnosis adds it, without optional linear parameters."""
+        return self
 
     @property
     def key(self) -> str:
@@ -201,9 +284,55 @@ class Effect:
         return f"{self.name}/{self.law}" if self.law else self.name
 
     @property
-    def free(self) -> bool:
-        """True if the law is a free shape, whose parameters are torques at knots."""
-        return self.law == "table" or self.name == "unnamed"
+    def two_joints(self) -> bool:
+        """True if a location has two joints."""
+        return self.scope in ("pair", "other")
+
+    @property
+    def units(self) -> dict[str, tuple[str, str]]:
+        """Units at a revolute and at a prismatic joint of all parameters by name, the linear ones first."""
+        return {p.name: p.unit for p in self.linear} | {s.name: s.unit for s in self.shapes}
+
+    @property
+    def defaults(self) -> dict[str, float]:
+        """Nonlinear parameters that the configuration may leave out, with their values."""
+        return {shape.name: shape.default for shape in self.shapes if shape.default is not None}
+
+    def places(self, n: int) -> list[Place]:
+        """Return the possible locations in an arm.
+
+        Parameters
+        ----------
+        n
+            Number of joints.
+        """
+        if self.two_joints:
+            chosen = combinations(range(n), 2) if self.scope == "pair" else permutations(range(n), 2)
+            return [Place(*joints) for joints in chosen]
+        return [Place(j) for j in range(1 if self.scope == "arm" else n)]
+
+    def grid(self, motion: Motion, place: Place) -> tuple[Shapes, ...]:
+        """Return all combinations of the nonlinear parameters to try.
+
+        Parameters
+        ----------
+        motion
+            Motion that determines the ranges.
+        place
+            Location of the effect.
+        """
+        values = zip(self.shapes, self.trial_values(motion, place), strict=True)
+        return tuple(product(*([(shape.name, float(v)) for v in of_shape] for shape, of_shape in values)))
+
+    def present(self, shapes: Mapping[str, float]) -> tuple[int, ...]:
+        """Return the indices of the linear parameters that the effect has at given nonlinear ones.
+
+        Parameters
+        ----------
+        shapes
+            Nonlinear parameters by name.
+        """
+        return tuple(k for k, p in enumerate(self.linear) if p.requires is None or shapes[p.requires] != 0.0)
 
     def allows(
         self, values: Array, std: Array, shapes: Mapping[str, float], largest: Mapping[str, float] | None = None
@@ -221,23 +350,13 @@ class Effect:
         largest
             Largest value of each nonlinear parameter in the grid of the motion; ``None``: as ``shapes``.
         """
-        if self.physical is not None and not self.physical(values, shapes, largest or shapes):
-            return False
-        return all(
+        return self.possible(values, shapes, largest or shapes) and all(
             p.sign * value >= -SIGN_TOLERANCE * deviation
             and p.bounds[0] - SIGN_TOLERANCE * deviation <= value <= p.bounds[1] + SIGN_TOLERANCE * deviation
             for p, value, deviation in zip(self.linear, values, std, strict=True)
         )
 
-    @property
-    def essence(self) -> "Effect":
-        """Effect without its optional linear parameters."""
-        kept = [k for k, linear in enumerate(self.linear) if linear.through is None]
-        if len(kept) == len(self.linear):
-            return self
-        return replace(self, linear=tuple(self.linear[k] for k in kept), columns=partial(_some, self.columns, kept))
-
-    def refinable(self, robot: RobotConfig, place: "Place") -> tuple[bool, ...]:
+    def refinable(self, robot: RobotConfig, place: Place) -> tuple[bool, ...]:
         """Return, for each nonlinear parameter, True if it may lie between the values of its grid at a place.
 
         Parameters
@@ -250,7 +369,7 @@ class Effect:
         prismatic = robot.joints[place.joint].type == "prismatic"
         return tuple(shape.continuous[prismatic] for shape in self.shapes)
 
-    def movable(self, robot: RobotConfig, place: "Place", shapes: Mapping[str, float]) -> list[str]:
+    def movable(self, robot: RobotConfig, place: Place, shapes: Mapping[str, float]) -> list[str]:
         """Return the names of the nonlinear parameters to refine; those at zero stay, as refinement is by factors.
 
         Parameters
@@ -265,7 +384,7 @@ class Effect:
         between = zip(self.shapes, self.refinable(robot, place), strict=True)
         return [s.name for s, may in between if (may or s.movable) and shapes[s.name] != 0.0]
 
-    def torque(self, motion: Motion, place: "Place", shapes: Mapping[str, float]) -> Array:
+    def torque(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the columns of all joints, shape (N, n, k).
 
         Parameters
@@ -275,32 +394,36 @@ class Effect:
         place
             Location of the effect.
         shapes
-            Nonlinear parameters by name.
+            Nonlinear parameters by name; `defaults` may be left out.
         """
-        columns = self.columns(motion, place, **shapes)
+        columns = self.columns(motion, place, {**self.defaults, **shapes})
         if columns.ndim == 3:
             return columns
         whole = np.zeros((motion.samples, motion.n, columns.shape[1]))
         whole[:, place.joint] = columns
         return whole
 
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and vars(self) == vars(other)
 
-def _some(columns: Callable[..., Array], kept: Sequence[int], motion: Motion, place: "Place", **shapes: float) -> Array:
-    """Return those columns of an effect whose indices are ``kept``."""
-    return columns(motion, place, **shapes)[..., kept]
+    def __hash__(self) -> int:
+        return hash((type(self), self.key))
 
 
-@dataclass(frozen=True)
-class Place:
-    """Location of an effect in an arm.
+class TorqueDependent(Effect):
+    """Effect whose columns depend on the torque that the model predicts.
 
-    Parameters
-    ----------
-    joint
-        Index of the joint, from 0.
-    other
-        Index of the second joint of a pair, or ``None``.
+    They are computed at the simulated motion, because measured signals that are differentiated twice add more noise
+    than torque.
     """
 
-    joint: int
-    other: int | None = None
+    depends_on_torque = True
+    regressor_signals: Signals = "simulated"
+
+
+class Periodic(Effect):
+    """Effect of which a joint may have several at different periods; together they are one torque."""
+
+    def may_be_added(self, motion: Motion, place: Place, present: Sequence[Shapes]) -> bool:
+        """Return True: at another period."""
+        return self.invisible(motion, place) is None

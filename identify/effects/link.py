@@ -1,27 +1,146 @@
 """Effects of links, springs, payload and mounting."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.effects.effect import Effect, Linear, Place
-from armident.identify.effects.tables import RANGE, table, values
+from armident.identify.effects.effect import TORQUE, Effect, Linear, Place, TorqueDependent
+from armident.identify.effects.numbers import ParameterChange
+from armident.identify.effects.tables import OverPosition, table, values
 from armident.identify.robot.chain import INERTIAL
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
 
 
-def _spring(motion: Motion, place: Place) -> Array:
-    return motion.q[:, place.joint, None]
+class JointSpring(Effect):
+    """Linear spring."""
+
+    name = "joint_spring"
+    title = "a spring at the joint"
+    says = "a torque proportional to the joint's position: a spring, a gravity compensator, a stiff cable harness"
+    reference = "Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 9"
+    needs = "a wide range of joint positions"
+    excitation = ("range",)
+    linear: tuple[Linear, ...] = (Linear("ks", ("N m/rad", "N/m")),)
+
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return the position."""
+        return motion.q[:, place.joint, None]
 
 
-def _stiffening_spring(motion: Motion, place: Place) -> Array:
-    q = motion.q[:, place.joint]
-    return np.stack([q, q**2, q**3], axis=1)
+class JointSpringCubic(JointSpring):
+    """Spring that stiffens with its deflection."""
+
+    law = "cubic"
+    says = "a torque that grows faster than the joint's position: a stiffening spring, a bumper, a cable harness"
+    linear = (
+        *JointSpring.linear,
+        Linear("ks2", ("N m/rad^2", "N/m^2")),
+        Linear("ks3", ("N m/rad^3", "N/m^3")),
+    )
+
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return the first three powers of the position."""
+        q = motion.q[:, place.joint]
+        return np.stack([q, q**2, q**3], axis=1)
 
 
-def _spring_table(motion: Motion, place: Place, *, low: float, high: float) -> Array:
-    return table(motion.q[:, place.joint], low, high)
+class JointSpringTable(OverPosition, JointSpring):
+    """Spring of any shape."""
+
+    says = "a torque that depends on the joint's position: a spring, a gravity compensator, a stiff cable harness"
+    linear = values("kst", TORQUE)
+
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return the functions of the table."""
+        return table(motion.q[:, place.joint], shapes["low"], shapes["high"])
+
+
+class Payload(ParameterChange):
+    """Other inertial parameters of the last link."""
+
+    name = "payload"
+    title = "a payload on the flange"
+    says = "the last link is heavier than in the baseline: a gripper or a workpiece is mounted"
+    reference = "Gaz, De Luca 2017, IROS, Payload estimation based on identified coefficients of robot dynamics"
+    needs = "a baseline identified without it"
+    excitation = ("load", "range")
+    scope = "arm"
+    linear = tuple(
+        Linear(f"{kind}p", ("kg" if kind == "m" else "kg m" if len(kind) == 2 and kind[0] == "m" else "kg m^2",) * 2)
+        for kind in INERTIAL
+    )
+
+    def _parameters(self, place: Place, n: int) -> list[str]:
+        return [f"{kind}{n}" for kind in INERTIAL]
+
+    def change_in_words(self, joint: str, values: Mapping[str, float], std: Mapping[str, float]) -> str:
+        """Return mass and centre of mass, if they are estimable."""
+        if "mp" not in values:
+            return super().change_in_words(joint, values, std)
+        mass = values["mp"]
+        words = f"{abs(mass):.3g} kg (standard deviation {std['mp']:.2g} kg) {'more' if mass > 0 else 'less'}"
+        words += " on the flange than in the baseline"
+        moments = [values.get(f"m{axis}p") for axis in "xyz"]
+        if mass > 3 * std["mp"] and None not in moments:
+            at = ", ".join(f"{moment / mass:.3f}" for moment in moments if moment is not None)
+            words += f", centre of mass at ({at}) m in the frame of the last link"
+        return words
+
+
+class RotorInertia(Effect):
+    """Inertia that turns with the motor."""
+
+    name = "rotor_inertia"
+    title = "an unmodelled rotor inertia"
+    says = "a motor has more inertia than the links explain: a rotor, a brake or a coupling is missing in the model"
+    reference = "Brunot 2017, equation 2.13"
+    needs = "strong accelerations"
+    excitation = ("accelerations",)
+    scope = "motor"
+    linear = (Linear("iax", ("kg m^2", "kg"), sign=1),)
+    change_title = "motor inertia changed since the baseline"
+
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return the acceleration of the motor."""
+        ratios = motion.model.robot.transmission_matrix[place.joint]
+        # The motor's inertia, referred to its own joint: divided by that joint's ratio squared.
+        own = ratios[int(np.argmax(np.abs(ratios)))]
+        return motion.of_motor(place.joint, motion.qdd @ ratios / own**2)
+
+
+class GravityDirection(TorqueDependent):
+    """Tilt of the base about two axes."""
+
+    name = "gravity_direction"
+    title = "a tilted base"
+    says = "the direction of gravity differs from the configuration: the base is tilted or hangs"
+    reference = "Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 12"
+    needs = "postures all over the workspace"
+    excitation = ("range", "load")
+    scope = "arm"
+    linear = (Linear("tilt_x", ("rad", "rad")), Linear("tilt_y", ("rad", "rad")))
+    change_title = "gravity direction changed since the baseline"
+
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return those of gravity along `across`, in which the torque is linear; zeros without gravity."""
+        model, size = motion.model, float(np.linalg.norm(motion.model.chain.gravity))
+        if size == 0.0:
+            return np.zeros((motion.samples, motion.n, len(self.linear)))
+        still = np.zeros_like(motion.q)
+        theta = motion.standard
+        without = model.with_gravity(np.zeros(3)).inverse_dynamics(theta, motion.q, still, still)
+        columns = [
+            model.with_gravity(size * axis).inverse_dynamics(theta, motion.q, still, still) - without
+            for axis in across(model.chain.gravity)
+        ]
+        return np.stack(columns, axis=2)
+
+    def invisible(self, motion: Motion, place: Place) -> str | None:
+        """Return a reason if there is no gravity."""
+        return None if np.any(motion.model.chain.gravity) else "the configuration has no gravity"
 
 
 def across(gravity: Array) -> Array:
@@ -33,146 +152,18 @@ def across(gravity: Array) -> Array:
     return np.stack([first, np.cross(first, down)])
 
 
-def _gravity(motion: Motion, place: Place) -> Array:
-    """Return columns of a tilt: the torque is linear in gravity, so they are those of gravity along `across`."""
-    model, size = motion.model, float(np.linalg.norm(motion.model.chain.gravity))
-    still = np.zeros_like(motion.q)
-    theta = motion.standard
-    without = model.with_gravity(np.zeros(3)).inverse_dynamics(theta, motion.q, still, still)
-    columns = [
-        model.with_gravity(size * axis).inverse_dynamics(theta, motion.q, still, still) - without
-        for axis in across(model.chain.gravity)
-    ]
-    return np.stack(columns, axis=2)
+class TorqueOffset(ParameterChange):
+    """Other constant offset."""
+
+    name = "torque_offset"
+    title = "a torque offset"
+    says = "a constant torque that the baseline does not have: a drifting current sensor, a dragging brake"
+    reference = "Brunot 2017, equation 2.12"
+    needs = "a baseline identified without it"
+    linear = (Linear("offx", TORQUE),)
+
+    def _parameters(self, place: Place, n: int) -> list[str]:
+        return [f"off{place.joint + 1}"]
 
 
-def _no_gravity(motion: Motion, place: Place) -> str | None:
-    if not np.any(motion.model.chain.gravity):
-        return "the configuration has no gravity"
-    return None
-
-
-def _payload_numbers(motion: Motion, place: Place) -> Array:
-    base, n = motion.model.base, motion.n
-    chosen = [motion.model.names.index(f"{kind}{n}") for kind in INERTIAL]
-    change: Array = base.regroup[:, chosen]
-    return change
-
-
-def _rotor(motion: Motion, place: Place) -> Array:
-    ratios = motion.model.robot.transmission_matrix[place.joint]
-    # The motor's inertia, referred to its own joint: divided by that joint's ratio squared.
-    own = ratios[int(np.argmax(np.abs(ratios)))]
-    return motion.of_motor(place.joint, motion.qdd @ ratios / own**2)
-
-
-def _offset_numbers(motion: Motion, place: Place) -> Array:
-    model = motion.model
-    change: Array = model.base.regroup[:, [model.names.index(f"off{place.joint + 1}")]]
-    return change
-
-
-def by_numbers(motion: Motion, change: Array) -> Array:
-    """Return the columns (N, n, k), N m or N per unit of a parameter, of a change of the base parameters.
-
-    Parameters
-    ----------
-    motion
-        Motion of the arm, N samples.
-    change
-        Jacobian (b, k) of the base parameters.
-    """
-    columns: Array = motion.model.rigid_regressor(motion.q, motion.qd, motion.qdd, sharp_sign=motion.sharp) @ change
-    return columns
-
-
-EFFECTS = (
-    Effect(
-        name="joint_spring",
-        title="a spring at the joint",
-        says="a torque proportional to the joint's position: a spring, a gravity compensator, a stiff cable harness",
-        reference="Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 9",
-        linear=(Linear("ks", ("N m/rad", "N/m")),),
-        columns=_spring,
-        needs="a wide range of joint positions",
-        excitation=("range",),
-    ),
-    Effect(
-        name="joint_spring",
-        law="cubic",
-        title="a spring at the joint",
-        says="a torque that grows faster than the joint's position: a stiffening spring, a bumper, a cable harness",
-        reference="Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 9",
-        linear=(
-            Linear("ks", ("N m/rad", "N/m")),
-            Linear("ks2", ("N m/rad^2", "N/m^2")),
-            Linear("ks3", ("N m/rad^3", "N/m^3")),
-        ),
-        columns=_stiffening_spring,
-        needs="a wide range of joint positions",
-        excitation=("range",),
-    ),
-    Effect(
-        name="joint_spring",
-        law="table",
-        title="a spring at the joint",
-        says="a torque that depends on the joint's position: a spring, a gravity compensator, a stiff cable harness",
-        reference="Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 9",
-        linear=values("kst", ("N m", "N")),
-        shapes=RANGE,
-        columns=_spring_table,
-        needs="a wide range of joint positions",
-        excitation=("range",),
-    ),
-    Effect(
-        name="payload",
-        title="a payload on the flange",
-        says="the last link is heavier than in the baseline: a gripper or a workpiece is mounted",
-        reference="Gaz, De Luca 2017, IROS, Payload estimation based on identified coefficients of robot dynamics",
-        linear=tuple(
-            Linear(
-                f"{kind}p", ("kg" if kind == "m" else "kg m" if len(kind) == 2 and kind[0] == "m" else "kg m^2",) * 2
-            )
-            for kind in INERTIAL
-        ),
-        columns=lambda motion, place: by_numbers(motion, _payload_numbers(motion, place)),
-        numbers=_payload_numbers,
-        needs="a baseline identified without it",
-        scope="arm",
-        excitation=("load", "range"),
-    ),
-    Effect(
-        name="rotor_inertia",
-        title="an unmodelled rotor inertia",
-        says="a motor has more inertia than the links explain: a rotor, a brake or a coupling is missing in the model",
-        reference="Brunot 2017, equation 2.13",
-        linear=(Linear("iax", ("kg m^2", "kg"), sign=1),),
-        columns=_rotor,
-        needs="strong accelerations",
-        scope="motor",
-        excitation=("accelerations",),
-    ),
-    Effect(
-        name="gravity_direction",
-        title="a tilted base",
-        says="the direction of gravity differs from the configuration: the base is tilted or hangs",
-        reference="Khalil, Dombre 2002, Modeling, Identification and Control of Robots, chapter 12",
-        linear=(Linear("tilt_x", ("rad", "rad")), Linear("tilt_y", ("rad", "rad"))),
-        columns=_gravity,
-        visible=_no_gravity,
-        predicts=True,
-        needs="postures all over the workspace",
-        scope="arm",
-        excitation=("range", "load"),
-    ),
-    Effect(
-        name="torque_offset",
-        title="a torque offset",
-        says="a constant torque that the baseline does not have: a drifting current sensor, a dragging brake",
-        reference="Brunot 2017, equation 2.12",
-        linear=(Linear("offx", ("N m", "N")),),
-        columns=lambda motion, place: by_numbers(motion, _offset_numbers(motion, place)),
-        numbers=_offset_numbers,
-        needs="a baseline identified without it",
-    ),
-)
+EFFECTS = (JointSpring, JointSpringCubic, JointSpringTable, Payload, RotorInertia, GravityDirection, TorqueOffset)

@@ -33,11 +33,11 @@ def described(effect: Effect) -> dict[str, Any]:
                 "name": p.name,
                 "unit": list(p.unit),
                 "sign": p.sign,
-                "requires": p.through,
-                "absorbs": p.replaces or None,
+                "requires": p.requires,
+                "absorbs": p.absorbs or None,
                 # Former names, printed for one release.
-                "through": p.through,
-                "replaces": p.replaces or None,
+                "through": p.requires,
+                "replaces": p.absorbs or None,
             }
             for p in effect.linear
         ],
@@ -92,20 +92,20 @@ def _one(effect: Effect) -> None:
     for parameter in _parameters(effect):
         print(f"  {parameter}")
     for linear in effect.linear:
-        if linear.through is not None:
-            print(f"{linear.name} requires {linear.through} and absorbs {linear.replaces} of the joint;")
-            print(f"  `without: [{linear.name}]` in the configuration keeps {linear.replaces}")
+        if linear.requires is not None:
+            print(f"{linear.name} requires {linear.requires} and absorbs {linear.absorbs} of the joint;")
+            print(f"  `without: [{linear.name}]` in the configuration keeps {linear.absorbs}")
     print(f"required motion: {effect.needs}\nsource: {effect.reference}")
     names = [shape.name for shape in effect.shapes] + [parameter.name for parameter in effect.linear]
     values = [f"{parameter}: ..." for parameter in names]
     law = f", law: {effect.law}" if effect.law else ""
-    other = ", other: joint_2" if effect.scope in ("pair", "other") else ""
+    other = ", other: joint_2" if effect.two_joints else ""
     place = f"effect: {effect.name}{law}, joint: joint_1{other}"
     print(f"configuration: {{{place}, parameters: {{{', '.join(values)}}}}}")
 
 
 def _parameters(effect: Effect) -> list[str]:
-    units = [(p.name, p.unit) for p in effect.linear] + [(s.name, s.unit) for s in effect.shapes]
     return [
-        f"{name} ({' | '.join(dict.fromkeys(u for u in unit if u))})" if any(unit) else name for name, unit in units
+        f"{name} ({' | '.join(dict.fromkeys(u for u in unit if u))})" if any(unit) else name
+        for name, unit in effect.units.items()
     ]

@@ -1,31 +1,62 @@
 """Changes of parameters that every model has: visible against a baseline only."""
 
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.effects.effect import Effect, Linear, Place
-from armident.identify.effects.friction import TORQUE, VISCOUS
-from armident.identify.effects.link import by_numbers
+from armident.identify.effects.effect import TORQUE, VISCOUS, Effect, Linear, Place, Shapes
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
 
 
-def _friction(motion: Motion, place: Place) -> Array:
-    names, number = motion.model.names, place.joint + 1
-    change: Array = motion.model.base.regroup[:, [names.index(f"fv{number}"), names.index(f"fc{number}")]]
-    return change
+class ParameterChange(Effect):
+    """Effect that only changes parameters of the same model."""
+
+    @abstractmethod
+    def _parameters(self, place: Place, n: int) -> list[str]:
+        """Names of the standard parameters that the linear ones change, (k,), of ``n`` joints."""
+
+    def change(self, motion: Motion, place: Place) -> Array:
+        """Return the Jacobian (b, k) of the base parameters with respect to the linear ones.
+
+        Parameters
+        ----------
+        motion
+            Motion of the model.
+        place
+            Location of the effect.
+        """
+        model = motion.model
+        chosen = [model.names.index(name) for name in self._parameters(place, motion.n)]
+        change: Array = model.base.regroup[:, chosen]
+        return change
+
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return the columns of the rigid model's parameters."""
+        regressor = motion.model.rigid_regressor(motion.q, motion.qd, motion.qdd, sharp_sign=motion.sharp)
+        columns: Array = regressor @ self.change(motion, place)
+        return columns
+
+    def may_be_added(self, motion: Motion, place: Place, present: Sequence[Shapes]) -> bool:
+        """Return False: every model has these parameters."""
+        return False
 
 
-EFFECTS = (
-    Effect(
-        name="friction_change",
-        title="a change of friction",
-        says="viscous or Coulomb friction of a joint differs from the baseline: cold or aged grease, a worn gear",
-        reference="Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)",
-        linear=(Linear("fvx", VISCOUS), Linear("fcx", TORQUE)),
-        columns=lambda motion, place: by_numbers(motion, _friction(motion, place)),
-        numbers=_friction,
-        needs="a baseline identified before the change",
-    ),
-)
+class FrictionChange(ParameterChange):
+    """Other viscous and Coulomb friction."""
+
+    name = "friction_change"
+    title = "a change of friction"
+    says = "viscous or Coulomb friction of a joint differs from the baseline: cold or aged grease, a worn gear"
+    reference = "Bittencourt, Gunnarsson 2012, J. Dyn. Sys. Meas. Control 134(5)"
+    needs = "a baseline identified before the change"
+    linear = (Linear("fvx", VISCOUS), Linear("fcx", TORQUE))
+
+    def _parameters(self, place: Place, n: int) -> list[str]:
+        return [f"fv{place.joint + 1}", f"fc{place.joint + 1}"]
+
+
+EFFECTS = (FrictionChange,)

@@ -1,14 +1,13 @@
 """Correction of recordings for effects on signals: wiring; torques that are scaled, delayed or saturated."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.effects.effect import Recorded, motor_limit
+from armident.identify.effects.drive import Correction
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.wiring import rewired
 from armident.identify.experiment import Experiment
@@ -20,8 +19,7 @@ def of_recording(entry: Entry) -> bool:
     Wiring errors always do. A torque correction (gain, delay, lag, saturation) does if the entry gives its value;
     otherwise the value is a parameter of the model and estimated with the rest.
     """
-    effect = of_entry(entry)
-    return effect.rewires or (effect.undo is not None and bool(entry.parameters.get(effect.linear[0].name)))
+    return of_entry(entry).corrects(entry)
 
 
 def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Experiment]:
@@ -40,20 +38,11 @@ def put_right(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Exp
         If the entry of a wiring error does not name the signal or the other joint.
     """
     experiments = rewired(experiments, robot)
-    names = [joint.name for joint in robot.joints]
     for entry in robot.effects:
         effect = of_entry(entry)
-        if effect.undo is None or not of_recording(entry):
-            continue
-        motor, value = names.index(entry.joint), entry.parameters[effect.linear[0].name]
-        done = []
-        for e in experiments:
-            at_motors = e.tau @ np.linalg.inv(robot.transmission_matrix)
-            at = Recorded(e.dt, motor_limit(robot, motor))
-            at_motors[:, motor] = effect.undo(at_motors[:, motor], at, value)
-            done.append(replace(e, tau=np.ascontiguousarray(at_motors @ robot.transmission_matrix)))
-        experiments = done
-    return list(experiments)
+        if isinstance(effect, Correction) and effect.corrects(entry):
+            experiments = [effect.put_right(e, robot, entry) for e in experiments]
+    return experiments
 
 
 STEP = 0.01

@@ -9,7 +9,10 @@ from armident.identify.effects import drive, friction, link, numbers, transmissi
 from armident.identify.effects.effect import Effect
 
 ENTRY_POINTS = "armident.effects"
-"""Entry-point group of plug-ins: each entry names an `Effect` or a sequence of them."""
+"""Entry-point group of plug-ins: each entry names a subclass of `Effect`, an instance, or a sequence of them."""
+
+REQUIRED = ("name", "title", "says", "reference", "needs", "linear")
+"""Attributes without a usual value."""
 
 
 @cache
@@ -22,21 +25,33 @@ def catalogue() -> dict[str, Effect]:
         If an entry point cannot be loaded, is not an effect, or repeats a name.
     """
     modules = (friction, link, transmission, drive, numbers, wiring, unnamed)
-    ours = [effect for module in modules for effect in module.EFFECTS]
-    found = {e.key: e for e in ours}
+    found = {e.key: e for e in (effect() for module in modules for effect in module.EFFECTS)}
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda p: p.name):
         where = f"effect {point.name} ({point.value})"
         try:
             loaded = point.load()
         except (ImportError, AttributeError) as error:
             raise ConfigError(f"{where}: cannot be loaded: {error}") from error
-        for effect in (loaded,) if isinstance(loaded, Effect) else tuple(loaded):
-            if not isinstance(effect, Effect):
-                raise ConfigError(f"{where}: expected an Effect, got {type(effect).__name__}")
+        for one in loaded if isinstance(loaded, tuple | list) else (loaded,):
+            effect = _instance(one, where)
             if effect.key in found:
                 raise ConfigError(f"{where}: an effect {effect.key!r} exists already")
             found[effect.key] = effect
     return found
+
+
+def _instance(one: object, where: str) -> Effect:
+    """Return the effect that a plug-in offers as a class or an instance."""
+    try:
+        effect = one() if isinstance(one, type) and issubclass(one, Effect) else one
+    except TypeError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    if not isinstance(effect, Effect):
+        raise ConfigError(f"{where}: expected an Effect, got {type(effect).__name__}")
+    missing = [name for name in REQUIRED if not hasattr(effect, name)]
+    if missing:
+        raise ConfigError(f"{where}: an effect needs {', '.join(missing)}")
+    return effect
 
 
 def known(name: str) -> Effect:

@@ -7,6 +7,9 @@ import numpy as np
 from armident.identify.effects.effect import Shape
 from armident.identify.robot.motion import Motion
 
+ROTOR = Shape("rotor", ("kg m^2", "kg"), continuous=(False, False), default=0.0, movable=True)
+"""Nonlinear parameter of effects that depend on the torque that the gear transmits."""
+
 SHARES = (0.0, 0.25, 0.5, 0.75)
 """Rotor inertias to try, over the least inertia of the joint along the motion."""
 
@@ -35,7 +38,3 @@ def rotors(motion: Motion, joint: int) -> Sequence[float]:
         return (0.0,)
     least = max(float(motion.slopes(joint, links=True)[2][:, joint].min()), 0.0)
     return tuple(share * least for share in SHARES) if least > 0.0 else (0.0,)
-
-
-ROTOR = Shape("rotor", ("kg m^2", "kg"), rotors, continuous=(False, False), default=0.0, movable=True)
-"""Nonlinear parameter of effects that depend on the torque that the gear transmits."""

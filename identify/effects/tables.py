@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.effects.effect import Linear, Shape
+from armident.identify.effects.effect import POSITION, Effect, Linear, Place, Shape, Trials
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
@@ -59,35 +59,24 @@ def values(prefix: str, unit: tuple[str, str]) -> tuple[Linear, ...]:
     return tuple(Linear(f"{prefix}{k}", unit) for k in range(1, KNOTS))
 
 
-def lowest(motion: Motion, joint: int) -> Sequence[float]:
-    """Return the lowest position of a joint, rad or m.
-
-    Parameters
-    ----------
-    motion
-        Motion of the arm.
-    joint
-        Index of the joint, from 0.
-    """
-    return [float(motion.q[:, joint].min())]
+def ends(unit: tuple[str, str]) -> tuple[Shape, ...]:
+    """Return the nonlinear parameters of a table, its first and last knot, of a unit."""
+    return tuple(Shape(name, unit, continuous=(False, False)) for name in ("low", "high"))
 
 
-def highest(motion: Motion, joint: int) -> Sequence[float]:
-    """Return the highest position of a joint, rad or m.
+class FreeShape(Effect):
+    """Law without a formula, whose linear parameters are torques at knots."""
 
-    Parameters
-    ----------
-    motion
-        Motion of the arm.
-    joint
-        Index of the joint, from 0.
-    """
-    low = float(motion.q[:, joint].min())
-    return [max(float(motion.q[:, joint].max()), low + 1e-6)]
+    law = "table"
 
 
-RANGE = (
-    Shape("low", ("rad", "m"), lowest, continuous=(False, False)),
-    Shape("high", ("rad", "m"), highest, continuous=(False, False)),
-)
-"""First and last knot of a table over the position: the range of the motion."""
+class OverPosition(FreeShape):
+    """Table over the position of the joint."""
+
+    shapes = ends(POSITION)
+
+    def trial_values(self, motion: Motion, place: Place) -> Trials:
+        """Return the range of the motion."""
+        q = motion.q[:, place.joint]
+        low = float(q.min())
+        return (low,), (max(float(q.max()), low + 1e-6),)

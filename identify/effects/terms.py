@@ -53,12 +53,12 @@ class Term:
     @property
     def depends_on_torque(self) -> bool:
         """True if the columns need torques that the model predicts."""
-        return self.effect.predicts
+        return self.effect.depends_on_torque
 
     @property
     def scales_torque(self) -> bool:
         """True if the term is a share of the torque that the model predicts."""
-        return self.effect.share
+        return self.effect.scales_torque
 
     def of_effect(self, values: Array) -> Array:
         """Return the values of all linear parameters of the effect: those of the term (k,), the others zero."""
@@ -153,7 +153,7 @@ def place_of(stanza: Stanza, effect: Effect, robot: RobotConfig, where: str) -> 
     """
     names = [joint.name for joint in robot.joints]
     joint = names.index(stanza.joint)
-    if effect.scope not in ("pair", "other"):
+    if not effect.two_joints:
         if stanza.other is not None:
             raise ConfigError(f"{where}: other: only an effect between two joints has one")
         return Place(joint)
@@ -190,13 +190,12 @@ def stanza_of(
 
 
 def _kept(stanza: Stanza, effect: Effect, shapes: dict[str, float], where: str) -> tuple[int, ...]:
-    """Return the indices of the linear parameters that neither ``without`` nor a zero `Linear.through` removes."""
+    """Return the indices of the linear parameters that the effect has and ``without`` does not remove."""
     names = [parameter.name for parameter in effect.linear]
     for name in stanza.without:
         if name not in names:
             raise ConfigError(f"{where}: without: {name!r} is not one of its linear parameters ({', '.join(names)})")
-    there = [p.through is None or shapes[p.through] != 0.0 for p in effect.linear]
-    kept = tuple(k for k, name in enumerate(names) if name not in stanza.without and there[k])
+    kept = tuple(k for k in effect.present(shapes) if names[k] not in stanza.without)
     if not kept:
         raise ConfigError(f"{where}: without: removes all its parameters")
     return kept
@@ -204,12 +203,12 @@ def _kept(stanza: Stanza, effect: Effect, shapes: dict[str, float], where: str) 
 
 def _shapes(stanza: Stanza, effect: Effect, where: str) -> dict[str, float]:
     shapes = [shape.name for shape in effect.shapes]
-    linear = [parameter.name for parameter in effect.linear]
-    given = {shape.name: shape.default for shape in effect.shapes if shape.default is not None} | stanza.parameters
+    given = effect.defaults | stanza.parameters
     missing = [name for name in shapes if name not in given]
     if missing:
         raise ConfigError(f"{where} needs {', '.join(missing)}")
-    unknown = [name for name in stanza.parameters if name not in (*shapes, *linear)]
+    known = (*shapes, *(parameter.name for parameter in effect.linear))
+    unknown = [name for name in stanza.parameters if name not in known]
     if unknown:
-        raise ConfigError(f"{where}: parameters.{unknown[0]}: unknown (takes {', '.join((*shapes, *linear))})")
+        raise ConfigError(f"{where}: parameters.{unknown[0]}: unknown (takes {', '.join(known)})")
     return {name: given[name] for name in shapes}

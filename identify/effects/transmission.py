@@ -1,12 +1,12 @@
 """Effects between motor and joint: elasticity, backlash, cogging."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.effects.effect import Effect, Linear, Place, Shape
-from armident.identify.effects.rotor import ROTOR
+from armident.identify.effects.effect import POSITION, TORQUE, Linear, Periodic, Place, Shape, TorqueDependent, Trials
+from armident.identify.effects.rotor import ROTOR, rotors
 from armident.identify.robot.compiled import compiled
 from armident.identify.robot.motion import Motion
 
@@ -19,49 +19,77 @@ LEAST_INERTIA = 0.1
 """Lower bound of the link inertia, over its maximum along the motion: a fit may make it negative."""
 
 
-def _cogging(motion: Motion, place: Place, *, harmonic: float) -> Array:
-    angle = harmonic * motion.motor[:, place.joint]
-    ripple = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    ratios = motion.model.robot.transmission_matrix[place.joint]
-    # Referred to the motor's own joint; a coupled transmission passes the rest on in proportion.
-    share: Array = ratios / ratios[int(np.argmax(np.abs(ratios)))]
-    columns: Array = ripple[:, None, :] * share[:, None]
-    return columns
+class MotorOrder(Periodic):
+    """Effect whose one nonlinear parameter is an order of the motor angle.
 
-
-def harmonics(motion: Motion, joint: int) -> Sequence[float]:
-    """Return harmonics of a motor turn, or wave numbers, rad/m, for a prismatic axis.
-
-    The pitch of the axis is unknown; the wave numbers are those that its travel resolves.
-
-    Parameters
-    ----------
-    motion
-        Motion of the arm.
-    joint
-        Index of the joint, from 0.
+    A diagnosis finds it by order analysis of the residual instead of a grid.
     """
-    if motion.model.robot.joints[joint].type == "revolute":
-        return (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 18.0, 24.0)
-    resolution = np.pi / float(motion.span[joint])
-    return [float(resolution * k) for k in range(4, 161)]
 
 
-def _elasticity(
-    motion: Motion, place: Place, *, frequency: float, damping: float = DAMPINGS[-1], rotor: float = 0.0
-) -> Array:
-    """Return the column of an elastic joint: the link lags by compliance times load, with second-order dynamics.
+class CoggingTorque(MotorOrder):
+    """Torque ripple of a motor."""
 
-    ``frequency`` refers to the mean inertia over the postures of the arm, so that it stands for the same stiffness in
-    every motion.
-    """
-    j = place.joint
-    inertia, share = inertias(motion, j, rotor), np.ones(motion.samples)
-    if inertia.max() > 0.0:
-        usual = float(motion.model.mass_matrix(motion.links, motion.postures)[:, j, j].mean()) - rotor
-        share = inertia / max(usual, LEAST_INERTIA * float(inertia.max()))
-    moves = swinging(-motion.handed_on(j, rotor), share, 2 * np.pi * frequency, damping, motion.dt)
-    return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
+    name = "cogging_torque"
+    title = "a torque ripple of the motor"
+    says = "a torque ripple that is periodic in the motor angle: magnets of the motor, or an eccentric gear"
+    reference = "Petrovic et al. 2000, IEEE Trans. Power Electronics 15(6); Gandhi et al. 2002, ICRA"
+    needs = "slow motion over several motor turns"
+    excitation = ("slow", "range")
+    scope = "motor"
+    linear = (Linear("cgc", TORQUE), Linear("cgs", TORQUE))
+    shapes = (Shape("harmonic", ("per rad of the motor", "rad/m"), continuous=(False, False)),)
+
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return cosine and sine of ``harmonic`` times the motor angle."""
+        angle = shapes["harmonic"] * motion.motor[:, place.joint]
+        ripple = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        ratios = motion.model.robot.transmission_matrix[place.joint]
+        # Referred to the motor's own joint; a coupled transmission passes the rest on in proportion.
+        share: Array = ratios / ratios[int(np.argmax(np.abs(ratios)))]
+        columns: Array = ripple[:, None, :] * share[:, None]
+        return columns
+
+    def trial_values(self, motion: Motion, place: Place) -> Trials:
+        """Return harmonics of a motor turn; of a prismatic axis the wave numbers that its travel resolves.
+
+        The pitch of a prismatic axis is unknown.
+        """
+        if motion.model.robot.joints[place.joint].type == "revolute":
+            return ((1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 18.0, 24.0),)
+        resolution = np.pi / float(motion.span[place.joint])
+        return ([resolution * k for k in range(4, 161)],)
+
+
+class JointElasticity(TorqueDependent):
+    """Elastic joint: the link lags by compliance times load, with second-order dynamics."""
+
+    name = "joint_elasticity"
+    title = "an elastic joint"
+    says = "the link oscillates relative to its motor: an elastic gear, belt or coupling, or a bending link"
+    reference = "Spong 1987, J. Dyn. Sys. Meas. Control 109(4)"
+    needs = "quick accelerations near the resonance, under load"
+    excitation = ("accelerations",)
+    linear = (Linear("compliance", ("rad/(N m)", "m/N"), sign=1),)
+    shapes = (Shape("frequency", ("Hz", "Hz")), Shape("damping", ("", ""), default=DAMPINGS[-1]), ROTOR)
+
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return the torques by `swinging` of the link.
+
+        ``frequency`` refers to the mean inertia over the postures of the arm, so that it stands for the same stiffness
+        in every motion.
+        """
+        j, rotor = place.joint, shapes["rotor"]
+        inertia, share = inertias(motion, j, rotor), np.ones(motion.samples)
+        if inertia.max() > 0.0:
+            usual = float(motion.model.mass_matrix(motion.links, motion.postures)[:, j, j].mean()) - rotor
+            share = inertia / max(usual, LEAST_INERTIA * float(inertia.max()))
+        w = 2 * np.pi * shapes["frequency"]
+        moves = swinging(-motion.handed_on(j, rotor), share, w, shapes["damping"], motion.dt)
+        return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
+
+    def trial_values(self, motion: Motion, place: Place) -> Trials:
+        """Return resonance frequencies up to a fifth of the sampling rate, `DAMPINGS` and `rotors`."""
+        return np.geomspace(4.0, min(80.0, 0.2 / motion.dt), 7), DAMPINGS, rotors(motion, place.joint)
 
 
 @compiled
@@ -95,24 +123,38 @@ def swinging(pull: Array, share: Array, w: float, damping: float, dt: float) -> 
     return way, rate, acceleration
 
 
-def frequencies(motion: Motion, joint: int) -> Sequence[float]:
-    """Return resonance frequencies up to a fifth of the sampling rate, Hz.
+class Backlash(TorqueDependent):
+    """Gap of the gear, in which the link moves freely until the teeth are in contact again.
 
-    Parameters
-    ----------
-    motion
-        Motion of the arm.
-    joint
-        Index of the joint, from 0; not used.
+    The motion has jumps at instants that a simulation does not reproduce to the sample, so that the columns at measured
+    signals are their own instruments.
     """
-    return [float(f) for f in np.geomspace(4.0, min(80.0, 0.2 / motion.dt), 7)]
 
+    name = "backlash"
+    title = "backlash of the gear"
+    says = "after a sign change of the load the motor crosses a gap before the link follows: worn teeth, a loose key"
+    reference = "Nordin, Gutman 2002, Automatica 38(10)"
+    needs = "many changes of the load's direction"
+    excitation = ("reversals", "accelerations")
+    linear = (Linear("behind", ("", ""), sign=1, bounds=(0.1, 1.5)),)
+    shapes = (Shape("gap", POSITION), ROTOR)
+    regressor_signals = "measured"
+    instrument_signals = "measured"
 
-def _backlash(motion: Motion, place: Place, *, gap: float, rotor: float = 0.0) -> Array:
-    """Return the column of backlash: inside the gap the link moves freely, until the teeth are in contact again."""
-    j = place.joint
-    moves = crossing(falls(motion, j, rotor), gap, motion.dt)
-    return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return the torques by `crossing` of the gap."""
+        j, rotor = place.joint, shapes["rotor"]
+        moves = crossing(falls(motion, j, rotor), shapes["gap"], motion.dt)
+        return motion.response(j, *moves, links=True, rotor=rotor)[:, :, None]
+
+    def trial_values(self, motion: Motion, place: Place) -> Trials:
+        """Return gaps that the link crosses in 5 to 100 ms under the usual load, and `rotors`.
+
+        An error of 25 % in the gap misses the instants of the impacts.
+        """
+        usual = max(float(np.std(falls(motion, place.joint))), 1e-9)
+        gaps = [0.5 * usual * float(time) ** 2 for time in np.geomspace(0.005, 0.1, 25)]
+        return gaps, rotors(motion, place.joint)
 
 
 def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
@@ -132,25 +174,6 @@ def falls(motion: Motion, joint: int, rotor: float = 0.0) -> Array:
         return np.zeros(motion.samples)
     away: Array = -motion.handed_on(joint, rotor) / inertia
     return away
-
-
-def inertias(motion: Motion, joint: int, rotor: float) -> Array:
-    """Return the inertia (N,) of the link that a gear drives, kg m^2 or kg.
-
-    It has a lower bound, `LEAST_INERTIA`, and is zero where the fit has no inertia.
-
-    Parameters
-    ----------
-    motion
-        Motion of the arm, N samples.
-    joint
-        Index of the joint, from 0.
-    rotor
-        Rotor inertia that the model contains in the link, kg m^2 or kg.
-    """
-    inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
-    believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())
-    return believed
 
 
 @compiled
@@ -185,64 +208,23 @@ def crossing(pull: Array, gap: float, dt: float) -> tuple[Array, Array, Array]:
     return way, rate, acceleration
 
 
-def gaps(motion: Motion, joint: int) -> Sequence[float]:
-    """Return gaps that the link crosses in 5 to 100 ms under the usual load, rad or m.
+def inertias(motion: Motion, joint: int, rotor: float) -> Array:
+    """Return the inertia (N,) of the link that a gear drives, kg m^2 or kg.
 
-    An error of 25 % in the gap misses the instants of the impacts.
+    It has a lower bound, `LEAST_INERTIA`, and is zero where the fit has no inertia.
 
     Parameters
     ----------
     motion
-        Motion of the arm.
+        Motion of the arm, N samples.
     joint
         Index of the joint, from 0.
+    rotor
+        Rotor inertia that the model contains in the link, kg m^2 or kg.
     """
-    usual = max(float(np.std(falls(motion, joint))), 1e-9)
-    return [0.5 * usual * float(time) ** 2 for time in np.geomspace(0.005, 0.1, 25)]
+    inertia = motion.slopes(joint, links=True)[2][:, joint] - rotor
+    believed: Array = np.maximum(inertia, LEAST_INERTIA * inertia.max())
+    return believed
 
 
-EFFECTS = (
-    Effect(
-        name="cogging_torque",
-        order_of="motor",
-        title="a torque ripple of the motor",
-        says="a torque ripple that is periodic in the motor angle: magnets of the motor, or an eccentric gear",
-        reference="Petrovic et al. 2000, IEEE Trans. Power Electronics 15(6); Gandhi et al. 2002, ICRA",
-        linear=(Linear("cgc", ("N m", "N")), Linear("cgs", ("N m", "N"))),
-        shapes=(Shape("harmonic", ("per rad of the motor", "rad/m"), harmonics, continuous=(False, False)),),
-        columns=_cogging,
-        needs="slow motion over several motor turns",
-        scope="motor",
-        together=True,
-        excitation=("slow", "range"),
-    ),
-    Effect(
-        name="joint_elasticity",
-        title="an elastic joint",
-        says="the link oscillates relative to its motor: an elastic gear, belt or coupling, or a bending link",
-        reference="Spong 1987, J. Dyn. Sys. Meas. Control 109(4)",
-        linear=(Linear("compliance", ("rad/(N m)", "m/N"), sign=1),),
-        shapes=(
-            Shape("frequency", ("Hz", "Hz"), frequencies),
-            Shape("damping", ("", ""), lambda motion, joint: DAMPINGS, default=DAMPINGS[-1]),
-            ROTOR,
-        ),
-        columns=_elasticity,
-        predicts=True,
-        needs="quick accelerations near the resonance, under load",
-        excitation=("accelerations",),
-    ),
-    Effect(
-        name="backlash",
-        title="backlash of the gear",
-        says="after a sign change of the load the motor crosses a gap before the link follows: worn teeth, a loose key",
-        reference="Nordin, Gutman 2002, Automatica 38(10)",
-        linear=(Linear("behind", ("", ""), sign=1, bounds=(0.1, 1.5)),),
-        shapes=(Shape("gap", ("rad", "m"), gaps), ROTOR),
-        columns=_backlash,
-        predicts=True,
-        sudden=True,
-        needs="many changes of the load's direction",
-        excitation=("reversals", "accelerations"),
-    ),
-)
+EFFECTS = (CoggingTorque, JointElasticity, Backlash)

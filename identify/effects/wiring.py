@@ -1,13 +1,15 @@
 """Mistakes of recorded signals: wrong sign, wrong drive or column, wrong scale."""
 
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig
-from armident.identify.effects.effect import Effect, Place
+from armident.configs.schema.robot import Effect as Entry
+from armident.identify.effects.effect import Effect, Place, Scope, Shapes
 from armident.identify.experiment import Experiment
 from armident.identify.robot.motion import Motion
 
@@ -20,47 +22,91 @@ JOINT_SIDE = "joint_side"
 """Parameter with the value 1 where columns in SI units on the joint side are concerned, not raw numbers of drives."""
 
 
-def _none(motion: Motion, place: Place) -> Array:
-    return np.zeros((motion.samples, 0))
+class Wiring(Effect):
+    """Effect that exchanges signals or changes their signs or scales, and so adds no torque."""
+
+    scope: Scope = "motor"
+    linear = ()
+
+    @abstractmethod
+    def _exchange(self, n: int, first: int, second: int, value: float) -> Array:
+        """Return the matrix (n, n) that corrects a signal; ``second`` is ``first`` without another joint."""
+
+    def on_joint_side(self, entry: Entry) -> bool:
+        """Return True if an entry concerns columns in SI units on the joint side, False for raw numbers of drives."""
+        return bool(entry.parameters.get(JOINT_SIDE))
+
+    def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
+        """Return no columns."""
+        return np.zeros((motion.samples, 0))
+
+    def corrects(self, entry: Entry) -> bool:
+        """Return True."""
+        return True
+
+    def may_be_added(self, motion: Motion, place: Place, present: Sequence[Shapes]) -> bool:
+        """Return False: it is no term of a model."""
+        return False
 
 
-EFFECTS = (
-    Effect(
-        name="sign_error",
-        title="a signal with the wrong sign",
-        says="position or torque of a drive is read with the wrong sign: a swapped polarity, a wrong gear sign",
-        reference="CiA 402-2, object 607Eh (polarity)",
-        linear=(),
-        columns=_none,
-        needs="motion against gravity or friction",
-        scope="motor",
-        rewires=True,
-    ),
-    Effect(
-        name="joint_order",
-        title="two drives exchanged",
-        says="the signals of two drives are exchanged: swapped node numbers or plugs",
-        reference="CiA 301, node-ID; CiA 305",
-        linear=(),
-        columns=_none,
-        needs="different motion of the joints",
-        scope="pair",
-        rewires=True,
-    ),
-    Effect(
-        name="signal_scale",
-        title="a signal with the wrong scale",
-        says="position or torque of a joint is recorded in another unit, on the other side of the gear, or with "
-        "another gear ratio; the value is true over recorded",
-        reference="Brunot 2017, equation 2.14",
-        linear=(),
-        columns=_none,
-        needs="motion of the neighbouring joints",
-        scope="motor",
-        rewires=True,
-    ),
-)
-NAMES = tuple(effect.name for effect in EFFECTS)
+class SignError(Wiring):
+    """Wrong sign of a signal."""
+
+    name = "sign_error"
+    title = "a signal with the wrong sign"
+    says = "position or torque of a drive is read with the wrong sign: a swapped polarity, a wrong gear sign"
+    reference = "CiA 402-2, object 607Eh (polarity)"
+    needs = "motion against gravity or friction"
+
+    def _exchange(self, n: int, first: int, second: int, value: float) -> Array:
+        """Return a change of sign."""
+        change = np.eye(n)
+        change[first, first] = -1.0
+        return change
+
+
+class JointOrder(Wiring):
+    """Exchange of the signals of two drives."""
+
+    name = "joint_order"
+    title = "two drives exchanged"
+    says = "the signals of two drives are exchanged: swapped node numbers or plugs"
+    reference = "CiA 301, node-ID; CiA 305"
+    needs = "different motion of the joints"
+    scope = "pair"
+
+    def _exchange(self, n: int, first: int, second: int, value: float) -> Array:
+        """Return a permutation."""
+        change = np.eye(n)
+        change[[first, second]] = change[[second, first]]
+        return change
+
+
+class SignalScale(Wiring):
+    """Wrong scale of a signal."""
+
+    name = "signal_scale"
+    title = "a signal with the wrong scale"
+    says = (
+        "position or torque of a joint is recorded in another unit, on the other side of the gear, or with "
+        "another gear ratio; the value is true over recorded"
+    )
+    reference = "Brunot 2017, equation 2.14"
+    needs = "motion of the neighbouring joints"
+
+    def _exchange(self, n: int, first: int, second: int, value: float) -> Array:
+        """Return the factor of the joint, or of the other joint's signal that is added."""
+        change = np.eye(n)
+        change[first, second] = value
+        return change
+
+    def on_joint_side(self, entry: Entry) -> bool:
+        """Return True."""
+        return True
+
+
+EFFECTS = (SignError, JointOrder, SignalScale)
+BY_NAME = {effect.name: effect() for effect in EFFECTS}
 
 
 def rewired(experiments: Sequence[Experiment], robot: RobotConfig) -> list[Experiment]:
@@ -116,29 +162,22 @@ def exchanges(robot: RobotConfig) -> tuple[Array, Array]:
     to_motor = {"position": ratios, "torque": np.linalg.inv(ratios).T}
     found = {signal: np.eye(robot.n) for signal in SIGNALS}
     for k, entry in enumerate(robot.effects):
-        if entry.effect not in NAMES:
+        effect = BY_NAME.get(entry.effect)
+        if effect is None:
             continue
+        where = f"effects[{k}]: {entry.effect} of {entry.joint}"
         meant = [signal for signal in SIGNALS if entry.parameters.get(signal)]
         if not meant:
-            raise ConfigError(f"effects[{k}]: {entry.effect} of {entry.joint} needs position: 1, torque: 1 or both")
-        first = names.index(entry.joint)
-        joint_side = bool(entry.parameters.get(JOINT_SIDE)) or entry.effect == "signal_scale"
+            raise ConfigError(f"{where} needs position: 1, torque: 1 or both")
+        if effect.two_joints and entry.other is None:
+            raise ConfigError(f"{where} needs the other joint")
+        first, second = names.index(entry.joint), names.index(entry.other or entry.joint)
         for signal in meant:
-            change = np.eye(robot.n)
-            if entry.effect == "sign_error":
-                change[first, first] = -1.0
-            elif entry.effect == "signal_scale":
-                second = first if entry.other is None else names.index(entry.other)
-                change[first, second] = entry.parameters[signal]
-            else:
-                if entry.other is None:
-                    raise ConfigError(f"effects[{k}]: joint_order of {entry.joint} needs the other joint")
-                second = names.index(entry.other)
-                change[[first, second]] = change[[second, first]]
-                if not joint_side:
-                    change = change * worth[signal][:, None] / worth[signal]
-            if joint_side:
+            change = effect._exchange(robot.n, first, second, entry.parameters[signal])
+            if effect.on_joint_side(entry):
                 change = to_motor[signal] @ change @ np.linalg.inv(to_motor[signal])
+            else:
+                change = change * worth[signal][:, None] / worth[signal]
             found[signal] = change @ found[signal]
     return found["position"], found["torque"]
 

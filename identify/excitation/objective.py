@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from armident.configs import ConfigError, RobotConfig
-from armident.identify.diagnosis.candidates import Shapes, grid, places
+from armident.identify.diagnosis.candidates import Shapes
 from armident.identify.effects.effect import Effect, Place
+from armident.identify.effects.numbers import ParameterChange
 from armident.identify.effects.registry import known
+from armident.identify.effects.wiring import Wiring
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.decimate import Decimation
 
@@ -64,7 +66,9 @@ class EffectObjective:
     @property
     def predicts(self) -> bool:
         """True if an effect depends on the predicted torques."""
-        return any(location is not None and location.effect.predicts for pair in self.pairs for location in pair)
+        return any(
+            location is not None and location.effect.depends_on_torque for pair in self.pairs for location in pair
+        )
 
     def cost(self, motion: Motion, x: Array, decimation: Decimation, sigma: Array) -> float:
         """Return the mean log standard deviation of all linear parameters (D-optimality); lower is better.
@@ -144,8 +148,8 @@ def effect_objective(
     if joint is not None and joint not in joints:
         raise ConfigError(f"--joint {joint}: {robot.name} has {', '.join(joints)}")
     at = None if joint is None else joints.index(joint)
-    if motion.theta is None and any(e is not None and e.predicts for e in (effect, rival)):
-        name = effect.name if effect.predicts else against
+    if motion.theta is None and any(e is not None and e.depends_on_torque for e in (effect, rival)):
+        name = effect.name if effect.depends_on_torque else against
         raise ConfigError(f"{name} depends on the torques of the arm: add --known identification.json")
     here = _locations(effect, robot, at, motion)
     if not here:
@@ -176,18 +180,18 @@ def weighted_rows(x: Array, sigma: ArrayLike) -> Array:
 
 def _designable(name: str, option: str) -> Effect:
     effect = known(name)
-    if effect.rewires:
+    if isinstance(effect, Wiring):
         raise ConfigError(f"{option} {name}: visible in any motion, needs no special trajectory")
     return effect
 
 
 def _locations(effect: Effect, robot: RobotConfig, joint: int | None, motion: Motion) -> list[EffectLocation]:
     found = []
-    for place in places(effect, robot.n):
+    for place in effect.places(robot.n):
         elsewhere = joint is not None and effect.scope != "arm" and joint not in (place.joint, place.other)
-        if elsewhere or (effect.visible is not None and effect.visible(motion, place) is not None):
+        if elsewhere or effect.invisible(motion, place) is not None:
             continue
-        found.append(EffectLocation(effect, place, _typical(grid(effect, motion, place))))
+        found.append(EffectLocation(effect, place, _typical(effect.grid(motion, place))))
     return found
 
 
@@ -234,7 +238,7 @@ def _information(
     own = location.columns(motion, shapes, decimation, sigma)
     power = np.einsum("rk,rk->k", own, own)
     own = own / np.sqrt(np.where(power > 0.0, power, 1.0))
-    beside = [] if location.effect.numbers is not None else [x]
+    beside = [] if isinstance(location.effect, ParameterChange) else [x]
     if rival is not None:
         beside += [rival.columns(motion, s, decimation, sigma) for s in rival.shapes]
     information = own.T @ own

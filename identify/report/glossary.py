@@ -10,6 +10,7 @@ from armident.identify.document import DiagnosisDocument, IdentificationDocument
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.tables import KNOTS
+from armident.identify.effects.wiring import Wiring
 
 
 @dataclass(frozen=True)
@@ -356,10 +357,8 @@ def effect_entries(effect: Effect) -> list[Entry]:
         In the order of the effect: linear, nonlinear; of a wiring error the signals.
     """
     texts = EFFECT_PARAMETERS.get(effect.key, {})
-    given = [(p.name, p.unit) for p in effect.linear] + [(s.name, s.unit) for s in effect.shapes]
-    if effect.rewires:
-        given = [(name, ("", "")) for name in texts]
-    return [Entry(name, texts.get(name, effect.says), unit) for name, unit in given]
+    units = {name: ("", "") for name in texts} if isinstance(effect, Wiring) else effect.units
+    return [Entry(name, texts.get(name, effect.says), unit) for name, unit in units.items()]
 
 
 def base_entry(name: str) -> Entry | None:

@@ -94,6 +94,11 @@ class Motion:
         t: Array = self.start + self.dt * np.arange(self.samples, dtype=np.float64)
         return t
 
+    @property
+    def whole_time(self) -> float:
+        """Duration of all recordings together, at least that of this motion, s."""
+        return max(self.duration, self.dt * self.samples)
+
     @cached_property
     def motor(self) -> Array:
         """Motor positions, rad (m at prismatic joints with direct drive), (N, n)."""

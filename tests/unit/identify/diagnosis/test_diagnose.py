@@ -80,7 +80,7 @@ def test_a_diagnosed_model_is_a_robot_configuration_again(robot: RobotConfig) ->
 ELSEWHERE = ("encoder_eccentricity", "backlash", "joint_elasticity")
 """Effects that act on all joints: an error of one position changes every torque."""
 JOINT_EFFECTS = sorted(
-    name for name, e in catalogue().items() if not e.rewires and e.scope == "joint" and name not in ELSEWHERE
+    name for name, e in catalogue().items() if e.linear and e.scope == "joint" and name not in ELSEWHERE
 )
 
 
@@ -91,8 +91,7 @@ def test_an_effect_of_a_joint_acts_on_that_joint_only(robot: RobotConfig, name: 
     q, qd, qdd = rng.normal(size=(3, 50, 6))
     motion = model.anchored(rng.normal(size=model.base.b)).motion(q, qd, qdd, 1e-3)
     effect, place = catalogue()[name], Place(2)
-    shapes = {shape.name: shape.grid(motion, 2)[0] for shape in effect.shapes}
-    columns = effect.torque(motion, place, shapes)
+    columns = effect.torque(motion, place, dict(effect.grid(motion, place)[0]))
     assert columns.shape == (50, 6, len(effect.linear))
     assert np.abs(np.delete(columns, 2, axis=1)).max() == 0
 

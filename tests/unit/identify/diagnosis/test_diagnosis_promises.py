@@ -26,17 +26,21 @@ import numpy as np
 from armident.identify.effects.effect import Effect, Linear, Shape
 
 
-def columns(motion, place, position):
-    """Torque (N, 1) per unit of height: a bell 10 mm wide around a position."""
-    return np.exp(-0.5 * ((motion.q[:, place.joint, None] - position) / 0.01) ** 2)
+class TightSpot(Effect):
+    name = "tight_spot"
+    title = "a tight spot"
+    says = "something pushes back near one position"
+    reference = "the machine's log book"
+    needs = "motion across the spot"
+    linear = (Linear("height", ("N m", "N")),)
+    shapes = (Shape("position", ("rad", "m")),)
 
+    def columns(self, motion, place, shapes):
+        """Torque (N, 1) per unit of height: a bell 10 mm wide around a position."""
+        return np.exp(-0.5 * ((motion.q[:, place.joint, None] - shapes["position"]) / 0.01) ** 2)
 
-TIGHT_SPOT = Effect(
-    name="tight_spot", title="a tight spot", says="something pushes back near one position",
-    reference="the machine's log book", linear=(Linear("height", ("N m", "N")),), columns=columns,
-    needs="motion across the spot",
-    shapes=(Shape("position", ("rad", "m"), lambda motion, joint: tuple(0.01 * k for k in range(1, 12))),),
-)
+    def trial_values(self, motion, place):
+        return ([0.01 * k for k in range(1, 12)],)
 '''
 
 
@@ -119,7 +123,7 @@ def elsewhere(tmp_path: Path) -> dict[str, str]:
     info.mkdir(parents=True)
     (site / "tight_spots.py").write_text(PLUGIN)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tight-spots\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[armident.effects]\ntight_spot = tight_spots:TIGHT_SPOT\n")
+    (info / "entry_points.txt").write_text("[armident.effects]\ntight_spot = tight_spots:TightSpot\n")
     paths = [str(site), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 

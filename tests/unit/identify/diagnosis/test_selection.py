@@ -11,6 +11,7 @@ from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.diagnose import diagnose
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.selection import Selected, StepwiseSelection
+from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.from_recording import experiments_from_recording
 from tests.fixtures.arms import FAST, recording
@@ -106,7 +107,7 @@ def test_a_named_effect_that_explains_half_comes_before_a_better_term_without_a_
     steps, first = selection(1, SPRING)
     step = steps.step(first)
     named = addition_of(step, "joint_spring")
-    effect = replace(named.candidate.effect, name="unnamed", law="time")
+    effect = known("unnamed/time")
     nameless = replace(named, made=replace(named.made, candidate=replace(named.candidate, effect=effect)))
     for factor, expected in ((1.9, "joint_spring"), (2.1, "unnamed")):
         better = replace(nameless, share=factor * named.share)

@@ -10,6 +10,7 @@ from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.diagnose import diagnose
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.registry import catalogue
+from armident.identify.effects.tables import FreeShape
 from armident.identify.effects.terms import arm_model, stanza_of
 from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
@@ -26,7 +27,7 @@ ROBOT = load_robot("kuka_lwr4").model_copy(update={"effects": ()})
 JOINT, OTHER = 1, 2
 DT, SECONDS, NOISE = 5e-3, 20.0, 0.05
 LINK = {"m": 2.0, "mx": 0.05, "my": 0.1, "mz": 0.2, "xx": 0.06, "yy": 0.05, "zz": 0.03, "fv": 1.0, "fc": 0.5}
-FREE = sorted(key for key, effect in catalogue().items() if effect.free)
+FREE = sorted(key for key, effect in catalogue().items() if isinstance(effect, FreeShape))
 
 Floats = NDArray[np.float64]
 
@@ -61,10 +62,7 @@ def configured(effect: Effect) -> RobotConfig:
     """The arm with an effect in its configuration."""
     place = Place(JOINT, None if effect.scope == "joint" else OTHER)
     motion = moved(ROBOT)
-    shapes = {
-        s.name: next(iter(s.grid(motion, JOINT, *([] if place.other is None else [place.other]))))
-        for s in effect.shapes
-    }
+    shapes = dict(effect.grid(motion, place)[0])
     return ROBOT.model_copy(update={"effects": (stanza_of(effect, place, ROBOT, shapes),)})
 
 

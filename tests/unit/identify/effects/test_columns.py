@@ -112,10 +112,8 @@ def test_no_nonlinear_parameter_depends_on_the_configured_limits(axis: Motion) -
     wider = arm_model(robot.model_copy(update={"joints": (robot.joints[0].model_copy(update={"limits": limits}),)}))
     other = replace(axis, model=wider)
     for name, effect in catalogue().items():
-        if effect.scope in ("pair", "other") or effect.rewires:
-            continue
-        for shape in effect.shapes:
-            assert list(shape.grid(axis, 0)) == list(shape.grid(other, 0)), (name, shape.name)
+        if not effect.two_joints:
+            assert effect.grid(axis, Place(0)) == effect.grid(other, Place(0)), name
 
 
 def test_load_dependent_friction_goes_with_what_the_link_takes(axis: Motion) -> None:
@@ -344,10 +342,9 @@ def test_a_lagging_motor_is_commanded_ahead_of_its_torque(axis: Motion) -> None:
 
 @pytest.mark.parametrize("name", ["time_delay", "actuator_bandwidth"])
 def test_less_than_a_sample_of_the_recording_is_no_fault(name: str) -> None:
-    negligible = catalogue()[name].negligible
-    assert negligible is not None
-    assert negligible(np.array([0.0008]), 1e-3)
-    assert not negligible(np.array([0.0008]), 2e-4)
+    effect = catalogue()[name]
+    assert effect.is_convention(np.array([0.0008]), 1e-3)
+    assert not effect.is_convention(np.array([0.0008]), 2e-4)
 
 
 def test_an_eccentric_encoder_shows_a_motion_that_is_not_there(arm: Motion) -> None:

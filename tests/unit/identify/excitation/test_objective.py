@@ -8,6 +8,7 @@ import yaml
 
 from armident.configs import ConfigError, config_path, load_robot, load_trajectory
 from armident.identify.cli import trajectory as trajectory_command
+from armident.identify.effects.effect import Place
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.design import design_trajectory, predict_precision, with_objective
 from armident.identify.excitation.point_to_point import SEARCH_RATE, sample_trajectory
@@ -128,7 +129,7 @@ def test_typical_values_are_positions_in_the_grid_of_each_nonlinear_parameter() 
     usual = design_trajectory(robot, seed=0, evaluations=0).trajectory
     period = 1.0 / SEARCH_RATE
     motion = arm_model(robot).motion(*sample_trajectory(usual, period), period)
-    velocities, displacements = (shape.grid(motion, 0) for shape in location.effect.shapes)
+    velocities, displacements = location.effect.trial_values(motion, Place(0))
     assert len(displacements) == 4
     assert len(velocities) == 7
     positions = ((2, 1), (3, 2), (4, 2))

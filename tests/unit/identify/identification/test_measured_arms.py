@@ -21,6 +21,7 @@ from armident.configs import RobotConfig, load_robot
 from armident.configs.schema.robot import Effect
 from armident.daq.interchange.importing import import_recording
 from armident.daq.recording import read_recording, write_recording
+from armident.identify.effects.effect import Place
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import arm_model
 from armident.identify.estimators.idim_iv import idim_iv
@@ -217,9 +218,9 @@ def test_every_training_part_by_itself_shows_four_ripples_per_turn_of_joint_6(
     first, _ = parts(settled[number])
     q = differentiate(first.q, first.dt)
     motion = arm_model(RIGID).motion(q.q, q.qd, q.qdd, first.dt)
-    (shape,) = known("cogging_torque").shapes
+    (harmonics,) = known("cogging_torque").trial_values(motion, Place(5))
     misses = {}
-    for harmonic in shape.grid(motion, 5):
+    for harmonic in harmonics:
         ripple = Effect(effect="cogging_torque", joint="lwr_5_joint", parameters={"harmonic": harmonic})
         found = least_squares([first], RIGID.model_copy(update={"effects": (ripple,)}))
         misses[harmonic] = found.relative_error_pct_by_joint[5]
