@@ -43,16 +43,38 @@ class Correction(TorqueDependent):
     scope = "motor"
 
     @abstractmethod
-    def _shaft(self, torque: Array, motion: Motion, motor: int) -> Array:
-        """Column (N,) at the shaft of a motor, given its torque (N,), N m or N."""
+    def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
+        """Return the torque (N,) at the shaft of a motor per unit of the parameter.
+
+        Parameters
+        ----------
+        torque
+            Predicted torque at the shaft, N m or N, (N,).
+        motion
+            The motion, N samples.
+        motor
+            Index of the motor, from 0.
+        """
 
     @abstractmethod
-    def _true(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
-        """True torques (N,) of a motor from the recorded ones; sampling period in s, limit in N m or N."""
+    def true_torque(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
+        """Return the true torque (N,) of a motor.
+
+        Parameters
+        ----------
+        recorded
+            Recorded torque, N m or N, (N,).
+        value
+            Value of the parameter.
+        dt
+            Sampling period, s.
+        limit
+            Largest torque of the motor, N m or N.
+        """
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the torques of the joints that the motor drives."""
-        return motion.of_motor(place.joint, self._shaft(motion.motor_torque[:, place.joint], motion, place.joint))
+        return motion.of_motor(place.joint, self.shaft_column(motion.motor_torque[:, place.joint], motion, place.joint))
 
     def corrects(self, entry: Entry) -> bool:
         """Return True if the entry gives the value; otherwise it is estimated with the other parameters."""
@@ -73,7 +95,7 @@ class Correction(TorqueDependent):
         motor = [joint.name for joint in robot.joints].index(entry.joint)
         at_motors = experiment.tau @ np.linalg.inv(robot.transmission_matrix)
         value, limit = entry.parameters[self.linear[0].name], motor_limit(robot, motor)
-        at_motors[:, motor] = self._true(at_motors[:, motor], value, experiment.dt, limit)
+        at_motors[:, motor] = self.true_torque(at_motors[:, motor], value, experiment.dt, limit)
         return replace(experiment, tau=np.ascontiguousarray(at_motors @ robot.transmission_matrix))
 
 
@@ -90,7 +112,8 @@ class DriveGainError(Correction):
     scales_torque = True
     change_title = "torque constant changed since the baseline"
 
-    def _shaft(self, torque: Array, motion: Motion, motor: int) -> Array:
+    def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
+        """Return the torque."""
         return torque
 
     def invisible(self, motion: Motion, place: Place) -> str | None:
@@ -99,7 +122,8 @@ class DriveGainError(Correction):
             return "the parameters of a single axis grow and shrink with the gain of its only drive"
         return None
 
-    def _true(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
+    def true_torque(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
+        """Return the torque over one plus the gain error."""
         true: Array = recorded / (1.0 + value)
         return true
 
@@ -119,13 +143,17 @@ class DriveGainSaturation(Correction):
     excitation = ("load", "accelerations")
     linear = (Linear("gain_loss", ("", "")),)
 
-    def _shaft(self, torque: Array, motion: Motion, motor: int) -> Array:
+    def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
+        """Return the cubic term of the curve."""
         # Normalised by the torque limit, so that the parameter does not depend on the motion.
         loss: Array = torque * (torque / motor_limit(motion.model.robot, motor)) ** 2
         return loss
 
-    def _true(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
-        # Sample by sample: the saturation acts on the noise that the controller adds, too.
+    def true_torque(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
+        """Return ``i / sqrt(1 + 2 loss (i / limit)^2)``.
+
+        Sample by sample: the saturation acts on the noise that the controller adds, too.
+        """
         given: Array = recorded / np.sqrt(np.maximum(1.0 + 2.0 * value * (recorded / limit) ** 2, LEAST))
         return given
 
@@ -141,10 +169,12 @@ class TimeDelay(Correction):
     excitation = ("accelerations",)
     linear: tuple[Linear, ...] = (Linear("delay", ("s", "s"), sign=1),)
 
-    def _shaft(self, torque: Array, motion: Motion, motor: int) -> Array:
+    def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
+        """Return minus the rate of the torque."""
         return -motion.rate(torque)
 
-    def _true(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
+    def true_torque(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
+        """Return the torque at the instants at which it acted."""
         t = dt * np.arange(recorded.size)
         early: Array = np.interp(t + value, t, recorded)
         return early
@@ -166,11 +196,12 @@ class ActuatorBandwidth(TimeDelay):
     reference = "Leonhard 2001, Control of Electrical Drives, chapter 7"
     linear = (Linear("lag", ("s", "s"), sign=1),)
 
-    def _shaft(self, torque: Array, motion: Motion, motor: int) -> Array:
+    def shaft_column(self, torque: Array, motion: Motion, motor: int) -> Array:
+        """Return the rate of the torque."""
         return motion.rate(torque)
 
-    def _true(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
-        # Tustin's method, from rest.
+    def true_torque(self, recorded: Array, value: float, dt: float, limit: float) -> Array:
+        """Return the torque after ``1 / (1 + lag s)``, from rest (Tustin)."""
         if value <= 0.0:
             return recorded
         ratio = 2.0 * value / dt

@@ -73,7 +73,8 @@ class Payload(ParameterChange):
         for kind in INERTIAL
     )
 
-    def _parameters(self, place: Place, n: int) -> list[str]:
+    def parameters(self, place: Place, n: int) -> list[str]:
+        """Return those of the last link."""
         return [f"{kind}{n}" for kind in INERTIAL]
 
     def change_in_words(self, joint: str, values: Mapping[str, float], std: Mapping[str, float]) -> str:
@@ -162,7 +163,8 @@ class TorqueOffset(ParameterChange):
     needs = "a baseline identified without it"
     linear = (Linear("offx", TORQUE),)
 
-    def _parameters(self, place: Place, n: int) -> list[str]:
+    def parameters(self, place: Place, n: int) -> list[str]:
+        """Return that of the joint."""
         return [f"off{place.joint + 1}"]
 
 

@@ -16,8 +16,16 @@ class ParameterChange(Effect):
     """Effect that only changes parameters of the same model."""
 
     @abstractmethod
-    def _parameters(self, place: Place, n: int) -> list[str]:
-        """Names of the standard parameters that the linear ones change, (k,), of ``n`` joints."""
+    def parameters(self, place: Place, n: int) -> list[str]:
+        """Return the names of the standard parameters that the linear ones change, (k,).
+
+        Parameters
+        ----------
+        place
+            Location of the effect.
+        n
+            Number of joints.
+        """
 
     def change(self, motion: Motion, place: Place) -> Array:
         """Return the Jacobian (b, k) of the base parameters with respect to the linear ones.
@@ -30,7 +38,7 @@ class ParameterChange(Effect):
             Location of the effect.
         """
         model = motion.model
-        chosen = [model.names.index(name) for name in self._parameters(place, motion.n)]
+        chosen = [model.names.index(name) for name in self.parameters(place, motion.n)]
         change: Array = model.base.regroup[:, chosen]
         return change
 
@@ -55,7 +63,8 @@ class FrictionChange(ParameterChange):
     needs = "a baseline identified before the change"
     linear = (Linear("fvx", VISCOUS), Linear("fcx", TORQUE))
 
-    def _parameters(self, place: Place, n: int) -> list[str]:
+    def parameters(self, place: Place, n: int) -> list[str]:
+        """Return those of the joint."""
         return [f"fv{place.joint + 1}", f"fc{place.joint + 1}"]
 
 
