@@ -9,8 +9,8 @@ from scipy import stats
 from armident.identify.diagnosis.baseline import Change, Comparison
 from armident.identify.diagnosis.candidates import ColumnCache, places
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.whitening import whitened
 from armident.identify.effects.registry import catalogue
+from armident.identify.regression.whitening import whitened
 
 STRUCTURAL = {
     "drive_gain_error": "torque constant changed since the baseline",
@@ -69,7 +69,7 @@ def changes(comparison: Comparison, column_cache: ColumnCache) -> Iterator[Chang
                 continue
             else:
                 columns = column_cache.band(effect, place, (), "train", "measured")
-                directions = fit.absorbed(whitened(columns, fit.noise))
+                directions = fit.regression.absorbed(whitened(columns, fit.noise))
             directions = directions[comparison.known]
             if directions.any():
                 yield Change(effect, place, directions)
