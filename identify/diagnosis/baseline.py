@@ -11,7 +11,7 @@ from armident.configs import DataError
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
 from armident.identify.document import IdentificationDocument
 from armident.identify.effects.effect import Effect, Place
-from armident.identify.regression.equations import COVARIANCE_PASSES, ExperimentEquations, noise_models
+from armident.identify.regression.equations import COVARIANCE_PASSES, noise_models
 
 Array = NDArray[np.float64]
 
@@ -158,12 +158,11 @@ def compared(fit: Fit, baseline: IdentificationDocument) -> Comparison:
     theta0 = np.array([baseline.parameters[k].value for k in chosen])
     covariance0 = theirs[np.ix_(chosen, chosen)]
     free = np.setdiff1d(np.arange(len(names)), known)
-    z, x = fit.train.z[:, known], fit.train.x
+    cross, scale = fit.regression.solution.cross, fit.regression.solution.scale
     absorbed = np.zeros((known.size, 0))
     if free.size:
-        scale = np.linalg.norm(z, axis=0)
-        scale[scale == 0] = 1.0
-        absorbed = np.linalg.solve((z / scale).T @ (x[:, known] / scale), (z / scale).T @ x[:, free]) / scale[:, None]
+        through = cross[np.ix_(known, free)] * scale[free]
+        absorbed = np.linalg.solve(cross[np.ix_(known, known)], through) / scale[known, None]
     covariance = fit.covariance[np.ix_(known, known)] + covariance0
     return Comparison(fit, known, theta0, covariance0, covariance, absorbed)
 
@@ -173,10 +172,6 @@ def cautious(fit: Fit) -> Fit:
 
     A search compares candidates in one recording, and needs neither; two recordings are compared by covariances.
     """
-    blocks = [
-        ExperimentEquations(y, x, np.ones(y.shape, dtype=np.bool_), np.arange(float(y.shape[0])))
-        for x, _, y in fit.equations.train
-    ]
     for _ in range(COVARIANCE_PASSES - 1):
-        fit = fit.renoised(noise_models(blocks, fit.theta, fit.covariance, MAX_AR_ORDER))
+        fit = fit.renoised(noise_models(fit.equations.train, fit.theta, fit.covariance, MAX_AR_ORDER))
     return fit

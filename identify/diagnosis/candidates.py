@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from armident.identify.diagnosis.stretch import Stretch
 from armident.identify.diagnosis.study import Study
-from armident.identify.diagnosis.whitening import joints_of, whitened
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.effect import Shapes as Shapes
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.whitening import joints_of, whitened
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ from scipy import stats
 from armident.identify.diagnosis.baseline import Change, Comparison
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.whitening import whitened
 from armident.identify.effects.numbers import ParameterChange
 from armident.identify.effects.registry import catalogue
+from armident.identify.regression.whitening import whitened
 
 USUAL = Criteria.close
 """Prior log-odds of common changes (friction, loads, offsets) against rare ones of the structure: where the torque of a
@@ -60,7 +60,7 @@ def changes(comparison: Comparison, column_cache: ColumnCache) -> Iterator[Chang
                 directions[:rigid] = exact[:rigid]
             else:
                 columns = column_cache.band(effect, place, (), "train", "measured")
-                directions = fit.absorbed(whitened(columns, fit.noise))
+                directions = fit.regression.absorbed(whitened(columns, fit.noise))
             directions = directions[comparison.known]
             if directions.any():
                 yield Change(effect, place, directions)

@@ -8,7 +8,7 @@ from scipy import stats
 
 from armident.identify.diagnosis.model_state import ModelState, acted_on
 from armident.identify.diagnosis.predictive_score import SUMS
-from armident.identify.diagnosis.regression import applied
+from armident.identify.regression.equations import applied
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
     before, after = (state.fit.errors(state.fit.theta, held=True) for state in (without, with_it))
     if with_it.study.recorded == without.study.recorded:
         theta = _less(with_it, without)
-        change = [applied(z, theta) for _, z, _ in with_it.fit.equations.held]
+        change = [applied(e.z, theta) for e in with_it.fit.equations.held]
     else:
         change = [b - a for b, a in zip(before, after, strict=True)]
     noiseless = [b - c for b, c in zip(before, change, strict=True)]

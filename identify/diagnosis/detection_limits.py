@@ -10,7 +10,6 @@ from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.precision import variance_of_sum
 from armident.identify.diagnosis.screening import directions_beside
-from armident.identify.diagnosis.whitening import rows_of_joints
 from armident.identify.document import DetectionLimit
 from armident.identify.effects.transmission import MotorOrder
 from armident.identify.effects.unnamed import NAME as UNNAMED
@@ -69,7 +68,7 @@ def _smallest(
     along = u.T @ z
     score = np.sqrt(2.0 * np.log(max(tests, 1) / criteria.alpha["selection"])) + float(stats.norm.ppf(POWER))
     residual = fit.residual
-    rows = rows_of_joints([s.y.shape[0] for s in fit.study.train], fit.noise)
+    rows = fit.regression.rows_of
     sizes = np.full(scale.size, np.inf)
     for k in np.flatnonzero(able):
         own = u @ along[:, k]

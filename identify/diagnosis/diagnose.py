@@ -44,6 +44,7 @@ from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.experiment import Experiment
+from armident.identify.regression.equations import applied
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -315,7 +316,7 @@ def _verdict(findings: Sequence[Finding], left: Sequence[Unexplained]) -> Verdic
 
 def _predicted(state: ModelState) -> Array:
     """Torques of the model on the held-out data, (M, n)."""
-    return np.concatenate([x @ state.fit.theta for x, _, _ in state.fit.equations.held])
+    return np.concatenate([applied(e.x, state.fit.theta) for e in state.fit.equations.held])
 
 
 def _beside(final: ModelState, state: ModelState) -> Array:
@@ -334,7 +335,7 @@ def _own(final: ModelState, one: Selected) -> Array | None:
     if of_recording(one.entry):
         return None
     own = [final.study.model.base.names.index(name) for name in final.term_of(one.entry).names]
-    return np.concatenate([x[:, :, own] @ final.fit.theta[own] for x, _, _ in final.fit.equations.held])
+    return np.concatenate([e.x[:, :, own] @ final.fit.theta[own] for e in final.fit.equations.held])
 
 
 def _of_findings(

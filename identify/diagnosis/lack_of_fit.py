@@ -25,7 +25,7 @@ from armident.identify.diagnosis.projection import JointResidual, Projection
 from armident.identify.diagnosis.regression import Fit
 from armident.identify.diagnosis.spectral_lines import Line, bandwidth_of_motion, lines_of_joints
 from armident.identify.diagnosis.stretch import Stretch
-from armident.identify.diagnosis.whitening import rows_of_joints, whitened
+from armident.identify.regression.whitening import rows_of_joints
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.periodogram import hann_window, periodogram
 
@@ -281,7 +281,7 @@ class LackOfFit:
     def joints(self) -> tuple[JointResidual, ...]:
         """Residual and functions of every joint, whitened by noise models of the residual beyond its dependences."""
         errors = self.fit.errors(self.fit.theta, held=False)
-        model = [[z[:, j] for _, z, _ in self.fit.equations.train] for j in range(self.fit.study.robot.n)]
+        model = [[e.z[:, j] for e in self.fit.equations.train] for j in range(self.fit.study.robot.n)]
         taken: list[set[int]] = [set() for _ in model]
         noise = [noise_beyond([e[:, j] for e in errors], z) for j, z in enumerate(model)]
         while True:
@@ -320,26 +320,23 @@ class LackOfFit:
         return sum(len(own) + 2 for own in self.functions)
 
     def _whitened(self, fit: Fit) -> tuple[JointResidual, ...]:
-        rows, held_rows = (
-            rows_of_joints([y.shape[0] for _, _, y in part], fit.noise)
-            for part in (fit.equations.train, fit.equations.held)
-        )
-        regressor, instruments = (whitened([row[k] for row in fit.equations.held], fit.noise) for k in range(2))
-        covariance = np.zeros((fit.theta.size,) * 2) if fit.fixed else fit.covariance
+        blocks, rows = fit.equations.held, fit.regression.rows_of
+        held_rows = rows_of_joints(sum(e.y.shape[0] - ar.order for e in blocks) for ar in fit.noise)
+        regressor, instruments, _ = fit.held
         errors = fit.errors(fit.theta, held=True)
         out = []
         for j, (own, unseen) in enumerate(zip(*self.columns, strict=True)):
             d = np.concatenate([fit.noise[j].whiten(c) for c in own])
             full = np.zeros((fit.residual.size, d.shape[1]))
             full[rows[j]] = d
-            away = fit.absorbed(full)
+            away = fit.regression.absorbed(full)
             change = -instruments @ away
             change[held_rows[j]] += np.concatenate([fit.noise[j].whiten(c) for c in unseen])
-            band = np.concatenate([c - z[:, j] @ away for c, (_, z, _) in zip(unseen, fit.equations.held, strict=True)])
+            band = np.concatenate([c - e.z[:, j] @ away for c, e in zip(unseen, blocks, strict=True)])
             out.append(
                 JointResidual(
-                    j, rows[j], held_rows[j], d, fit.beside(full), change, fit.residual, fit.held_residual, band,
-                    np.concatenate([e[:, j] for e in errors]), held_rows, regressor, covariance,
+                    j, rows[j], held_rows[j], d, fit.regression.beside(full), change, fit.residual, fit.held_residual,
+                    band, np.concatenate([e[:, j] for e in errors]), held_rows, regressor, fit.covariance,
                 )
             )  # fmt: skip
         return tuple(out)
@@ -370,7 +367,7 @@ class LackOfFit:
 
     def _all_together(self, joint: int) -> NDArray[np.int64]:
         """Columns of the wide functions of the motion of a joint, as many as the data determine."""
-        left = sum(np.count_nonzero(y[:, joint]) for _, _, y in self.fit.equations.train) // ROWS_PER_COLUMN
+        left = sum(np.count_nonzero(e.y[:, joint]) for e in self.fit.equations.train) // ROWS_PER_COLUMN
         chosen: list[NDArray[np.int64]] = []
         for f, own in zip(self.functions[joint], self._sets(joint), strict=True):
             if f.kind != "motor angle" and len(f.knots) < FINE and own.size <= left:

@@ -11,7 +11,7 @@ from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.predictive_score import PredictiveScore
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, noise_models, safe
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, safe
 from armident.identify.diagnosis.screening import noise_beyond_shapes
 from armident.identify.diagnosis.study import Study
 from armident.identify.effects.recorded import of_recording
@@ -74,7 +74,7 @@ class ModelState:
     @cached_property
     def own_noise(self) -> tuple[ArModel, ...]:
         """Noise models of the residual, one for each joint."""
-        return tuple(noise_models(self.fit.left, self.fit.theta.size, MAX_AR_ORDER))
+        return self.fit.own_noise(MAX_AR_ORDER)
 
     def under(self, noise: tuple[ArModel, ...]) -> "ModelState":
         """The model fitted under given noise models, so that it can be compared with another one fitted under them.
@@ -220,8 +220,8 @@ def acted_on(with_it: ModelState, without: ModelState) -> NDArray[np.bool_]:
     """
     known = set(without.study.model.base.names)
     added = [k for k, name in enumerate(with_it.study.model.base.names) if name not in known]
-    blocks = with_it.fit.equations.blocks
-    return np.array([not added or bool(np.isin(added, block.x).any()) for block in blocks])
+    joints = with_it.fit.equations.joints
+    return np.array([not added or bool(np.isin(added, joint.x).any()) for joint in joints])
 
 
 def _iterated(found: Fit) -> Fit:

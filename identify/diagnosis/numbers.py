@@ -143,14 +143,14 @@ def _held_out(comparison: Comparison, before: Array, after: Array) -> float:
 
     Its variance comes from the noise, from the remaining serial correlation (Newey-West), and from the baseline.
     """
-    held = comparison.fit.held
-    change = held.z @ (after - before)
+    x, z, y = comparison.fit.held
+    change = z @ (after - before)
     size = float(change @ change)
     if size == 0.0:
         return 0.0
-    residual = held.y - held.x @ before
+    residual = y - x @ before
     inflation = max(1.0, variance_of_sum(change * (residual - change)) / size)
-    through = change @ held.x[:, comparison.known]
+    through = change @ x[:, comparison.known]
     spread = float(through @ comparison.covariance0 @ through)
     return float(change @ residual) / float(np.sqrt(size * inflation + spread))
 

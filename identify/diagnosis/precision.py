@@ -92,7 +92,7 @@ def _deviations(fit: Fit, slopes: list[Array]) -> Array:
     variances: Array = np.concatenate([np.diag(fit.covariance), np.zeros(len(slopes))])
     if not e and not slopes:
         return variances**0.5
-    z = np.column_stack([fit.train.z, *slopes])
+    z = np.column_stack([fit.instruments, *slopes])
     scale = np.linalg.norm(z, axis=0)
     scale[scale == 0] = 1.0
     inverse = np.linalg.pinv((z / scale).T @ (z / scale), rcond=1e-12, hermitian=True)

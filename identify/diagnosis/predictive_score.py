@@ -14,10 +14,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, noise_models
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
 from armident.identify.effects.tables import FreeShape
 from armident.identify.effects.terms import effect_terms
-from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.ar_noise import ArModel, ar_models
 
 Array = NDArray[np.float64]
 
@@ -44,17 +44,16 @@ class PredictiveScore:
     @cached_property
     def folds(self) -> Array:
         """Parameters estimated without each fold, (`FOLDS`, b)."""
-        equations, products = self.fit.equations, self.fit.products
+        regression = self.fit.regression
         b = self.fit.theta.size
         zx, zy = np.zeros((FOLDS, b, b)), np.zeros((FOLDS, b))
-        for block, rows in zip(equations.blocks, products.rows, strict=True):
-            width, fold = block.x.size, fold_of(rows.shape[0])
+        for joint, rows in zip(self.fit.equations.joints, regression.rows, strict=True):
+            fold = fold_of(rows.shape[0])
             for k in range(FOLDS):
-                own = rows[fold == k]
-                through = own[:, width:-1].T @ own
-                zx[k][np.ix_(block.z, block.x)] += through[:, :width]
-                zy[k][block.z] += through[:, -1]
-        scale, weak = products.scale, np.diag(self._prior)
+                sums = joint.products([rows[fold == k]])
+                zx[k][np.ix_(joint.z, joint.x)] += sums[:, : joint.x.size]
+                zy[k][joint.z] += sums[:, -1]
+        scale, weak = regression.solution.scale, np.diag(self._prior)
         found = [
             np.linalg.lstsq(
                 (zx.sum(0) - zx[k] + weak) / np.outer(scale, scale), (zy.sum(0) - zy[k]) / scale, rcond=1e-12
@@ -94,14 +93,15 @@ class PredictiveScore:
     @cached_property
     def _parts(self) -> tuple[tuple[Array, ...], ...]:
         found = []
-        for block in self.fit.equations.blocks:
-            width = block.x.size
-            total = sum(part.shape[0] for part in block.parts)
+        for joint in self.fit.equations.joints:
+            width = joint.x.size
+            total = sum(len(part) for part in joint.parts)
             fold, begin, parts = fold_of(total), 0, []
-            for part in block.parts:
-                own = self.folds[fold[begin : begin + part.shape[0]]][:, block.x]
-                parts.append(part[:, -1] - np.einsum("mi,mi->m", part[:, :width], own))
-                begin += part.shape[0]
+            for part in joint.parts:
+                rows = part[:]
+                own = self.folds[fold[begin : begin + len(part)]][:, joint.x]
+                parts.append(rows[:, -1] - np.einsum("mi,mi->m", rows[:, :width], own))
+                begin += len(part)
             found.append(tuple(parts))
         return tuple(found)
 
@@ -133,9 +133,7 @@ class PredictiveScore:
     @cached_property
     def own_noise(self) -> tuple[ArModel, ...]:
         """Noise models of the predicted errors, one for each joint."""
-        return tuple(
-            one for parts in self._parts for one in noise_models([part[:, None] for part in parts], 0, MAX_AR_ORDER)
-        )
+        return tuple(one for parts in self._parts for one in ar_models([part[:, None] for part in parts], MAX_AR_ORDER))
 
     @cached_property
     def own_log_likelihoods(self) -> Array:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
-from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, noise_models
+from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
 from armident.identify.effects.tables import hats
-from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.ar_noise import ArModel, ar_models
 from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int)
     able = np.isfinite(size) & (size > 0.0)
     scale = np.where(able, size, np.inf)
     scaled = [(j, np.where(able, own, 0.0) / scale) for j, own in columns]
-    gram, score = fit.products_beside(scaled, count)
+    gram, score = fit.regression.products_beside(scaled, count)
     power, right = np.linalg.eigh(gram)
     kept = power > RANK_TOLERANCE**2
     along = np.einsum("gij,gi->gj", right, score)
@@ -112,7 +112,7 @@ def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array
     scale = np.linalg.norm(instruments, axis=0)
     if np.any(scale == 0) or not np.isfinite(scale).all():
         return None
-    beside = fit.beside(instruments / scale)
+    beside = fit.regression.beside(instruments / scale)
     # Through the small Gram matrix: candidates have a few columns and many rows.
     power, right = np.linalg.eigh(beside.T @ beside)
     kept = power > RANK_TOLERANCE**2
@@ -197,7 +197,7 @@ def noise_beyond_shapes(fit: Fit, column_cache: ColumnCache) -> list[ArModel]:
         for e, c in zip(left, columns, strict=True):
             e[:, j] -= c[j] @ shapes
         used += shapes.size
-    return noise_models(left, fit.theta.size + used, MAX_AR_ORDER)
+    return ar_models(left, MAX_AR_ORDER, parameters=fit.theta.size + used)
 
 
 def _smooth_functions(column_cache: ColumnCache, motion: Motion, rows: int) -> list[Array]:

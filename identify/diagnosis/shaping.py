@@ -14,7 +14,7 @@ from scipy import optimize
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
 from armident.identify.diagnosis.regression import Fit
 from armident.identify.diagnosis.screening import directions_beside, replaced
-from armident.identify.diagnosis.whitening import whitened
+from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,6 @@ from scipy import signal
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Stanza
 from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distances, moving_rows, rows_before
-from armident.identify.diagnosis.whitening import ar_models
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.recorded import of_recording, put_right
 from armident.identify.effects.registry import known
@@ -24,6 +23,7 @@ from armident.identify.identification.equations import Prepared, equations, leas
 from armident.identify.identification.options import CONTROLLERS, Options
 from armident.identify.identification.sign_smoothing import unsaturated_joints, with_sign_smoothing
 from armident.identify.identification.solvers import decimation_of
+from armident.identify.regression.ar_noise import ar_models
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.motion import Motion
 from armident.identify.signals.bandwidth import motion_bandwidth
@@ -95,7 +95,7 @@ class Study:
         `log_volume`.
     rigid
         Cache of the regressors that all models of the study share; see
-        `armident.identify.diagnosis.regression.regressors`.
+        `armident.identify.diagnosis.equations.regressors`.
     """
 
     robot: RobotConfig

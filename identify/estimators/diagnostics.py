@@ -14,18 +14,11 @@ from numpy.typing import NDArray
 from scipy import linalg, signal, stats
 
 from armident.identify.regression.ar_noise import ArModel, lagged_sums
-from armident.identify.regression.equations import (
-    MAX_AR_ORDER,
-    Estimate,
-    ExperimentEquations,
-    instrumental_variable,
-    inverse_gram,
-    least_squares,
-    noise_models,
-    serial_covariance,
-    weighted_rows,
-)
+from armident.identify.regression.equations import MAX_AR_ORDER, Estimate, ExperimentEquations, noise_models
 from armident.identify.regression.hac import newey_west
+from armident.identify.regression.iv import factored, serial_covariance
+from armident.identify.regression.least_squares import inverse_gram, least_squares
+from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
 
@@ -238,13 +231,13 @@ def diagnose_estimate(
     if not any(w.order for w in weights):
         noise = noise_models(blocks, estimate.theta, estimate.covariance, max_order)
     keep, x = [b.keep for b in blocks], [b.x for b in blocks]
-    rows = weighted_rows(x, keep, weights)
+    rows = whitened(x, weights, keep)
     condition, relevance, endogeneity, ratio = None, None, None, 1.0
     if not any(w.order for w in [*weights, *estimate.noise]):
         zeta = x if instruments is None else instruments
         ratio = _largest_ratio(serial_covariance(zeta, x, keep, weights, noise), estimate.covariance)
     if instruments is not None:
-        z = weighted_rows(instruments, keep, weights)
+        z = whitened(instruments, weights, keep)
         condition = float(np.linalg.cond(_normalised(z).T @ _normalised(rows)))
         relevance = instrument_relevance(names, blocks, instruments, weights)
         endogeneity = durbin_wu_hausman(names, blocks, instruments, weights, noise)
@@ -289,8 +282,8 @@ def instrument_relevance(
     variance of ``w_k v_k`` summed over the joints at each instant (Newey and West 1987).
     """
     keep = [b.keep for b in blocks]
-    x = weighted_rows([b.x for b in blocks], keep, weights)
-    q, _ = linalg.qr(_normalised(weighted_rows(instruments, keep, weights)), mode="economic")
+    x = whitened([b.x for b in blocks], weights, keep)
+    q, _ = linalg.qr(_normalised(whitened(instruments, weights, keep)), mode="economic")
     projected = q.T @ x
     a = inverse_gram(projected)
     r2 = np.diag(inverse_gram(x)) / np.diag(a)
@@ -337,10 +330,10 @@ def durbin_wu_hausman(
     the two are the same carry no information; they are left out, and the degrees of freedom with them.
     """
     keep = [b.keep for b in blocks]
-    x = weighted_rows([b.x for b in blocks], keep, weights)
-    z = weighted_rows(instruments, keep, weights)
-    y = weighted_rows([b.y for b in blocks], keep, weights)
-    shift = instrumental_variable(z, x, y) - least_squares(x, y)
+    x = whitened([b.x for b in blocks], weights, keep)
+    z = whitened(instruments, weights, keep)
+    y = whitened([b.y for b in blocks], weights, keep)
+    shift = factored(z, x, y).theta - least_squares(x, y)
     maps = _estimator_maps(z, x)
     # H' W A' for both estimators at once: its Gram matrix holds their covariances and their cross-covariance.
     coloured = _coloured(maps, keep, weights, noise)
@@ -546,7 +539,7 @@ def _estimator_maps(z: Array, x: Array) -> Array:
 
 
 def _slices(keep: Sequence[NDArray[np.bool_]], weights: Sequence[ArModel]) -> list[tuple[int, int, slice]]:
-    """Joint, experiment and place of every series in the rows of ``weighted_rows``."""
+    """Joint, experiment and place of every series in the rows of `whitened`."""
     places, first = [], 0
     for j, ar in enumerate(weights):
         for number, kept in enumerate(keep):
@@ -572,7 +565,7 @@ def _coloured(
 
 
 def _by_instant(rows: Array, keep: Sequence[NDArray[np.bool_]], weights: Sequence[ArModel]) -> list[Array]:
-    """Rows of ``weighted_rows`` (R, b) summed over the joints at each instant, one (M, b) per experiment."""
+    """Rows of `whitened` (R, b) summed over the joints at each instant, one (M, b) per experiment."""
     sums = [np.zeros((kept.shape[0], rows.shape[1])) for kept in keep]
     for j, number, place in _slices(keep, weights):
         order = weights[j].order

@@ -8,19 +8,16 @@ from numpy.typing import NDArray
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.sensitivity import torque_sensitivities
 from armident.identify.regression.equations import (
-    ITERATIONS,
     Estimate,
     ExperimentEquations,
-    Iterations,
-    inverse_gram,
-    iterate,
-    iv_covariance,
     joint_variances,
-    least_squares,
     residual_norm,
     stacked,
     whitened_residuals,
 )
+from armident.identify.regression.iterations import ITERATIONS, Iterations, iterate
+from armident.identify.regression.iv import factored
+from armident.identify.regression.least_squares import inverse_gram, least_squares
 
 
 def didim(
@@ -60,9 +57,9 @@ def didim(
     auxiliary = auxiliary.fresh()
     (theta, done, converged, reason), simulated = solve_didim(blocks, auxiliary, start, iterations)
     noise = joint_variances(simulated, theta)
-    z, _y = stacked(simulated, noise)
+    z, y = stacked(simulated, noise)
     if true_sensitivities:
-        covariance = iv_covariance(z, torque_sensitivities(auxiliary, theta, blocks, noise))
+        covariance = factored(z, torque_sensitivities(auxiliary, theta, blocks, noise), y).covariance
     else:
         covariance = inverse_gram(z)  # 2.37
     residuals = whitened_residuals(simulated, theta, noise)

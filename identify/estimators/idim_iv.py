@@ -8,19 +8,16 @@ from numpy.typing import NDArray
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
-    ITERATIONS,
     Estimate,
     ExperimentEquations,
-    instrumental_variable,
-    iterate,
-    iv_covariance,
     joint_variances,
     noise_models,
     residual_norm,
-    serial_covariance,
     stacked,
     whitened_residuals,
 )
+from armident.identify.regression.iterations import ITERATIONS, iterate
+from armident.identify.regression.iv import factored, serial_covariance
 
 
 def idim_iv(
@@ -58,14 +55,14 @@ def idim_iv(
     def step(previous: NDArray[np.float64], _: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise
         z, _y = stacked(auxiliary.equations(blocks, previous), noise)
-        estimate = instrumental_variable(z, *stacked(blocks, noise))  # 2.33
+        estimate = factored(z, *stacked(blocks, noise)).theta  # 2.33
         noise = joint_variances(blocks, estimate)
         return estimate, residual_norm(blocks, estimate, scale)
 
     theta, done, converged, reason = iterate(step, start, iterations)
     noise = joint_variances(blocks, theta)
     simulated = auxiliary.equations(blocks, theta)
-    covariance = iv_covariance(stacked(simulated, noise)[0], stacked(blocks, noise)[0])
+    covariance = factored(stacked(simulated, noise)[0], *stacked(blocks, noise)).covariance
     if serial_order:
         weights, keep = noise, [b.keep for b in blocks]
         zeta, x = [b.x for b in simulated], [b.x for b in blocks]

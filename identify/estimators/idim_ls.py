@@ -2,20 +2,18 @@
 
 from collections.abc import Sequence
 
+from armident.identify.regression.ar_noise import WHITE
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
     Estimate,
     ExperimentEquations,
-    inverse_gram,
     joint_variances,
-    least_squares,
     noise_models,
-    require_excitation,
-    serial_covariance,
     stacked,
-    unweighted,
     whitened_residuals,
 )
+from armident.identify.regression.iv import serial_covariance
+from armident.identify.regression.least_squares import inverse_gram, least_squares, require_excitation
 
 
 def idim_ls(
@@ -41,7 +39,7 @@ def idim_ls(
     DataError
         If the motion leaves parameters undetermined.
     """
-    plain = unweighted(blocks[0].y.shape[1])
+    plain = [WHITE] * blocks[0].y.shape[1]
     x, y = stacked(blocks, plain)
     require_excitation(x, names)
     theta = least_squares(x, y)  # 2.22

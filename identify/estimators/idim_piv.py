@@ -9,17 +9,17 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.grey_box import InverseController
 from armident.identify.regression.ar_noise import ArModel
 from armident.identify.regression.equations import (
-    ITERATIONS,
     MAX_AR_ORDER,
     Estimate,
     ExperimentEquations,
-    iterate,
+    instrumented,
     joint_variances,
     noise_models,
     residual_norm,
     whitened_residuals,
 )
-from armident.identify.regression.iv_products import IvProducts, iv_products
+from armident.identify.regression.iterations import ITERATIONS, iterate
+from armident.identify.regression.iv import IvProducts, iv_products
 
 NOISE_UPDATES = 6
 """Iterations after which the noise models are held: an order that flips between two equal AICs never settles."""
@@ -74,7 +74,7 @@ def idim_piv(
 
     def solved(at: NDArray[np.float64]) -> IvProducts:
         instruments = [block.x for block in seen(auxiliary.equations(blocks, at))]
-        return iv_products(instruments, measured, noise)  # 6.30
+        return iv_products(instrumented(measured, instruments), noise)  # 6.30
 
     def step(previous: NDArray[np.float64], k: int) -> tuple[NDArray[np.float64], float]:
         nonlocal noise

@@ -10,19 +10,12 @@ from scipy import linalg
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
 from armident.identify.estimators.didim import solve_didim
 from armident.identify.estimators.sensitivity import Array, Arrays, difference_steps, sensitivities, weighted_columns
-from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.equations import (
-    TOLERANCE,
-    Estimate,
-    ExperimentEquations,
-    column_norms,
-    error_variances,
-    inverse_gram,
-    iterate,
-    weighted_rows,
-    whitened,
-)
-from armident.identify.regression.tall_qr import triangularize
+from armident.identify.regression.ar_noise import ArModel, ar_models
+from armident.identify.regression.equations import Estimate, ExperimentEquations
+from armident.identify.regression.iterations import TOLERANCE, iterate
+from armident.identify.regression.least_squares import column_norms, inverse_gram
+from armident.identify.regression.qr import triangularize
+from armident.identify.regression.whitening import whitened, whitened_series
 
 Signal = Callable[[Response], Arrays]
 
@@ -80,14 +73,14 @@ def output_error(
 
     def step(_: Array, _k: int) -> tuple[Array, float]:
         search.step()
-        return search.theta, float(np.linalg.norm(weighted_rows(search.errors(), keep, scale)))
+        return search.theta, float(np.linalg.norm(whitened(search.errors(), scale, keep)))
 
     theta, done, converged, reason = iterate(step, search.theta, iterations)
     if search.stuck:
         converged, reason = False, "no step lowers the error although the sensitivities promise it"
     noise = search.variances()
     covariance = search.covariance(noise)
-    residuals = whitened(search.errors(), keep, noise)
+    residuals = whitened_series(search.errors(), noise, keep)
     return Estimate(theta, covariance, tuple(noise), residuals, done, converged, reason, auxiliary.warnings)
 
 
@@ -130,7 +123,7 @@ class _LevenbergMarquardt:
         return [m - s for m, s in zip(self.measured, simulated, strict=True)]
 
     def variances(self) -> list[ArModel]:
-        return error_variances(self.errors(), self.keep, self.theta.size)
+        return ar_models(self.errors(), 0, keep=self.keep, parameters=self.theta.size)
 
     def log_likelihood_loss(self) -> float:
         """``sum_j N_j log sigma_j^2``: joints of any unit and size compare."""
@@ -173,7 +166,7 @@ class _LevenbergMarquardt:
         assert self._columns is not None
         psi = weighted_columns(self._columns, self.keep, noise)
         norms = column_norms(psi)
-        top = triangularize(psi / norms, weighted_rows(self.errors(), self.keep, noise), columns=norms.size)
+        top = triangularize(psi / norms, whitened(self.errors(), noise, self.keep), columns=norms.size)
         return top[:, :-1], top[:, -1], norms
 
     def _step_left(self, noise: Sequence[ArModel]) -> float:
@@ -183,7 +176,7 @@ class _LevenbergMarquardt:
         return np.inf if delta is None else float(np.linalg.norm(delta / norms) / np.linalg.norm(self.theta))
 
     def _cost(self, errors: Arrays, noise: Sequence[ArModel]) -> float:
-        rows = weighted_rows(errors, self.keep, noise)
+        rows = whitened(errors, noise, self.keep)
         return float(rows @ rows)
 
     def _accept(self, noise: Sequence[ArModel]) -> bool:

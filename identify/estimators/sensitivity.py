@@ -8,15 +8,11 @@ from numpy.typing import NDArray
 
 from armident.configs import DataError
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel, Response
-from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.equations import (
-    ExperimentEquations,
-    column_norms,
-    error_variances,
-    unweighted,
-    weighted_rows,
-)
-from armident.identify.regression.tall_qr import triangularize
+from armident.identify.regression.ar_noise import WHITE, ArModel, ar_models
+from armident.identify.regression.equations import ExperimentEquations
+from armident.identify.regression.least_squares import column_norms
+from armident.identify.regression.qr import triangularize
+from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
 Arrays = Sequence[Array]
@@ -77,7 +73,7 @@ def sensitivity(auxiliary: AuxiliaryModel, theta: Array, parameters: Sequence[in
     none = [np.zeros_like(torque) for torque in response.torque]
     steps = difference_steps(zeta, response.torque, none, keep)
     columns = sensitivities(auxiliary, theta, response, steps)
-    plain = unweighted(auxiliary.model.n)
+    plain = [WHITE] * auxiliary.model.n
 
     def singular_values(jacobian: Array) -> Array:
         factor = triangularize(jacobian[:, chosen], columns=chosen.size)
@@ -86,7 +82,7 @@ def sensitivity(auxiliary: AuxiliaryModel, theta: Array, parameters: Sequence[in
     return Sensitivity(
         clie=singular_values(weighted_columns([column.torque for column in columns], keep, plain)),
         cloe=singular_values(weighted_columns([column.position for column in columns], keep, plain)),
-        didim=singular_values(weighted_rows(zeta, keep, plain)),
+        didim=singular_values(whitened(zeta, plain, keep)),
     )
 
 
@@ -132,9 +128,9 @@ def difference_steps(zeta: Arrays, torques: Arrays, errors: Arrays, keep: Sequen
     """
     noise = [
         ArModel(np.empty(0), max(e.variance, LEAST_TORQUE**2 * y.variance), 0.0)
-        for e, y in zip(error_variances(errors, keep, 0), error_variances(torques, keep, 0), strict=True)
+        for e, y in zip(ar_models(errors, 0, keep=keep), ar_models(torques, 0, keep=keep), strict=True)
     ]
-    return DIFFERENCE / column_norms(weighted_rows(zeta, keep, noise))
+    return DIFFERENCE / column_norms(whitened(zeta, noise, keep))
 
 
 def weighted_columns(columns: Sequence[Arrays], keep: Sequence[NDArray[np.bool_]], noise: Sequence[ArModel]) -> Array:
@@ -149,7 +145,7 @@ def weighted_columns(columns: Sequence[Arrays], keep: Sequence[NDArray[np.bool_]
     noise
         Noise model of each joint.
     """
-    return np.stack([weighted_rows(column, keep, noise) for column in columns], axis=1)
+    return np.stack([whitened(column, noise, keep) for column in columns], axis=1)
 
 
 def _quotient(moved: Response, response: Response, step: float) -> Response:

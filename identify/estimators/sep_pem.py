@@ -9,16 +9,16 @@ from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.didim import solve_didim
 from armident.identify.regression.equations import (
     COVARIANCE_PASSES,
-    ITERATIONS,
     MAX_AR_ORDER,
     Estimate,
     ExperimentEquations,
-    inverse_gram,
     joint_variances,
     noise_models,
     stacked,
     whitened_residuals,
 )
+from armident.identify.regression.iterations import ITERATIONS
+from armident.identify.regression.least_squares import inverse_gram
 
 
 def sep_pem(

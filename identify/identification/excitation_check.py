@@ -15,14 +15,9 @@ from armident.identify.identification.moving_joints import FARTHEST, MOVE
 from armident.identify.identification.result import units
 from armident.identify.identification.verdict import Level, Reason, listed
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.equations import (
-    RANK_TOLERANCE,
-    ExperimentEquations,
-    column_norms,
-    filtered_regressor,
-    least_squares,
-)
-from armident.identify.regression.tall_qr import triangularize
+from armident.identify.regression.equations import ExperimentEquations, filtered_regressor
+from armident.identify.regression.least_squares import RANK_TOLERANCE, column_norms, least_squares
+from armident.identify.regression.qr import triangularize
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives

@@ -14,14 +14,8 @@ from numpy.typing import NDArray
 
 from armident.identify.identification.equations import Prepared
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.equations import (
-    MAX_AR_ORDER,
-    Estimate,
-    ExperimentEquations,
-    noise_models,
-    residuals,
-    weighted_rows,
-)
+from armident.identify.regression.equations import MAX_AR_ORDER, Estimate, ExperimentEquations, noise_models, residuals
+from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
 
@@ -100,7 +94,7 @@ def residual_statistics(
     at = [np.rint(block.t / dt).astype(np.int64) for block in blocks]
     keep = [block.keep for block in blocks]
     errors = residuals(blocks, estimate.theta)
-    x, e = weighted_rows([block.x for block in blocks], keep, noise), weighted_rows(errors, keep, noise)
+    x, e = whitened([block.x for block in blocks], noise, keep), whitened(errors, noise, keep)
     scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
     values, vectors = np.linalg.eigh((x / scale).T @ (x / scale))
     regular = values > RANK * values[-1]

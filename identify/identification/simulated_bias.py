@@ -22,12 +22,13 @@ from armident.identify.regression.equations import (
     Estimate,
     ExperimentEquations,
     filtered_regressor,
+    instrumented,
     joint_variances,
-    least_squares,
     stacked,
     whitened_residuals,
 )
-from armident.identify.regression.iv_products import iv_products
+from armident.identify.regression.iv import iv_products
+from armident.identify.regression.least_squares import least_squares
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import central_difference
@@ -140,7 +141,7 @@ def simulated_bias(
             return None
         kept = [replace(new, keep=block.keep, t=block.t) for new, block in zip(recorded, blocks, strict=True)]
         try:
-            found = iv_products(instruments, kept, weights).theta
+            found = iv_products(instrumented(kept, instruments), weights).theta
         except np.linalg.LinAlgError:
             return None
         if not np.isfinite(found).all():

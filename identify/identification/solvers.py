@@ -28,13 +28,8 @@ from armident.identify.identification.simulated_bias import (
 )
 from armident.identify.identification.torque_delay import TorqueDelay, torque_delay
 from armident.identify.identification.verdict import Reason
-from armident.identify.regression.equations import (
-    Estimate,
-    ExperimentEquations,
-    joint_variances,
-    noise_models,
-    serial_covariance,
-)
+from armident.identify.regression.equations import Estimate, ExperimentEquations, joint_variances, noise_models
+from armident.identify.regression.iv import serial_covariance
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives

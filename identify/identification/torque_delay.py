@@ -16,17 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.identify.experiment import Experiment
-from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.ar_noise import WHITE, ArModel
 from armident.identify.regression.equations import (
     ExperimentEquations,
     filtered_regressor,
-    instrumental_variable,
     joint_variances,
     noise_models,
-    serial_covariance,
-    unweighted,
-    weighted_rows,
 )
+from armident.identify.regression.iv import factored, serial_covariance
+from armident.identify.regression.whitening import whitened
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import Decimation
 from armident.identify.signals.differentiate import Derivatives, differentiate
@@ -143,14 +141,13 @@ def torque_delay(
     def solve(
         zeta: Sequence[Array], phi: Sequence[Array], noise: Sequence[ArModel]
     ) -> tuple[Array, list[ExperimentEquations]]:
-        rows = [weighted_rows(values, keep, noise) for values in (zeta, phi, y)]
-        theta = instrumental_variable(*rows)
+        theta = factored(*(whitened(values, noise, keep) for values in (zeta, phi, y))).theta
         return theta, [
             ExperimentEquations(*parts, np.zeros(parts[0].shape[0])) for parts in zip(y, phi, keep, strict=True)
         ]
 
     without = [value[:, :, :b] for value in z], [value[:, :, :b] for value in x]
-    theta, blocks = solve(*without, unweighted(n))
+    theta, blocks = solve(*without, [WHITE] * n)
     theta, blocks = solve(*without, joint_variances(blocks, theta))
     noise: Sequence[ArModel] = joint_variances(blocks, theta)
     for _ in range(REWEIGHTINGS):

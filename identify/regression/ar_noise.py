@@ -6,7 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from armident.identify.regression.fir import filter_columns
 from armident.identify.robot.compiled import compiled
+
+LEAST_VARIANCE = 1e-300
+"""Variance of a residual that is zero, in squared units of the series: its inverse is finite."""
+
+PIECE = 4096
+"""Numbers multiplied at a time: they stay in the cache."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +39,21 @@ class ArModel:
         """Number of coefficients."""
         return self.coefficients.size
 
+    @property
+    def whitening(self) -> NDArray[np.float64]:
+        """Impulse response of the filter ``C(z^-1) / lambda``, shape (l + 1,)."""
+        response: NDArray[np.float64] = np.append(1.0, self.coefficients) / np.sqrt(self.variance)
+        return response
+
     def whiten(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order, ...); no initial state is assumed."""
-        flat = np.ascontiguousarray(x, dtype=np.float64).reshape(x.shape[0], -1)
-        out: NDArray[np.float64] = _convolve(flat, self.coefficients) / np.sqrt(self.variance)
-        return out.reshape((out.shape[0], *x.shape[1:]))
+        """``C(z^-1) x / lambda`` along the first axis, (M, ...) to (M - order, ...); no initial state is assumed.
+
+        Shape (0, ...) where there are no more samples than coefficients.
+        """
+        rows = x.shape[0] - self.order
+        if rows < 1:
+            return np.empty((0, *x.shape[1:]))
+        return filter_columns(self.whitening, x.reshape(x.shape[0], -1)).reshape((rows, *x.shape[1:]))
 
     def widened(self, samples: int) -> "ArModel":
         """The same filter, its variance times ``((N + l) / (N - l))^2``: for weights and covariances of an estimate.
@@ -87,6 +104,50 @@ class Whiteness:
         return float(np.mean(np.abs(self.autocorrelation) > self.bound))
 
 
+def ar_models(
+    errors: Sequence[NDArray[np.float64]],
+    max_order: int,
+    *,
+    keep: Sequence[NDArray[np.bool_]] | None = None,
+    parameters: float = 0.0,
+    absorbed: Sequence[NDArray[np.float64]] | None = None,
+) -> list[ArModel]:
+    """AR model of the errors of each joint (2.25, 2.26, 6.21 to 6.25).
+
+    Two corrections make up for the noise that estimated parameters have taken out of the errors. The number of
+    parameters widens all variances by the same factor, which suffices for weights and comparisons. The autocovariances
+    of that noise (``absorbed``) are right for every frequency, but need the covariance of the parameters.
+
+    Parameters
+    ----------
+    errors
+        Errors, one (M, n) array per experiment, N m or N.
+    max_order
+        Highest order tried; limited to a tenth of the samples. 0: white noise.
+    keep
+        Equations to use, (M, n) per experiment; ``None``: all. For white noise alone: a filter needs a gapless record.
+    parameters
+        Number of estimated parameters. Joints share their degrees of freedom in proportion to their equations.
+    absorbed
+        Sums of the autocovariances that the parameters took from each joint, see `fit_ar`; ``None``: nothing.
+
+    Raises
+    ------
+    ValueError
+        If ``keep`` is given for coloured noise.
+    """
+    if keep is not None and max_order:
+        raise ValueError("coloured noise needs a record without gaps")
+    models, equations = [], 0
+    for j in range(errors[0].shape[1]):
+        series = [e[:, j] if keep is None else e[keep[k][:, j], j] for k, e in enumerate(errors)]
+        models.append(fit_ar(series, max_order, None if absorbed is None else absorbed[j]))
+        equations += sum(s.size for s in series)
+    equations = max(equations, 1)
+    free = max(1.0 - parameters / equations, 1.0 / equations)
+    return [replace(ar, variance=ar.variance / free) for ar in models]
+
+
 def fit_ar(
     series: Sequence[NDArray[np.float64]], max_order: int, absorbed: NDArray[np.float64] | None = None
 ) -> ArModel:
@@ -107,9 +168,9 @@ def fit_ar(
     r = np.zeros(max_order + 1) if absorbed is None else absorbed[: max_order + 1].copy()
     for s in series:
         r += lagged_sums(s[:, None], max_order)
-    r /= total
-    if r[0] <= 0:
-        return ArModel(np.empty(0), np.finfo(np.float64).tiny, -np.inf)
+    r /= max(total, 1)
+    if r[0] <= LEAST_VARIANCE:
+        return ArModel(np.empty(0), LEAST_VARIANCE, -np.inf)
     return lowest_aic(r, total)
 
 
@@ -226,32 +287,15 @@ def _lowest_aic(r: NDArray[np.float64], samples: int) -> tuple[NDArray[np.float6
 @compiled
 def _lagged_sums(x: NDArray[np.float64], max_lag: int, first: int) -> NDArray[np.float64]:
     samples, width = x.shape
-    sums, products = np.zeros(max_lag + 1), np.empty(width)
-    for lag in range(max_lag + 1):
-        products[:] = 0.0
-        for k in range(max(lag, first), samples):
-            for c in range(width):
-                products[c] += x[k, c] * x[k - lag, c]
-        for c in range(width):
-            sums[lag] += products[c]
+    # The previous sample is the previous row of the array: one long sum per lag, in pieces that stay in the cache.
+    flat, rows = x.ravel(), max(1, PIECE // width)
+    sums = np.zeros(max_lag + 1)
+    for begin in range(0, samples, rows):
+        end = min(begin + rows, samples)
+        for lag in range(max_lag + 1):
+            start = max(begin, first, lag)
+            if start < end:
+                sums[lag] += np.dot(
+                    flat[start * width : end * width], flat[(start - lag) * width : (end - lag) * width]
+                )
     return sums
-
-
-PIECE = 2048
-"""Numbers filtered at a time."""
-
-
-@compiled
-def _convolve(x: NDArray[np.float64], coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-    order, width = coefficients.size, x.shape[1]
-    out = x[order:].copy()
-    # The previous sample is the previous row of the array: one long sum per coefficient, in pieces that stay in the
-    # cache.
-    late, early = out.ravel(), x.ravel()
-    for begin in range(0, late.size, PIECE):
-        piece = late[begin : begin + PIECE]
-        for i in range(order):
-            c, before = coefficients[i], early[begin + (order - 1 - i) * width :]
-            for m in range(piece.size):
-                piece[m] += c * before[m]
-    return out

@@ -16,11 +16,12 @@ from armident.identify.diagnosis.free_functions import free_functions, hats
 from armident.identify.diagnosis.hints import HINTS, hint_of
 from armident.identify.diagnosis.lack_of_fit import Dependence, LackOfFit
 from armident.identify.diagnosis.noise_beyond import noise_beyond
-from armident.identify.diagnosis.regression import Fit, applied, fit
+from armident.identify.diagnosis.regression import Fit, fit
 from armident.identify.diagnosis.spectral_lines import strongest_line
 from armident.identify.diagnosis.stretch import Stretch
 from armident.identify.diagnosis.study import Study, build_study
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.regression.equations import applied
 from tests.fixtures.arms import FAST, recording
 
 pytestmark = pytest.mark.slow
@@ -57,9 +58,10 @@ def of_coloured_noise(seed: int) -> LackOfFit:
     def noisy(part: str) -> tuple[Stretch, ...]:
         rows = found.equations.train if part == "train" else found.equations.held
         out = []
-        for stretch, (x, _, y) in zip(getattr(study, part), rows, strict=True):
+        for stretch, own in zip(getattr(study, part), rows, strict=True):
+            y = own.y
             noise = np.stack([coloured(rng, y.shape[0]) for _ in range(y.shape[1])], axis=1)
-            out.append(replace(stretch, y=np.where(y == 0, 0.0, applied(x, found.theta) + 0.4 * size * noise)))
+            out.append(replace(stretch, y=np.where(y == 0, 0.0, applied(own.x, found.theta) + 0.4 * size * noise)))
         return tuple(out)
 
     return LackOfFit(fit(replace(study, train=noisy("train"), held=noisy("held"))), Criteria())

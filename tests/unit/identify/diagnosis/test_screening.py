@@ -9,11 +9,11 @@ from armident.configs import load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.candidates import ColumnCache, candidates
 from armident.identify.diagnosis.model_state import fitted as model_of
-from armident.identify.diagnosis.regression import Fit, Products
+from armident.identify.diagnosis.regression import Fit
 from armident.identify.diagnosis.screening import directions_beside, score_statistics
 from armident.identify.diagnosis.study import build_study
-from armident.identify.diagnosis.whitening import joints_of
 from armident.identify.identification.from_recording import experiments_from_recording
+from armident.identify.regression.iv_regression import IvRegression
 from tests.fixtures.arms import FAST, recording
 
 pytestmark = pytest.mark.slow
@@ -50,7 +50,7 @@ def test_every_shape_of_a_grid_gets_the_statistic_that_it_has_by_itself(fitted: 
 
 
 def test_a_shape_without_an_effect_has_no_statistic_and_spoils_no_other(fitted: Fit) -> None:
-    columns = np.random.default_rng(0).standard_normal((fitted.products.rows[2].shape[0], 4))
+    columns = np.random.default_rng(0).standard_normal((fitted.regression.rows[2].shape[0], 4))
     whole = score_statistics(fitted, [(2, columns)], 4)
     columns[:, 1], columns[5, 2] = 0.0, np.nan
     found = score_statistics(fitted, [(2, columns)], 4)
@@ -62,16 +62,8 @@ def test_a_shape_without_an_effect_has_no_statistic_and_spoils_no_other(fitted: 
 def test_products_are_made_anew_only_where_the_noise_is_another(fitted: Fit) -> None:
     noise = list(fitted.noise)
     noise[4] = replace(noise[4], variance=2.0 * noise[4].variance)
-    known = Products.of(fitted.equations, noise, fitted.products)
-    fresh = Products.of(fitted.equations, noise)
-    assert [a is b for a, b in zip(known.rows, fitted.products.rows, strict=True)] == [j != 4 for j in range(6)]
-    np.testing.assert_array_equal(known.zx, fresh.zx)
-    np.testing.assert_array_equal(known.zz, fresh.zz)
-    np.testing.assert_array_equal(known.zy, fresh.zy)
-
-
-def test_joints_are_those_with_a_number_that_is_not_zero() -> None:
-    columns = np.zeros((50, 4, 2))
-    columns[49, 1, 1], columns[0, 3, 0] = 1e-300, np.nan
-    assert joints_of(columns) == [1, 3]
-    assert joints_of(columns.transpose(0, 1, 2)[:, ::-1]) == [0, 2]
+    known = IvRegression.of(fitted.equations, noise, fitted.regression)
+    fresh = IvRegression.of(fitted.equations, noise)
+    assert [a is b for a, b in zip(known.rows, fitted.regression.rows, strict=True)] == [j != 4 for j in range(6)]
+    for name in ("cross", "gram", "projected", "scale"):
+        np.testing.assert_array_equal(getattr(known.solution, name), getattr(fresh.solution, name))

@@ -23,13 +23,11 @@ from armident.identify.regression.ar_noise import WHITE, ArModel
 from armident.identify.regression.equations import (
     Estimate,
     ExperimentEquations,
-    instrumental_variable,
-    inverse_gram,
-    iv_covariance,
-    least_squares,
-    weighted_rows,
     whitened_residuals,
 )
+from armident.identify.regression.iv import factored
+from armident.identify.regression.least_squares import inverse_gram, least_squares
+from armident.identify.regression.whitening import whitened
 
 Array = NDArray[np.float64]
 
@@ -141,9 +139,9 @@ def test_hausman_leaves_out_directions_in_which_the_two_estimators_are_one(draws
 def test_shea_r2_is_the_share_of_the_variance_that_least_squares_would_have() -> None:
     block, z = drawn(np.random.default_rng(5), WHITE, errors_in_variables=False)
     keep = [block.keep]
-    x, zeta = (weighted_rows([v], keep, [AR1] * 2) for v in (block.x, z))
+    x, zeta = (whitened([v], [AR1] * 2, keep) for v in (block.x, z))
     found = instrument_relevance(NAMES, [block], [z], [AR1] * 2)
-    share = np.diag(inverse_gram(x)) / np.diag(iv_covariance(zeta, x))
+    share = np.diag(inverse_gram(x)) / np.diag(factored(zeta, x, x[:, 0]).covariance)
     np.testing.assert_allclose([r.partial_r2 for r in found], share, rtol=1e-9)
     assert not any(r.weak for r in found)
 
@@ -312,11 +310,11 @@ def test_all_of_it_for_instruments_with_rows_left_out_and_two_experiments() -> N
     blocks = [replace(block, keep=rng.random(block.keep.shape) > 0.1) for block, _ in drawn_twice]
     instruments = [z for _, z in drawn_twice]
     keep = [b.keep for b in blocks]
-    x, z = weighted_rows([b.x for b in blocks], keep, [WHITE] * 2), weighted_rows(instruments, keep, [WHITE] * 2)
-    y = weighted_rows([b.y for b in blocks], keep, [WHITE] * 2)
-    theta = instrumental_variable(z, x, y)
+    x, z, y = (whitened(v, [WHITE] * 2, keep) for v in ([b.x for b in blocks], instruments, [b.y for b in blocks]))
+    solution = factored(z, x, y)
+    theta = solution.theta
     noise = (WHITE, WHITE)
-    estimate = Estimate(theta, 3 * iv_covariance(z, x), noise, whitened_residuals(blocks, theta, noise))
+    estimate = Estimate(theta, 3 * solution.covariance, noise, whitened_residuals(blocks, theta, noise))
     found = diagnose_estimate(NAMES, JOINTS, blocks, estimate, instruments=instruments)
     assert found.endogeneity is not None
     assert found.endogeneity.rejected

@@ -21,8 +21,8 @@ from armident.identify.identification.from_recording import experiments_from_rec
 from armident.identify.identification.options import Options
 from armident.identify.identification.pipeline import identify_experiment
 from armident.identify.identification.solvers import decimation_of
-from armident.identify.regression.equations import Estimate, ExperimentEquations, filtered_regressor
-from armident.identify.regression.iv_products import iv_products
+from armident.identify.regression.equations import Estimate, ExperimentEquations, filtered_regressor, instrumented
+from armident.identify.regression.iv import iv_products
 from armident.identify.robot.arm import ArmModel
 from armident.identify.signals.decimate import design
 from armident.identify.signals.differentiate import Derivatives, differentiate
@@ -94,7 +94,7 @@ def test_instruments_of_any_band_take_set_points_for_information_that_the_smooth
     blocks, auxiliary, _ = loop(1, np.inf)
     limited = estimated(1, BAND_HZ)
 
-    unlimited = iv_products(auxiliary.fresh().instruments(limited.theta), blocks, limited.noise).theta
+    unlimited = iv_products(instrumented(blocks, auxiliary.fresh().instruments(limited.theta)), limited.noise).theta
 
     assert np.max(np.abs(unlimited - limited.theta) / limited.std) > 10.0
 

@@ -10,11 +10,10 @@ from armident.identify.regression.equations import (
     LONG_SERIES,
     ExperimentEquations,
     absorbed_sums,
-    inverse_gram,
-    least_squares,
     noise_models,
     stacked,
 )
+from armident.identify.regression.least_squares import inverse_gram, least_squares
 
 COEFFICIENTS = np.array([-1.5, 0.7])
 
@@ -107,6 +106,13 @@ def test_errors_of_parameters_are_as_large_as_said_although_the_noise_model_is_a
     assert np.mean(plain - known) > unwidened
     # The scatter is common to both.
     assert abs(np.mean(said - known)) < np.mean(plain - known)
+
+
+def test_lagged_sums_are_sums_of_products_of_rows() -> None:
+    x = np.random.default_rng(2).standard_normal((3000, 5))
+    for first in (0, 7, 40):
+        expected = [np.sum(x[max(k, first) :] * x[max(k, first) - k : 3000 - k]) for k in range(31)]
+        np.testing.assert_allclose(lagged_sums(x, 30, first), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_stretches_of_a_long_series_say_what_the_parameters_absorbed() -> None:

@@ -1,5 +1,7 @@
 """Estimate and covariance from sums of whitened rows, against those from orthogonal triangularisation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,15 +9,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.equations import (
-    ExperimentEquations,
-    instrumental_variable,
-    iv_covariance,
-    stacked,
-    weighted_rows,
-)
+from armident.identify.regression.equations import InstrumentedEquations, stacked
 from armident.identify.regression.fir import filter_columns
-from armident.identify.regression.iv_products import CHUNK_ROWS, iv_products
+from armident.identify.regression.iv import CHUNK_ROWS, factored, iv_products
+from armident.identify.regression.whitening import whitened
 
 Floats = NDArray[np.float64]
 
@@ -27,12 +24,10 @@ NOISE = [
 """Noise models of three joints, one of them white."""
 
 
-def problem(
-    samples: int, columns: int, similarity: float = 0.0, left_out: bool = False
-) -> tuple[list[Floats], list[ExperimentEquations]]:
+def problem(samples: int, columns: int, similarity: float = 0.0, left_out: bool = False) -> list[InstrumentedEquations]:
     """Two experiments of three joints; the last two regressors differ by a share of 10 to the ``-similarity``."""
     rng = np.random.default_rng(3)
-    instruments, blocks = [], []
+    blocks = []
     for m in (samples, samples // 2):
         z = rng.standard_normal((m, 3, columns)) * np.logspace(-3, 3, columns)
         z[:, :, -1] = z[:, :, -2] * (1 + 10.0**-similarity * rng.standard_normal((m, 3)))
@@ -41,33 +36,32 @@ def problem(
         if left_out:
             keep[::3, 0], keep[m // 2 :, 2] = False, False
         y = x @ (1 / np.logspace(-3, 3, columns)) + rng.standard_normal((m, 3))
-        instruments.append(z)
-        blocks.append(ExperimentEquations(y, x, keep, np.arange(m, dtype=np.float64)))
-    return instruments, blocks
+        blocks.append(InstrumentedEquations(y, x, keep, np.arange(m, dtype=np.float64), z))
+    return blocks
 
 
 @pytest.mark.parametrize("samples", [60, CHUNK_ROWS + 5, 3 * CHUNK_ROWS + 1])
 @pytest.mark.parametrize("left_out", [False, True])
 def test_estimate_and_covariance_are_those_of_the_triangular_factors(samples: int, left_out: bool) -> None:
-    instruments, blocks = problem(samples, 7, left_out=left_out)
+    blocks = problem(samples, 7, left_out=left_out)
 
-    found = iv_products(instruments, blocks, NOISE)
+    found = iv_products(blocks, NOISE)
 
-    z = weighted_rows(instruments, [b.keep for b in blocks], NOISE)
-    x, y = stacked(blocks, NOISE)
-    np.testing.assert_allclose(found.theta, instrumental_variable(z, x, y), rtol=1e-10)
-    np.testing.assert_allclose(found.covariance, iv_covariance(z, x), rtol=1e-8, atol=1e-12 * found.covariance.max())
+    z = whitened([b.z for b in blocks], NOISE, [b.keep for b in blocks])
+    exact = factored(z, *stacked(blocks, NOISE))
+    np.testing.assert_allclose(found.theta, exact.theta, rtol=1e-10)
+    np.testing.assert_allclose(found.covariance, exact.covariance, rtol=1e-8, atol=1e-12 * found.covariance.max())
 
 
 def test_regressors_alike_to_six_digits_cost_the_sums_no_more_digits_than_the_triangular_factors() -> None:
-    instruments, blocks = problem(20000, 7, similarity=6.0)
+    blocks = problem(20000, 7, similarity=6.0)
     truth = 1 / np.logspace(-3, 3, 7)
-    silent = [ExperimentEquations(b.x @ truth, b.x, b.keep, b.t) for b in blocks]
+    silent = [replace(b, y=b.x @ truth) for b in blocks]
 
-    found = iv_products(instruments, silent, NOISE).theta
+    found = iv_products(silent, NOISE).theta
 
-    z = weighted_rows(instruments, [b.keep for b in blocks], NOISE)
-    by_factors = instrumental_variable(z, *stacked(silent, NOISE))
+    z = whitened([b.z for b in blocks], NOISE, [b.keep for b in blocks])
+    by_factors = factored(z, *stacked(silent, NOISE)).theta
     scale = np.abs(truth)
     # Products of the unchanged instruments would square the condition number: 1e12, four digits left.
     assert np.max(np.abs(found - truth) / scale) < 10 * np.max(np.abs(by_factors - truth) / scale) + 1e-12
@@ -75,20 +69,20 @@ def test_regressors_alike_to_six_digits_cost_the_sums_no_more_digits_than_the_tr
 
 
 def test_the_same_data_give_the_same_bits() -> None:
-    instruments, blocks = problem(5000, 9)
+    blocks = problem(5000, 9)
 
-    first, second = (iv_products(instruments, blocks, NOISE) for _ in range(2))
+    first, second = (iv_products(blocks, NOISE) for _ in range(2))
 
     assert np.array_equal(first.theta, second.theta)
     assert np.array_equal(first.covariance, second.covariance)
 
 
 def test_a_parameter_without_any_equation_has_no_solution() -> None:
-    instruments, blocks = problem(200, 5)
-    for z, block in zip(instruments, blocks, strict=True):
-        z[:, :, 2], block.x[:, :, 2] = 0.0, 0.0
+    blocks = problem(200, 5)
+    for block in blocks:
+        block.z[:, :, 2], block.x[:, :, 2] = 0.0, 0.0
 
-    products = iv_products(instruments, blocks, NOISE)
+    products = iv_products(blocks, NOISE)
 
     with pytest.raises(np.linalg.LinAlgError):
         _ = products.theta

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from armident.identify.regression.tall_qr import triangularize
+from armident.identify.regression.qr import triangularize
 
 
 def test_factor_and_projections_are_those_of_a_qr_decomposition() -> None:

@@ -1,0 +1,81 @@
+"""Iterations of an estimator, and the rules that end them."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+ITERATIONS = 20
+"""Most iterations of an iterative estimator."""
+
+TOLERANCE = 1e-4
+"""Relative change of theta and of the residual norm that ends the iterations; far below one standard deviation."""
+
+EXACT = 1e-10
+"""Relative change of theta that ends the iterations whatever the residual does: data without noise leave rounding."""
+
+
+class Iterations(NamedTuple):
+    """End of an iteration.
+
+    Parameters
+    ----------
+    theta
+        Last or best iterate, shape (b,).
+    done
+        Iterations done.
+    converged
+        True if the iterates settled.
+    reason
+        Rule that ended the iteration, as a sentence.
+    """
+
+    theta: NDArray[np.float64]
+    done: int
+    converged: bool
+    reason: str
+
+
+def iterate(
+    step: Callable[[NDArray[np.float64], int], tuple[NDArray[np.float64], float]],
+    start: NDArray[np.float64],
+    iterations: int = ITERATIONS,
+    tolerance: float = TOLERANCE,
+) -> Iterations:
+    """Repeat a step until neither theta nor the residual norm changes by more than ``tolerance``.
+
+    Where that does not happen, the iterate of the smallest residual norm is kept. Equations without a finite
+    solution end the iterations.
+
+    Parameters
+    ----------
+    step
+        ``step(theta, k) -> (theta, residual norm)`` of iteration k, from 1 on.
+    start
+        First theta, shape (b,).
+    iterations
+        Most iterations.
+    tolerance
+        Relative change that ends the iterations.
+    """
+    theta, norm = start, np.inf
+    best, least = start, np.inf
+    for k in range(1, iterations + 1):
+        try:
+            new, new_norm = step(theta, k)
+        except np.linalg.LinAlgError:
+            new, new_norm = np.full_like(start, np.nan), np.nan
+        if not (np.isfinite(new).all() and np.isfinite(new_norm)):
+            return Iterations(best, k, False, f"the equations of iteration {k} have no finite solution")
+        change = float(np.linalg.norm(new - theta)) / max(float(np.linalg.norm(new)), 1e-300)
+        drift = abs(new_norm - norm) / max(new_norm, 1e-300)
+        theta, norm = new, new_norm
+        if norm < least:
+            best, least = theta, norm
+        if change < EXACT:
+            return Iterations(theta, k, True, f"theta changed by {change:.1e} (relative), which is rounding")
+        if change < tolerance and drift < tolerance:
+            reason = f"theta changed by {change:.1e} and the residual norm by {drift:.1e} (relative)"
+            return Iterations(theta, k, True, reason)
+    return Iterations(best, iterations, False, f"stopped after {iterations} iterations")

@@ -1,0 +1,360 @@
+"""Instrumental variables: products of whitened equations, their solution and its covariance (thesis 2.33, 4.34, 6.30).
+
+At the recorded rate the whitened regressor and instruments of six joints are many times as large as the recording.
+Their orthogonal triangularisation costs more than everything else. So rows are whitened joint by joint, a few at a
+time, summed and forgotten. Instruments in nearly orthonormal combinations, found from a share of the rows, make plain
+sums of products as accurate.
+"""
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, signal
+
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.equations import InstrumentedEquations
+from armident.identify.regression.fir import filter_columns
+from armident.identify.regression.least_squares import column_norms
+from armident.identify.regression.qr import triangularize
+from armident.identify.regression.whitening import columns_of, whitened
+from armident.identify.robot.compiled import compiled
+from armident.identify.signals.decimate import Decimation
+
+Array = NDArray[np.float64]
+
+SAMPLE = 64
+"""Rows per parameter, at least, from which the combinations of the instruments are found."""
+
+CHUNK_ROWS = 2048
+"""Rows whitened at a time."""
+
+ORTHOGONAL_ENOUGH = 1e3
+"""Condition number of normalised instruments up to which plain products, losing six digits of sixteen, will do."""
+
+NEGLIGIBLE = 1e-14
+"""Share of an instrument, beside the others, that counts as rounding: such a one is left as it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class IvProducts:
+    """Products of whitened rows: combinations ``Q = Z T`` of the instruments, of norm one, and columns ``X D``.
+
+    Parameters
+    ----------
+    gram
+        ``Q' Q``, shape (b, b).
+    cross
+        ``Q' X D``, shape (b, b).
+    projected
+        ``Q' y``, shape (b,).
+    scale
+        Inverse diagonal of D, shape (b,).
+    """
+
+    gram: Array
+    cross: Array
+    projected: Array
+    scale: Array
+
+    @cached_property
+    def _factors(self) -> tuple[Array, NDArray[np.int32]]:
+        lu, pivots, info = linalg.lapack.dgetrf(self.cross)
+        if info > 0:
+            raise np.linalg.LinAlgError("the instruments do not determine all parameters")
+        return lu, pivots
+
+    def parameters(self, through: Array) -> Array:
+        """Parameters (b,) or (b, k) of torques with the products ``Q' torques`` = ``through``.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the equations are singular.
+        """
+        solved: Array = linalg.lu_solve(self._factors, through, check_finite=False)
+        return (solved.T / self.scale).T
+
+    def beside(self, through: Array) -> Array:
+        """Weights W (b, k) of the combinations with ``X' Q W`` = ``through``.
+
+        Instruments less ``Q W`` are orthogonal to the regressor, where ``through`` are their products with it.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the equations are singular.
+        """
+        weights: Array = linalg.lu_solve(self._factors, through / self.scale[:, None], trans=1, check_finite=False)
+        return weights
+
+    @cached_property
+    def theta(self) -> Array:
+        """The solution of ``Z' W (y - X theta) = 0`` (2.33, 6.30), shape (b,).
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the equations are singular.
+        """
+        return self.parameters(self.projected)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """``(Z' W X)^-1 Z' W Z (X' W Z)^-1`` (4.34), shape (b, b).
+
+        It equals ``(Z' W Z)^-1`` (2.34, 6.31) where the simulator is exact. It stays valid where the controller is only
+        approximate, as an identified impulse response is.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the equations are singular.
+        """
+        covariance = self.parameters(self.parameters(self.gram).T)
+        return (covariance + covariance.T) / 2
+
+
+def factored(z: Array, x: Array, y: Array) -> IvProducts:
+    """Products of whitened rows with orthonormal instruments, by the QR factors of ``z``: none of ``z' x`` is formed.
+
+    Parameters
+    ----------
+    z, x
+        Instruments and regressor, shape (rows, b).
+    y
+        Torques, shape (rows,).
+    """
+    b, scale = x.shape[1], column_norms(x)
+    top = triangularize(z, x, y, columns=b, scales=(column_norms(z), scale))
+    return IvProducts(np.eye(b), top[:, b : 2 * b], top[:, 2 * b], scale)
+
+
+def serial_covariance(
+    zeta: Sequence[Array],
+    x: Sequence[Array],
+    keep: Sequence[NDArray[np.bool_]],
+    weights: Sequence[ArModel],
+    noise: Sequence[ArModel],
+) -> Array:
+    """Covariance (b, b) of an IV estimate with weights 2.24 whose residuals are serially correlated.
+
+    ``A = (Z' W X)^-1 Z' W`` maps the noise to the estimate and ``A Omega A'`` is its covariance, with ``Omega`` given
+    by the AR model of each joint: ``Z' W Omega W Z`` is the Gram matrix of ``H' W Z``.
+
+    Parameters
+    ----------
+    zeta, x
+        Instruments and regressor, one (M, n, b) array per experiment.
+    keep
+        Equations to use, (M, n) per experiment.
+    weights
+        White noise models by which the estimate weights its rows, one per joint.
+    noise
+        Noise model of the residuals of each joint.
+    """
+    z = whitened(zeta, weights, keep)
+    zs = column_norms(z)
+    cross = (z / zs).T @ whitened(x, weights, keep)
+    meat = np.zeros((zs.size, zs.size))
+    for j, (weight, ar) in enumerate(zip(weights, noise, strict=True)):
+        for value, kept in zip(zeta, keep, strict=True):
+            rows = value[:, j] * kept[:, j, None] / (weight.variance * zs)
+            coloured = signal.lfilter([np.sqrt(ar.variance)], np.append(1.0, ar.coefficients), rows[::-1], axis=0)
+            meat += coloured.T @ coloured
+    return IvProducts(meat, cross / zs, np.zeros(zs.size), zs).covariance
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Rows ``[X, Z, y]`` of one joint in one experiment, collected when they are used.
+
+    Parameters
+    ----------
+    x, z
+        Regressor and instruments, shape (M, b), in which the numbers of the columns are those of a `JointEquations`.
+    y
+        Torques, shape (M,).
+    chosen
+        Numbers of the columns of regressor and instruments.
+    """
+
+    x: Array
+    z: Array
+    y: Array
+    chosen: tuple[NDArray[np.int64], NDArray[np.int64]]
+
+    def __len__(self) -> int:
+        return self.y.size
+
+    def __getitem__(self, rows: slice) -> Array:
+        return _side_by_side(self.x[rows], self.z[rows], self.y[rows], *self.chosen)
+
+
+@dataclass(frozen=True, eq=False)
+class JointEquations:
+    """Equations of one joint without the columns that are zero there: a link acts on the joints before it only.
+
+    Parameters
+    ----------
+    x, z
+        Numbers of the columns of regressor and instruments that are not zero.
+    parts
+        Rows ``[X, Z, y]`` of these columns, one array (M, x + z + 1) per experiment.
+    keep
+        Rows to use, (M,) per experiment; ``None``: all.
+    """
+
+    x: NDArray[np.int64]
+    z: NDArray[np.int64]
+    parts: tuple[Columns | Array, ...]
+    keep: tuple[NDArray[np.bool_] | None, ...]
+
+    @classmethod
+    def of(cls, blocks: Sequence[InstrumentedEquations], joint: int, *, copied: bool) -> "JointEquations":
+        """Equations of a joint.
+
+        Parameters
+        ----------
+        blocks
+            Equations of every experiment.
+        joint
+            Number of the joint.
+        copied
+            True to copy the columns side by side: faster where the same equations are whitened many times.
+        """
+        x = np.unique(np.concatenate([columns_of(b.x[:, joint]) for b in blocks]))
+        z = np.unique(np.concatenate([columns_of(b.z[:, joint]) for b in blocks]))
+        parts = [Columns(b.x[:, joint], b.z[:, joint], b.y[:, joint], (x, z)) for b in blocks]
+        keep = [None if b.keep[:, joint].all() else b.keep[:, joint] for b in blocks]
+        return cls(x, z, tuple(part[:] if copied else part for part in parts), tuple(keep))
+
+    def whitened(self, ar: ArModel) -> Iterator[Array]:
+        """Rows whitened by a noise model, (m, x + z + 1), a few at a time, which stay in the cache.
+
+        Parameters
+        ----------
+        ar
+            Noise model of the joint.
+        """
+        for part, kept in zip(self.parts, self.keep, strict=True):
+            for first in range(0, len(part) - ar.order, CHUNK_ROWS):
+                span = slice(first, first + CHUNK_ROWS + ar.order)
+                rows = filter_columns(ar.whitening, part[span])
+                yield rows if kept is None else rows[kept[span][ar.order :]]
+
+    def products(self, rows: Iterable[Array], combine: Array | None = None) -> Array:
+        """``Q' [X, Q, y]`` of whitened rows, shape (q, x + q + 1).
+
+        Parameters
+        ----------
+        rows
+            Whitened rows ``[X, Z, y]``.
+        combine
+            Combinations T of the instruments, ``Q = Z T``, shape (b, b); ``None``: the instruments of the joint.
+        """
+        width = self.x.size
+        count = self.z.size if combine is None else combine.shape[1]
+        sums = np.zeros((count, width + count + 1))
+        for white in rows:
+            own = white[:, width:-1]
+            if combine is None:
+                sums += own.T @ white
+                continue
+            own = own @ combine[self.z]
+            sums[:, :width] += own.T @ white[:, :width]
+            sums[:, width:-1] += own.T @ own
+            sums[:, -1] += own.T @ white[:, -1]
+        return sums
+
+
+def together(
+    products: Iterable[tuple[JointEquations, Array]], b: int, *, combined: bool = False, scale: Array | None = None
+) -> IvProducts:
+    """Products of the rows of all joints, with combinations of the instruments of norm one.
+
+    Parameters
+    ----------
+    products
+        Equations of each joint, or of parts of it, and their products; added in this order.
+    b
+        Number of parameters.
+    combined
+        True if the instruments are combined.
+    scale
+        Scale of the parameters' columns, shape (b,); ``None``: norms of the instruments.
+    """
+    gram, cross, projected = np.zeros((b, b)), np.zeros((b, b)), np.zeros(b)
+    for joint, sums in products:
+        q, width = np.arange(b) if combined else joint.z, joint.x.size
+        cross[np.ix_(q, joint.x)] += sums[:, :width]
+        gram[np.ix_(q, q)] += sums[:, width:-1]
+        projected[q] += sums[:, -1]
+    norms = np.sqrt(np.diag(gram))
+    norms = np.where(norms == 0.0, 1.0, norms)
+    scale = norms if scale is None else scale
+    return IvProducts(gram / np.outer(norms, norms), cross / np.outer(norms, scale), projected / norms, scale)
+
+
+def iv_products(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel]) -> IvProducts:
+    """Whiten every joint by its noise model and sum the products that the IV equations need.
+
+    Parameters
+    ----------
+    blocks
+        Equations of every experiment.
+    noise
+        Noise model of each joint.
+    """
+    combine, scale = _combinations(blocks, noise)
+
+    def of_series(joint_and_block: tuple[int, InstrumentedEquations]) -> tuple[JointEquations, Array]:
+        j, block = joint_and_block
+        joint = JointEquations.of([block], j, copied=False)
+        return joint, joint.products(joint.whitened(noise[j]), combine)
+
+    series = [(j, block) for j in range(len(noise)) for block in blocks]
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        # Summed in the order of the joints, so that the same data give the same bits.
+        return together(pool.map(of_series, series), scale.size, combined=combine is not None, scale=scale)
+
+
+def _combinations(blocks: Sequence[InstrumentedEquations], noise: Sequence[ArModel]) -> tuple[Array | None, Array]:
+    """``T`` (b, b) that makes the columns of ``Z T`` nearly orthonormal, and norms (b,), from every so many rows.
+
+    ``None`` instead of ``T`` where the columns are far enough from dependent as they are.
+    """
+    b = blocks[0].z.shape[2]
+    total = sum(int(block.keep.sum()) for block in blocks)
+    every = max(1, total // (SAMPLE * b))
+    parts = []
+    for j, ar in enumerate(noise):
+        thinned = Decimation(every, ar.whitening[::-1])
+        for block in blocks:
+            parts.append(thinned(block.z[:, j])[block.keep[ar.order :: every, j]])
+    rows = np.concatenate(parts)
+    norms = column_norms(rows)
+    factor = triangularize(rows / norms, columns=b)
+    scale = norms * np.sqrt(every)
+    if np.linalg.cond(factor) < ORTHOGONAL_ENOUGH:
+        return None, scale
+    weak = np.abs(np.diag(factor)) < NEGLIGIBLE
+    factor[weak, weak] = 1.0
+    combined: Array = linalg.solve_triangular(factor, np.eye(b)) / norms[:, None]
+    return combined, scale
+
+
+@compiled
+def _side_by_side(x: Array, z: Array, y: Array, of_x: NDArray[np.int64], of_z: NDArray[np.int64]) -> Array:
+    out = np.empty((y.size, of_x.size + of_z.size + 1))
+    for m in range(y.size):
+        for i in range(of_x.size):
+            out[m, i] = x[m, of_x[i]]
+        for i in range(of_z.size):
+            out[m, of_x.size + i] = z[m, of_z[i]]
+        out[m, -1] = y[m]
+    return out

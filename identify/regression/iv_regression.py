@@ -1,0 +1,171 @@
+"""Instrumental-variable regression that keeps its whitened rows, for comparison with further columns."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.regression.iv import IvProducts, JointEquations, together
+from armident.identify.regression.whitening import rows_of_joints
+
+Array = NDArray[np.float64]
+
+
+class Jointwise(Protocol):
+    """Equations of all joints, which may be computed again after they were freed."""
+
+    @property
+    def joints(self) -> tuple[JointEquations, ...]:
+        """Equations of each joint."""
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters, b."""
+
+    def release(self) -> None:
+        """Free the equations; they are computed again, with the same values, when they are next used."""
+
+
+@dataclass(frozen=True, eq=False)
+class IvRegression:
+    """Solution of whitened equations with instruments, and their rows.
+
+    Parameters
+    ----------
+    equations
+        Equations of each joint.
+    noise
+        Noise models that whiten the rows.
+    products
+        Products ``Z' [X, Z, y]`` of the rows of each joint.
+    solution
+        Products of all rows, with the instruments in units of their norms.
+    """
+
+    equations: Jointwise
+    noise: tuple[ArModel, ...]
+    products: tuple[Array, ...]
+    solution: IvProducts
+
+    @classmethod
+    def of(cls, equations: Jointwise, noise: Sequence[ArModel], known: "IvRegression | None" = None) -> "IvRegression":
+        """Regression under given noise models.
+
+        Parameters
+        ----------
+        equations
+            Equations of each joint.
+        noise
+            Noise model of each joint.
+        known
+            Regression of the same equations; rows and products of joints with the same noise model are reused.
+        """
+        joints, rows, products = equations.joints, [], []
+        for j, (joint, ar) in enumerate(zip(joints, noise, strict=True)):
+            if known is not None and known.noise[j] is ar:
+                rows.append(known.rows[j])
+                products.append(known.products[j])
+            else:
+                rows.append(_whitened(joint, ar))
+                products.append(joint.products(rows[-1:]))
+        solution = together(zip(joints, products, strict=True), equations.parameters)
+        made = cls(equations, tuple(noise), tuple(products), solution)
+        made.__dict__["rows"] = tuple(rows)
+        return made
+
+    @cached_property
+    def rows(self) -> tuple[Array, ...]:
+        """Whitened rows ``[X, Z, y]`` of each joint without the columns that are zero there."""
+        return tuple(_whitened(joint, ar) for joint, ar in zip(self.equations.joints, self.noise, strict=True))
+
+    @cached_property
+    def residual(self) -> Array:
+        """Whitened residual, joint after joint, (R,)."""
+        own = zip(self.equations.joints, self.rows, strict=True)
+        theta = self.solution.theta
+        return np.concatenate([rows[:, -1] - rows[:, : joint.x.size] @ theta[joint.x] for joint, rows in own])
+
+    @cached_property
+    def rows_of(self) -> list[slice]:
+        """Rows of each joint among those of all joints."""
+        return rows_of_joints(rows.shape[0] for rows in self.rows)
+
+    def release(self) -> None:
+        """Free equations and rows; they are computed again, with the same values, when they are next used."""
+        self.equations.release()
+        for name in ("rows", "residual"):
+            self.__dict__.pop(name, None)
+
+    def absorbed(self, columns: Array) -> Array:
+        """Parameters (b, k) that the model would give to torques (R, k): ``(Z'X)^-1 Z' columns``.
+
+        Parameters
+        ----------
+        columns
+            Whitened torques of all joints, (R, k).
+        """
+        _, q = self._through([(j, columns[own]) for j, own in enumerate(self.rows_of)], columns.shape[1])
+        return self.solution.parameters(q)
+
+    def beside(self, instruments: Array) -> Array:
+        """Instruments (R, k) orthogonal to the regressor: ``D - Z (X'Z)^-1 X'D``.
+
+        Parameters
+        ----------
+        instruments
+            Whitened instruments D of all joints, (R, k).
+        """
+        x, _ = self._through([(j, instruments[own]) for j, own in enumerate(self.rows_of)], instruments.shape[1])
+        weights = self.solution.beside(x) / self.solution.scale[:, None]
+        rest = instruments.copy()
+        for joint, rows, own in zip(self.equations.joints, self.rows, self.rows_of, strict=True):
+            rest[own] -= rows[:, joint.x.size : -1] @ weights[joint.z]
+        return rest
+
+    def products_beside(self, columns: Sequence[tuple[int, Array]], count: int) -> tuple[Array, Array]:
+        """``B'B`` (G, k, k) and ``B' residual`` (G, k) of ``B = beside(instruments)``, without computing B.
+
+        Parameters
+        ----------
+        columns
+            Instruments (R_j, G k) of each joint on which they act, with its number, group after group.
+        count
+            Number of groups, G.
+        """
+        width = columns[0][1].shape[1]
+        gram, score = np.zeros((count, width // count, width // count)), np.zeros(width)
+        for joint, own in columns:
+            score += own.T @ self.residual[self.rows_of[joint]]
+            groups = own.reshape(own.shape[0], count, -1).transpose(1, 0, 2)
+            gram += groups.transpose(0, 2, 1) @ groups
+        x, q = self._through(columns, width)
+        weights = self.solution.beside(x)
+
+        def products(right: Array) -> Array:
+            left, other = (part.reshape(part.shape[0], count, -1).transpose(1, 0, 2) for part in (weights, right))
+            return left.transpose(0, 2, 1) @ other
+
+        # The residual is orthogonal to the model's own instruments.
+        both = products(q)
+        gram = gram - both - both.transpose(0, 2, 1) + products(self.solution.gram @ weights)
+        return gram, score.reshape(count, -1)
+
+    def _through(self, columns: Sequence[tuple[int, Array]], width: int) -> tuple[Array, Array]:
+        """``X' columns`` and ``Q' columns`` (b, k) of columns (R_j, k) of some joints; Q as in `IvProducts`."""
+        x, q = np.zeros((2, self.equations.parameters, width))
+        for j, own in columns:
+            # Most candidates act on one joint.
+            if own.any():
+                joint, through = self.equations.joints[j], self.rows[j][:, :-1].T @ own
+                x[joint.x] += through[: joint.x.size]
+                q[joint.z] += through[joint.x.size :]
+        return x, q / self.solution.scale[:, None]
+
+
+def _whitened(joint: JointEquations, ar: ArModel) -> Array:
+    rows = list(joint.whitened(ar))
+    return rows[0] if len(rows) == 1 else np.concatenate(rows)

@@ -1,0 +1,94 @@
+"""Whitening of the equations of all joints, each joint by its noise model (thesis 2.3.1 and 6.1.3)."""
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.identify.regression.ar_noise import ArModel
+from armident.identify.robot.compiled import compiled
+
+Array = NDArray[np.float64]
+
+
+def whitened(
+    values: Sequence[Array], noise: Sequence[ArModel], keep: Sequence[NDArray[np.bool_]] | None = None
+) -> Array:
+    """Values of all joints, one below the other as in 2.21, each whitened by its noise model, shape (R,) or (R, k).
+
+    Parameters
+    ----------
+    values
+        One (M, n) or (M, n, k) array per experiment.
+    noise
+        Noise model of each joint.
+    keep
+        Equations to use, (M, n) per experiment; ``None``: all.
+    """
+    return np.concatenate([part for joint in whitened_series(values, noise, keep) for part in joint])
+
+
+def whitened_series(
+    values: Sequence[Array], noise: Sequence[ArModel], keep: Sequence[NDArray[np.bool_]] | None = None
+) -> tuple[tuple[Array, ...], ...]:
+    """Values of each joint in standard deviations of its noise model, one array per experiment.
+
+    Parameters
+    ----------
+    values
+        One (M, n) or (M, n, k) array per experiment.
+    noise
+        Noise model of each joint.
+    keep
+        Equations to use, (M, n) per experiment; ``None``: all.
+    """
+    acts = [range(len(noise)) if value.ndim == 2 else joints_of(value) for value in values]
+    out = []
+    for j, ar in enumerate(noise):
+        series = []
+        for k, value in enumerate(values):
+            if j in acts[k]:
+                part = ar.whiten(value[:, j])
+            else:
+                # Columns of one joint are zero at all others.
+                part = np.broadcast_to(0.0, (max(value.shape[0] - ar.order, 0), *value.shape[2:]))
+            series.append(part if keep is None else part[keep[k][ar.order :, j]])
+        out.append(tuple(series))
+    return tuple(out)
+
+
+def rows_of_joints(counts: Iterable[int]) -> list[slice]:
+    """Rows of each joint in the result of `whitened`.
+
+    Parameters
+    ----------
+    counts
+        Number of rows of each joint.
+    """
+    ends = np.cumsum([0, *counts]).tolist()
+    return [slice(begin, end) for begin, end in pairwise(ends)]
+
+
+def joints_of(columns: Array) -> list[int]:
+    """Numbers of the joints at which columns (M, n, k) are not all zero."""
+    return [int(j) for j in np.flatnonzero(_acting(columns))]
+
+
+def columns_of(values: Array) -> NDArray[np.int64]:
+    """Numbers of the columns of an array (M, k) that are not all zero."""
+    return np.flatnonzero(_acting(values[:, :, None]))
+
+
+@compiled
+def _acting(columns: Array) -> NDArray[np.bool_]:
+    acting = np.zeros(columns.shape[1], np.bool_)
+    for j in range(columns.shape[1]):
+        for m in range(columns.shape[0]):
+            for k in range(columns.shape[2]):
+                if columns[m, j, k] != 0.0:
+                    acting[j] = True
+                    break
+            if acting[j]:
+                break
+    return acting
