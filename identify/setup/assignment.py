@@ -37,7 +37,7 @@ def by_rows(bench: Bench, h: Hypothesis) -> Hypothesis:
     for m in range(n):
         used = np.flatnonzero(np.abs(x[:, m]).max(axis=0) > 0)
         own = np.ascontiguousarray(x[:, m, used])
-        gram, physical = own.T @ own, found.physical[[m, n + m]][:, used]
+        gram, physical = own.T @ own, found.physical[m::n][:, used]
         for k in range(n):
             right = own.T @ y[:, k]
             shares = []

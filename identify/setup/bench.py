@@ -41,8 +41,13 @@ SPRING_TERMS = 2
 """Springs of every joint beside the rigid model: linear and cubic. Without the cubic one a spring that stiffens looks
 like another direction of gravity."""
 
-FREE_TERMS = SPRING_TERMS + 3
-"""Free terms of every joint beside the rigid model: springs, asymmetric, quadratic and low-velocity friction."""
+ROTOR_TERMS = 1
+"""Rotor inertia of every joint beside the rigid model: where the configuration lacks it, its torque looks like another
+unit of the positions."""
+
+FREE_TERMS = SPRING_TERMS + ROTOR_TERMS + 3
+"""Free terms of every joint beside the rigid model: springs, rotor inertia, asymmetric, quadratic and low-velocity
+friction."""
 
 POSTURES = 40
 """Postures over which moments of inertia are averaged."""
@@ -225,7 +230,7 @@ class Bench:
         at_rest = weightless.rigid_regressor(q, still, still)
         along = [self.model.with_gravity(axis).rigid_regressor(q, still, still) for axis in np.eye(3)]
         gravity = np.stack(along) - at_rest
-        physical = np.zeros((2, n, x.shape[2]))
+        physical = np.zeros((3, n, x.shape[2]))
         stroke = q - q.mean(axis=0)
         springs = np.stack([stroke, stroke**3 / np.maximum(np.abs(stroke).max(axis=0), 1e-12) ** 2], axis=2)
         for j in range(n):
@@ -233,8 +238,10 @@ class Bench:
             x[:, :, dry] = 0.0
             x[:, j, dry] = free[:, j, 0]
             own = b + FREE_TERMS * j + np.arange(FREE_TERMS)
+            rotor, friction = own[SPRING_TERMS], own[SPRING_TERMS + ROTOR_TERMS :]
             x[:, j, own[:SPRING_TERMS]] = springs[:, j]
-            x[:, j, own[SPRING_TERMS:]] = free[:, j, 1:]
+            x[:, j, rotor] = qdd[:, j]
+            x[:, j, friction] = free[:, j, 1:]
             push = np.zeros_like(postures)
             push[:, j] = 1.0
             motionless = np.zeros_like(postures)
@@ -242,9 +249,11 @@ class Bench:
                 postures, motionless, motionless
             )
             physical[0, j, :b] = unit[:, j].mean(axis=0)
-            columns = [self.column(f"fv{j + 1}"), dry, *own[SPRING_TERMS:]]
+            physical[0, j, rotor] = 1.0
+            columns = [self.column(f"fv{j + 1}"), dry, *friction]
             physical[1, j, columns] = (x[:, j, columns] * qd[:, j, None]).mean(axis=0)
-        return Rows(x, gravity, physical.reshape(2 * n, -1))
+            physical[2, j, rotor] = 1.0
+        return Rows(x, gravity, physical.reshape(3 * n, -1))
 
 
 def make_bench(

@@ -255,3 +255,13 @@ def test_different_rates_and_short_recordings_are_refused_in_one_line(
     short = replace(healthy[0], q=healthy[0].q[:40], tau=healthy[0].tau[:40])
     with pytest.raises(DataError, match="too short"):
         check_setup([short], arm)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("joint", [1, 2, 3])
+def test_a_rotor_that_the_configuration_lacks_is_no_mistake_of_the_set_up(
+    joint: int, healthy: list[Experiment], arm: RobotConfig
+) -> None:
+    joints = list(arm.joints)
+    joints[joint] = joints[joint].model_copy(update={"rotor_inertia": False})
+    assert check_setup(healthy, arm.model_copy(update={"joints": tuple(joints)})).findings == ()
