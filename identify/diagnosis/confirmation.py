@@ -57,13 +57,18 @@ class Confirmation:
         return np.asarray(np.sqrt(np.maximum(self.before**2 - self.best**2, 0.0)))
 
     @property
-    def smaller(self) -> bool:
-        """True if the errors are smaller with the effect: the mean of their logarithms, and those of the whole arm.
+    def reduction(self) -> float:
+        """Mean logarithm of the factors by which the errors of each joint and of the whole arm fall, nats.
 
         Joints differ in size, so that the norm of all alone would judge the largest.
         """
-        ratios = np.maximum(self.best, 1e-300) / np.maximum(self.before, 1e-300)
-        return float(np.mean(np.log(ratios))) < 0.0 and self.whole_after < self.whole_before
+        before, after = np.append(self.before, self.whole_before), np.append(self.best, self.whole_after)
+        return float(np.mean(np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))))
+
+    @property
+    def smaller(self) -> bool:
+        """True if the errors are smaller with the effect."""
+        return self.reduction > 0.0
 
 
 def confirmed(with_it: ModelState, without: ModelState) -> Confirmation:
