@@ -1,6 +1,6 @@
 """Model of one step of a diagnosis: the data with its closed loop, the fit, and the predictive score."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -177,6 +177,34 @@ def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> Model
     if any(term.scales_torque for term in effect_terms(model)):
         first = _iterated(first)
     return ModelState(moved, first)
+
+
+def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
+    """Return a configuration with further effect entries.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    entries
+        Entries to add.
+    """
+    return robot.model_copy(update={"effects": (*robot.effects, *entries)})
+
+
+def without_entry(robot: RobotConfig, entry: Entry) -> RobotConfig:
+    """Return a configuration without one of its effect entries.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    entry
+        The entry.
+    """
+    effects = list(robot.effects)
+    effects.remove(entry)
+    return robot.model_copy(update={"effects": tuple(effects)})
 
 
 def with_own_noise(state: ModelState) -> ModelState:

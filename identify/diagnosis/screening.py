@@ -46,14 +46,14 @@ def screened(fit: Fit, candidate: Candidate, column_cache: ColumnCache) -> tuple
     # Columns that depend on theta are useless for the next model, and a grid of them is large.
     keep = not candidate.effect.depends_on_torque
     columns = column_cache.grid(candidate.effect, candidate.place, candidate.grid, fit.noise, keep=keep)
-    statistics = score_statistics(fit, columns, len(candidate.grid))
+    statistics = score_statistics(fit, columns, len(candidate.grid), candidate.effect.sign)
     if np.isnan(statistics).all():
         return None
     best = int(np.nanargmax(statistics))
     return float(statistics[best]), candidate.grid[best]
 
 
-def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int) -> Array:
+def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int, sign: int = 0) -> Array:
     """Power of the training residual along groups of instruments orthogonal to the model's own, (G,).
 
     Parameters
@@ -64,11 +64,13 @@ def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int)
         Whitened instruments (R, G k) of each joint on which they act, with its number, group after group.
     count
         Number of groups, G.
+    sign
+        +1 or -1: sign of the parameter of a group of one, which physics determines; 0: none.
 
     Returns
     -------
     ndarray
-        Not a number where the model contains a group.
+        Zero where the parameter would have the wrong sign. Not a number where the model contains a group.
     """
     if not columns:
         return np.full(count, np.nan)
@@ -81,11 +83,13 @@ def score_statistics(fit: Fit, columns: Sequence[tuple[int, Array]], count: int)
     kept = power > RANK_TOLERANCE**2
     along = np.einsum("gij,gi->gj", right, score)
     statistics = np.sum(np.where(kept, along**2 / np.where(kept, power, 1.0), 0.0), axis=1)
+    if sign:
+        statistics = np.where(sign * score[:, 0] > 0.0, statistics, 0.0)
     usable = able.reshape(count, -1).all(axis=1) & kept.any(axis=1)
     return np.where(usable, statistics, np.nan)
 
 
-def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]]) -> float | None:
+def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]], sign: int = 0) -> float | None:
     """Score statistic of one group of instruments; ``None`` if the model contains it.
 
     Parameters
@@ -94,8 +98,10 @@ def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]]) -> float | N
         Fit of the model.
     columns
         Whitened instruments (R, k) of each joint on which they act, with its number.
+    sign
+        See `score_statistics`.
     """
-    found = float(score_statistics(fit, columns, 1)[0])
+    found = float(score_statistics(fit, columns, 1, sign)[0])
     return None if np.isnan(found) else found
 
 
@@ -148,9 +154,8 @@ def refined(fit: Fit, candidate: Candidate, column_cache: ColumnCache, best: tup
 
         def loss(logarithm: float, start: Shapes = start, k: int = k) -> float:
             shapes = replaced(start, k, float(np.exp(logarithm)))
-            statistic = score_statistic(
-                fit, column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
-            )
+            columns = column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
+            statistic = score_statistic(fit, columns, candidate.effect.sign)
             return 0.0 if statistic is None else -statistic
 
         result = optimize.minimize_scalar(

@@ -11,7 +11,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,31 +22,37 @@ from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates
 from armident.identify.diagnosis.comparison import Addition, Made, Step, compared, gain, materiality
 from armident.identify.diagnosis.confirmation import Confirmation, confirmed
+from armident.identify.diagnosis.corrections import screened_correction
 from armident.identify.diagnosis.criteria import Criteria
-from armident.identify.diagnosis.model_state import ModelState, fitted, with_own_noise, with_report_part
+from armident.identify.diagnosis.model_state import (
+    ModelState,
+    fitted,
+    with_entries,
+    with_own_noise,
+    with_report_part,
+    without_entry,
+)
 from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
 from armident.identify.diagnosis.screening import refined, screened
 from armident.identify.diagnosis.shaping import both_ends
 from armident.identify.diagnosis.study import Study
+from armident.identify.diagnosis.transitions import with_transitions
 from armident.identify.effects.drive import Correction
-from armident.identify.effects.effect import Place
-from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.recorded import of_recording
-from armident.identify.effects.registry import known, of_entry
+from armident.identify.effects.registry import known
 from armident.identify.effects.tables import FreeShape
 from armident.identify.effects.terms import stanza_of
 from armident.identify.effects.transmission import MotorOrder
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
 Array = NDArray[np.float64]
+Starts = tuple[float, ...]
+"""Values from which the correction of a recorded torque starts; empty for a term of the model."""
 
 CORRECTIONS = 3
-"""Corrections of a recording, each refined by the expansion that remains."""
-FINER = (1.4, 1.2, 1.1, 1.05, 1.02)
-"""Factors of the refinement of the velocity of a transition; the grid has factors of 1.9."""
+"""Values of a correction from each start, each refined by the expansion that remains."""
 CLEAR = 3.0
-"""Gain of log-likelihood from which a transition of dry friction is a part of the friction model, and another shift of
-all torques is chosen: odds of 20 to 1."""
+"""Gain of log-likelihood from which another shift of all torques is chosen: odds of 20 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +139,7 @@ class StepwiseSelection:
         state = self._aligned(fitted(self.study, self.study.robot, None))
         self.study = state.study
         if not self.study.sign_given:
-            state = with_own_noise(self._with_transitions(state))
+            state = with_own_noise(with_transitions(state, self._state))
         self.study = replace(self.study, robot=state.robot, model=state.study.model)
         self._states[_key(state.robot)] = state
         return state
@@ -149,7 +155,7 @@ class StepwiseSelection:
         Returns
         -------
         tuple
-            Model with the effects, and the effects, largest change of the errors first.
+            Model with the effects, and the effects, largest reduction of the errors first.
         """
         state = first
         found: tuple[Selected, ...] = ()
@@ -195,22 +201,9 @@ class StepwiseSelection:
                     # An effect is admitted only against all others.
                     return Step(state, (), (), (), tests)
                 made += [m for m in (self._made(state, *one),) if m is not None]
-            step = compared(state, made, tests, self.passes)
-            to_correct = self._to_correct(step)
-            exact = [self._corrected(state, m) if m in to_correct else m for m in made]
-            self._steps[key] = step if exact == made else compared(state, exact, tests, self.passes)
+            self._steps[key] = compared(state, made, tests, self.passes)
             self._release()
         return self._steps[key]
-
-    def _to_correct(self, step: Step) -> tuple[Made, ...]:
-        """Effects on what was recorded whose expansion promises to be admitted when the recording is corrected for it.
-
-        What the expansion leaves is correlated with the effect, so that the gain counts as if the noise were white.
-        """
-        able = [a for a in step.ranked if a.allowed]
-        most = max((a.raw_gain for a in able), default=0.0)
-        least = max(self._needed(step.tests), self.criteria.promising * most)
-        return tuple(a.made for a in able if isinstance(a.candidate.effect, Correction) and a.raw_gain > least)
 
     def _needed(self, tests: int) -> float:
         """Gain of log-likelihood of a significant effect, found among a number of candidates."""
@@ -311,88 +304,55 @@ class StepwiseSelection:
         study = models[best].study
         return replace(models[best], study=replace(study, warnings=(*study.warnings, line)))
 
-    def _with_transitions(self, state: ModelState) -> ModelState:
-        """Model with the transition of dry friction at the reversals of each joint, where it predicts better.
+    def _shortlist(self, state: ModelState) -> tuple[list[tuple[Candidate, Shapes, Starts]], int]:
+        """Candidates with the highest statistics less their numbers of parameters, and the number of all.
 
-        The smoothed sign of the model approaches its limits slowly. Beside another law of the reversal it looks like
-        friction that depends on the velocity (Stribeck). Each velocity is tried at all joints at once; each joint keeps
-        the one with which its own torque is predicted best.
+        Each has its nonlinear parameters, or the values from which its correction of recorded torques starts.
         """
-        effect = known(TRANSITION)
-        column_cache = ColumnCache(state.study, state.fit.theta)
-        motion = column_cache.motion(state.study.train[0], "measured")
-        present = {e.joint for e in state.robot.effects if e.effect == TRANSITION}
-        places = [Place(j) for j, name in enumerate(self.study.joints) if name not in present]
-        noise = state.weights
-        before = state.score.log_likelihoods_under(noise)
-        best = {place: (before[place.joint] + CLEAR, 0.0) for place in places}
-
-        def tried(velocities: Sequence[float], scores: Callable[[ModelState], Array]) -> ModelState | None:
-            chosen = [(place, v) for place, v in zip(places, velocities, strict=True) if v > 0.0]
-            entries = [stanza_of(effect, place, state.robot, {"velocity": v}) for place, v in chosen]
-            made = self._state(with_entries(state.robot, entries), state) if entries else None
-            if made is None:
-                return None
-            for (place, v), entry in zip(chosen, entries, strict=True):
-                score = float(scores(made)[place.joint])
-                if made.values_of(made.term_of(entry))[0][0] > 0.0 and score > best[place][0]:
-                    best[place] = score, v
-            return made
-
-        def common(made: ModelState) -> Array:
-            return made.score.log_likelihoods_under(noise)
-
-        def own(made: ModelState) -> Array:
-            return made.score.own_log_likelihoods
-
-        for shapes in zip(*(effect.grid(motion, place) for place in places), strict=True):
-            tried([dict(one)["velocity"] for one in shapes], common)
-        # Common noise models decide whether there is a transition; those of each model itself refine its velocity.
-        best = {place: (-np.inf, v) for place, (_, v) in best.items()}
-        tried([v for _, v in best.values()], own)
-        for factor in FINER:
-            centre = [v for _, v in best.values()]
-            tried([factor * v for v in centre], own)
-            tried([v / factor for v in centre], own)
-        made = tried([v for _, v in best.values()], own)
-        better = made is not None and made.score.log_likelihood_under(noise) > float(before.sum())
-        return made if made is not None and better else state
-
-    def _shortlist(self, state: ModelState) -> tuple[list[tuple[Candidate, Shapes]], int]:
-        """Candidates with the highest score statistics less their numbers of parameters, and the number of all."""
         column_cache = ColumnCache(state.study, state.fit.theta)
         noise = state.fit.renoised(state.weights)
-        looks: list[tuple[float, Candidate, tuple[float, Shapes]]] = []
+        looks: list[tuple[float, Candidate, tuple[float, Shapes], Starts]] = []
         tests, hidden = 0, set()
         for every in candidates(column_cache):
             candidate = every
             if isinstance(candidate.effect, MotorOrder):
                 candidate = replace(candidate, grid=motor_orders(state.study, state.fit.theta, candidate.place.joint))
             tests += 1
-            found = screened(noise, candidate, column_cache)
+            found: tuple[float, Shapes] | None
+            starts: Starts = ()
+            if isinstance(candidate.effect, Correction):
+                statistic, starts = screened_correction(noise, candidate, column_cache)
+                found = statistic, ()
+            else:
+                found = screened(noise, candidate, column_cache)
             if found is None:
                 hidden.add(candidate.key)
             else:
-                looks.append((found[0] - 2.0 * len(candidate.effect.linear), candidate, found))
+                looks.append((found[0] - 2.0 * len(candidate.effect.linear), candidate, found, starts))
         if not self._steps:
             self.hidden = frozenset(hidden)
-        # A score statistic is twice the gain of log-likelihood that it promises.
-        least = 2.0 * self.criteria.promising * self._needed(tests)
-        looks = sorted((look for look in looks if look[2][0] > least), key=lambda look: -look[0])
+        # A score statistic is twice the gain of log-likelihood that it promises. A correction needs all of it: its
+        # likelihood also rewards smaller noise.
+        needed = 2.0 * self._needed(tests)
+        looks = [x for x in looks if x[2][0] > needed * (1.0 if x[3] else self.criteria.promising)]
+        looks.sort(key=lambda look: -look[0])
         named = [x for x in looks if x[1].effect.name != UNNAMED][: self.criteria.shortlist]
         unnamed = [x for x in looks if x[1].effect.name == UNNAMED][: self.criteria.unnamed]
-        chosen: list[tuple[Candidate, Shapes]] = []
-        for _, own, first in (*named, *unnamed):
+        chosen: list[tuple[Candidate, Shapes, Starts]] = []
+        for _, own, first, starts in (*named, *unnamed):
             candidate, found = own, first
+            if starts:
+                chosen.append((candidate, (), starts))
+                continue
             if isinstance(candidate.effect, MotorOrder):
                 near = nearby_orders(state.study, candidate.place.joint, found[1][0][1])
                 candidate = replace(candidate, grid=near)
                 found = screened(noise, candidate, column_cache) or found
             shapes = refined(noise, candidate, column_cache, found)
-            chosen += [(candidate, ends) for ends in both_ends(noise, candidate, column_cache, shapes)]
+            chosen += [(candidate, ends, ()) for ends in both_ends(noise, candidate, column_cache, shapes)]
         return chosen, tests
 
-    def _made(self, state: ModelState, candidate: Candidate, shapes: Shapes) -> Made | None:
+    def _made(self, state: ModelState, candidate: Candidate, shapes: Shapes, starts: Starts) -> Made | None:
         effect, whole = candidate.effect, known(candidate.effect.key)
         spared = tuple(p.name for p in whole.linear if p not in effect.linear)
         entry = stanza_of(effect, candidate.place, state.robot, dict(shapes), spared)
@@ -405,41 +365,48 @@ class StepwiseSelection:
         for name, value in (pair for one in candidate.grid for pair in one):
             largest[name] = max(value, largest.get(name, value))
         allowed = whole.allows(term.of_effect(values), term.of_effect(std), dict(term.shapes), largest)
-        return Made(candidate, shapes, entry, made, allowed)
+        one = Made(candidate, shapes, entry, made, allowed)
+        if not starts:
+            return one
+        corrected = self._corrected(state, candidate, entry, (float(values[0]), *starts) if allowed else starts)
+        return one if corrected is None else max((one, corrected), key=lambda m: (m.allowed, gain(m.state, state)))
 
-    def _corrected(self, state: ModelState, made: Made) -> Made:
-        """Model in which the recordings are corrected for an effect that changes what was recorded.
+    def _corrected(self, state: ModelState, candidate: Candidate, entry: Entry, starts: Starts) -> Made | None:
+        """Model in which the recordings are corrected for an effect on a recorded torque.
 
-        A torque column is the first-order expansion of such an effect at the model's own torque. The corrected
-        recording is exact, and the part of the expansion that remains refines the value, until it is within its
-        standard deviation. The first value of a large effect can be so far off that its correction predicts worse than
-        the expansion; so the best of all is chosen at the end.
+        The first-order expansion beside the corrected torque refines the value, until what remains is within its
+        standard deviation. Where that does not come about, the value with the largest gain is chosen.
 
         Parameters
         ----------
         state
             Model without the effect.
-        made
-            Model with its expansion.
+        candidate
+            The effect.
+        entry
+            Its entry without a value: the first-order expansion.
+        starts
+            Values to start from.
         """
-        entry, best = made.entry, made
-        name = of_entry(entry).linear[0].name
-        value = float(made.state.values_of(made.state.term_of(entry))[0][0])
-        for _ in range(CORRECTIONS):
-            right = entry.model_copy(update={"parameters": {**entry.parameters, name: value}})
-            exact = self._state(with_entries(state.robot, [right]), state)
-            if exact is None:
-                break
-            if gain(exact, state) > gain(best.state, state):
-                best = replace(made, state=exact, entry=right)
-            further = self._state(with_entries(exact.robot, [entry]), exact)
-            if further is None:
-                break
-            rest, std = (float(x[0]) for x in further.values_of(further.term_of(entry)))
-            if abs(rest) < std:
-                break
-            value += rest
-        return best
+        name = candidate.effect.linear[0].name
+        found: list[Made] = []
+        for start in starts:
+            value = start
+            for _ in range(CORRECTIONS):
+                right = entry.model_copy(update={"parameters": {**entry.parameters, name: value}})
+                exact = self._state(with_entries(state.robot, [right]), state)
+                further = None if exact is None else self._state(with_entries(exact.robot, [entry]), exact)
+                if exact is None:
+                    break
+                allowed = candidate.effect.allows(np.array([value]), np.zeros(1), {})
+                found.append(Made(candidate, (), right, exact, allowed))
+                if further is None:
+                    break
+                rest, std = (float(x[0]) for x in further.values_of(further.term_of(entry)))
+                if abs(rest) < std and allowed:
+                    return found[-1]
+                value += rest
+        return max(found, key=lambda made: (made.allowed, gain(made.state, state)), default=None)
 
     def _state(self, robot: RobotConfig, before: ModelState) -> ModelState | None:
         """Fit of a model in its own closed loop, cached; ``None`` if the motion does not determine its parameters."""
@@ -453,9 +420,7 @@ class StepwiseSelection:
 
     def _without(self, state: ModelState, entry: Entry) -> ModelState | None:
         """The model without one of its effects."""
-        effects = list(state.robot.effects)
-        effects.remove(entry)
-        return self._state(state.robot.model_copy(update={"effects": tuple(effects)}), state)
+        return self._state(without_entry(state.robot, entry), state)
 
     def _reduced(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
         """Model without findings that later ones made insignificant or immaterial."""
@@ -502,7 +467,7 @@ class StepwiseSelection:
         return state, found
 
     def _confirmed(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Model with the findings that the report part confirms, largest change first.
+        """Model with the findings that the report part confirms, largest reduction of the errors first.
 
         The models are compared as they are reported: each estimated under the noise models of its own residual.
         """
@@ -518,7 +483,7 @@ class StepwiseSelection:
                     checked.append((replace(one, confirmation=report, without=final), less))
             failed = [(one, less) for one, less in checked if not self._holds(one)]
             if not failed:
-                return state, tuple(sorted((one for one, _ in checked), key=_change, reverse=True))
+                return state, tuple(sorted((one for one, _ in checked), key=_reduction, reverse=True))
             gone, state = max(
                 failed, key=lambda one: 1.0 if one[0].confirmation is None else one[0].confirmation.p_value
             )
@@ -539,22 +504,10 @@ class StepwiseSelection:
         return bool((enough & report.acts).any())
 
 
-def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
-    """Return a configuration with further effect entries.
-
-    Parameters
-    ----------
-    robot
-        The configuration.
-    entries
-        Entries to add.
-    """
-    return robot.model_copy(update={"effects": (*robot.effects, *entries)})
-
-
-def _change(one: Selected) -> float:
-    """Change of the torque of a joint when the finding was admitted, percent: findings may overlap."""
-    return one.addition.material_pct
+def _reduction(one: Selected) -> float:
+    """Reduction of the errors of the report part by a finding, beside all others."""
+    assert one.confirmation is not None
+    return one.confirmation.reduction
 
 
 def _key(robot: RobotConfig) -> str:

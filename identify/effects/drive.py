@@ -72,6 +72,20 @@ class Correction(TorqueDependent):
             Largest torque of the motor, N m or N.
         """
 
+    @abstractmethod
+    def values_to_test(self, recorded: Array, dt: float, limit: float) -> Array:
+        """Return the values at which a diagnosis tests the correction, increasing in size for each sign.
+
+        Parameters
+        ----------
+        recorded
+            Recorded torque, N m or N, (N,).
+        dt
+            Sampling period, s.
+        limit
+            Largest torque of the motor, N m or N.
+        """
+
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the torques of the joints that the motor drives."""
         return motion.of_motor(place.joint, self.shaft_column(motion.motor_torque[:, place.joint], motion, place.joint))
@@ -127,6 +141,11 @@ class DriveGainError(Correction):
         true: Array = recorded / (1.0 + value)
         return true
 
+    def values_to_test(self, recorded: Array, dt: float, limit: float) -> Array:
+        """Return errors from 4 to 60 % to either side, and 120 %."""
+        sizes = np.geomspace(0.04, 0.6, 5)
+        return np.concatenate([-sizes, sizes, [1.2]])
+
 
 class DriveGainSaturation(Correction):
     """Odd torque curve: the share lost grows with the square of the torque."""
@@ -157,6 +176,11 @@ class DriveGainSaturation(Correction):
         given: Array = recorded / np.sqrt(np.maximum(1.0 + 2.0 * value * (recorded / limit) ** 2, LEAST))
         return given
 
+    def values_to_test(self, recorded: Array, dt: float, limit: float) -> Array:
+        """Return losses of 2 to 60 % at the largest recorded torque, to either side."""
+        sizes = np.geomspace(0.02, 0.6, 5) * (limit / max(float(np.abs(recorded).max()), 1e-300)) ** 2
+        return np.concatenate([-sizes, sizes])
+
 
 class TimeDelay(Correction):
     """Torque that is reported late."""
@@ -178,6 +202,10 @@ class TimeDelay(Correction):
         t = dt * np.arange(recorded.size)
         early: Array = np.interp(t + value, t, recorded)
         return early
+
+    def values_to_test(self, recorded: Array, dt: float, limit: float) -> Array:
+        """Return times from a quarter of a sample to 64 samples."""
+        return np.asarray(dt * np.geomspace(0.25, 64.0, 9))
 
     def is_convention(self, values: Array, dt: float) -> bool:
         """Return True below a sampling period: drives differ in the instant at which they latch signals."""

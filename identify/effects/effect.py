@@ -284,6 +284,11 @@ class Effect(ABC):
         return f"{self.name}/{self.law}" if self.law else self.name
 
     @property
+    def sign(self) -> int:
+        """Sign of the one linear parameter; 0 if physics determines none, or there are several."""
+        return self.linear[0].sign if len(self.linear) == 1 else 0
+
+    @property
     def two_joints(self) -> bool:
         """True if a location has two joints."""
         return self.scope in ("pair", "other")

@@ -62,16 +62,22 @@ class CoulombTransition(Effect):
     needs = "reversals"
     excitation = ("reversals",)
     linear = (Linear("fct", TORQUE, sign=1),)
-    shapes = (Shape("velocity", VELOCITY),)
+    shapes = (Shape("velocity", VELOCITY), Shape("lead", ("s", "s"), default=0.0))
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
-        """Return ``tanh(qd / velocity) - sign(qd)``."""
+        """Return ``tanh((qd + lead qdd) / velocity) - sign(qd)``.
+
+        A joint stops suddenly and leaves standstill slowly, while its friction reverses under the rising torque. A
+        smoothed velocity passes zero late in that time.
+        """
         j = place.joint
-        return (np.tanh(motion.qd[:, j] / shapes["velocity"]) - motion.sign[:, j])[:, None]
+        reversal = motion.qd[:, j] + shapes["lead"] * motion.qdd[:, j]
+        return (np.tanh(reversal / shapes["velocity"]) - motion.sign[:, j])[:, None]
 
     def trial_values(self, motion: Motion, place: Place) -> Trials:
-        """Return velocities from 0.06 to 3 % of the joint's top speed."""
-        return (float(motion.top_speed[place.joint]) * np.geomspace(0.0006, SLOWEST, 7),)
+        """Return velocities from 0.06 to 3 % of the joint's top speed, and leads from an eighth of a sample to four."""
+        velocities = float(motion.top_speed[place.joint]) * np.geomspace(0.0006, SLOWEST, 7)
+        return velocities, motion.dt * np.geomspace(0.125, 4.0, 6)
 
     def is_convention(self, values: Array, dt: float) -> bool:
         """Return True: every model of dry friction has some transition, so that it is no missing effect."""

@@ -111,6 +111,19 @@ class IvRegression:
         _, q = self._through([(j, columns[own]) for j, own in enumerate(self.rows_of)], columns.shape[1])
         return self.solution.parameters(q)
 
+    def without_model(self, torques: Array) -> Array:
+        """Torques (R, k) less those that the model gives to them: ``T - X (Z'X)^-1 Z'T``.
+
+        Parameters
+        ----------
+        torques
+            Whitened torques T of all joints, (R, k).
+        """
+        theta, rest = self.absorbed(torques), torques.copy()
+        for joint, rows, own in zip(self.equations.joints, self.rows, self.rows_of, strict=True):
+            rest[own] -= rows[:, : joint.x.size] @ theta[joint.x]
+        return rest
+
     def beside(self, instruments: Array) -> Array:
         """Instruments (R, k) orthogonal to the regressor: ``D - Z (X'Z)^-1 X'D``.
 

@@ -167,9 +167,10 @@ EFFECT_PARAMETERS: dict[str, dict[str, str]] = {
         "torque": "True over recorded torque; with another joint, the multiple of its torque that is added.",
     },
     "coulomb_transition": {
-        "fct": "Part of the Coulomb friction that reverses gradually: `fct tanh(qd / velocity)` in place of the "
-        "smoothed sign.",
+        "fct": "Part of the Coulomb friction that reverses gradually: `fct tanh((qd + lead qdd) / velocity)` in place "
+        "of the smoothed sign.",
         "velocity": "Velocity over which the dry friction reverses.",
+        "lead": "Time by which the dry friction reverses before the differentiated velocity.",
     },
     "stribeck_friction/exponential": {
         "fst": "Additional friction torque at low speed: `fst exp(-|qd| / velocity) sign(qd)`.",

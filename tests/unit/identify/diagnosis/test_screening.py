@@ -8,6 +8,7 @@ import pytest
 from armident.configs import load_robot
 from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.candidates import ColumnCache, candidates
+from armident.identify.diagnosis.corrections import screened_correction
 from armident.identify.diagnosis.model_state import fitted as model_of
 from armident.identify.diagnosis.regression import Fit
 from armident.identify.diagnosis.screening import directions_beside, score_statistics
@@ -67,3 +68,27 @@ def test_products_are_made_anew_only_where_the_noise_is_another(fitted: Fit) -> 
     assert [a is b for a, b in zip(known.rows, fitted.regression.rows, strict=True)] == [j != 4 for j in range(6)]
     for name in ("cross", "gram", "projected", "scale"):
         np.testing.assert_array_equal(getattr(known.solution, name), getattr(fresh.solution, name))
+
+
+def test_statistics_of_a_parameter_with_the_wrong_sign_are_zero(fitted: Fit) -> None:
+    bench = ColumnCache(fitted.study, fitted.theta)
+    candidate = next(c for c in candidates(bench) if c.effect.name == "stribeck_friction" and c.effect.law == "")
+    columns = bench.grid(candidate.effect, candidate.place, candidate.grid, fitted.noise)
+    whole = score_statistics(fitted, columns, len(candidate.grid))
+    up, down = (score_statistics(fitted, columns, len(candidate.grid), sign) for sign in (1, -1))
+    np.testing.assert_allclose(up + down, whole)
+    assert (np.minimum(up, down) == 0.0).all()
+
+
+def test_a_delay_is_promised_with_about_its_value() -> None:
+    robot, delay = load_robot("emps"), 0.003
+    hidden = HiddenEffect(effect="time_delay", joint="joint_1", parameters={"delay": delay})
+    data = recording("emps", "emps_excitation", 1, hidden, period=FAST, setpoint_every=1)
+    state = model_of(build_study(experiments_from_recording(data, robot)[0], [], robot), robot, None)
+    fit = state.fit.renoised(state.weights)
+    bench = ColumnCache(fit.study, state.fit.theta)
+    late = next(c for c in candidates(bench) if c.effect.name == "time_delay")
+    statistic, starts = screened_correction(fit, late, bench)
+    assert statistic > 100.0
+    # The model absorbs a part of the delay; what remains is found from the corrected torques.
+    assert all(0.3 * delay < start < 1.1 * delay for start in starts)

@@ -1,0 +1,120 @@
+"""Screening of effects on recorded torques, such as delays, over the values of their parameter.
+
+A first-order expansion holds for small effects only: a delay is small if it is shorter than the fastest change of the
+torque.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from armident.identify.diagnosis.candidates import Candidate, ColumnCache
+from armident.identify.diagnosis.regression import Fit
+from armident.identify.diagnosis.study import NOISE_ORDER, PERTURBATION
+from armident.identify.effects.drive import Correction, motor_limit
+from armident.identify.regression.ar_noise import ar_models
+from armident.identify.regression.whitening import whitened, whitened_series
+
+Array = NDArray[np.float64]
+
+REFINEMENTS = 10
+"""Evaluations of the refinement between two values of the grid."""
+
+
+def screened_correction(fit: Fit, candidate: Candidate, column_cache: ColumnCache) -> tuple[float, tuple[float, float]]:
+    """Score statistic of an effect on the recorded torque of a motor, and two values of its parameter to start from.
+
+    The statistic is the reduction of the squared whitened residual by the change of the torque that the model predicts
+    at the simulated motion, which has no noise. A correction changes the noise of a torque, too, and the smoothing of
+    the positions makes low-pass filtered noise look like a better model. The likelihood of the corrected torques is
+    therefore no evidence of an effect. It gives the second value, for effects that are so large that the predicted
+    torque is far from the true one.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model without the effect.
+    candidate
+        Effect on a recorded torque, and its motor.
+    column_cache
+        Cache of the columns of the same fit.
+    """
+    study, effect, motor = fit.study, candidate.effect, candidate.place.joint
+    assert isinstance(effect, Correction)
+    limit = motor_limit(study.robot, motor)
+    shaft = np.linalg.inv(study.robot.transmission_matrix)[:, motor]
+    recorded = np.concatenate([s.torque @ shaft for s in study.train])
+    grid = [float(value) for value in effect.values_to_test(recorded, study.dt, limit)]
+    promised, small = _largest(lambda values: _at_simulated(fit, effect, motor, limit, column_cache, values), grid)
+    _, large = _largest(lambda values: _likelihoods(fit, effect, motor, limit, values), grid)
+    return promised, (small, large)
+
+
+def _at_simulated(
+    fit: Fit, effect: Correction, motor: int, limit: float, column_cache: ColumnCache, values: Sequence[float]
+) -> Array:
+    """Reduction of the squared whitened residual by the change of the predicted torque at each value, (k,)."""
+    study, transmission = fit.study, fit.study.robot.transmission_matrix[motor]
+    joints, changes = np.flatnonzero(transmission), []
+    for s in study.train:
+        motion = column_cache.motion(s, "simulated")
+        torque = motion.motor_torque[motion.lead :, motor]
+        change = torque[:, None] - _true(effect, torque, values, study.dt, limit)
+        at_joints = study.decimation(change)[:, None] * transmission[joints][:, None]
+        changes.append(at_joints * s.moving[:, joints, None])
+    series = whitened_series(changes, [fit.noise[j] for j in joints])
+    columns = [(int(j), np.concatenate(parts)) for j, parts in zip(joints, series, strict=True)]
+    gram, score = fit.regression.products_beside(columns, len(values))
+    return np.asarray(2.0 * score[:, 0] - gram[:, 0, 0])
+
+
+def _likelihoods(fit: Fit, effect: Correction, motor: int, limit: float, values: Sequence[float]) -> Array:
+    """Twice the log-likelihood of the torques that are corrected for each value, (k,), without a constant.
+
+    The other parameters are estimated again, and the noise model of the joint of the motor: a strong correction changes
+    the spectrum of its residual. Those of the other joints stay.
+    """
+    study, transmission = fit.study, fit.study.robot.transmission_matrix
+    own = [s.torque @ np.linalg.inv(transmission)[:, motor] for s in study.train]
+    size = PERTURBATION * float(np.concatenate(own).std())
+    changes, disturbed = [], []
+    for torque, s in zip(own, study.train, strict=True):
+        noise = size * np.random.default_rng(0).standard_normal(torque.size)
+        true = _true(effect, torque, values, study.dt, limit)
+        moved = _true(effect, torque + noise, values, study.dt, limit) - true
+        both = study.decimation(np.hstack([true - torque[:, None], moved]))
+        at_joints = both[:, None, : len(values)] * transmission[motor][:, None]
+        changes.append(np.where(s.moving[:, :, None], at_joints, 0.0))
+        disturbed.append(both[:, len(values) :])
+    left = fit.residual[:, None] + fit.regression.without_model(whitened(changes, fit.noise))
+    rows = fit.regression.rows_of[int(np.argmax(np.abs(transmission[motor])))]
+    elsewhere = np.sum(left**2, axis=0) - np.sum(left[rows] ** 2, axis=0)
+    # By the theorem of Szegoe, see `log_volume`: noise that a correction makes smaller is no better model.
+    ratio = np.log(_innovations([left[rows]]) / _innovations(disturbed))
+    return np.asarray(-elsewhere - (rows.stop - rows.start) * ratio)
+
+
+def _true(effect: Correction, torque: Array, values: Sequence[float], dt: float, limit: float) -> Array:
+    """True torques of a recorded one at each value, (N, k)."""
+    return np.stack([effect.true_torque(torque, value, dt, limit) for value in values], axis=1)
+
+
+def _innovations(parts: Sequence[Array]) -> Array:
+    """Innovation variances of the noise in each column, (k,)."""
+    return np.array([ar.variance for ar in ar_models(parts, NOISE_ORDER)])
+
+
+def _largest(criterion: Callable[[Sequence[float]], Array], grid: Sequence[float]) -> tuple[float, float]:
+    """Largest criterion and its value: the best of the grid, refined between its neighbours of the same sign."""
+    tried = criterion(grid)
+    most, best = float(tried.max()), grid[int(np.argmax(tried))]
+    near = [abs(value) for value in grid if value * best > 0.0]
+    k, side = near.index(abs(best)), float(np.sign(best))
+    low, high = near[max(k - 1, 0)], near[min(k + 1, len(near) - 1)]
+    found = optimize.minimize_scalar(
+        lambda x: -float(criterion([side * float(np.exp(x))])[0]), bounds=(np.log(low), np.log(high)),
+        method="bounded", options={"maxiter": REFINEMENTS},
+    )  # fmt: skip
+    return max((most, best), (-float(found.fun), side * float(np.exp(found.x))))

@@ -1,0 +1,155 @@
+"""Transitions of dry friction at the reversals of the joints: a part of the friction model, found before any effect."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from armident.configs import RobotConfig
+from armident.configs.schema.robot import Effect as Entry
+from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
+from armident.identify.diagnosis.model_state import ModelState, with_entries, without_entry
+from armident.identify.diagnosis.screening import refined, screened
+from armident.identify.effects.effect import SIGN_TOLERANCE, Place
+from armident.identify.effects.friction import TRANSITION
+from armident.identify.effects.registry import known
+from armident.identify.effects.terms import stanza_of
+from armident.identify.regression.ar_noise import ArModel
+
+PASSES = 2
+"""Searches between the values of the grid: the second with better transitions of the other joints."""
+FINER = (1.2, 1.1, 1.05, 1.02)
+"""Factors of the last refinement of a velocity: what the score statistic proposes is a linearisation."""
+CLEAR = 3.0
+"""Gain of log-likelihood from which a joint has a transition: odds of 20 to 1."""
+
+LARGEST = 2.0
+"""Largest transition over the dry friction of the joint. One needs no more; dry friction breaks away at up to twice the
+level of slow motion (Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30(7)), and a joint that sticks looks
+like that."""
+
+Model = Callable[[RobotConfig, ModelState], ModelState | None]
+"""``(robot, before)`` to the fitted model of a configuration; ``None`` if the motion does not determine it."""
+
+
+def with_transitions(state: ModelState, model: Model) -> ModelState:
+    """Model with the transition of dry friction at the reversals of each joint, where it predicts better.
+
+    The smoothed sign of the model approaches its limits slowly. Beside another law of the reversal it looks like
+    friction that depends on the velocity (Stribeck), or like a torque that is early. All joints are tried at once; each
+    keeps what predicts its own torque best. A score statistic proposes values between those of the grid.
+
+    Parameters
+    ----------
+    state
+        Model to start from.
+    model
+        Fits a model.
+    """
+    search = _Search(state, model)
+    for number in range(search.count):
+        search.tried({place: grid[number] for place, grid in search.grids.items()}, state)
+    made = search.tried(search.chosen, state)
+    for _ in range(PASSES):
+        if made is None:
+            return state
+        search.tried({place: search.proposed(made, place) for place in search.chosen}, made)
+        made = search.tried(search.chosen, made)
+    for factor in (f for finer in FINER for f in (finer, 1.0 / finer)):
+        if made is not None:
+            search.tried({place: _scaled(shapes, factor) for place, shapes in search.chosen.items()}, made)
+    made = search.tried(search.chosen, state) or state
+    kept = [entry for place, entry in search.entries(search.chosen).items() if search.clear(made, entry, place.joint)]
+    return model(with_entries(state.robot, kept), state) or state
+
+
+class _Search:
+    """Best transition of each joint so far.
+
+    Parameters
+    ----------
+    state
+        Model without them.
+    model
+        Fits a model.
+    """
+
+    def __init__(self, state: ModelState, model: Model) -> None:
+        self.state, self.model, self.effect = state, model, known(TRANSITION)
+        present = {entry.joint for entry in state.robot.effects if entry.effect == TRANSITION}
+        motion = ColumnCache(state.study, state.fit.theta).motion(state.study.train[0], "measured")
+        places = [Place(j) for j, name in enumerate(state.study.joints) if name not in present]
+        self.whole = {place: self.effect.grid(motion, place) for place in places}
+        # Velocities with the shortest lead.
+        self.grids = {
+            place: grid[:: len(self.effect.trial_values(motion, place)[1])] for place, grid in self.whole.items()
+        }
+        self.count = min(map(len, self.grids.values()), default=0)
+        self.best: dict[Place, tuple[float, Shapes]] = {}
+
+    @property
+    def chosen(self) -> dict[Place, Shapes]:
+        """Nonlinear parameters of the best transitions."""
+        return {place: shapes for place, (_, shapes) in self.best.items()}
+
+    def entries(self, shapes: dict[Place, Shapes]) -> dict[Place, Entry]:
+        """Entries of transitions."""
+        return {place: stanza_of(self.effect, place, self.state.robot, dict(one)) for place, one in shapes.items()}
+
+    def tried(self, shapes: dict[Place, Shapes], before: ModelState) -> ModelState | None:
+        """Model with transitions; each that predicts the torque of its joint better becomes the best one."""
+        entries = self.entries(shapes)
+        made = self.model(with_entries(self.state.robot, list(entries.values())), before)
+        if made is None:
+            return None
+        for place, entry in entries.items():
+            score = float(made.score.own_log_likelihoods[place.joint])
+            least = self.best[place][0] if place in self.best else -np.inf
+            if score > least and _possible(made, entry, place.joint):
+                self.best[place] = score, shapes[place]
+        return made
+
+    def proposed(self, made: ModelState, place: Place) -> Shapes:
+        """Nonlinear parameters with the largest score statistic beside the transitions of the other joints."""
+        best = self.chosen[place]
+        less = self.model(without_entry(made.robot, self.entries({place: best})[place]), made)
+        return best if less is None else self._largest(less, place, made.weights) or best
+
+    def _largest(self, state: ModelState, place: Place, weights: tuple[ArModel, ...]) -> Shapes | None:
+        column_cache = ColumnCache(state.study, state.fit.theta)
+        candidate = Candidate(self.effect, place, self.whole[place])
+        noise = state.fit.renoised(weights)
+        found = screened(noise, candidate, column_cache)
+        return None if found is None else refined(noise, candidate, column_cache, found)
+
+    def clear(self, state: ModelState, entry: Entry, joint: int) -> bool:
+        """True if a transition is possible, and clearly improves the prediction of its joint's torque.
+
+        Each model predicts under noise models of its own, or both under those of the model without it.
+        """
+        less = self.model(without_entry(state.robot, entry), state)
+        if less is None or not _possible(state, entry, joint):
+            return False
+        own = (state.score.own_log_likelihoods - less.score.own_log_likelihoods)[joint]
+        alike = [one.score.log_likelihoods_under(less.weights)[joint] for one in (state, less)]
+        return bool(max(own, alike[0] - alike[1]) > CLEAR)
+
+
+def _possible(state: ModelState, entry: Entry, joint: int) -> bool:
+    """True if a transition is positive, and at most `LARGEST` within two standard deviations.
+
+    Together with the smoothed sign, a larger one is friction that falls with the velocity: an effect (Stribeck).
+    """
+    names = state.study.model.base.names
+    own, dry = names.index(state.term_of(entry).names[0]), f"fc{joint + 1}"
+    if state.fit.theta[own] <= 0.0 or dry not in names:
+        return bool(state.fit.theta[own] > 0.0)
+    direction = np.zeros(state.fit.theta.size)
+    direction[own], direction[names.index(dry)] = 1.0, -LARGEST
+    std = float(np.sqrt(direction @ state.fit.covariance @ direction))
+    return bool(direction @ state.fit.theta <= SIGN_TOLERANCE * std)
+
+
+def _scaled(shapes: Shapes, factor: float) -> Shapes:
+    """The same transition over another range of velocities."""
+    (name, velocity), *rest = shapes
+    return ((name, factor * velocity), *rest)
