@@ -37,7 +37,7 @@ $(PY):
 
 $(VENV)/.lock: requirements.lock | $(PY)
 	@echo "installing what requirements.lock lists into $(VENV) (a minute or two)"
-	$(PY) -m pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
+	$(PY) -m pip install -qq --disable-pip-version-check --no-deps --require-hashes -r requirements.lock
 	touch $@
 
 $(VENV)/.project: pyproject.toml $(VENV)/.lock
