@@ -92,11 +92,25 @@ class _Search:
         return {place: shapes for place, (_, shapes) in self.best.items()}
 
     def entries(self, shapes: dict[Place, Shapes]) -> dict[Place, Entry]:
-        """Entries of transitions."""
+        """Entries of transitions.
+
+        Parameters
+        ----------
+        shapes
+            Nonlinear parameters of the transition at each place.
+        """
         return {place: stanza_of(self.effect, place, self.state.robot, dict(one)) for place, one in shapes.items()}
 
     def tried(self, shapes: dict[Place, Shapes], before: ModelState) -> ModelState | None:
-        """Model with transitions; each that predicts the torque of its joint better becomes the best one."""
+        """Model with transitions; each that predicts the torque of its joint better becomes the best one.
+
+        Parameters
+        ----------
+        shapes
+            Nonlinear parameters of the transition at each place.
+        before
+            Model to start the fit from.
+        """
         entries = self.entries(shapes)
         made = self.model(with_entries(self.state.robot, list(entries.values())), before)
         if made is None:
@@ -109,7 +123,15 @@ class _Search:
         return made
 
     def proposed(self, made: ModelState, place: Place) -> Shapes:
-        """Nonlinear parameters with the largest score statistic beside the transitions of the other joints."""
+        """Nonlinear parameters with the largest score statistic beside the transitions of the other joints.
+
+        Parameters
+        ----------
+        made
+            Model with the best transitions so far.
+        place
+            Joint of the transition.
+        """
         best = self.chosen[place]
         less = self.model(without_entry(made.robot, self.entries({place: best})[place]), made)
         return best if less is None else self._largest(less, place, made.weights) or best
@@ -125,6 +147,15 @@ class _Search:
         """True if a transition is possible, and clearly improves the prediction of its joint's torque.
 
         Each model predicts under noise models of its own, or both under those of the model without it.
+
+        Parameters
+        ----------
+        state
+            Model with all transitions.
+        entry
+            Entry of the transition.
+        joint
+            Index of its joint, from 0.
         """
         less = self.model(without_entry(state.robot, entry), state)
         if less is None or not _possible(state, entry, joint):
