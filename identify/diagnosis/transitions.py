@@ -15,8 +15,6 @@ from armident.identify.effects.registry import known
 from armident.identify.effects.terms import stanza_of
 from armident.identify.regression.ar_noise import ArModel
 
-PASSES = 2
-"""Searches between the values of the grid: the second with better transitions of the other joints."""
 FINER = (1.2, 1.1, 1.05, 1.02)
 """Factors of the last refinement of a velocity: what the score statistic proposes is a linearisation."""
 CLEAR = 3.0
@@ -49,11 +47,10 @@ def with_transitions(state: ModelState, model: Model) -> ModelState:
     for number in range(search.count):
         search.tried({place: grid[number] for place, grid in search.grids.items()}, state)
     made = search.tried(search.chosen, state)
-    for _ in range(PASSES):
-        if made is None:
-            return state
-        search.tried({place: search.proposed(made, place) for place in search.chosen}, made)
-        made = search.tried(search.chosen, made)
+    if made is None:
+        return state
+    search.tried({place: search.proposed(made, place) for place in search.chosen}, made)
+    made = search.tried(search.chosen, made)
     for factor in (f for finer in FINER for f in (finer, 1.0 / finer)):
         if made is not None:
             search.tried({place: _scaled(shapes, factor) for place, shapes in search.chosen.items()}, made)
