@@ -216,7 +216,7 @@ def candidates(column_cache: ColumnCache) -> Iterator[Candidate]:
     for effect in catalogue().values():
         if effect.name == TRANSITION and study.sign_given:
             continue
-        right = {names.index(stanza.joint) for stanza in study.recorded if stanza.effect == effect.name}
+        right = {names.index(entry.joint) for entry in study.recorded if entry.effect == effect.name}
         for place in effect.places(study.robot.n):
             there = present.get((effect.name, place.joint, place.other), [])
             if place.joint not in right and effect.may_be_added(motion, place, there):

@@ -41,7 +41,7 @@ from armident.identify.effects.drive import Correction
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import known
 from armident.identify.effects.tables import FreeShape
-from armident.identify.effects.terms import stanza_of
+from armident.identify.effects.terms import entry_of
 from armident.identify.effects.transmission import MotorOrder
 from armident.identify.effects.unnamed import NAME as UNNAMED
 
@@ -355,7 +355,7 @@ class StepwiseSelection:
     def _made(self, state: ModelState, candidate: Candidate, shapes: Shapes, starts: Starts) -> Made | None:
         effect, whole = candidate.effect, known(candidate.effect.key)
         spared = tuple(p.name for p in whole.linear if p not in effect.linear)
-        entry = stanza_of(effect, candidate.place, state.robot, dict(shapes), spared)
+        entry = entry_of(effect, candidate.place, state.robot, dict(shapes), spared)
         made = self._state(with_entries(state.robot, [entry]), state)
         if made is None:
             return None

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from armident.configs import DataError, RobotConfig
-from armident.configs.schema.robot import Effect as Stanza
+from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distances, moving_rows, rows_before
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.recorded import of_recording, put_right
@@ -118,9 +118,9 @@ class Study:
     )
 
     @property
-    def recorded(self) -> tuple[Stanza, ...]:
+    def recorded(self) -> tuple[Entry, ...]:
         """Effect entries that correct the recordings."""
-        return tuple(stanza for stanza in self.robot.effects if of_recording(stanza))
+        return tuple(entry for entry in self.robot.effects if of_recording(entry))
 
     def of_robot(self, robot: RobotConfig) -> "Study":
         """The same recordings for another model, corrected again where its effect entries require other corrections.

@@ -12,7 +12,7 @@ from armident.identify.diagnosis.screening import refined, screened
 from armident.identify.effects.effect import SIGN_TOLERANCE, Place
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.registry import known
-from armident.identify.effects.terms import stanza_of
+from armident.identify.effects.terms import entry_of
 from armident.identify.regression.ar_noise import ArModel
 
 FINER = (1.2, 1.1, 1.05, 1.02)
@@ -96,7 +96,7 @@ class _Search:
         shapes
             Nonlinear parameters of the transition at each place.
         """
-        return {place: stanza_of(self.effect, place, self.state.robot, dict(one)) for place, one in shapes.items()}
+        return {place: entry_of(self.effect, place, self.state.robot, dict(one)) for place, one in shapes.items()}
 
     def tried(self, shapes: dict[Place, Shapes], before: ModelState) -> ModelState | None:
         """Model with transitions; each that predicts the torque of its joint better becomes the best one.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs import ConfigError, RobotConfig
-from armident.configs.schema.robot import Effect as Stanza
+from armident.configs.schema.robot import Effect as Entry
 from armident.identify.effects.effect import Effect, Linear, Place
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import of_entry
@@ -103,16 +103,16 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
     """
     terms: list[Term] = []
     taken: dict[str, int] = {}
-    for k, stanza in enumerate(robot.effects):
-        effect = of_entry(stanza)
-        if of_recording(stanza):
+    for k, entry in enumerate(robot.effects):
+        effect = of_entry(entry)
+        if of_recording(entry):
             continue
-        where = f"effects[{k}]: {stanza.effect} of {stanza.joint}"
-        place = place_of(stanza, effect, robot, where)
-        shapes = _shapes(stanza, effect, where)
+        where = f"effects[{k}]: {entry.effect} of {entry.joint}"
+        place = place_of(entry, effect, robot, where)
+        shapes = _shapes(entry, effect, where)
         kind = int(robot.joints[place.joint].type == "prismatic")
         number = f"{place.joint + 1}" if place.other is None else f"{place.joint + 1}{place.other + 1}"
-        kept = _kept(stanza, effect, shapes, where)
+        kept = _kept(entry, effect, shapes, where)
         names = []
         for linear in (effect.linear[k] for k in kept):
             name = f"{linear.name}{number}"
@@ -126,18 +126,18 @@ def terms_of(robot: RobotConfig) -> tuple[Term, ...]:
                 kept,
                 tuple(names),
                 tuple(effect.linear[k].unit[kind] for k in kept),
-                np.array([stanza.parameters.get(effect.linear[k].name, 0.0) for k in kept]),
+                np.array([entry.parameters.get(effect.linear[k].name, 0.0) for k in kept]),
             )
         )
     return tuple(terms)
 
 
-def place_of(stanza: Stanza, effect: Effect, robot: RobotConfig, where: str) -> Place:
+def place_of(entry: Entry, effect: Effect, robot: RobotConfig, where: str) -> Place:
     """Return the location of an effect entry.
 
     Parameters
     ----------
-    stanza
+    entry
         Entry of the ``effects`` of the configuration.
     effect
         Its effect.
@@ -152,19 +152,19 @@ def place_of(stanza: Stanza, effect: Effect, robot: RobotConfig, where: str) -> 
         If a pair lacks its second joint, or another effect has one.
     """
     names = [joint.name for joint in robot.joints]
-    joint = names.index(stanza.joint)
+    joint = names.index(entry.joint)
     if not effect.two_joints:
-        if stanza.other is not None:
+        if entry.other is not None:
             raise ConfigError(f"{where}: other: only an effect between two joints has one")
         return Place(joint)
-    if stanza.other is None or stanza.other == stanza.joint:
+    if entry.other is None or entry.other == entry.joint:
         raise ConfigError(f"{where}: other: expected the second joint")
-    return Place(joint, names.index(stanza.other))
+    return Place(joint, names.index(entry.other))
 
 
-def stanza_of(
+def entry_of(
     effect: Effect, place: Place, robot: RobotConfig, parameters: dict[str, float], without: tuple[str, ...] = ()
-) -> Stanza:
+) -> Entry:
     """Return the configuration entry of an effect.
 
     Parameters
@@ -179,7 +179,7 @@ def stanza_of(
         Linear parameters that it leaves out.
     """
     other = None if place.other is None else robot.joints[place.other].name
-    return Stanza(
+    return Entry(
         effect=effect.name,
         law=effect.law,
         joint=robot.joints[place.joint].name,
@@ -189,26 +189,26 @@ def stanza_of(
     )
 
 
-def _kept(stanza: Stanza, effect: Effect, shapes: dict[str, float], where: str) -> tuple[int, ...]:
+def _kept(entry: Entry, effect: Effect, shapes: dict[str, float], where: str) -> tuple[int, ...]:
     """Return the indices of the linear parameters that the effect has and ``without`` does not remove."""
     names = [parameter.name for parameter in effect.linear]
-    for name in stanza.without:
+    for name in entry.without:
         if name not in names:
             raise ConfigError(f"{where}: without: {name!r} is not one of its linear parameters ({', '.join(names)})")
-    kept = tuple(k for k in effect.present(shapes) if names[k] not in stanza.without)
+    kept = tuple(k for k in effect.present(shapes) if names[k] not in entry.without)
     if not kept:
         raise ConfigError(f"{where}: without: removes all its parameters")
     return kept
 
 
-def _shapes(stanza: Stanza, effect: Effect, where: str) -> dict[str, float]:
+def _shapes(entry: Entry, effect: Effect, where: str) -> dict[str, float]:
     shapes = [shape.name for shape in effect.shapes]
-    given = effect.defaults | stanza.parameters
+    given = effect.defaults | entry.parameters
     missing = [name for name in shapes if name not in given]
     if missing:
         raise ConfigError(f"{where} needs {', '.join(missing)}")
     known = (*shapes, *(parameter.name for parameter in effect.linear))
-    unknown = [name for name in stanza.parameters if name not in known]
+    unknown = [name for name in entry.parameters if name not in known]
     if unknown:
         raise ConfigError(f"{where}: parameters.{unknown[0]}: unknown (takes {', '.join(known)})")
     return {name: given[name] for name in shapes}

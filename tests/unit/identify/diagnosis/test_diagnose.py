@@ -8,7 +8,7 @@ from armident.configs.schema.robot import Effect
 from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.effects.effect import Place
 from armident.identify.effects.registry import catalogue
-from armident.identify.effects.terms import arm_model, stanza_of
+from armident.identify.effects.terms import arm_model, entry_of
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.report.files import robot_yaml
@@ -69,8 +69,8 @@ def test_held_out_error_of_the_joint_falls_with_every_finding() -> None:
 def test_a_diagnosed_model_is_a_robot_configuration_again(robot: RobotConfig) -> None:
     from armident.configs.loading import parse
 
-    stanza = Effect(effect="stribeck_friction", joint="joint_4", parameters={"velocity": 0.04, "fst": 0.5})
-    changed = robot.model_copy(update={"effects": (stanza,)})
+    entry = Effect(effect="stribeck_friction", joint="joint_4", parameters={"velocity": 0.04, "fst": 0.5})
+    changed = robot.model_copy(update={"effects": (entry,)})
     assert parse(robot_yaml(changed), RobotConfig, "model.yaml") == changed
     (term,) = arm_model(changed).terms
     assert term.names == ("fst4",)
@@ -102,10 +102,10 @@ def test_an_unknown_effect_is_refused_naming_the_known_ones(robot: RobotConfig) 
         arm_model(changed)
 
 
-def test_a_stanza_with_a_parameter_of_another_effect_is_refused(robot: RobotConfig) -> None:
-    stanza = stanza_of(catalogue()["joint_spring"], Place(0), robot, {"fst": 1.0})
+def test_an_entry_with_a_parameter_of_another_effect_is_refused(robot: RobotConfig) -> None:
+    entry = entry_of(catalogue()["joint_spring"], Place(0), robot, {"fst": 1.0})
     with pytest.raises(ConfigError, match=r"joint_spring of joint_1: parameters\.fst: unknown"):
-        arm_model(robot.model_copy(update={"effects": (stanza,)}))
+        arm_model(robot.model_copy(update={"effects": (entry,)}))
 
 
 @pytest.mark.slow

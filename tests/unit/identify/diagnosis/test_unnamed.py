@@ -11,7 +11,7 @@ from armident.identify.diagnosis.diagnose import diagnose
 from armident.identify.effects.effect import Effect, Place
 from armident.identify.effects.registry import catalogue
 from armident.identify.effects.tables import FreeShape
-from armident.identify.effects.terms import arm_model, stanza_of
+from armident.identify.effects.terms import arm_model, entry_of
 from armident.identify.experiment import Experiment
 from armident.identify.identification.from_recording import experiments_from_recording
 from armident.identify.identification.options import Options
@@ -63,7 +63,7 @@ def configured(effect: Effect) -> RobotConfig:
     place = Place(JOINT, None if effect.scope == "joint" else OTHER)
     motion = moved(ROBOT)
     shapes = dict(effect.grid(motion, place)[0])
-    return ROBOT.model_copy(update={"effects": (stanza_of(effect, place, ROBOT, shapes),)})
+    return ROBOT.model_copy(update={"effects": (entry_of(effect, place, ROBOT, shapes),)})
 
 
 @pytest.mark.parametrize("key", FREE)

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from armident.configs import load_robot
-from armident.configs.schema.robot import Effect as Stanza
+from armident.configs.schema.robot import Effect as Entry
 from armident.configs.schema.robot import Limits
 from armident.identify.effects.effect import Place
 from armident.identify.effects.friction import dahl
@@ -301,9 +301,9 @@ def test_a_recording_of_a_saturated_motor_is_put_right_to_its_end(axis: Motion) 
     robot, tau = axis.model.robot, axis.torque[:, :1]
     knee = 1.1 * np.abs(tau).max()
     loss = robot.joints[0].limits.torque ** 2 / (2 * knee**2)
-    stanza = Stanza(effect="drive_gain_saturation", joint=robot.joints[0].name, parameters={"gain_loss": loss})
+    entry = Entry(effect="drive_gain_saturation", joint=robot.joints[0].name, parameters={"gain_loss": loss})
     current = Experiment(axis.q, tau / np.sqrt(1 - (tau / knee) ** 2), None, axis.dt)
-    (found,) = put_right([current], robot.model_copy(update={"effects": (stanza,)}))
+    (found,) = put_right([current], robot.model_copy(update={"effects": (entry,)}))
     np.testing.assert_allclose(found.tau, tau, rtol=1e-9, atol=1e-12)
 
 

@@ -24,8 +24,8 @@ from tests.fixtures.arms import FAST, recording
 DT = 1e-3
 
 
-def with_effects(robot: RobotConfig, *stanzas: Effect) -> RobotConfig:
-    return robot.model_copy(update={"effects": stanzas})
+def with_effects(robot: RobotConfig, *entries: Effect) -> RobotConfig:
+    return robot.model_copy(update={"effects": entries})
 
 
 @pytest.fixture(scope="module")

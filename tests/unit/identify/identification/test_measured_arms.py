@@ -171,7 +171,7 @@ def settled(kuka: list[Experiment]) -> list[Experiment]:
     return [replace(e, q=e.q[RUN_IN:], tau=e.tau[RUN_IN:]) for e in kuka]
 
 
-def with_stanzas(*names: str) -> RobotConfig:
+def with_entries(*names: str) -> RobotConfig:
     return KUKA.model_copy(update={"effects": tuple(e for e in KUKA.effects if e.effect in names)})
 
 
@@ -192,7 +192,7 @@ def test_the_last_thirds_of_all_recordings_of_the_kuka_are_predicted_up_to_1_7_p
     tilt, std = np.array([askew["tilt_x1"], askew["tilt_y1"]]).T
     assert 0.9 < np.degrees(np.linalg.norm(tilt)) < 1.3
     assert np.linalg.norm(tilt) > 10 * std.max()
-    errors = [held_out_error(robot, first, last) for robot in (RIGID, with_stanzas("gravity_direction"), KUKA)]
+    errors = [held_out_error(robot, first, last) for robot in (RIGID, with_entries("gravity_direction"), KUKA)]
     # Each effect improves the prediction of held-out data.
     assert errors[0] - errors[1] > 0.1
     assert errors[1] - errors[2] > 0.1
