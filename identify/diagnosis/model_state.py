@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs import RobotConfig
+from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.predictive_score import PredictiveScore
@@ -164,6 +164,8 @@ def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> Model
     model = changed.model
     theta: Array | None = None
     if before is not None:
+        first_motions = before.study.auxiliary.first_motions
+        changed = replace(changed, auxiliary=replace(changed.auxiliary, first_motions=first_motions))
         theta = padded(before.fit, model)
     elif any(term.depends_on_torque for term in effect_terms(model)):
         bare = robot.model_copy(update={"effects": ()})
@@ -177,6 +179,28 @@ def fitted(study: Study, robot: RobotConfig, before: ModelState | None) -> Model
     if any(term.scales_torque for term in effect_terms(model)):
         first = _iterated(first)
     return ModelState(moved, first)
+
+
+def fitted_in_loop_of(before: ModelState, robot: RobotConfig) -> ModelState | None:
+    """Fit the model of a configuration with the simulated motion of another one: quick, for small changes of the model.
+
+    Parameters
+    ----------
+    before
+        Model of the same recordings, with its loop.
+    robot
+        Configuration of the model.
+
+    Returns
+    -------
+    ModelState
+        ``None`` if the motion does not determine the parameters of the model.
+    """
+    study = before.study.of_robot(robot)
+    try:
+        return ModelState(study, fit(study, padded(before.fit, study.model), before.weights))
+    except (DataError, np.linalg.LinAlgError):
+        return None
 
 
 def with_entries(robot: RobotConfig, entries: Sequence[Entry]) -> RobotConfig:
@@ -221,6 +245,18 @@ def with_own_noise(state: ModelState) -> ModelState:
     own = replace(state, fit=safe(state.fit.renoised(state.own_noise)))
     sizes = (float(np.log(np.maximum(one.score.rms, 1e-300)).sum()) for one in (own, state))
     return own if next(sizes) < next(sizes) else state
+
+
+def with_first_motions(state: ModelState) -> ModelState:
+    """Return a model from whose loop the simulations of its successors begin.
+
+    Parameters
+    ----------
+    state
+        Model of the selection.
+    """
+    study = state.study.with_first_motions(state.fit.theta)
+    return ModelState(study, replace(state.fit, study=study))
 
 
 def with_report_part(state: ModelState) -> ModelState:

@@ -28,6 +28,7 @@ from armident.identify.diagnosis.model_state import (
     ModelState,
     fitted,
     with_entries,
+    with_first_motions,
     with_own_noise,
     with_report_part,
     without_entry,
@@ -140,6 +141,7 @@ class StepwiseSelection:
         self.study = state.study
         if not self.study.sign_given:
             state = with_own_noise(with_transitions(state, self._state))
+        state = with_first_motions(state)
         self.study = replace(self.study, robot=state.robot, model=state.study.model)
         self._states[_key(state.robot)] = state
         return state
@@ -168,6 +170,7 @@ class StepwiseSelection:
             self.progress(f"adding {best.candidate.effect.name.replace('_', ' ')} of {name}")
             found = (*found, Selected(best.entry, step, best))
             state, found = self._reduced(best.state, found)
+            state = with_first_motions(state)
         # Removing a finding changes the comparison of the others.
         while True:
             state, found = self._exchanged(state, found)
@@ -183,27 +186,33 @@ class StepwiseSelection:
                 state = fitted(state.study.with_own_controller(), state.robot, state)
         return with_own_noise(state)
 
-    def step(self, state: ModelState) -> Step:
+    def step(self, state: ModelState, present: float = 0.0) -> Step:
         """Compare all candidates in a model.
 
         Parameters
         ----------
         state
             Model without them.
+        present
+            Gain of log-likelihood of an effect that they could take the place of. Those that promise much less are left
+            out.
         """
         key = _key(state.robot)
-        if key not in self._steps:
-            shortlist, tests = self._shortlist(state)
-            made: list[Made] = []
-            for k, one in enumerate(shortlist):
-                self.tested(k / len(shortlist))
-                if self._late():
-                    # An effect is admitted only against all others.
-                    return Step(state, (), (), (), tests)
-                made += [m for m in (self._made(state, *one),) if m is not None]
-            self._steps[key] = compared(state, made, tests, self.passes)
-            self._release()
-        return self._steps[key]
+        if key in self._steps:
+            return self._steps[key]
+        shortlist, tests = self._shortlist(state, present)
+        made: list[Made] = []
+        for k, one in enumerate(shortlist):
+            self.tested(k / len(shortlist))
+            if self._late():
+                # An effect is admitted only against all others.
+                return Step(state, (), (), (), tests)
+            made += [m for m in (self._made(state, *one),) if m is not None]
+        step = compared(state, made, tests, self.passes)
+        if not present:
+            self._steps[key] = step
+        self._release()
+        return step
 
     def _needed(self, tests: int) -> float:
         """Gain of log-likelihood of a significant effect, found among a number of candidates."""
@@ -304,7 +313,7 @@ class StepwiseSelection:
         study = models[best].study
         return replace(models[best], study=replace(study, warnings=(*study.warnings, line)))
 
-    def _shortlist(self, state: ModelState) -> tuple[list[tuple[Candidate, Shapes, Starts]], int]:
+    def _shortlist(self, state: ModelState, present: float) -> tuple[list[tuple[Candidate, Shapes, Starts]], int]:
         """Candidates with the highest statistics less their numbers of parameters, and the number of all.
 
         Each has its nonlinear parameters, or the values from which its correction of recorded torques starts.
@@ -333,8 +342,8 @@ class StepwiseSelection:
             self.hidden = frozenset(hidden)
         # A score statistic is twice the gain of log-likelihood that it promises. A correction needs all of it: its
         # likelihood also rewards smaller noise.
-        needed = 2.0 * self._needed(tests)
-        looks = [x for x in looks if x[2][0] > needed * (1.0 if x[3] else self.criteria.promising)]
+        needed, promising = self._needed(tests), self.criteria.promising
+        looks = [x for x in looks if 0.5 * x[2][0] > max(needed * (1.0 if x[3] else promising), promising * present)]
         looks.sort(key=lambda look: -look[0])
         named = [x for x in looks if x[1].effect.name != UNNAMED][: self.criteria.shortlist]
         unnamed = [x for x in looks if x[1].effect.name == UNNAMED][: self.criteria.unnamed]
@@ -455,14 +464,14 @@ class StepwiseSelection:
             if less is None:
                 continue
             self.progress(f"exchanging {one.entry.effect.replace('_', ' ')} of {one.entry.joint}")
-            step = self.step(less)
+            step = self.step(less, gain(state, less))
             best = self.admitted(step)
             if best is None or best.family == one.addition.family or _key(best.state.robot) in self._visited:
                 continue
             present = state.under(step.state.fit.noise).score.log_likelihood_under(step.noise)
             if best.log_likelihood > present + self.criteria.close:
                 other = Selected(best.entry, step, best)
-                state, found = best.state, tuple(other if f is one else f for f in found)
+                state, found = with_first_motions(best.state), tuple(other if f is one else f for f in found)
                 self._visited.add(_key(state.robot))
         return state, found
 

@@ -26,6 +26,7 @@ from armident.identify.identification.solvers import decimation_of
 from armident.identify.regression.ar_noise import ar_models
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.motion import Motion
+from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandwidth import motion_bandwidth
 from armident.identify.signals.decimate import Decimation, design
 from armident.identify.signals.differentiate import Derivatives, differentiate
@@ -44,8 +45,9 @@ WORKING_RATE = 20.0
 
 ROUNDS = 4
 """Most simulations of a loop with terms: instruments have to follow the arm, not to solve its equations."""
-SETTLED = 0.01
-"""Relative difference of the torque of the terms and the simulated load that ends these simulations."""
+TOLERATED = 0.05
+"""Difference between the torque of the terms and the simulated load that ends these simulations, over the torque of a
+joint: less hardly moves an arm under feedback."""
 PERTURBATION = 1e-3
 """Noise over the spread of a torque: small enough for a nonlinear correction to be linear."""
 NOISE_ORDER = 10
@@ -260,6 +262,25 @@ class Study:
             return self
         return replace(self, train=train, held=self._moved(self.held, motions))
 
+    def with_first_motions(self, theta: Array) -> "Study":
+        """The study whose simulations begin with the torques of terms at the motion of its own loop.
+
+        Loops of models with one more or one less effect then take one simulation instead of several.
+
+        Parameters
+        ----------
+        theta
+            Parameters of the loop, (b,).
+        """
+        numbers = sorted({s.experiment for s in self.train})
+        runs = self._runs(theta, numbers, AuxiliaryModel.rounds)
+        if runs is None or self.auxiliary.first_motions is None:
+            return self
+        motions = list(self.auxiliary.first_motions)
+        for k, run in zip(numbers, runs, strict=True):
+            motions[k] = replace(motions[k], q=run.q, qd=run.qd, qdd=run.qdd)
+        return replace(self, auxiliary=replace(self.auxiliary, first_motions=motions))
+
     def with_report_part(self, theta: Array) -> "Study":
         """The study with the motion of its loop for the experiments that are held out altogether.
 
@@ -278,14 +299,18 @@ class Study:
 
     def _simulated(self, theta: Array, numbers: Sequence[int]) -> dict[int, Derivatives] | None:
         """Motion of the closed loop with the model of the study by experiment; ``None`` if it diverges."""
-        auxiliary = replace(
-            self.auxiliary.fresh(), model=self.model.anchored(theta), anchor=None, rounds=ROUNDS, settled=SETTLED
-        )
-        runs = auxiliary.of_experiments(numbers).simulate(theta)
+        runs = self._runs(theta, numbers)
         if runs is None:
             return None
         measured = {s.experiment: s.measured for s in (*self.train, *self.held)}
-        return {k: _seen(run.q, measured[k], auxiliary.dt) for k, run in zip(numbers, runs, strict=True)}
+        return {k: _seen(run.q, measured[k], self.auxiliary.dt) for k, run in zip(numbers, runs, strict=True)}
+
+    def _runs(self, theta: Array, numbers: Sequence[int], rounds: int = ROUNDS) -> list[Simulation] | None:
+        """Simulations of the closed loop with the model of the study by experiment; ``None`` if one diverges."""
+        auxiliary = replace(
+            self.auxiliary.fresh(), model=self.model.anchored(theta), anchor=None, rounds=rounds, tolerated=TOLERATED
+        )
+        return auxiliary.of_experiments(numbers).simulate(theta)
 
     def _moved(self, stretches: Sequence[Stretch], motions: Mapping[int, Derivatives]) -> tuple[Stretch, ...]:
         """Stretches with other simulated motions."""
@@ -422,7 +447,7 @@ def _simulated(
     if runs is None:
         raise DataError("the closed loop cannot be simulated with the model as it stands")
     motions = [Derivatives(run.q, run.qd, run.qdd, None, dt, e.start) for run, e in zip(runs, experiments, strict=True)]
-    return motions, str(description["kind"]), auxiliary, list(warnings)
+    return motions, str(description["kind"]), replace(auxiliary, first_motions=motions), list(warnings)
 
 
 def _seen(q: Array, measured: Derivatives, dt: float) -> Derivatives:

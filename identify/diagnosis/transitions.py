@@ -7,7 +7,7 @@ import numpy as np
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
-from armident.identify.diagnosis.model_state import ModelState, with_entries, without_entry
+from armident.identify.diagnosis.model_state import ModelState, fitted_in_loop_of, with_entries, without_entry
 from armident.identify.diagnosis.screening import refined, screened
 from armident.identify.effects.effect import SIGN_TOLERANCE, Place
 from armident.identify.effects.friction import TRANSITION
@@ -43,35 +43,38 @@ def with_transitions(state: ModelState, model: Model) -> ModelState:
     model
         Fits a model.
     """
-    search = _Search(state, model)
+    search = _Search(state)
     for number in range(search.count):
         search.tried({place: grid[number] for place, grid in search.grids.items()}, state)
     made = search.tried(search.chosen, state)
     if made is None:
         return state
     search.tried({place: search.proposed(made, place) for place in search.chosen}, made)
-    made = search.tried(search.chosen, made)
+    made = search.tried(search.chosen, made) or made
     for factor in (f for finer in FINER for f in (finer, 1.0 / finer)):
-        if made is not None:
-            search.tried({place: _scaled(shapes, factor) for place, shapes in search.chosen.items()}, made)
-    made = search.tried(search.chosen, state) or state
-    kept = [entry for place, entry in search.entries(search.chosen).items() if search.clear(made, entry, place.joint)]
+        search.tried({place: _scaled(shapes, factor) for place, shapes in search.chosen.items()}, made)
+    made = model(with_entries(state.robot, list(search.entries(search.chosen).values())), state)
+    if made is None:
+        return state
+    kept = [
+        entry
+        for place, entry in search.entries(search.chosen).items()
+        if _clear(made, model(without_entry(made.robot, entry), made), entry, place.joint)
+    ]
     return model(with_entries(state.robot, kept), state) or state
 
 
 class _Search:
-    """Best transition of each joint so far.
+    """Best transition of each joint so far, in the loop of the model without them.
 
     Parameters
     ----------
     state
         Model without them.
-    model
-        Fits a model.
     """
 
-    def __init__(self, state: ModelState, model: Model) -> None:
-        self.state, self.model, self.effect = state, model, known(TRANSITION)
+    def __init__(self, state: ModelState) -> None:
+        self.state, self.effect = state, known(TRANSITION)
         present = {entry.joint for entry in state.robot.effects if entry.effect == TRANSITION}
         motion = ColumnCache(state.study, state.fit.theta).motion(state.study.train[0], "measured")
         places = [Place(j) for j, name in enumerate(state.study.joints) if name not in present]
@@ -106,10 +109,10 @@ class _Search:
         shapes
             Nonlinear parameters of the transition at each place.
         before
-            Model to start the fit from.
+            Model that gives the noise models.
         """
         entries = self.entries(shapes)
-        made = self.model(with_entries(self.state.robot, list(entries.values())), before)
+        made = fitted_in_loop_of(before, with_entries(self.state.robot, list(entries.values())))
         if made is None:
             return None
         for place, entry in entries.items():
@@ -130,7 +133,7 @@ class _Search:
             Joint of the transition.
         """
         best = self.chosen[place]
-        less = self.model(without_entry(made.robot, self.entries({place: best})[place]), made)
+        less = fitted_in_loop_of(made, without_entry(made.robot, self.entries({place: best})[place]))
         return best if less is None else self._largest(less, place, made.weights) or best
 
     def _largest(self, state: ModelState, place: Place, weights: tuple[ArModel, ...]) -> Shapes | None:
@@ -140,26 +143,17 @@ class _Search:
         found = screened(noise, candidate, column_cache)
         return None if found is None else refined(noise, candidate, column_cache, found)
 
-    def clear(self, state: ModelState, entry: Entry, joint: int) -> bool:
-        """True if a transition is possible, and clearly improves the prediction of its joint's torque.
 
-        Each model predicts under noise models of its own, or both under those of the model without it.
+def _clear(state: ModelState, less: ModelState | None, entry: Entry, joint: int) -> bool:
+    """True if a transition is possible, and clearly improves the prediction of its joint's torque.
 
-        Parameters
-        ----------
-        state
-            Model with all transitions.
-        entry
-            Entry of the transition.
-        joint
-            Index of its joint, from 0.
-        """
-        less = self.model(without_entry(state.robot, entry), state)
-        if less is None or not _possible(state, entry, joint):
-            return False
-        own = (state.score.own_log_likelihoods - less.score.own_log_likelihoods)[joint]
-        alike = [one.score.log_likelihoods_under(less.weights)[joint] for one in (state, less)]
-        return bool(max(own, alike[0] - alike[1]) > CLEAR)
+    Each model predicts under noise models of its own, or both under those of the model without it.
+    """
+    if less is None or not _possible(state, entry, joint):
+        return False
+    own = (state.score.own_log_likelihoods - less.score.own_log_likelihoods)[joint]
+    alike = [one.score.log_likelihoods_under(less.weights)[joint] for one in (state, less)]
+    return bool(max(own, alike[0] - alike[1]) > CLEAR)
 
 
 def _possible(state: ModelState, entry: Entry, joint: int) -> bool:

@@ -14,7 +14,7 @@ from armident.identify.regression.equations import ExperimentEquations, filtered
 from armident.identify.robot.arm import ArmModel
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.physical import damp_to_physical
-from armident.identify.robot.relaxation import ROUNDS, SETTLED, simulate_with_terms
+from armident.identify.robot.relaxation import ROUNDS, simulate_with_terms
 from armident.identify.robot.simulation import Simulation
 from armident.identify.signals.bandpass import butterworth
 from armident.identify.signals.decimate import Decimation
@@ -88,8 +88,10 @@ class AuxiliaryModel:
         measured ones. ``None``: simulated velocities and accelerations.
     feedback
         True if the controller is that of the drives, through which the noise of their encoders passes.
-    rounds, settled
-        Most simulations of a loop with terms, and the relative difference that ends them; see `simulate_with_terms`.
+    rounds, tolerated
+        Most simulations of a loop with terms, and the difference of torques that ends them; see `simulate_with_terms`.
+    first_motions
+        Motion of every experiment at which the torque of the terms is computed first; ``None``: begin without it.
     """
 
     model: ArmModel
@@ -105,7 +107,8 @@ class AuxiliaryModel:
     measured: Callable[[NDArray[np.float64], int], Derivatives] | None = None
     feedback: bool = True
     rounds: int = ROUNDS
-    settled: float = SETTLED
+    tolerated: float = 0.0
+    first_motions: Sequence[Derivatives] | None = None
     _last: NDArray[np.float64] | None = None
     _warnings: list[str] = field(default_factory=list)
 
@@ -167,6 +170,7 @@ class AuxiliaryModel:
             references=[self.references[k] for k in numbers],
             initial=[self.initial[k] for k in numbers],
             starts=[self._start(k) for k in numbers],
+            first_motions=None if self.first_motions is None else [self.first_motions[k] for k in numbers],
         )
 
     def simulate(
@@ -195,7 +199,8 @@ class AuxiliaryModel:
                 disturbance=None if disturbances is None else disturbances[k],
                 band_hz=FELT * self.band_hz,
                 rounds=self.rounds,
-                settled=self.settled,
+                tolerated=self.tolerated,
+                motion=None if self.first_motions is None else self.first_motions[k],
                 q0=q0,
                 qd0=qd0,
                 max_velocity=self.max_velocity,

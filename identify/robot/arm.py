@@ -176,6 +176,15 @@ class ArmModel:
         columns = [term.columns(motion) for term in self.terms]
         return np.concatenate(columns, axis=2) if columns else np.zeros((motion.samples, self.n, 0))
 
+    def term_torque(self, motion: Motion, values: Floats) -> Floats:
+        """Joint torques of the terms with the values (e,) of their linear parameters, N m or N, shape (N, n)."""
+        torque, first = np.zeros((motion.samples, self.n)), 0
+        for term in self.terms:
+            last = first + len(term.names)
+            torque += term.columns(motion) @ values[first:last]
+            first = last
+        return torque
+
     def regressor(
         self,
         q: ArrayLike,

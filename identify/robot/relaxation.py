@@ -21,12 +21,13 @@ from armident.identify.robot.chain import Floats
 from armident.identify.robot.controller import DiscreteController
 from armident.identify.robot.simulation import Simulation, simulate
 from armident.identify.signals.bandpass import butterworth
+from armident.identify.signals.differentiate import Derivatives
 
 ROUNDS = 16
 """Maximum number of simulations."""
 
 SETTLED = 1e-3
-"""Relative difference between the torque of the terms and the applied load at which the iteration ends."""
+"""Difference between the torque of the terms and the applied load, over that torque, at which the iteration ends."""
 
 POSTURES = 100
 """Approximate number of postures of a motion at which the joint inertias are evaluated."""
@@ -55,7 +56,8 @@ def simulate_with_terms(
     disturbance: ArrayLike | None = None,
     band_hz: float = np.inf,
     rounds: int = ROUNDS,
-    settled: float = SETTLED,
+    tolerated: float = 0.0,
+    motion: Derivatives | None = None,
     **initial: Any,
 ) -> Simulation:
     """Simulate the closed loop with the terms of the model; see :func:`armident.identify.robot.simulation.simulate`.
@@ -81,8 +83,11 @@ def simulate_with_terms(
         three times differentiated, would otherwise prevent convergence.
     rounds
         Most simulations.
-    settled
-        Relative difference of the torque of the terms and the simulated load that ends the iteration.
+    tolerated
+        Difference between the torque of the terms and the applied load, over the torque of each joint, that ends the
+        iteration, too.
+    motion
+        Motion (N, n) close to that of the loop, at which the first load is computed; ``None``: begin without load.
     **initial
         Further arguments of ``simulate``: ``q0``, ``qd0``, ``max_velocity``.
 
@@ -103,32 +108,52 @@ def simulate_with_terms(
     inertia: Floats = np.zeros(model.n)
     best: tuple[float, Simulation, Floats] | None = None
     past = _Past()
-    for k in range(rounds):
+
+    def torque_at(run: Simulation | Derivatives) -> Floats:
+        return known.term_torque(known.motion(run.q, run.qd, run.qdd, dt, start), values)
+
+    def held(torque: Floats, run: Simulation | Derivatives) -> Floats:
+        # The load is held during each period: take the mean of the torques at its two ends.
+        rest = torque - run.qdd * inertia
+        rest[:-1] = 0.5 * (rest[1:] + rest[:-1])
+        return _slow(rest, dt, band_hz)
+
+    def felt(torque: Floats, run: Simulation | Derivatives) -> Floats:
+        return _inertia(model, theta, run.q, _slow(torque, dt, band_hz), _slow(run.qdd, dt, band_hz))
+
+    if motion is not None:
+        torque = torque_at(motion)
+        inertia = felt(torque, motion)
+        load = held(torque, motion)
+    # A motion may be too far from that of the loop, and the load may contain inertia: begin without either.
+    attempts = ["without load", "without inertia"] if motion is not None else ["without inertia"]
+    begins = motion is None
+    for _ in range(rounds):
         pushes = pushed - load @ to_motors
         run = simulate(model, theta, controller, reference, dt, disturbance=pushes, inertia=inertia, **initial)
         if run.diverged_at is not None:
-            if best is None and inertia.any():
-                load, inertia = np.zeros_like(reference), np.zeros(model.n)
+            if best is not None:
+                load = 0.5 * (load + best[2])
                 continue
-            if best is None:
+            if not attempts or not (load.any() or inertia.any()):
                 return run
-            load = 0.5 * (load + best[2])
+            begins = attempts.pop(0) == "without load"
+            load, inertia = np.zeros_like(reference), np.zeros(model.n)
             continue
-        torque = known.term_regressor(known.motion(run.q, run.qd, run.qdd, dt, start)) @ values
-        if k == 0:
-            inertia = _inertia(model, theta, run, _slow(torque, dt, band_hz), _slow(run.qdd, dt, band_hz))
-        # The load is held during each period: take the mean of the torques at its two ends.
-        held = torque - run.qdd * inertia
-        held[:-1] = 0.5 * (held[1:] + held[:-1])
-        held = _slow(held, dt, band_hz)
-        if k == 0 and inertia.any():
-            load = held
+        torque = torque_at(run)
+        if begins:
+            inertia = felt(torque, run)
+        answer = held(torque, run)
+        if begins and inertia.any():
+            load, begins = answer, False
             continue
-        missing = held - load
-        apart = float(np.linalg.norm(missing)) / max(float(np.linalg.norm(held)), 1e-300)
+        begins = False
+        missing = answer - load
+        apart = float(np.linalg.norm(missing)) / max(float(np.linalg.norm(answer)), 1e-300)
         if best is None or apart < best[0]:
             best = apart, replace(run, tau=run.tau + load), load
-        if apart < settled:
+        small = np.linalg.norm(missing, axis=0) <= tolerated * np.linalg.norm(run.tau + load, axis=0)
+        if apart < SETTLED or small.all():
             break
         load = past.next(load, missing)
     assert best is not None
@@ -140,10 +165,10 @@ def _slow(values: Floats, dt: float, band_hz: float) -> Floats:
     return butterworth(values, dt, band_hz) if band_hz < 0.45 / dt else values
 
 
-def _inertia(model: ArmModel, theta: Floats, run: Simulation, torque: Floats, qdd: Floats) -> Floats:
+def _inertia(model: ArmModel, theta: Floats, q: Floats, torque: Floats, qdd: Floats) -> Floats:
     """Inertia (n,) of each joint that fits the torque (N, n) of the terms, zero where it is small; kg m^2 or kg."""
     found = np.sum(torque * qdd, axis=0) / np.maximum(np.sum(qdd * qdd, axis=0), 1e-300)
-    postures = run.q[:: max(1, run.q.shape[0] // POSTURES)]
+    postures = q[:: max(1, q.shape[0] // POSTURES)]
     own = np.maximum(np.einsum("kjj->kj", model.mass_matrix(theta, postures)).min(axis=0), 0.0)
     found = np.maximum(found, (LEAST_INERTIA - 1.0) * own)
     return np.where(np.abs(found) > FELT_INERTIA * own, found, 0.0)
