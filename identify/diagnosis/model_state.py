@@ -14,6 +14,7 @@ from armident.identify.diagnosis.predictive_score import PredictiveScore
 from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit, fit, safe
 from armident.identify.diagnosis.screening import noise_beyond_shapes
 from armident.identify.diagnosis.study import Study
+from armident.identify.effects.effect import SIGN_TOLERANCE
 from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.terms import Term, arm_model, effect_terms
 from armident.identify.regression.ar_noise import ArModel
@@ -270,6 +271,29 @@ def with_report_part(state: ModelState) -> ModelState:
     moved = state.study.with_report_part(state.fit.theta)
     equations = state.fit.equations.with_held(moved)
     return ModelState(moved, replace(state.fit, study=moved, equations=equations))
+
+
+def viscous_friction_rises(state: ModelState, term: Term) -> bool:
+    """False if a term makes the viscous friction of its joint fall with the speed, beyond two standard deviations.
+
+    Friction that falls with the speed is Stribeck friction; a viscous friction never does.
+
+    Parameters
+    ----------
+    state
+        Model with the term.
+    term
+        The term.
+    """
+    slopes, names = term.effect.viscous_slope(term.shapes)[list(term.kept)], state.study.model.base.names
+    viscous = f"fv{term.place.joint + 1}"
+    if not slopes.any() or viscous not in names:
+        return True
+    direction = np.zeros(state.fit.theta.size)
+    direction[[names.index(name) for name in term.names]] = slopes
+    direction[names.index(viscous)] = 1.0
+    std = float(np.sqrt(direction @ state.fit.covariance @ direction))
+    return bool(direction @ state.fit.theta >= -SIGN_TOLERANCE * std)
 
 
 def acted_on(with_it: ModelState, without: ModelState) -> NDArray[np.bool_]:

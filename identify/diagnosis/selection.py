@@ -27,6 +27,7 @@ from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import (
     ModelState,
     fitted,
+    viscous_friction_rises,
     with_entries,
     with_first_motions,
     with_own_noise,
@@ -370,10 +371,8 @@ class StepwiseSelection:
             return None
         term = made.term_of(entry)
         values, std = made.values_of(term)
-        largest: dict[str, float] = {}
-        for name, value in (pair for one in candidate.grid for pair in one):
-            largest[name] = max(value, largest.get(name, value))
-        allowed = whole.allows(term.of_effect(values), term.of_effect(std), dict(term.shapes), largest)
+        allowed = whole.allows(term.of_effect(values), term.of_effect(std), dict(term.shapes))
+        allowed = allowed and viscous_friction_rises(made, term)
         one = Made(candidate, shapes, entry, made, allowed)
         if not starts:
             return one

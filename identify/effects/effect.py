@@ -223,7 +223,7 @@ class Effect(ABC):
         """
         return not present and self.invisible(motion, place) is None
 
-    def possible(self, values: Array, shapes: Mapping[str, float], largest: Mapping[str, float]) -> bool:
+    def possible(self, values: Array, shapes: Mapping[str, float]) -> bool:
         """Return True if linear parameters are physically possible, beyond their signs and bounds.
 
         Parameters
@@ -232,8 +232,6 @@ class Effect(ABC):
             Linear parameters, (k,).
         shapes
             Nonlinear parameters by name.
-        largest
-            Largest value of each nonlinear parameter in the grid of the motion.
         """
         return True
 
@@ -339,9 +337,7 @@ class Effect(ABC):
         """
         return tuple(k for k, p in enumerate(self.linear) if p.requires is None or shapes[p.requires] != 0.0)
 
-    def allows(
-        self, values: Array, std: Array, shapes: Mapping[str, float], largest: Mapping[str, float] | None = None
-    ) -> bool:
+    def allows(self, values: Array, std: Array, shapes: Mapping[str, float]) -> bool:
         """Return True if linear parameters (k,) with standard deviations (k,) are physically possible.
 
         Signs and bounds may be violated by `SIGN_TOLERANCE` standard deviations: single parameters may be zero.
@@ -352,14 +348,25 @@ class Effect(ABC):
             Linear parameters and their standard deviations, (k,) each.
         shapes
             Nonlinear parameters by name.
-        largest
-            Largest value of each nonlinear parameter in the grid of the motion; ``None``: as ``shapes``.
         """
-        return self.possible(values, shapes, largest or shapes) and all(
+        return self.possible(values, shapes) and all(
             p.sign * value >= -SIGN_TOLERANCE * deviation
             and p.bounds[0] - SIGN_TOLERANCE * deviation <= value <= p.bounds[1] + SIGN_TOLERANCE * deviation
             for p, value, deviation in zip(self.linear, values, std, strict=True)
         )
+
+    def viscous_slope(self, shapes: Mapping[str, float]) -> Array:
+        """Return the slopes (k,) of a viscous friction over the velocity at rest, per unit of its linear parameters.
+
+        Viscous friction never falls with the speed: with that of the joint, the slope may not be negative. Zero for all
+        other effects.
+
+        Parameters
+        ----------
+        shapes
+            Nonlinear parameters by name.
+        """
+        return np.zeros(len(self.linear))
 
     def refinable(self, robot: RobotConfig, place: Place) -> tuple[bool, ...]:
         """Return, for each nonlinear parameter, True if it may lie between the values of its grid at a place.

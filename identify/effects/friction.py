@@ -26,11 +26,6 @@ from armident.identify.robot.motion import Motion
 
 Array = NDArray[np.float64]
 
-LATE = 0.3
-"""Lowest speed, over the largest one tried, at which nonlinear viscous friction may be negative (shear thickening).
-
-The largest one tried is a third of the joint's top speed.
-"""
 SLOWEST = 0.03
 """Least characteristic speed of a friction law over the joint's top speed: below it laws look like the reversal."""
 
@@ -210,7 +205,7 @@ class StribeckFrictionTable(FreeShape, StribeckBell):
         """Return the joint's top speed."""
         return ([motion.top_speed[place.joint]],)
 
-    def possible(self, values: Array, shapes: Mapping[str, float], largest: Mapping[str, float]) -> bool:
+    def possible(self, values: Array, shapes: Mapping[str, float]) -> bool:
         """Return True if friction falls with the speed.
 
         The value at rest is not judged alone: there the curve also contains the transition of dry friction at
@@ -240,9 +235,9 @@ class NonlinearViscousFriction(Effect):
         """Return `speeds`."""
         return (speeds(motion, place),)
 
-    def possible(self, values: Array, shapes: Mapping[str, float], largest: Mapping[str, float]) -> bool:
-        """Return False for a negative value with a low speed: that is additional friction at low speed (Stribeck)."""
-        return bool(shapes["velocity"] >= LATE * largest["velocity"] or values[0] >= 0.0)
+    def viscous_slope(self, shapes: Mapping[str, float]) -> Array:
+        """Return ``1 / velocity``, the slope at rest: friction that falls with the speed is Stribeck friction."""
+        return np.array([1.0 / shapes["velocity"]])
 
 
 class LoadDependentFriction(TorqueDependent):

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from armident.configs.schema.robot import Effect
-from armident.identify.diagnosis.model_state import padded, with_report_part
+from armident.configs.schema.scenario import HiddenEffect
+from armident.identify.diagnosis.model_state import padded, viscous_friction_rises, with_report_part
 from armident.identify.effects.terms import arm_model
+from tests.fixtures.arms import hide
 from tests.fixtures.diagnoses import SPRING, selection, with_effects
 
 pytestmark = pytest.mark.slow
@@ -43,3 +45,17 @@ def test_the_report_part_changes_no_parameter() -> None:
     errors = [np.linalg.norm(s.simulated.qd - s.measured.qd) for s in whole.study.held]
     size = [np.linalg.norm(s.measured.qd) for s in whole.study.held]
     assert sum(errors) < 0.1 * sum(size)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "rises"),
+    [
+        (hide("nonlinear_viscous_friction", "joint_1", thinning=0.3), True),
+        (hide("stribeck_friction", "joint_1", extra=15.0, velocity=0.03), False),
+    ],
+    ids=["shear thinning", "Stribeck"],
+)
+def test_friction_that_falls_with_the_speed_is_not_viscous(hidden: HiddenEffect, rises: bool) -> None:
+    entry = Effect(effect="nonlinear_viscous_friction", joint="joint_1", parameters={"velocity": 0.03})
+    state = with_effects(selection(1, hidden)[1], entry)
+    assert viscous_friction_rises(state, state.term_of(entry)) is rises

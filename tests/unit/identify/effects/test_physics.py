@@ -6,10 +6,12 @@ import pytest
 from armident.identify.effects.registry import known
 
 
-@pytest.mark.parametrize(("value", "velocity", "allowed"), [(-5.0, 0.02, False), (5.0, 0.02, True), (-5.0, 0.3, True)])
-def test_friction_does_not_fall_from_standstill(value: float, velocity: float, allowed: bool) -> None:
-    effect = known("nonlinear_viscous_friction")
-    assert effect.allows(np.array([value]), np.array([0.1]), {"velocity": velocity}, {"velocity": 0.35}) is allowed
+def test_the_slope_of_nonlinear_viscous_friction_at_rest_is_that_of_its_column() -> None:
+    effect, velocity = known("nonlinear_viscous_friction"), 0.02
+    step = 1e-6 * velocity
+    slope = np.arcsinh(step / velocity) / step
+    assert effect.viscous_slope({"velocity": velocity}) == pytest.approx([slope])
+    assert not known("stribeck_friction").viscous_slope({"velocity": velocity, "displacement": 0.0}).any()
 
 
 @pytest.mark.parametrize(("inertia", "allowed"), [(-0.0028, True), (-0.055, False), (0.055, True)])
