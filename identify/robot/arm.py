@@ -177,7 +177,15 @@ class ArmModel:
         return np.concatenate(columns, axis=2) if columns else np.zeros((motion.samples, self.n, 0))
 
     def term_torque(self, motion: Motion, values: Floats) -> Floats:
-        """Joint torques of the terms with the values (e,) of their linear parameters, N m or N, shape (N, n)."""
+        """Joint torques of the terms, N m or N, shape (N, n).
+
+        Parameters
+        ----------
+        motion
+            The motion, N samples.
+        values
+            Values of the linear parameters, (e,).
+        """
         torque, first = np.zeros((motion.samples, self.n)), 0
         for term in self.terms:
             last = first + len(term.names)
