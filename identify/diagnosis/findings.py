@@ -125,19 +125,16 @@ def _alternatives(final: ModelState, one: Addition, rivals: Sequence[Addition]) 
 
 def negligible(
     final: ModelState,
-    selected: Sequence[Selected],
     step: Step | None,
     criteria: Criteria,
     immaterial: Sequence[Addition] = (),
 ) -> list[Negligible]:
-    """Return the effects that are significant, and no cause: too small, or within the sampling convention of drives.
+    """Return the effects that are significant, and too small for a cause.
 
     Parameters
     ----------
     final
         Model with the findings.
-    selected
-        Effects of the selection.
     step
         Comparison of all effects in it; ``None`` if it was not made.
     criteria
@@ -146,12 +143,12 @@ def negligible(
         Effects that change too little of the report part.
     """
     found: dict[Key, Negligible] = {}
-    small = [*(one.addition for one in selected if one.conventional(final)), *immaterial]
+    small = list(immaterial)
     if step is not None:
         needed = np.log(max(step.tests, 1) / criteria.alpha["selection"])
         small += [a for a in step.ranked if a.gain > needed and a not in step.passing]
     for addition in small:
-        if addition.allowed and addition.named:
+        if addition.allowed and addition.named and addition.candidate.effect.is_finding:
             joint = final.study.joints[addition.candidate.place.joint]
             entry = Negligible(
                 effect=addition.candidate.effect.name,

@@ -207,10 +207,6 @@ class TimeDelay(Correction):
         """Return times from a quarter of a sample to 64 samples."""
         return np.asarray(dt * np.geomspace(0.25, 64.0, 9))
 
-    def is_convention(self, values: Array, dt: float) -> bool:
-        """Return True below a sampling period: drives differ in the instant at which they latch signals."""
-        return bool(np.all(np.abs(values) < dt))
-
 
 class ActuatorBandwidth(TimeDelay):
     """Torque that follows the reported command with a first-order lag."""

@@ -29,7 +29,7 @@ def robot() -> RobotConfig:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("period", "repeats"), RATES)
+@pytest.mark.parametrize(("period", "repeats"), RATES_OF_PROOF)
 def test_a_plant_without_hidden_effects_has_no_gap(period: float | None, repeats: int) -> None:
     document = diagnosis("tx40", MOTION, 1, period=period, repeats=repeats).document
     assert document.verdict == "no_gap"
