@@ -225,7 +225,9 @@ def _diagnose(
     steps("comparison of effects")
     chosen, every = selection.run(first)
     final = with_report_part(chosen)
-    selected = [one for one in every if one.addition.candidate.effect.is_finding]
+    # Where the instant of all torques is unknown, a delay of one drive is known to the sample only.
+    conventional = [one for one in every if one.conventional(final, 0.0 if stage.shift_known else final.study.sample)]
+    selected = [one for one in every if one not in conventional]
     after = gap_of(final, held=True)
     named = findings_of(final, selected)
     places = {id(f): k for k, f in enumerate(named)}
@@ -270,7 +272,7 @@ def _diagnose(
         not_visible=undetectable(first, selection.hidden),
         detection_limits=limits,
         simulated=simulated.document(),
-        negligible=negligible(final, last, criteria, selection.immaterial),
+        negligible=negligible(final, conventional, last, criteria, selection.immaterial),
         sign_smoothing=dict(zip(study.joints, map(float, first.robot.sign_smoothing), strict=True)),
         transitions={e.joint: e.parameters["velocity"] for e in final.robot.effects if e.effect == TRANSITION},
         criteria=asdict(criteria),

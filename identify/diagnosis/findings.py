@@ -125,16 +125,19 @@ def _alternatives(final: ModelState, one: Addition, rivals: Sequence[Addition]) 
 
 def negligible(
     final: ModelState,
+    conventional: Sequence[Selected],
     step: Step | None,
     criteria: Criteria,
     immaterial: Sequence[Addition] = (),
 ) -> list[Negligible]:
-    """Return the effects that are significant, and too small for a cause.
+    """Return the effects that are significant, and no cause: too small, or within the sampling convention of drives.
 
     Parameters
     ----------
     final
         Model with the findings.
+    conventional
+        Effects of the selection within the sampling convention.
     step
         Comparison of all effects in it; ``None`` if it was not made.
     criteria
@@ -143,12 +146,12 @@ def negligible(
         Effects that change too little of the report part.
     """
     found: dict[Key, Negligible] = {}
-    small = list(immaterial)
+    small = [*(one.addition for one in conventional), *immaterial]
     if step is not None:
         needed = np.log(max(step.tests, 1) / criteria.alpha["selection"])
         small += [a for a in step.ranked if a.gain > needed and a not in step.passing]
     for addition in small:
-        if addition.allowed and addition.named and addition.candidate.effect.is_finding:
+        if addition.allowed and addition.named:
             joint = final.study.joints[addition.candidate.place.joint]
             entry = Negligible(
                 effect=addition.candidate.effect.name,

@@ -40,6 +40,7 @@ from armident.identify.diagnosis.shaping import both_ends
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.transitions import with_transitions
 from armident.identify.effects.drive import Correction
+from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import known
 from armident.identify.effects.tables import FreeShape
 from armident.identify.effects.terms import entry_of
@@ -79,6 +80,23 @@ class Selected:
     addition: Addition
     confirmation: Confirmation | None = None
     without: ModelState | None = None
+
+    def conventional(self, state: ModelState, uncertain: float) -> bool:
+        """True if the effect is a part of every model, or within the sampling convention of drives: no finding.
+
+        Parameters
+        ----------
+        state
+            Final model.
+        uncertain
+            Time by which the common instant of all torques is uncertain, s.
+        """
+        effect = self.addition.candidate.effect
+        if of_recording(self.entry):
+            values = np.array([self.entry.parameters[p.name] for p in effect.linear])
+        else:
+            values = state.values_of(state.term_of(self.entry))[0]
+        return effect.is_convention(values, uncertain)
 
 
 @dataclass

@@ -38,6 +38,8 @@ class SetupStage:
         Relative error of the rigid model in the set-up as configured by joint, percent, (n,).
     shifts
         Common shifts of the torques between which the check could not decide, samples; the diagnosis compares them.
+    shift_known
+        True if the common shift of the torques is known.
     """
 
     training: tuple[Experiment, ...]
@@ -48,6 +50,7 @@ class SetupStage:
     warnings: tuple[str, ...]
     errors: tuple[float, ...]
     shifts: tuple[float, ...] = ()
+    shift_known: bool = False
 
     def as_configured(self, gap: Gap) -> Gap:
         """Gap of the model in the set-up as configured, from that in the corrected one.
@@ -146,6 +149,7 @@ def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], rob
         ),
         check.relative_error_pct,
         CONVENTIONS if shift is not None and shift.undetermined else (),
+        shift is not None and shift.determined,
     )
 
 

@@ -207,6 +207,10 @@ class TimeDelay(Correction):
         """Return times from a quarter of a sample to 64 samples."""
         return np.asarray(dt * np.geomspace(0.25, 64.0, 9))
 
+    def is_convention(self, values: Array, uncertain: float) -> bool:
+        """Return True below the time by which the instant of all torques is uncertain: drives latch signals then."""
+        return bool(np.all(np.abs(values) < uncertain))
+
 
 class ActuatorBandwidth(TimeDelay):
     """Torque that follows the reported command with a first-order lag."""

@@ -140,8 +140,6 @@ class Effect(ABC):
         Linear parameters, one per column.
     shapes
         Nonlinear parameters.
-    is_finding
-        False if every model has the effect in some form: it is a part of the model, and no finding.
     depends_on_torque
         True if the columns depend on the torque that the model predicts, and so on its parameters.
     scales_torque
@@ -162,7 +160,6 @@ class Effect(ABC):
     scope: Scope = "joint"
     linear: tuple[Linear, ...]
     shapes: tuple[Shape, ...] = ()
-    is_finding: bool = True
     depends_on_torque: bool = False
     scales_torque: bool = False
     regressor_signals: Signals = "measured"
@@ -237,6 +234,18 @@ class Effect(ABC):
             Nonlinear parameters by name.
         """
         return True
+
+    def is_convention(self, values: Array, uncertain: float) -> bool:
+        """Return True if the effect is a part of every model at these values, and no finding.
+
+        Parameters
+        ----------
+        values
+            Linear parameters, (k,).
+        uncertain
+            Time by which the common instant of all torques is uncertain, s.
+        """
+        return False
 
     def corrects(self, entry: Entry) -> bool:
         """Return True if an entry of the configuration corrects the recordings instead of being a term of the model.

@@ -57,7 +57,6 @@ class CoulombTransition(Effect):
     needs = "reversals"
     excitation = ("reversals",)
     linear = (Linear("fct", TORQUE, sign=1),)
-    is_finding = False
     shapes = (Shape("velocity", VELOCITY), Shape("lead", ("s", "s"), default=0.0))
 
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
@@ -74,6 +73,10 @@ class CoulombTransition(Effect):
         """Return velocities from 0.06 to 3 % of the joint's top speed, and leads from an eighth of a sample to four."""
         velocities = float(motion.top_speed[place.joint]) * np.geomspace(0.0006, SLOWEST, 7)
         return velocities, motion.dt * np.geomspace(0.125, 4.0, 6)
+
+    def is_convention(self, values: Array, uncertain: float) -> bool:
+        """Return True: every model of dry friction has some transition, so that it is no missing effect."""
+        return True
 
 
 class AsymmetricViscousFriction(Effect):

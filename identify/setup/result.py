@@ -87,15 +87,20 @@ class TorqueShift:
         It is that of a sampling convention, if one agrees with the estimate: no estimate is as exact. Otherwise it is
         the estimate, if that is no longer than a sample.
         """
-        compared = sum(std <= MOST_UNCERTAIN for _, std in self.by_joint.values())
-        # Of one joint alone, dynamics that the model lacks look the same. Disturbances that feed back bias each joint
-        # differently: without instruments, two joints must confirm the shift.
-        several = len(self.by_joint) >= 2 if self.instrumented else compared >= 2
-        if not several or self.std > MOST_UNCERTAIN:
+        if not self.determined:
             return 0.0
         if any(abs(self.samples - shift) <= SIGNIFICANT * self.std for shift in CONVENTIONS):
             return CONVENTIONS[self.odds > SUBSTANTIAL]
         return self.samples if SHORTEST <= abs(self.samples) <= LONGEST else 0.0
+
+    @property
+    def determined(self) -> bool:
+        """True if the estimate is certain enough to be corrected, or to need no correction."""
+        compared = sum(std <= MOST_UNCERTAIN for _, std in self.by_joint.values())
+        # Of one joint alone, dynamics that the model lacks look the same. Disturbances that feed back bias each joint
+        # differently: without instruments, two joints must confirm the shift.
+        several = len(self.by_joint) >= 2 if self.instrumented else compared >= 2
+        return several and self.std <= MOST_UNCERTAIN
 
     @property
     def undetermined(self) -> bool:

@@ -340,6 +340,14 @@ def test_a_lagging_motor_is_commanded_ahead_of_its_torque(axis: Motion) -> None:
     np.testing.assert_allclose(followed[50:], tau[50:], atol=2e-3 * np.abs(tau).max())
 
 
+@pytest.mark.parametrize("name", ["time_delay", "actuator_bandwidth"])
+def test_a_delay_is_no_fault_within_the_uncertain_instant_of_all_torques(name: str) -> None:
+    effect = catalogue()[name]
+    assert effect.is_convention(np.array([0.0008]), 1e-3)
+    assert not effect.is_convention(np.array([0.0008]), 2e-4)
+    assert not effect.is_convention(np.array([0.0008]), 0.0)
+
+
 def test_an_eccentric_encoder_shows_a_motion_that_is_not_there(arm: Motion) -> None:
     joint, h, size = 2, 2.0, 1e-6
     found = columns("encoder_eccentricity", arm, joint, harmonic=h)

@@ -136,5 +136,5 @@ def test_a_sample_of_the_development_half_is_diagnosed(tmp_path: Path) -> None:
     assert right >= LEAST_RIGHT, report
 
 
-LEAST_RIGHT = 2
-"""Right answers of the sample of twelve: three were measured with the search of 2026-11-25."""
+LEAST_RIGHT = 9
+"""Right answers of the sample of twelve: eleven were measured on 2026-11-26; two may be on the edge."""
