@@ -272,9 +272,11 @@ class Study:
         theta
             Parameters of the loop, (b,).
         """
+        if self.auxiliary.first_motions is None or not self.model.e:
+            return self
         numbers = sorted({s.experiment for s in self.train})
         runs = self._runs(theta, numbers, AuxiliaryModel.rounds)
-        if runs is None or self.auxiliary.first_motions is None:
+        if runs is None:
             return self
         motions = list(self.auxiliary.first_motions)
         for k, run in zip(numbers, runs, strict=True):

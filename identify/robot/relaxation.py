@@ -125,9 +125,9 @@ def simulate_with_terms(
         torque = torque_at(motion)
         inertia = felt(torque, motion)
         load = held(torque, motion)
-    # A motion may be too far from that of the loop, and the load may contain inertia: begin without either.
-    attempts = ["without load", "without inertia"] if motion is not None else ["without inertia"]
-    begins = motion is None
+    # Where a loop diverges, the given motion may be far from its own: begin without load. Then leave the inertia out.
+    begins, restarts = motion is None, 0
+    most = 1 if begins else 2
     for _ in range(rounds):
         pushes = pushed - load @ to_motors
         run = simulate(model, theta, controller, reference, dt, disturbance=pushes, inertia=inertia, **initial)
@@ -135,9 +135,10 @@ def simulate_with_terms(
             if best is not None:
                 load = 0.5 * (load + best[2])
                 continue
-            if not attempts or not (load.any() or inertia.any()):
+            if restarts == most or not (load.any() or inertia.any()):
                 return run
-            begins = attempts.pop(0) == "without load"
+            restarts += 1
+            begins = restarts < most
             load, inertia = np.zeros_like(reference), np.zeros(model.n)
             continue
         torque = torque_at(run)

@@ -18,6 +18,7 @@ from armident.identify.identification.options import Method, Options
 from armident.identify.robot.relaxation import simulate_with_terms
 from armident.identify.robot.simulation import simulate
 from armident.identify.signals.bandpass import butterworth
+from armident.identify.signals.differentiate import Derivatives
 from armident.virtual_robot.inertias import plant_parameters
 from tests.fixtures.arms import FAST, recording
 
@@ -62,6 +63,26 @@ def test_viscous_friction_as_a_term_moves_the_simulated_arm_like_that_of_the_mod
     # A load held over a sample instead of acting at once is worth a few thousandths of its effect.
     assert np.abs(found.q - expected.q).max() < 0.02 * lag
     assert np.linalg.norm(found.tau - expected.tau) < 0.002 * np.linalg.norm(expected.tau)
+
+
+@pytest.mark.parametrize("wrong", [False, True], ids=["own motion", "motion of another amplitude"])
+def test_a_simulation_that_begins_at_a_motion_ends_where_the_one_without_does(
+    robot: RobotConfig, theta: Any, wrong: bool
+) -> None:
+    q_ref = reference(robot)
+    controller = nominal_controller(arm_model(robot), theta, q_ref[::50], DT, 10.0)
+    entry = Effect(effect="nonlinear_viscous_friction", joint="joint_2", parameters={"velocity": 0.3})
+    extended, whole = arm_model(with_effects(robot, entry)), np.append(theta, 5.0)
+    expected = simulate_with_terms(extended, whole, controller, q_ref, DT)
+    scale = 3.0 if wrong else 1.0
+    motion = Derivatives(scale * expected.q, scale * expected.qd, scale * expected.qdd, None, DT)
+    found = simulate_with_terms(extended, whole, controller, q_ref, DT, motion=motion)
+    np.testing.assert_allclose(found.q, expected.q, atol=2e-3 * np.abs(expected.q).max())
+    once = simulate_with_terms(extended, whole, controller, q_ref, DT, motion=motion, rounds=1)
+    apart = np.linalg.norm(once.q - expected.q) / np.linalg.norm(
+        expected.q - simulate(extended, whole, controller, q_ref, DT).q
+    )
+    assert apart > 0.1 if wrong else apart < 0.02
 
 
 @pytest.mark.parametrize(
