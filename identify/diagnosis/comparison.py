@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, Key, Shapes
 from armident.identify.diagnosis.model_state import ModelState, acted_on
+from armident.identify.diagnosis.precision import p_value
 from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.regression.ar_noise import ArModel
 
@@ -84,6 +86,11 @@ class Addition:
     def allowed(self) -> bool:
         """False if a linear parameter has a sign or a size that physics does not allow."""
         return self.made.allowed
+
+    @cached_property
+    def p_value(self) -> float:
+        """Probability of its parameters if it is not there, by their own standard deviations."""
+        return p_value(self.state, self.entry)
 
     @property
     def named(self) -> bool:

@@ -4,7 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
+from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import ColumnCache
 from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.regression import Fit
@@ -14,11 +16,13 @@ from armident.identify.effects.recorded import of_recording, relative_slope
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import Term
 from armident.identify.regression.ar_noise import ArModel
-from armident.identify.regression.hac import newey_west
+from armident.identify.regression.hac import newey_west, newey_west_matrix
 
 Array = NDArray[np.float64]
 
 NEWEY_WEST_LAGS = 20
+RANK = 1e-10
+"""Variance of a combination of parameters over the largest below which it is a rounding error."""
 STEP = 0.01
 """Relative change of a nonlinear parameter for its derivative."""
 
@@ -37,12 +41,67 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
     state
         The model.
     """
+    fit, terms = state.fit, _terms(state)
+    slopes, owners = _further_columns(state)
+    deviations = _deviations(fit, slopes)
+    b = fit.theta.size
+    found: dict[int, dict[str, float]] = {k: {} for k in range(len(state.robot.effects))}
+    for k, term in terms.items():
+        found[k] = {p.name: float(deviations[i]) for p, i in zip(term.linear, _own(state, term), strict=True)}
+    for number, (owner, name) in enumerate(owners):
+        found[owner][name] = float(deviations[b + number])
+    return found
+
+
+def p_value(state: ModelState, entry: Entry) -> float:
+    """Probability of linear parameters of an effect so far from zero if it is not there (Wald's test).
+
+    Their covariance is that of `standard_deviations`. The likelihood of a model can rise without such evidence:
+    corrected torques have other noise, and instruments that follow the measured motion leave a parameter undetermined.
+
+    Parameters
+    ----------
+    state
+        Model with the effect.
+    entry
+        Its entry in the configuration.
+    """
+    slopes, owners = _further_columns(state)
+    number = list(state.robot.effects).index(entry)
+    if of_recording(entry):
+        effect = of_entry(entry)
+        if not isinstance(effect, Correction):
+            return 0.0
+        name = effect.linear[0].name
+        own, values = [state.fit.theta.size + owners.index((number, name))], np.array([entry.parameters[name]])
+    else:
+        term = state.term_of(entry)
+        own, values = _own(state, term), state.values_of(term)[0]
+    statistics = []
+    for covariance in _covariances(state.fit, slopes, own):
+        scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        unit = values / scale
+        statistics.append(float(unit @ np.linalg.lstsq(covariance / np.outer(scale, scale), unit, rcond=RANK)[0]))
+    return float(stats.chi2.sf(min(statistics), len(own)))
+
+
+def _terms(state: ModelState) -> dict[int, Term]:
+    """Terms of the model by the number of their entry."""
+    return {k: state.term_of(e) for k, e in enumerate(state.robot.effects) if not of_recording(e)}
+
+
+def _own(state: ModelState, term: Term) -> list[int]:
+    """Positions of the linear parameters of a term among those of the model."""
+    return [state.study.model.base.names.index(name) for name in term.names]
+
+
+def _further_columns(state: ModelState) -> tuple[list[Array], list[tuple[int, str]]]:
+    """Columns (R,) of nonlinear parameters and of corrections, and number of the entry and name of each."""
     study, fit = state.study, state.fit
     column_cache = ColumnCache(study, fit.theta)
-    terms = {k: state.term_of(e) for k, e in enumerate(state.robot.effects) if not of_recording(e)}
     slopes: list[Array] = []
     owners: list[tuple[int, str]] = []
-    for k, term in terms.items():
+    for k, term in _terms(state).items():
         values = term.of_effect(state.values_of(term)[0])
         for name in term.effect.movable(study.robot, term.place, term.shapes):
             slopes.append(_slope(column_cache, fit.noise, term, name, values))
@@ -55,15 +114,7 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
             column = column_cache.instruments(effect, place, (), fit.noise, keep=False)[:, 0]
             slopes.append(column * relative_slope(experiments, state.robot, entry))
             owners.append((k, effect.linear[0].name))
-    deviations = _deviations(fit, slopes)
-    b = fit.theta.size
-    found: dict[int, dict[str, float]] = {k: {} for k in range(len(state.robot.effects))}
-    for k, term in terms.items():
-        own = [study.model.base.names.index(name) for name in term.names]
-        found[k] = {p.name: float(deviations[i]) for p, i in zip(term.linear, own, strict=True)}
-    for number, (owner, name) in enumerate(owners):
-        found[owner][name] = float(deviations[b + number])
-    return found
+    return slopes, owners
 
 
 def _slope(column_cache: ColumnCache, noise: Sequence[ArModel], term: Term, name: str, values: Array) -> Array:
@@ -90,19 +141,31 @@ def _deviations(fit: Fit, slopes: list[Array]) -> Array:
     """
     b, e = fit.theta.size, fit.study.model.e
     variances: Array = np.concatenate([np.diag(fit.covariance), np.zeros(len(slopes))])
-    if not e and not slopes:
-        return variances**0.5
+    if e or slopes:
+        own = list(range(b - e, b + len(slopes)))
+        variances[own] = np.max([np.diag(found) for found in _covariances(fit, slopes, own)], axis=0)
+    return variances**0.5
+
+
+def _covariances(fit: Fit, slopes: list[Array], own: list[int]) -> tuple[Array, Array]:
+    """Covariances (k, k) of some parameters beside further ones with columns ``slopes``.
+
+    The first is that of white innovations, the second that of the residual along the influence of each parameter.
+    """
+    b = fit.theta.size
     z = np.column_stack([fit.instruments, *slopes])
     scale = np.linalg.norm(z, axis=0)
     scale[scale == 0] = 1.0
     inverse = np.linalg.pinv((z / scale).T @ (z / scale), rcond=1e-12, hermitian=True)
+    white = (inverse / np.outer(scale, scale))[np.ix_(own, own)]
     # With an inexact simulator 4.34 is wider than (Z'Z)^-1; the further columns only widen it.
     alone = np.linalg.pinv((z[:, :b] / scale[:b]).T @ (z[:, :b] / scale[:b]), rcond=1e-12, hermitian=True)
-    for k in range(b - e, b + len(slopes)):
-        influence = (z / scale) @ inverse[:, k] / scale[k]
-        variances[k] += (inverse[k, k] - (alone[k, k] if k < b else 0.0)) / scale[k] ** 2
-        variances[k] = max(variances[k], variance_of_sum(influence * fit.residual))
-    return variances**0.5
+    within = [k for k, i in enumerate(own) if i < b]
+    model = [own[k] for k in within]
+    parts = np.ix_(model, model)
+    white[np.ix_(within, within)] += fit.covariance[parts] - (alone / np.outer(scale[:b], scale[:b]))[parts]
+    products = (z / scale) @ (inverse[:, own] / scale[own]) * fit.residual[:, None]
+    return white, newey_west_matrix([products - products.mean(axis=0)], NEWEY_WEST_LAGS)
 
 
 def variance_of_sum(products: Array) -> float:

@@ -35,6 +35,7 @@ from armident.identify.diagnosis.model_state import (
     without_entry,
 )
 from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
+from armident.identify.diagnosis.precision import p_value
 from armident.identify.diagnosis.screening import refined, screened
 from armident.identify.diagnosis.shaping import both_ends
 from armident.identify.diagnosis.study import Study
@@ -73,6 +74,8 @@ class Selected:
         Comparison of the final models with and without it on the report part; ``None`` before that.
     without
         Final model without it; ``None`` before the comparison.
+    p_value
+        Probability of its parameters in the final model if it is not there.
     """
 
     entry: Entry
@@ -80,6 +83,7 @@ class Selected:
     addition: Addition
     confirmation: Confirmation | None = None
     without: ModelState | None = None
+    p_value: float = 0.0
 
     def conventional(self, state: ModelState, uncertain: float) -> bool:
         """True if the effect is a part of every model, or within the sampling convention of drives: no finding.
@@ -219,7 +223,11 @@ class StepwiseSelection:
 
     def _needed(self, tests: int) -> float:
         """Gain of log-likelihood of a significant effect, found among a number of candidates."""
-        return float(np.log(max(tests, 1) / self.criteria.alpha["selection"]))
+        return -float(np.log(self._level(tests)))
+
+    def _level(self, tests: int) -> float:
+        """Significance level of one of a number of candidates."""
+        return self.criteria.alpha["selection"] / max(tests, 1)
 
     def _release(self) -> None:
         """Free the equations of all models: hundreds are compared, and few are used again."""
@@ -246,7 +254,8 @@ class StepwiseSelection:
         """True if an addition is significant, material and physically possible.
 
         A ratio of likelihoods of ``r`` has at most the probability ``1 / r`` without the effect (Ville 1939), so that
-        no null distribution is needed.
+        no null distribution is needed. The parameters of the effect differ from zero at the same level by their own
+        standard deviations.
 
         Parameters
         ----------
@@ -260,6 +269,7 @@ class StepwiseSelection:
             and addition.gain > self._needed(tests)
             and addition.share >= self.criteria.least_share
             and addition.material_pct >= self.criteria.material_pct
+            and addition.p_value < self._level(tests)
         )
 
     def admitted(self, step: Step) -> Addition | None:
@@ -490,7 +500,8 @@ class StepwiseSelection:
                 if less is not None:
                     final = with_own_noise(less)
                     report = confirmed(held, with_report_part(final))
-                    checked.append((replace(one, confirmation=report, without=final), less))
+                    known_by = p_value(held, one.entry)
+                    checked.append((replace(one, confirmation=report, without=final, p_value=known_by), less))
             failed = [(one, less) for one, less in checked if not self._holds(one)]
             if not failed:
                 return state, tuple(sorted((one for one, _ in checked), key=_reduction, reverse=True))
@@ -503,10 +514,14 @@ class StepwiseSelection:
             found = tuple(one for one in found if one.entry is not gone.entry)
 
     def _holds(self, one: Selected) -> bool:
-        """True if the report part confirms a finding: the change goes the same way, and is material there, too."""
+        """True if the report part confirms a finding: the change goes the same way, and is material there, too.
+
+        Its parameters still differ from zero beside all others.
+        """
         report = one.confirmation
         assert report is not None
-        return report.p_value < self.criteria.confirmation_level and report.smaller and self._material(report)
+        determined = one.p_value < self._level(one.step.tests)
+        return determined and report.p_value < self.criteria.confirmation_level and report.smaller and self._material(report)
 
     def _material(self, report: Confirmation) -> bool:
         """True if the errors of one joint on which it acts fall by enough, relative to them and to its torque."""

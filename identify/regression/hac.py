@@ -35,6 +35,23 @@ def newey_west(series: Sequence[Array], lags: int) -> Array:
     return np.asarray(np.maximum(variance, 0.0))
 
 
+def newey_west_matrix(series: Sequence[Array], lags: int) -> Array:
+    """Covariance matrix of the sums of all terms, (b, b): `newey_west` with the covariances between the sums.
+
+    Parameters
+    ----------
+    series
+        Terms of mean zero, one array (M, b) per experiment.
+    lags
+        Number of autocovariances.
+    """
+    total = np.asarray(sum(s.T @ s for s in series))
+    for lag in range(1, min(lags, max(s.shape[0] for s in series) - 1) + 1):
+        products = np.asarray(sum(s[lag:].T @ s[: s.shape[0] - lag] for s in series if s.shape[0] > lag))
+        total = total + (1 - lag / (lags + 1)) * (products + products.T)
+    return total
+
+
 def _summed_products(a: Array, b: Array) -> Array:
     # Two loops for speed: the dot product of one series, einsum for many columns (0.4 of the time of np.sum(a * b)).
     return np.asarray(a @ b if a.ndim == 1 else np.einsum("ij,ij->j", a, b))
