@@ -35,11 +35,14 @@ class Candidate:
         Effect and its place.
     grid
         Combinations of nonlinear parameters to try, as pairs of name and value.
+    without
+        Linear parameters that it leaves out, because the model has others with the same torque.
     """
 
     effect: Effect
     place: Place
     grid: tuple[Shapes, ...]
+    without: tuple[str, ...] = ()
 
     @property
     def key(self) -> Key:

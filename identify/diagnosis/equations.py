@@ -18,6 +18,10 @@ RIGID_KEPT = 32
 """Rigid regressors kept, one per stretch and kind of signal. Limits the memory, changes no result: measured signals of
 up to eight recordings and the latest simulations stay."""
 
+HELD_AT_ZERO = 1e-10
+"""Weight by which the parameters of terms are held at zero. Where rigid model and terms give the same torque, as the
+offset and all functions of a table over a predicted torque may do, it belongs to the rigid model."""
+
 
 @dataclass(frozen=True, eq=False)
 class Equations:
@@ -38,6 +42,12 @@ class Equations:
     def parameters(self) -> int:
         """Number of parameters of the model, b."""
         return self.study.model.base.b
+
+    @property
+    def held_at_zero(self) -> Array:
+        """Weight by which each parameter is held at zero, (b,): see `HELD_AT_ZERO`."""
+        model = self.study.model
+        return np.repeat([0.0, HELD_AT_ZERO], [model.base.b - model.e, model.e])
 
     @cached_property
     def train(self) -> tuple[InstrumentedEquations, ...]:

@@ -105,6 +105,32 @@ def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]], sign: int = 
     return None if np.isnan(found) else found
 
 
+def contained(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> tuple[str, ...]:
+    """Linear parameters of a candidate whose torque the model can give without it, such as an inertia of two joints.
+
+    Parameters
+    ----------
+    fit
+        Fit of the model.
+    candidate
+        The candidate.
+    column_cache
+        Cache of the columns of the same fit.
+    shapes
+        Nonlinear parameters of the candidate.
+    """
+    columns = column_cache.grid(candidate.effect, candidate.place, (shapes,), fit.noise, keep=False)
+    size = np.sqrt(np.sum([np.einsum("ij,ij->j", own, own) for _, own in columns], axis=0))
+    size = np.where(size > 0.0, size, 1.0)
+    gram = fit.regression.products_beside([(j, own / size) for j, own in columns], 1)[0][0]
+    kept: list[int] = []
+    for k in candidate.effect.present(dict(shapes)):
+        along = gram[np.ix_(kept, [k])][:, 0]
+        rest = gram[k, k] - along @ np.linalg.solve(gram[np.ix_(kept, kept)], along)
+        kept += [k] if rest > RANK_TOLERANCE**2 else []
+    return tuple(p.name for k, p in enumerate(candidate.effect.linear) if k not in kept)
+
+
 def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
     """Orthonormal directions (R, r) of instruments orthogonal to the model's, and their map (k, r) with scales (k,).
 

@@ -36,7 +36,7 @@ from armident.identify.diagnosis.model_state import (
 )
 from armident.identify.diagnosis.order_analysis import motor_orders, nearby_orders
 from armident.identify.diagnosis.precision import p_value
-from armident.identify.diagnosis.screening import refined, screened
+from armident.identify.diagnosis.screening import contained, refined, screened
 from armident.identify.diagnosis.shaping import both_ends
 from armident.identify.diagnosis.study import Study
 from armident.identify.diagnosis.transitions import with_transitions
@@ -371,12 +371,14 @@ class StepwiseSelection:
                 candidate = replace(candidate, grid=near)
                 found = screened(noise, candidate, column_cache) or found
             shapes = refined(noise, candidate, column_cache, found)
-            chosen += [(candidate, ends, ()) for ends in both_ends(noise, candidate, column_cache, shapes)]
+            for ends in both_ends(noise, candidate, column_cache, shapes):
+                without = contained(noise, candidate, column_cache, ends)
+                chosen.append((replace(candidate, without=without), ends, ()))
         return chosen, tests
 
     def _made(self, state: ModelState, candidate: Candidate, shapes: Shapes, starts: Starts) -> Made | None:
         effect, whole = candidate.effect, known(candidate.effect.key)
-        spared = tuple(p.name for p in whole.linear if p not in effect.linear)
+        spared = (*(p.name for p in whole.linear if p not in effect.linear), *candidate.without)
         entry = entry_of(effect, candidate.place, state.robot, dict(shapes), spared)
         made = self._state(with_entries(state.robot, [entry]), state)
         if made is None:

@@ -1,7 +1,7 @@
 """Instrumental-variable regression that keeps its whitened rows, for comparison with further columns."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -25,6 +25,10 @@ class Jointwise(Protocol):
     @property
     def parameters(self) -> int:
         """Number of parameters, b."""
+
+    @property
+    def held_at_zero(self) -> Array:
+        """Weight by which each parameter is held at zero, over the norms of its columns, (b,)."""
 
     def release(self) -> None:
         """Free the equations; they are computed again, with the same values, when they are next used."""
@@ -73,6 +77,7 @@ class IvRegression:
                 rows.append(_whitened(joint, ar))
                 products.append(joint.products(rows[-1:]))
         solution = together(zip(joints, products, strict=True), equations.parameters)
+        solution = replace(solution, cross=solution.cross + np.diag(equations.held_at_zero))
         made = cls(equations, tuple(noise), tuple(products), solution)
         made.__dict__["rows"] = tuple(rows)
         return made
