@@ -37,6 +37,12 @@ HELD_OUT_LEVEL = 0.05
 ROWS_PER_COLUMN = 12
 """Least number of equations per function of all functions together, against overfitting of short recordings."""
 
+MOST_DEVIATIONS = 4.0
+"""Limit of whitened residuals, robust standard deviations: normal noise exceeds it once in 16 000 samples."""
+
+NORMAL = 1.4826
+"""Standard deviation of a normal variable over the median of its absolute value."""
+
 MOST_TAKEN = 3
 """Most sets of functions taken out of the residual of one joint for its noise model."""
 
@@ -324,6 +330,7 @@ class LackOfFit:
         held_rows = rows_of_joints(sum(e.y.shape[0] - ar.order for e in blocks) for ar in fit.noise)
         regressor, instruments, _ = fit.held
         errors = fit.errors(fit.theta, held=True)
+        residual, held_residual = limited(fit.residual, rows), limited(fit.held_residual, held_rows)
         out = []
         for j, (own, unseen) in enumerate(zip(*self.columns, strict=True)):
             d = np.concatenate([fit.noise[j].whiten(c) for c in own])
@@ -335,7 +342,7 @@ class LackOfFit:
             band = np.concatenate([c - e.z[:, j] @ away for c, e in zip(unseen, blocks, strict=True)])
             out.append(
                 JointResidual(
-                    j, rows[j], held_rows[j], d, fit.regression.beside(full), change, fit.residual, fit.held_residual,
+                    j, rows[j], held_rows[j], d, fit.regression.beside(full), change, residual, held_residual,
                     band, np.concatenate([e[:, j] for e in errors]), held_rows, regressor, fit.covariance,
                 )
             )  # fmt: skip
@@ -374,6 +381,29 @@ class LackOfFit:
                 chosen.append(own)
                 left -= own.size
         return np.concatenate(chosen) if chosen else np.arange(0)
+
+
+def limited(residual: Array, joints: Sequence[slice]) -> Array:
+    """Return whitened residuals (R,) limited to `MOST_DEVIATIONS` robust standard deviations of each joint.
+
+    About a reversal the sign of a measured velocity is uncertain, and with it the whole dry friction. A few samples there
+    would outweigh all others.
+
+    Parameters
+    ----------
+    residual
+        Whitened residuals of all joints, (R,).
+    joints
+        Rows of each joint.
+    """
+    found = residual.copy()
+    for rows in joints:
+        own = residual[rows]
+        used = own[own != 0.0]
+        if used.size:
+            most = MOST_DEVIATIONS * NORMAL * float(np.median(np.abs(used)))
+            found[rows] = np.clip(own, -most, most)
+    return found
 
 
 def _by_share(found: Sequence[Dependence]) -> tuple[Dependence, ...]:

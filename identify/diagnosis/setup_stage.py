@@ -149,7 +149,7 @@ def set_up(training: Sequence[Experiment], validation: Sequence[Experiment], rob
         ),
         check.relative_error_pct,
         CONVENTIONS if shift is not None and shift.undetermined else (),
-        shift is not None and shift.determined,
+        shift is not None and shift.known,
     )
 
 

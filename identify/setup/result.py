@@ -15,6 +15,9 @@ CONVENTIONS = (0.0, 0.5)
 SUBSTANTIAL = 3.2
 """Least odds of the torque of the instant over the held one: "substantial" evidence (Jeffreys 1961, appendix B)."""
 
+CERTAIN = 20.0
+"""Odds of one convention over the other from which the shift is known."""
+
 SHORTEST = 0.1
 """Shortest shift that is corrected, samples: derivatives and interpolation err by some hundredths."""
 
@@ -101,6 +104,13 @@ class TorqueShift:
         # differently: without instruments, two joints must confirm the shift.
         several = len(self.by_joint) >= 2 if self.instrumented else compared >= 2
         return several and self.std <= MOST_UNCERTAIN
+
+    @property
+    def known(self) -> bool:
+        """True if the estimate is certain enough to tell the conventions apart, or agrees with none of them."""
+        agrees = any(abs(self.samples - shift) <= SIGNIFICANT * self.std for shift in CONVENTIONS)
+        decided = self.odds > CERTAIN or self.odds < 1.0 / CERTAIN
+        return self.determined and (decided or not agrees)
 
     @property
     def undetermined(self) -> bool:
