@@ -502,8 +502,8 @@ class StepwiseSelection:
                 if less is not None:
                     final = with_own_noise(less)
                     report = confirmed(held, with_report_part(final))
-                    known_by = p_value(held, one.entry)
-                    checked.append((replace(one, confirmation=report, without=final, p_value=known_by), less))
+                    tested = replace(one, confirmation=report, without=final, p_value=p_value(held, one.entry))
+                    checked.append((tested, less))
             failed = [(one, less) for one, less in checked if not self._holds(one)]
             if not failed:
                 return state, tuple(sorted((one for one, _ in checked), key=_reduction, reverse=True))
@@ -523,7 +523,8 @@ class StepwiseSelection:
         report = one.confirmation
         assert report is not None
         determined = one.p_value < self._level(one.step.tests)
-        return determined and report.p_value < self.criteria.confirmation_level and report.smaller and self._material(report)
+        significant = report.p_value < self.criteria.confirmation_level
+        return determined and significant and report.smaller and self._material(report)
 
     def _material(self, report: Confirmation) -> bool:
         """True if the errors of one joint on which it acts fall by enough, relative to them and to its torque."""

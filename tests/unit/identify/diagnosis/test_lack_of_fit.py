@@ -14,7 +14,7 @@ from armident.configs.schema.scenario import HiddenEffect
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.free_functions import free_functions, hats
 from armident.identify.diagnosis.hints import HINTS, hint_of
-from armident.identify.diagnosis.lack_of_fit import Dependence, LackOfFit
+from armident.identify.diagnosis.lack_of_fit import MOST_DEVIATIONS, Dependence, LackOfFit, limited
 from armident.identify.diagnosis.noise_beyond import noise_beyond
 from armident.identify.diagnosis.regression import Fit, fit
 from armident.identify.diagnosis.spectral_lines import strongest_line
@@ -178,3 +178,16 @@ def test_a_line_in_coloured_noise_is_found_with_its_power() -> None:
     assert line.p_value < 1e-6
     assert line.share == pytest.approx(0.5 / np.mean(held**2), rel=0.3)
     assert strongest_line([train[:200]], [held], 1e-3, 10.0) is None
+
+
+def test_a_few_large_residuals_are_limited_and_a_large_residual_is_not() -> None:
+    rng = np.random.default_rng(0)
+    residual = np.concatenate([rng.standard_normal(1000), 50.0 * rng.standard_normal(1000), np.zeros(10)])
+    residual[[3, 900]] = 200.0, -300.0
+    joints = [slice(0, 1000), slice(1000, 2000), slice(2000, 2010)]
+    found = limited(residual, joints)
+    assert np.abs(found[:1000]).max() < 1.2 * MOST_DEVIATIONS
+    assert found[3] == -found[900] > 0.0
+    unusual = np.abs(residual) > MOST_DEVIATIONS * np.repeat([1.0, 50.0, 1.0], [1000, 1000, 10])
+    assert np.mean(found[~unusual] == residual[~unusual]) > 0.999
+    np.testing.assert_array_equal(found[2000:], 0.0)

@@ -52,6 +52,17 @@ def test_nothing_is_admitted_in_a_healthy_arm() -> None:
     assert final.robot == first.robot
 
 
+def test_an_addition_whose_parameters_may_be_zero_does_not_pass() -> None:
+    steps, first = selection(1, SPRING)
+    step = steps.step(first)
+    best = steps.admitted(step)
+    assert best is not None
+    assert steps.passes(best, step.tests)
+    undetermined = replace(best)
+    undetermined.__dict__["p_value"] = 0.01
+    assert not steps.passes(undetermined, step.tests)
+
+
 def test_two_effects_are_both_selected_whatever_their_order_and_confirmed() -> None:
     steps, first = selection(1, SPRING, WORN)
     _, found = steps.run(first)

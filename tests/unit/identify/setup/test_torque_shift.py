@@ -85,6 +85,17 @@ def test_a_shift_that_is_less_certain_than_the_convention_is_that_of_the_convent
     assert neither.correction == 0.25
 
 
+def test_a_shift_is_known_where_it_tells_the_conventions_apart() -> None:
+    joints = {"axis_1": (0.2, 0.26), "axis_2": (0.3, 0.12)}
+    either = TorqueShift(0.23, 0.18, 4e-3, joints, 0.9, instrumented=True)
+    assert either.determined
+    assert not either.known
+    assert replace(either, odds=25.0).known
+    assert replace(either, odds=0.04).known
+    assert replace(either, std=0.02).known
+    assert not replace(either, odds=25.0, std=0.3).known
+
+
 def test_a_shift_that_was_applied_is_not_found_again(healthy: list[Experiment], arm: RobotConfig) -> None:
     moved = late(healthy, np.full(arm.n, LATE))
     again = estimate(with_torque_shift(moved, estimate(moved, arm)), arm)
