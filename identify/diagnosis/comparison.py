@@ -162,11 +162,29 @@ def compared(state: ModelState, made: Sequence[Made], tests: int, passes: Callab
     passes
         ``(addition, tests)`` to True if an addition is significant, material and physically possible.
     """
-    best = max((state, *(m.state for m in made if m.allowed)), key=lambda one: one.score.own_log_likelihood)
-    weights = best.own_noise
-    alike, noise = state.under(weights), best.under(weights).score.own_noise
+    weights, noise = _noise_of_best([state, *(m.state for m in made if m.allowed)])
+    alike = state.under(weights)
     ranked = tuple(sorted((_compared(alike, m, weights, noise) for m in made), key=lambda a: -a.log_likelihood))
     return Step(alike, noise, ranked, tuple(a for a in ranked if passes(a, tests)), tests)
+
+
+def advantage(one: ModelState, other: ModelState) -> float:
+    """Log-likelihood of a model less that of another one, under the noise models of the more likely of both, nats.
+
+    Parameters
+    ----------
+    one, other
+        The models.
+    """
+    weights, noise = _noise_of_best([one, other])
+    first, second = (model.under(weights).score.log_likelihood_under(noise) for model in (one, other))
+    return first - second
+
+
+def _noise_of_best(models: Sequence[ModelState]) -> tuple[tuple[ArModel, ...], tuple[ArModel, ...]]:
+    """Noise models that weight the equations of all models, and those that score them: of the most likely model."""
+    best = max(models, key=lambda one: one.score.own_log_likelihood)
+    return best.own_noise, best.under(best.own_noise).score.own_noise
 
 
 def _compared(state: ModelState, made: Made, weights: tuple[ArModel, ...], noise: tuple[ArModel, ...]) -> Addition:

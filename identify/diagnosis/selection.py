@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
 from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Key, Shapes, candidates
-from armident.identify.diagnosis.comparison import Addition, Made, Step, compared, gain, materiality
+from armident.identify.diagnosis.comparison import Addition, Made, Step, advantage, compared, gain, materiality
 from armident.identify.diagnosis.confirmation import Confirmation, confirmed
 from armident.identify.diagnosis.corrections import screened_correction
 from armident.identify.diagnosis.criteria import Criteria
@@ -452,24 +452,33 @@ class StepwiseSelection:
                 less = self._without(state, one.entry)
                 if less is None:
                     continue
-                share, changed = materiality(less, state)
-                gained = gain(state, less)
-                if (
-                    gained < self._needed(one.step.tests)
-                    or share < self.criteria.least_share
-                    or changed < self.criteria.material_pct
-                ):
-                    weak.append((gained, less, one))
+                if self._superfluous(state, less, one.step.tests):
+                    weak.append((gain(state, less), less, one))
             if not weak:
                 break
             _, state, gone = min(weak, key=lambda one: one[0])
             found = tuple(one for one in found if one is not gone)
         return state, found
 
+    def _superfluous(self, state: ModelState, less: ModelState, tests: int) -> bool:
+        """True if a finding is insignificant or immaterial beside the others of a model.
+
+        Parameters
+        ----------
+        state, less
+            Models with and without it.
+        tests
+            Number of candidates among which it was found.
+        """
+        share, changed = materiality(less, state)
+        material = share >= self.criteria.least_share and changed >= self.criteria.material_pct
+        return not material or gain(state, less) < self._needed(tests)
+
     def _exchanged(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
         """Model whose findings have competed with all other effects beside the findings made after them.
 
-        No exchange returns to an earlier model: the noise models of two steps differ, and each could prefer its own.
+        A rival makes the finding superfluous; an effect beside which it stays explains something else. No exchange
+        returns to an earlier model: each could prefer its own noise models.
         """
         self._visited.add(_key(state.robot))
         for one in found:
@@ -481,8 +490,9 @@ class StepwiseSelection:
             best = self.admitted(step)
             if best is None or best.family == one.addition.family or _key(best.state.robot) in self._visited:
                 continue
-            present = state.under(step.state.fit.noise).score.log_likelihood_under(step.noise)
-            if best.log_likelihood > present + self.criteria.close:
+            both = self._state(with_entries(best.state.robot, [one.entry]), best.state)
+            rival = both is None or self._superfluous(both, best.state, one.step.tests)
+            if rival and advantage(best.made.state, state) > self.criteria.close:
                 other = Selected(best.entry, step, best)
                 state, found = with_first_motions(best.state), tuple(other if f is one else f for f in found)
                 self._visited.add(_key(state.robot))
