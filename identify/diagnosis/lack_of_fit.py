@@ -386,8 +386,8 @@ class LackOfFit:
 def limited(residual: Array, joints: Sequence[slice]) -> Array:
     """Return whitened residuals (R,) limited to `MOST_DEVIATIONS` robust standard deviations of each joint.
 
-    About a reversal the sign of a measured velocity is uncertain, and with it the whole dry friction. A few samples there
-    would outweigh all others.
+    About a reversal the sign of a measured velocity is uncertain, and with it the whole dry friction. A few samples
+    there would outweigh all others.
 
     Parameters
     ----------

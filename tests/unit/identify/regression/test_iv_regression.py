@@ -1,7 +1,7 @@
 """A regression that keeps its rows, against the plain formulas with all columns of all joints."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,6 +26,7 @@ class Given:
 
     blocks: Sequence[InstrumentedEquations]
     made: list[int] = field(default_factory=list)
+    held_at_zero: Array = field(default_factory=lambda: np.zeros(5))
 
     @cached_property
     def joints(self) -> tuple[JointEquations, ...]:
@@ -118,3 +119,14 @@ def test_equations_left_out_are_in_no_product(given: Given) -> None:
     expected = factored(z, *stacked(given.blocks, NOISE)).theta
     np.testing.assert_allclose(IvRegression.of(given, NOISE).solution.theta, expected, rtol=1e-10)
     np.testing.assert_allclose(iv_products(given.blocks, NOISE).theta, expected, rtol=1e-10)
+
+
+def test_a_parameter_that_two_columns_share_belongs_to_the_one_that_is_not_held_at_zero(given: Given) -> None:
+    for block in given.blocks:
+        block.x[:, :, 4], block.z[:, :, 4] = block.x[:, :, 3], block.z[:, :, 3]
+    given.held_at_zero[4] = 1e-10
+    theta = IvRegression.of(given, NOISE).solution.theta
+    assert abs(theta[4]) < 1e-4 * abs(theta[3])
+    both = [replace(b, x=b.x[:, :, :4], z=b.z[:, :, :4]) for b in given.blocks]
+    z, x, y = whitened([b.z for b in both], NOISE), *stacked(both, NOISE)
+    np.testing.assert_allclose(theta[:4], factored(z, x, y).theta, rtol=1e-4)
