@@ -12,7 +12,7 @@ from armident.identify.diagnosis.model_state import ModelState
 from armident.identify.diagnosis.regression import Fit
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.effect import Place
-from armident.identify.effects.recorded import of_recording, relative_slope
+from armident.identify.effects.recorded import of_recording
 from armident.identify.effects.registry import of_entry
 from armident.identify.effects.terms import Term
 from armident.identify.regression.ar_noise import ArModel
@@ -56,8 +56,9 @@ def standard_deviations(state: ModelState) -> dict[int, dict[str, float]]:
 def p_value(state: ModelState, entry: Entry) -> float:
     """Probability of linear parameters of an effect so far from zero if it is not there (Wald's test).
 
-    Their covariance is that of `standard_deviations`. The likelihood of a model can rise without such evidence:
-    corrected torques have other noise, and instruments that follow the measured motion leave a parameter undetermined.
+    Their covariance is that of `standard_deviations` with the nonlinear parameters of the effect as they are: without
+    it, they mean nothing. The nonlinear parameters of all others are free. The likelihood of a model can rise without
+    such evidence: corrected torques have other noise, and the time at which dry friction reverses is uncertain.
 
     Parameters
     ----------
@@ -66,23 +67,25 @@ def p_value(state: ModelState, entry: Entry) -> float:
     entry
         Its entry in the configuration.
     """
-    slopes, owners = _further_columns(state)
     number = list(state.robot.effects).index(entry)
+    every, owners = _further_columns(state)
+    slopes = [slope for slope, (owner, _) in zip(every, owners, strict=True) if owner != number]
     if of_recording(entry):
-        effect = of_entry(entry)
-        if not isinstance(effect, Correction):
+        own = [(slope, name) for slope, (owner, name) in zip(every, owners, strict=True) if owner == number]
+        if not own:
             return 0.0
-        name = effect.linear[0].name
-        own, values = [state.fit.theta.size + owners.index((number, name))], np.array([entry.parameters[name]])
+        ((slope, name),) = own
+        slopes.append(slope)
+        tested, values = [state.fit.theta.size + len(slopes) - 1], np.array([entry.parameters[name]])
     else:
         term = state.term_of(entry)
-        own, values = _own(state, term), state.values_of(term)[0]
+        tested, values = _own(state, term), state.values_of(term)[0]
     statistics = []
-    for covariance in _covariances(state.fit, slopes, own):
+    for covariance in _covariances(state.fit, slopes, tested):
         scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         unit = values / scale
         statistics.append(float(unit @ np.linalg.lstsq(covariance / np.outer(scale, scale), unit, rcond=RANK)[0]))
-    return float(stats.chi2.sf(min(statistics), len(own)))
+    return float(stats.chi2.sf(min(statistics), len(tested)))
 
 
 def _terms(state: ModelState) -> dict[int, Term]:
@@ -106,14 +109,14 @@ def _further_columns(state: ModelState) -> tuple[list[Array], list[tuple[int, st
         for name in term.effect.movable(study.robot, term.place, term.shapes):
             slopes.append(_slope(column_cache, fit.noise, term, name, values))
             owners.append((k, name))
-    experiments = [e for part in study.sources for e in part]
     for k, entry in enumerate(state.robot.effects):
         effect = of_entry(entry)
         if of_recording(entry) and isinstance(effect, Correction):
             place = Place(study.joints.index(entry.joint))
+            name = effect.linear[0].name
             column = column_cache.instruments(effect, place, (), fit.noise, keep=False)[:, 0]
-            slopes.append(column * relative_slope(experiments, state.robot, entry))
-            owners.append((k, effect.linear[0].name))
+            slopes.append(column * effect.relative_slope(entry.parameters[name]))
+            owners.append((k, name))
     return slopes, owners
 
 

@@ -86,6 +86,18 @@ class Correction(TorqueDependent):
             Largest torque of the motor, N m or N.
         """
 
+    def relative_slope(self, value: float) -> float:
+        """Return the change of the true torque by a change of the value, over that by a further small correction.
+
+        One for corrections that add up, such as delays.
+
+        Parameters
+        ----------
+        value
+            Value of the parameter.
+        """
+        return 1.0
+
     def columns(self, motion: Motion, place: Place, shapes: Mapping[str, float]) -> Array:
         """Return the torques of the joints that the motor drives."""
         return motion.of_motor(place.joint, self.shaft_column(motion.motor_torque[:, place.joint], motion, place.joint))
@@ -140,6 +152,10 @@ class DriveGainError(Correction):
         """Return the torque over one plus the gain error."""
         true: Array = recorded / (1.0 + value)
         return true
+
+    def relative_slope(self, value: float) -> float:
+        """Return ``1 / (1 + gain_error)``: gains multiply."""
+        return 1.0 / (1.0 + value)
 
     def values_to_test(self, recorded: Array, dt: float, limit: float) -> Array:
         """Return errors from 4 to 60 % to either side, and 120 %."""

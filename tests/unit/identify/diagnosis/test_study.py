@@ -4,15 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from armident.configs.schema.robot import Effect
 from armident.identify.diagnosis.model_state import ModelState, fitted
 from armident.identify.diagnosis.precision import standard_deviations
 from armident.identify.diagnosis.selection import StepwiseSelection
 from armident.identify.diagnosis.study import Study, _aligned, build_study
-from armident.identify.effects.recorded import put_right, relative_slope
+from armident.identify.effects.drive import Correction
+from armident.identify.effects.recorded import put_right
+from armident.identify.effects.registry import known
 from armident.identify.experiment import Experiment
 from tests.fixtures import setups
+
+Array = NDArray[np.float64]
 
 LATE = 0.5
 DT = 4e-3
@@ -57,16 +62,27 @@ def test_the_gain_of_a_drive_that_reports_too_much_is_put_right(experiments: lis
 
 
 @pytest.mark.parametrize(
-    ("effect", "name", "value", "slope"),
-    [("drive_gain_error", "gain_error", 0.25, 0.8), ("time_delay", "delay", 2 * DT, 1.0)],
+    ("name", "value", "step"),
+    [
+        ("drive_gain_error", 0.25, 1e-3),
+        ("drive_gain_saturation", 0.3, 1e-3),
+        ("time_delay", 2 * DT, DT),
+        ("actuator_bandwidth", 0.5 * DT, 0.01 * DT),
+    ],
 )
-def test_a_change_of_a_correction_is_a_further_correction(
-    experiments: list[Experiment], effect: str, name: str, value: float, slope: float
+def test_the_slope_of_a_correction_compares_a_change_of_its_value_with_a_further_correction(
+    name: str, value: float, step: float
 ) -> None:
-    robot = setups.random_arm(3, 4)
-    entry = Effect(effect=effect, joint=robot.joints[2].name, parameters={name: value})
-    corrected = robot.model_copy(update={"effects": (entry,)})
-    assert relative_slope(experiments, corrected, entry) == pytest.approx(slope, rel=0.02)
+    effect = known(name)
+    assert isinstance(effect, Correction)
+    recorded = 5.0 * np.sin(2 * np.pi * np.arange(500) / 200.0)
+
+    def true(torque: Array, value: float) -> Array:
+        return effect.true_torque(torque, value, DT, 8.0)
+
+    before = true(recorded, value)
+    changed, further = true(recorded, value + step) - before, true(before, step) - before
+    assert effect.relative_slope(value) == pytest.approx(changed @ further / (further @ further), rel=0.02)
 
 
 def test_the_standard_deviation_of_a_correction_is_that_of_its_likelihood(experiments: list[Experiment]) -> None:
