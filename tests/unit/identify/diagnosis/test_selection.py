@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from armident.configs.schema.robot import Effect
-from armident.identify.diagnosis.comparison import Addition, Step
+from armident.identify.diagnosis.comparison import Addition, Step, advantage
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.diagnose import diagnose
 from armident.identify.diagnosis.model_state import ModelState
@@ -90,6 +90,29 @@ def test_a_wrong_finding_is_exchanged_for_the_right_one() -> None:
     state, found = steps._exchanged(wrong.state, (Selected(wrong.entry, step, wrong),))
     assert [one.entry.effect for one in found] == ["joint_spring"]
     assert wrong.entry not in state.robot.effects
+
+
+def test_an_effect_beside_which_a_finding_stays_does_not_take_its_place() -> None:
+    """Both effects are there: the clearer one is a better model alone, and no rival of the other."""
+    steps, first = selection(1, SPRING, WORN)
+    step = steps.step(first)
+    clearer = steps.admitted(step)
+    assert clearer is not None
+    assert clearer.candidate.effect.name == "joint_spring"
+    other = addition_of(step, "asymmetric_viscous_friction")
+    assert advantage(clearer.state, other.state) > steps.criteria.close
+    state, found = steps._exchanged(other.state, (Selected(other.entry, step, other),))
+    assert state is other.state
+    assert [one.entry for one in found] == [other.entry]
+
+
+def test_the_advantage_of_a_model_is_the_disadvantage_of_the_other() -> None:
+    steps, first = selection(1, SPRING)
+    best = steps.admitted(steps.step(first))
+    assert best is not None
+    assert advantage(best.state, first) > steps.criteria.close
+    assert advantage(first, best.state) == pytest.approx(-advantage(best.state, first), rel=1e-9)
+    assert advantage(first, first) == 0.0
 
 
 def test_no_exchange_returns_to_an_earlier_model() -> None:
