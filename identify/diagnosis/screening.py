@@ -108,6 +108,8 @@ def score_statistic(fit: Fit, columns: Sequence[tuple[int, Array]], sign: int = 
 def contained(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes: Shapes) -> tuple[str, ...]:
     """Linear parameters of a candidate whose torque the model can give without it, such as an inertia of two joints.
 
+    None if these are all: an effect keeps one parameter, which is then zero.
+
     Parameters
     ----------
     fit
@@ -124,11 +126,12 @@ def contained(fit: Fit, candidate: Candidate, column_cache: ColumnCache, shapes:
     size = np.where(size > 0.0, size, 1.0)
     gram = fit.regression.products_beside([(j, own / size) for j, own in columns], 1)[0][0]
     kept: list[int] = []
-    for k in candidate.effect.present(dict(shapes)):
+    present = candidate.effect.present(dict(shapes))
+    for k in present:
         along = gram[np.ix_(kept, [k])][:, 0]
         rest = gram[k, k] - along @ np.linalg.solve(gram[np.ix_(kept, kept)], along)
         kept += [k] if rest > RANK_TOLERANCE**2 else []
-    return tuple(p.name for k, p in enumerate(candidate.effect.linear) if k not in kept)
+    return tuple(candidate.effect.linear[k].name for k in present if kept and k not in kept)
 
 
 def directions_beside(fit: Fit, instruments: Array) -> tuple[Array, Array, Array] | None:
