@@ -148,8 +148,9 @@ class Step:
 def compared(state: ModelState, made: Sequence[Made], tests: int, passes: Callable[[Addition, int], bool]) -> Step:
     """Compare models with candidates, all estimated and scored under the same noise models.
 
-    They are those of the most likely model that physics allows, each under noise models of its own. Noise models of the
-    model without the missing effect would take the effect for noise.
+    They are those of the most likely model that physics allows, each under noise models of its own residual without
+    smooth functions of the motion. Noise models of the model without the missing effect would take the effect for
+    noise, and so would those of a whole residual while other effects are missing.
 
     Parameters
     ----------
@@ -162,9 +163,9 @@ def compared(state: ModelState, made: Sequence[Made], tests: int, passes: Callab
     passes
         ``(addition, tests)`` to True if an addition is significant, material and physically possible.
     """
-    weights, noise = _noise_of_best([state, *(m.state for m in made if m.allowed)])
-    alike = state.under(weights)
-    ranked = tuple(sorted((_compared(alike, m, weights, noise) for m in made), key=lambda a: -a.log_likelihood))
+    noise = _noise_of_best([state, *(m.state for m in made if m.allowed)])
+    alike = state.under(noise)
+    ranked = tuple(sorted((_compared(alike, m, noise) for m in made), key=lambda a: -a.log_likelihood))
     return Step(alike, noise, ranked, tuple(a for a in ranked if passes(a, tests)), tests)
 
 
@@ -176,20 +177,19 @@ def advantage(one: ModelState, other: ModelState) -> float:
     one, other
         The models.
     """
-    weights, noise = _noise_of_best([one, other])
-    first, second = (model.under(weights).score.log_likelihood_under(noise) for model in (one, other))
+    noise = _noise_of_best([one, other])
+    first, second = (model.under(noise).score.log_likelihood_under(noise) for model in (one, other))
     return first - second
 
 
-def _noise_of_best(models: Sequence[ModelState]) -> tuple[tuple[ArModel, ...], tuple[ArModel, ...]]:
-    """Noise models that weight the equations of all models, and those that score them: of the most likely model."""
-    best = max(models, key=lambda one: one.score.own_log_likelihood)
-    return best.own_noise, best.under(best.own_noise).score.own_noise
+def _noise_of_best(models: Sequence[ModelState]) -> tuple[ArModel, ...]:
+    """Noise models that weight and score the equations of all models: of the most likely model, one for each joint."""
+    return max(models, key=lambda one: one.score.log_likelihood_under(one.weights)).weights
 
 
-def _compared(state: ModelState, made: Made, weights: tuple[ArModel, ...], noise: tuple[ArModel, ...]) -> Addition:
+def _compared(state: ModelState, made: Made, noise: tuple[ArModel, ...]) -> Addition:
     """Comparison of a model with an effect with the one without it."""
-    with_it = made.state.under(weights)
+    with_it = made.state.under(noise)
     share, changed = materiality(state, with_it)
     before, after = (one.score.log_likelihood_under(noise) for one in (state, with_it))
     gained = with_it.score.gain_over(state.score, noise)

@@ -145,11 +145,6 @@ class PredictiveScore:
         return np.asarray(self.log_likelihoods_under(self.own_noise) - orders)
 
     @property
-    def own_log_likelihood(self) -> float:
-        """Log-likelihood of the data of all joints, see `own_log_likelihoods`."""
-        return float(self.own_log_likelihoods.sum())
-
-    @property
     def volume(self) -> Array:
         """Logarithm of the volume by which corrections of the recordings scale the noise, per row, (n,)."""
         return self.fit.study.volume

@@ -78,7 +78,6 @@ def test_a_structural_effect_is_no_other_number() -> None:
     assert (finding.kind, finding.effect, finding.joint) == ("structure", "asymmetric_viscous_friction", "joint_2")
 
 
-@MISSED
 def test_the_gain_of_one_drive_is_named() -> None:
     gain = HiddenEffect(effect="drive_gain_error", joint="joint_2", parameters={"error": 0.1})
     findings = [f for f in against_baseline(5, gain) if f.effect == "drive_gain_error"]

@@ -26,7 +26,7 @@ def test_the_log_likelihood_favours_the_true_model() -> None:
     true, false = with_effects(first, TRUE), with_effects(first, FALSE)
     common = first.weights
     assert true.score.log_likelihood_under(common) > false.score.log_likelihood_under(common) + 100.0
-    assert true.score.own_log_likelihood > false.score.own_log_likelihood + 100.0
+    assert true.score.own_log_likelihoods.sum() > false.score.own_log_likelihoods.sum() + 100.0
     assert true.score.gain_over(first.score, true.score.own_noise) > 100.0
     assert true.score.rms[0] < 0.5 * first.score.rms[0]
 
