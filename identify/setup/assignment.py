@@ -71,8 +71,8 @@ def by_friction(bench: Bench, h: Hypothesis) -> Array:
     x = bench.rows(np.eye(n)).x
     dry = np.stack([x[:, j, bench.column(f"fc{j + 1}")] for j in range(n)], axis=1)
     slow = np.stack([x[:, j, bench.column(f"fv{j + 1}")] for j in range(n)], axis=1)
-    fast = np.concatenate([bench._kept(s.qdd) for s in bench.segments])
-    q = np.concatenate([bench._kept(s.q) for s in bench.segments])
+    fast = bench.kept([s.qdd for s in bench.segments])
+    q = bench.kept([s.q for s in bench.segments])
     smooth = np.concatenate([np.ones((q.shape[0], 1)), q, np.sin(q), np.cos(q), fast, slow], axis=1)
     basis, _ = np.linalg.qr(smooth)
     y = bench.torque(h.shift)

@@ -34,6 +34,13 @@ LEAST_SAMPLES = 200
 SLOW = 0.02
 """Share of a joint's largest velocity below which the sign of its velocity is smoothed."""
 
+AT_REST = 0.05
+"""Share of a joint's largest velocity below which it counts as at rest: the motion does not determine its dry friction
+there, nor the torque that holds it."""
+
+LEAST_MOVING = 0.1
+"""Least share of the instants at which all joints move, for only those to be used."""
+
 BREAKAWAY = 0.1
 """Share of a joint's largest velocity over which the free friction term of low velocities decays."""
 
@@ -120,6 +127,8 @@ class Bench:
         Sampling period of the recordings, s.
     rows_kept
         Largest number of instants.
+    at_rest
+        True for equations at all instants, False for those at which all joints move.
     normals
         Cache of `armident.identify.setup.fit.normal`.
     """
@@ -131,6 +140,7 @@ class Bench:
     moving: NDArray[np.bool_]
     period: float
     rows_kept: int = MOST_ROWS
+    at_rest: bool = False
     normals: dict[bytes, Any] = field(default_factory=dict, repr=False)
     _rows: dict[bytes, Rows] = field(default_factory=dict, repr=False)
     _torques: dict[bytes, Array] = field(default_factory=dict, repr=False)
@@ -140,11 +150,26 @@ class Bench:
         """Number of joints."""
         return self.model.n
 
+    @cached_property
+    def instants_used(self) -> tuple[NDArray[np.int64], ...]:
+        """Instants after filtering, of each segment, of the equations; at most `rows_kept` of all.
+
+        All hypotheses use the same ones. All instants count where the joints seldom move at once.
+        """
+        moves = [
+            np.all(np.abs(self.decimation(s.qd))[:, self.moving] > AT_REST * self._fastest[self.moving], axis=1)
+            for s in self.segments
+        ]
+        moving, every = (sum(count) for count in zip(*((int(m.sum()), m.size) for m in moves), strict=True))
+        if self.at_rest or moving < max(2 * LEAST_ROWS, LEAST_MOVING * every):
+            moves = [np.ones_like(m) for m in moves]
+        stride = max(1, -(-sum(int(m.sum()) for m in moves) // self.rows_kept))
+        return tuple(np.flatnonzero(m)[::stride] for m in moves)
+
     @property
-    def stride(self) -> int:
-        """Kept are one of so many instants."""
-        count = sum(self.decimation.count(s.q.shape[0]) for s in self.segments)
-        return max(1, -(-count // self.rows_kept))
+    def _fastest(self) -> Array:
+        """Largest recorded velocities, (n,), rad/s or m/s."""
+        return np.asarray(np.max([np.abs(s.qd).max(axis=0) for s in self.segments], axis=0))
 
     @property
     def rigid(self) -> int:
@@ -153,8 +178,10 @@ class Bench:
 
     @cached_property
     def recorded(self) -> tuple[Array, Array, Array]:
-        """Recorded positions, velocities and torques at the instants of the rows, (M, n) each."""
-        q, qd, tau = (np.concatenate([self._kept(getattr(s, x)) for s in self.segments]) for x in ("q", "qd", "tau"))
+        """Recorded positions, velocities and torques after filtering, at all instants, (W, n) each."""
+        q, qd, tau = (
+            np.concatenate([self.decimation(getattr(s, x)) for s in self.segments]) for x in ("q", "qd", "tau")
+        )
         return q, qd, tau
 
     def coarse(self, rows: int) -> "Bench":
@@ -165,7 +192,15 @@ class Bench:
         rows
             Largest number of instants.
         """
-        return Bench(self.model, self.robot, self.segments, self.decimation, self.moving, self.period, rows)
+        return self._with(rows, self.at_rest)
+
+    @cached_property
+    def everywhere(self) -> "Bench":
+        """The same signals with equations at all instants, also at those at which a joint is at rest."""
+        return self._with(self.rows_kept, True)
+
+    def _with(self, rows: int, at_rest: bool) -> "Bench":
+        return Bench(self.model, self.robot, self.segments, self.decimation, self.moving, self.period, rows, at_rest)
 
     def column(self, name: str) -> int:
         """Column of a standard parameter that is a base parameter, possibly with others regrouped into it.
@@ -187,14 +222,8 @@ class Bench:
         """
         key = np.round(shift, 9).tobytes()
         if key not in self._torques:
-            parts = [self._kept(_shifted(s.tau, shift / s.dt)) for s in self.segments]
-            self._torques[key] = np.concatenate(parts)
+            self._torques[key] = self.kept([_shifted(s.tau, shift / s.dt) for s in self.segments])
         return self._torques[key]
-
-    def instants(self) -> Array:
-        """Number of the segment of every row, (M,)."""
-        counts = [self._kept(s.tau[:, :1]).shape[0] for s in self.segments]
-        return np.repeat(np.arange(len(counts)), counts)
 
     def rows(self, position: Array) -> Rows:
         """Equations with the joint positions ``position @ q_recorded``.
@@ -211,17 +240,22 @@ class Bench:
             self._rows[key] = self._make(position)
         return self._rows[key]
 
-    def _kept(self, x: Array) -> Array:
-        return self.decimation(x)[:: self.stride]
+    def kept(self, signals: Sequence[Array]) -> Array:
+        """Signals at the instants of the rows, filtered, (M, ...).
+
+        Parameters
+        ----------
+        signals
+            Signals of each segment at the working rate, (W, ...).
+        """
+        pairs = zip(signals, self.instants_used, strict=True)
+        return np.concatenate([self.decimation(x)[instants] for x, instants in pairs])
 
     def _make(self, position: Array) -> Rows:
         n, b = self.n, self.rigid
-        q, qd, qdd = (
-            np.concatenate([self._kept(getattr(s, name)) for s in self.segments]) @ position.T
-            for name in ("q", "qd", "qdd")
-        )
+        q, qd, qdd = (self.kept([getattr(s, x) for s in self.segments]) @ position.T for x in ("q", "qd", "qdd"))
         top = np.maximum(np.max([np.abs(s.qd @ position.T).max(axis=0) for s in self.segments], axis=0), 1e-12)
-        free = np.concatenate([self._kept(_friction(s.qd @ position.T, top)) for s in self.segments])
+        free = self.kept([_friction(s.qd @ position.T, top) for s in self.segments])
         still = np.zeros_like(q)
         postures = np.ascontiguousarray(q[:: max(1, q.shape[0] // POSTURES)])
         weightless = self.model.with_gravity(np.zeros(3))

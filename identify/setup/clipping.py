@@ -66,7 +66,7 @@ def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
     h
         Corrections of the signals.
     """
-    x, y, physical = equations(bench, h)
+    x, y, physical = equations(bench.everywhere, h)
     found = []
     for k in np.flatnonzero(bench.moving):
         level = float(np.quantile(np.abs(y[:, k]), LEVEL_QUANTILE))

@@ -110,10 +110,7 @@ def unit_moves(robot: RobotConfig) -> Iterator[Move]:
     """
     n, ratios = robot.n, robot.transmission_matrix
     inverse = np.asarray(np.linalg.inv(ratios), np.float64)
-    revolute = np.array([joint.type == "revolute" for joint in robot.joints])
-    units = " and ".join(sorted({_unit(joint.type) for joint in robot.joints}))
-    small = np.diag(np.where(revolute, DEGREES, THOUSANDTH))
-    yield Move("position_unit", f"the positions are in {units}", small, None)
+    yield from _position_unit_moves(robot)
     yield Move("torque_unit", "the torques are 1000 times too small (kN m for N m, or A for mA)", None, 1e3 * np.eye(n))
     yield Move("torque_unit", "the torques are 1000 times too large (mN m for N m, mA for A)", None, 1e-3 * np.eye(n))
     if np.abs(ratios - np.eye(n)).max() > 1e-9:
@@ -128,6 +125,18 @@ def unit_moves(robot: RobotConfig) -> Iterator[Move]:
         share = ratios.T @ np.diag(rated / 1000.0)
         yield Move("torque_unit", "the torques are in per mille of the rated torque", None, share @ inverse.T)
         yield Move("torque_unit", "the torques are the motors', in per mille of the rated torque", None, share)
+
+
+def _position_unit_moves(robot: RobotConfig) -> Iterator[Move]:
+    """Positions of all joints of a type, and of all joints, in a smaller unit."""
+    types = [joint.type for joint in robot.joints]
+    present = sorted(set(types))
+    groups = [present, *([one] for one in present if len(present) > 1 and types.count(one) > 1)]
+    for chosen in groups:
+        factors = [_unit(one)[0] if one in chosen else 1.0 for one in types]
+        units = " and ".join(_unit(one)[1] for one in chosen)
+        words = "the positions" if chosen == present else f"the positions of the {chosen[0]} joints"
+        yield Move("position_unit", f"{words} are in {units}", np.diag(factors), None)
 
 
 def _where(places: tuple[bool, bool], position: Array, torque: Array) -> tuple[Array | None, Array | None]:
@@ -150,7 +159,7 @@ def single_unit_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Mov
         def at(factor: float, j: int = j) -> Array:
             return scaled(robot.n, j, factor)
 
-        unit, word = (DEGREES, "degrees") if robot.joints[j].type == "revolute" else (THOUSANDTH, "mm")
+        unit, word = _unit(robot.joints[j].type)
         yield Move("position_unit", f"the position of {name} is in {word}", at(unit), None)
         yield Move("torque_unit", f"the torque of {name} is 1000 times too large", None, at(1e-3))
         yield Move("torque_unit", f"the torque of {name} is 1000 times too small", None, at(1e3))
@@ -180,5 +189,6 @@ def scaled(n: int, joint: int, factor: float) -> Array:
     return matrix
 
 
-def _unit(kind: str) -> str:
-    return "degrees" if kind == "revolute" else "mm"
+def _unit(joint_type: str) -> tuple[float, str]:
+    """Factor and name of the smaller unit in which positions of a joint type are recorded."""
+    return (DEGREES, "degrees") if joint_type == "revolute" else (THOUSANDTH, "mm")

@@ -45,6 +45,9 @@ LEAST_TOGETHER_LATE = 1.2
 CLEAR_TILT = 3.0
 """Drop from which a direction of gravity needs no `LEAST_TOGETHER`, nats: a tilt shows at few joints."""
 
+LEAST_TILT = float(np.radians(1.0))
+"""Least angle between a direction of gravity and the configured one: floors and stands are level within a degree."""
+
 WHITE = 0.05
 """Least correlation of neighbouring residuals that counts as structure: below it, estimates are noise."""
 
@@ -146,12 +149,13 @@ class Search:
             return best
         for step in self._orders(first):
             other = self._greedy(step)
-            if self._gain(best, other)[0] > 0:
+            if self._gain(best, other, self.bench.everywhere)[0] > 0:
                 best = other
         return best
 
     def _understood(self, h: Hypothesis, limit: float) -> bool:
-        errors, memory = joint_errors(self.bench, h, free=True)
+        # Torques of another order are wrong at rest, too.
+        errors, memory = joint_errors(self.bench.everywhere, h, free=True)
         errors = np.where(memory > STRUCTURED, errors, 0.0)
         return bool(np.all(errors[self.bench.moving] <= limit))
 
@@ -188,8 +192,11 @@ class Search:
                 # The delay of one drive alone is an effect of its own, and no clock of the set-up.
                 best, least, together = one, LEAST_DROP, LEAST_TOGETHER
                 gain, drop, plausible = self._gain(step, best)
-        if best.families[-1] == "gravity_direction" and drop >= CLEAR_TILT:
-            together = 1.0
+        if best.families[-1] == "gravity_direction":
+            if _angle(step.h.gravity, best.h.gravity) < LEAST_TILT:
+                return None
+            if drop >= CLEAR_TILT:
+                together = 1.0
         material = drop >= least and self._together(step.h, best.h) >= together
         if gain < LEAST_ODDS or not (material or plausible >= LEAST_ODDS):
             return None
@@ -231,17 +238,17 @@ class Search:
         ]
         return min(alone, key=lambda s: s.rank)
 
-    def _gain(self, old: Step, new: Step) -> tuple[float, float, float]:
+    def _gain(self, old: Step, new: Step, bench: Bench | None = None) -> tuple[float, float, float]:
         """Gain of the score, drop of the held-out residual power, and gain of plausibility, nats each."""
-        moving = self.bench.moving
+        bench = self.bench if bench is None else bench
+        moving, n = bench.moving, bench.n
         try:
-            before, after = held_out(self.bench, old.h)[moving], held_out(self.bench, new.h)[moving]
+            before, after = held_out(bench, old.h)[moving], held_out(bench, new.h)[moving]
         except np.linalg.LinAlgError:
             return -np.inf, 0.0, 0.0
-        rows = independent_rows(fit(self.bench, new.h).residual)[moving]
+        rows = independent_rows(fit(bench, new.h).residual)[moving]
         drops = np.log(before / after)
-        plausible = log_plausibility(self.bench, new.h) - log_plausibility(self.bench, old.h)
-        n = self.bench.n
+        plausible = log_plausibility(bench, new.h) - log_plausibility(bench, old.h)
         dearer = cost(new.families, new.made, n) - cost(old.families, old.made, n)
         return float(0.5 * rows @ drops + plausible - dearer), float(drops.sum()), plausible
 
@@ -298,7 +305,7 @@ class Search:
     def _orders(self, first: Step) -> list[Step]:
         """Best orders of all joints, with torques in the order of positions, or as their friction assigns them."""
         n, start = self.bench.n, first.h
-        coarse = self.bench.coarse(ORDER_ROWS)
+        coarse = self.bench.everywhere.coarse(ORDER_ROWS)
         relative = [np.eye(n)]
         by_friction = assignment.by_friction(self.bench, start)
         if not np.array_equal(by_friction, np.eye(n)):
@@ -343,6 +350,12 @@ def _climb(order: Array, moving: NDArray[np.bool_], criterion: "assignment.Order
         if values[k] >= least:
             return
         order, least = swapped[k], values[k]
+
+
+def _angle(a: Array, b: Array) -> float:
+    """Angle between two vectors (3,), rad; pi where one of them is zero."""
+    sizes = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float(np.arccos(np.clip(a @ b / sizes, -1.0, 1.0))) if sizes > 0 else float(np.pi)
 
 
 def _differs(a: Hypothesis, b: Hypothesis) -> bool:

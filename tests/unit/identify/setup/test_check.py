@@ -154,6 +154,26 @@ def test_torques_without_gravity_are_named(arm: RobotConfig) -> None:
 
 
 @pytest.mark.slow
+def test_degrees_of_the_revolute_joints_alone_are_named_once() -> None:
+    robot = setups.random_arm(4, 4, lift=1)
+    experiments = setups.record(robot, 4)
+    assert check_setup(experiments, robot).findings == ()
+    degrees = np.diag([180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
+    (finding,) = check_setup(setups.with_positions(experiments, degrees), robot).findings
+    assert (finding.kind, finding.joints) == ("position_unit", ("axis_1", "axis_3", "axis_4"))
+    assert "of the revolute joints are in degrees" in finding.message
+
+
+@pytest.mark.slow
+def test_torques_that_hold_the_arm_in_pauses_are_no_error_of_the_model(arm: RobotConfig) -> None:
+    healthy = check_setup(setups.record(arm, 0, pauses=True), arm)
+    assert healthy.findings == ()
+    assert max(healthy.relative_error_pct) < 8.0
+    found = check_setup(setups.record(arm, 0, gravity=(0.0, 0.0, 0.0), pauses=True), arm)
+    assert [f.kind for f in found.findings] == ["gravity_missing"]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("added", [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, 0.2)])
 def test_healthy_arms_and_structural_effects_give_no_finding(seed: int, added: tuple[float, float, float]) -> None:
