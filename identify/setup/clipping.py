@@ -1,6 +1,11 @@
-"""Clipped torques behind noise: the model needs more than the largest recorded torque wherever that is reached."""
+"""Clipped torques behind noise: the model needs more than the largest recorded torque wherever that is reached.
+
+A drive whose torque saturates softly is no mistake of the set-up but an effect (`drive_gain_saturation`): both laws are
+fitted, and the better one decides.
+"""
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +32,16 @@ LEAST_IMPROVEMENT = 1.5
 
 MOST_SLOPE = 0.3
 """Largest slope of recorded over predicted torques near the level: 0 where they are clipped, near 1 elsewhere."""
+
+LEVELS = np.linspace(NEAR, 1.03, 10)
+"""Levels of clipping that are tried, over the quantile of the magnitude."""
+
+SHARPNESS = (2.0, 4.0)
+"""Powers p of the soft saturations ``y = m / (1 + |m / s|^p)^(1/p)`` that are tried: 2 is the law of
+`drive_gain_saturation`, and clipping is the limit of large ones."""
+
+SATURATIONS = (0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
+"""Values of ``|y / s|^p`` at the largest recorded torque y that are tried."""
 
 LEVEL_QUANTILE = 0.98
 """Quantile of the magnitude of the torques that stands for the level: single peaks of noise lie above it."""
@@ -81,9 +96,30 @@ def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
         residual = [np.mean((y[~near, k] - x[~near, k] @ theta) ** 2) for theta in (whole, below)]
         needed = float(np.median((x[near, k] @ below) * np.sign(y[near, k]))) / level
         flat = _slope(np.abs(x[near, k] @ below), np.abs(y[near, k])) < MOST_SLOPE
-        if flat and needed > LEAST_EXCESS and residual[0] > LEAST_IMPROVEMENT * residual[1]:
+        if not (flat and needed > LEAST_EXCESS and residual[0] > LEAST_IMPROVEMENT * residual[1]):
+            continue
+        errors = [np.mean((y[:, k] - np.clip(x[:, k] @ below, -top, top)) ** 2) for top in level * LEVELS]
+        if min(errors) < _soft_error(x, y, int(k), physical, bench.moving):
             found.append(Clip(int(k), level, share, needed))
     return found
+
+
+def _soft_error(x: Array, y: Array, k: int, physical: Array, moving: NDArray[np.bool_]) -> float:
+    """Mean squared error of torque k if it saturates softly, with the best of some saturations."""
+    every = np.ones(y.shape, dtype=np.bool_)
+    size = np.abs(y[:, k]) / np.max(np.abs(y[:, k]))
+    errors = []
+    for power, share in product(SHARPNESS, SATURATIONS):
+        left = 1.0 - share * size**power
+        # The equations of the true torque, with errors in units of the recorded one.
+        rows, torque = x.copy(), y.copy()
+        rows[:, k] *= left[:, None] ** (1.0 + 1.0 / power)
+        torque[:, k] *= left
+        needed = x[:, k] @ fit_rows(rows, torque, every, physical, moving)
+        loss = share / np.max(np.abs(y[:, k])) ** power
+        given = needed / (1.0 + loss * np.abs(needed) ** power) ** (1.0 / power)
+        errors.append(float(np.mean((y[:, k] - given) ** 2)))
+    return min(errors)
 
 
 def _slope(x: Array, y: Array) -> float:

@@ -248,6 +248,22 @@ def test_clipped_torques_are_named(healthy: list[Experiment], arm: RobotConfig) 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("share", [0.4, 0.6])
+def test_a_torque_that_saturates_softly_is_not_clipped(
+    share: float, healthy: list[Experiment], arm: RobotConfig
+) -> None:
+    level = share * np.abs(healthy[0].tau[:, 1]).max()
+    hard = [replace(e, tau=e.tau.copy()) for e in healthy]
+    soft = [replace(e, tau=e.tau.copy()) for e in healthy]
+    noise = np.random.default_rng(1)
+    for e, f in zip(hard, soft, strict=True):
+        e.tau[:, 1] = np.clip(e.tau[:, 1], -level, level) + 0.005 * level * noise.normal(size=e.tau.shape[0])
+        f.tau[:, 1] = level * np.tanh(f.tau[:, 1] / level)
+    assert [(f.kind, f.joints) for f in check_setup(hard, arm).findings] == [("torque_clipped", ("axis_2",))]
+    assert "torque_clipped" not in [f.kind for f in check_setup(soft, arm).findings]
+
+
+@pytest.mark.slow
 def test_a_torque_that_resembles_no_motion_is_not_understood(healthy: list[Experiment], arm: RobotConfig) -> None:
     made = []
     for number, e in enumerate(healthy):
