@@ -59,16 +59,37 @@ def sign_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
     joints
         Indices of the joints that move.
     """
-    names = [joint.name for joint in robot.joints]
-    groups: list[tuple[str, list[int]]] = [(names[j], [j]) for j in joints]
+    for j in joints:
+        yield from _signs(robot, (j,))
     if len(joints) > 1:
-        groups.append(("all joints", list(range(robot.n))))
-    for where, chosen in groups:
-        turned = np.eye(robot.n)
-        turned[chosen, chosen] = -1.0
-        yield Move("position_sign", f"position of {where} with the wrong sign", turned, None)
-        yield Move("torque_sign", f"torque of {where} with the wrong sign", None, turned)
-        yield Move("position_sign", f"position and torque of {where} with the wrong sign", turned, turned)
+        yield from _signs(robot, range(robot.n), "all joints")
+
+
+def _signs(robot: RobotConfig, joints: Sequence[int], where: str = "") -> Iterator[Move]:
+    turned = np.eye(robot.n)
+    turned[list(joints), list(joints)] = -1.0
+    where = where or _names(robot, joints)
+    yield Move("position_sign", f"position of {where} with the wrong sign", turned, None)
+    yield Move("torque_sign", f"torque of {where} with the wrong sign", None, turned)
+    yield Move("position_sign", f"position and torque of {where} with the wrong sign", turned, turned)
+
+
+def set_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
+    """The same mistake of sign, unit or side at every set of two and more joints.
+
+    The joints of an arm are coupled: one of such mistakes, corrected alone, may improve nothing.
+
+    Parameters
+    ----------
+    robot
+        The configuration.
+    joints
+        Indices of the joints that move.
+    """
+    for size in range(2, len(joints) + 1):
+        for chosen in combinations(joints, size):
+            yield from _signs(robot, chosen)
+            yield from _units(robot, chosen)
 
 
 def exchange_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
@@ -154,22 +175,39 @@ def single_unit_moves(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Mov
         Indices of the joints that move.
     """
     for j in joints:
-        name, ratio = robot.joints[j].name, float(robot.transmission_matrix[j, j])
+        yield from _units(robot, (j,))
 
-        def at(factor: float, j: int = j) -> Array:
-            return scaled(robot.n, j, factor)
 
-        unit, word = _unit(robot.joints[j].type)
-        yield Move("position_unit", f"the position of {name} is in {word}", at(unit), None)
-        yield Move("torque_unit", f"the torque of {name} is 1000 times too large", None, at(1e-3))
-        yield Move("torque_unit", f"the torque of {name} is 1000 times too small", None, at(1e3))
-        if ratio == 0.0 or abs(abs(ratio) - 1.0) < 1e-9:
-            continue
-        of_motor, of_joint = "is that of its motor", "is that of the joint, and was converted as that of the motor"
-        yield Move("side", f"the torque of {name} {of_motor}", None, at(ratio))
-        yield Move("side", f"the position of {name} {of_motor}", at(1.0 / ratio), None)
-        yield Move("side", f"the position of {name} {of_joint}", at(ratio), None)
-        yield Move("side", f"the torque of {name} {of_joint}", None, at(1.0 / ratio))
+def _units(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
+    """The same mistake of unit or side at some joints."""
+    chosen, diagonal = list(joints), np.diag(robot.transmission_matrix)
+    one, where = len(chosen) == 1, _names(robot, joints)
+    position, torque = (f"the {s} of {where} is" if one else f"the {s}s of {where} are" for s in ("position", "torque"))
+    units = [_unit(robot.joints[j].type) for j in chosen]
+
+    def at(factors: Sequence[float] | Array) -> Array:
+        matrix = np.eye(robot.n)
+        matrix[chosen, chosen] = factors
+        return matrix
+
+    words = " and ".join(sorted({word for _, word in units}))
+    yield Move("position_unit", f"{position} in {words}", at([factor for factor, _ in units]), None)
+    yield Move("torque_unit", f"{torque} 1000 times too large", None, at([1e-3] * len(chosen)))
+    yield Move("torque_unit", f"{torque} 1000 times too small", None, at([1e3] * len(chosen)))
+    ratios = np.asarray(diagonal[chosen], np.float64)
+    if np.any(ratios == 0.0) or np.any(np.abs(np.abs(ratios) - 1.0) < 1e-9):
+        return
+    of_motor = "that of its motor" if one else "those of their motors"
+    of_joint = f"{'that of the joint' if one else 'those of the joints'}, and {'was' if one else 'were'} converted as "
+    of_joint += "that of the motor" if one else "those of the motors"
+    yield Move("side", f"{torque} {of_motor}", None, at(ratios))
+    yield Move("side", f"{position} {of_motor}", at(1.0 / ratios), None)
+    yield Move("side", f"{position} {of_joint}", at(ratios), None)
+    yield Move("side", f"{torque} {of_joint}", None, at(1.0 / ratios))
+
+
+def _names(robot: RobotConfig, joints: Sequence[int]) -> str:
+    return " and ".join(robot.joints[j].name for j in joints)
 
 
 def scaled(n: int, joint: int, factor: float) -> Array:

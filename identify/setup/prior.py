@@ -42,10 +42,17 @@ def cost(families: tuple[str, ...], made: tuple[tuple[Array, Array, bool], ...],
         if family in WIRING and not raw:
             position, torque = of_position @ position, of_torque @ torque
         else:
-            total += MISTAKE + math.log(n) + (RAW if raw else 0.0)
+            total += MISTAKE + _place_cost(of_position, of_torque) + (RAW if raw else 0.0)
             if family == "torque_scales":
                 total += n * FACTOR
     return total + wiring_cost(position, torque)
+
+
+def _place_cost(position: Array, torque: Array) -> float:
+    """One joint among n, one set of joints among all of its size, or all joints."""
+    n = position.shape[0]
+    changed = np.any((np.abs(position - np.eye(n)) > 1e-12) | (np.abs(torque - np.eye(n)) > 1e-12), axis=1)
+    return math.log(max(math.comb(n, int(changed.sum())), n))
 
 
 def wiring_cost(position: Array, torque: Array) -> float:

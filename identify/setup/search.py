@@ -55,7 +55,7 @@ NOT_UNDERSTOOD = 1.0 / 3.0
 """Largest relative error of a joint that the rigid model explains (DIAGNOSIS.md, principle 1)."""
 
 WELL_UNDERSTOOD = 0.2
-"""Largest relative error of a joint after a correction for which no whole order is tried."""
+"""Largest relative error of a joint for which no whole orders and no mistakes of several joints are tried."""
 
 STRUCTURED = 0.3
 """Correlation of neighbouring residuals above which a large residual is no white noise of the torque."""
@@ -75,7 +75,10 @@ EQUAL = 0.1
 """Odds to the best hypothesis from which on another one is named beside it."""
 
 ORDERS_KEPT = 2
-"""Number of best orders from which the search continues."""
+"""Number of best orders, and of best mistakes of several joints, from which the search continues."""
+
+MOST_IN_SETS = 8
+"""Largest number of joints of which all sets are tried: 247 sets with ten mistakes each take seconds."""
 
 ORDER_ROWS = 150
 """Instants with which orders are ranked: enough for residuals that differ by tens of percent."""
@@ -142,22 +145,31 @@ class Search:
         """
         first = Step(start, rank=self.rank(start))
         best = self._greedy(first)
-        # An exchange that needs a second mistake beside it may be a part of another order.
-        simple = len(best.families) < 2 or not {"exchange", "assignment"} & set(best.families)
-        limit = WELL_UNDERSTOOD if best.families else NOT_UNDERSTOOD
-        if self.bench.moving.sum() < 3 or (simple and self._understood(best.h, limit)):
-            return best
-        for step in self._orders(first):
+        understood = self._understood(best.h)
+        starts: list[Step] = []
+        if self.bench.moving.sum() > 2:
+            # An exchange that needs a second mistake beside it may be a part of another order.
+            if not understood or (len(best.families) > 1 and {"exchange", "assignment"} & set(best.families)):
+                starts += self._orders(first)
+            # Several mistakes may be one that a set of joints shares.
+            if not understood or len(best.families) > 1:
+                starts += self._sets(first)
+        starts.sort(key=lambda s: s.rank)
+        for k, step in enumerate(starts):
             other = self._greedy(step)
             if self._gain(best, other, self.bench.everywhere)[0] > 0:
                 best = other
+            clear = all(0.5 * RANKED_ROWS * (other.rank - step.rank) > LEAST_ODDS for other in starts[k + 1 : k + 2])
+            if clear and self._understood(best.h):
+                break
         return best
 
-    def _understood(self, h: Hypothesis, limit: float) -> bool:
+    def _understood(self, h: Hypothesis) -> bool:
+        """True if the model leaves little of every joint's torque, apart from noise."""
         # Torques of another order are wrong at rest, too.
         errors, memory = joint_errors(self.bench.everywhere, h, free=True)
         errors = np.where(memory > STRUCTURED, errors, 0.0)
-        return bool(np.all(errors[self.bench.moving] <= limit))
+        return bool(np.all(errors[self.bench.moving] <= WELL_UNDERSTOOD))
 
     def _greedy(self, step: Step) -> Step:
         while len(step.families) < MOST_MISTAKES:
@@ -301,6 +313,15 @@ class Search:
         families, made = (*step.families, family), (*step.made, change)
         rank = self.rank(h) + 2.0 * cost(families, made, self.bench.n) / RANKED_ROWS
         return replace(step, h=h, families=families, words=(*step.words, words), made=made, rank=rank)
+
+    def _sets(self, first: Step) -> list[Step]:
+        """Best mistakes of sign, unit or side that several joints share."""
+        robot, joints = self.bench.robot, [int(j) for j in np.flatnonzero(self.bench.moving)]
+        if len(joints) > MOST_IN_SETS:
+            return []
+        made = [self._made(first, move.family, move.words, move(first.h)) for move in moves.set_moves(robot, joints)]
+        best = sorted(made, key=lambda s: s.rank)[:ORDERS_KEPT]
+        return [replace(s, probability=(1.0,), rivals=((),)) for s in best]
 
     def _orders(self, first: Step) -> list[Step]:
         """Best orders of all joints, with torques in the order of positions, or as their friction assigns them."""

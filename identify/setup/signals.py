@@ -76,7 +76,7 @@ def moving_joints(experiments: Sequence[Experiment], robot: RobotConfig) -> NDAr
         wanted = np.max([np.ptp(e.q_ref, axis=0) for e in experiments if e.q_ref is not None], axis=0) / whole
     power = np.sum([np.var(e.q, axis=0) for e in experiments], axis=0)
     of_steps = np.sum([np.mean(np.diff(e.q, axis=0) ** 2, axis=0) for e in experiments], axis=0)
-    moves = (share >= STILL_SHARE) & (wanted >= STILL_SHARE) & (share >= HELD_SHARE * share.max())
+    moves = (share >= STILL_SHARE) & (wanted >= STILL_SHARE) & (share >= HELD_SHARE * min(share.max(), 1.0))
     moving: NDArray[np.bool_] = moves & (of_steps < 2 * STILL_RATIO * power)
     return moving
 

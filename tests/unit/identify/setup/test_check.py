@@ -102,6 +102,18 @@ MISTAKES: dict[str, tuple[Made, str, tuple[str, ...]]] = {
         "gear_ratio",
         ("axis_2",),
     ),
+    "two joints turned": (
+        lambda e, r: setups.with_torques(setups.with_positions(e, setups.turned(4, 0, 3)), setups.turned(4, 0, 3)),
+        "position_sign",
+        ("axis_1", "axis_4"),
+    ),
+    "positions of two motors": (
+        lambda e, r: setups.with_positions(
+            e, np.diag([1.0, r.transmission_matrix[1, 1], r.transmission_matrix[2, 2], 1.0])
+        ),
+        "side",
+        ("axis_2", "axis_3"),
+    ),
     "all late": (lambda e, r: late(e, 12e-3), "time_shift", ("axis_1", "axis_2", "axis_3", "axis_4")),
     "time in ms": (
         lambda e, r: [replace(one, dt=1e3 * one.dt) for one in e],
