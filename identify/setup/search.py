@@ -157,7 +157,8 @@ class Search:
         starts.sort(key=lambda s: s.rank)
         for k, step in enumerate(starts):
             other = self._greedy(step)
-            if self._gain(best, other, self.bench.everywhere)[0] > 0:
+            better = self._gain(best, other, self.bench.everywhere)[0] > 0
+            if better and self._together(first.h, other.h) >= LEAST_TOGETHER:
                 best = other
             clear = all(0.5 * RANKED_ROWS * (other.rank - step.rank) > LEAST_ODDS for other in starts[k + 1 : k + 2])
             if clear and self._understood(best.h):
@@ -210,6 +211,8 @@ class Search:
             if drop >= CLEAR_TILT:
                 together = 1.0
         material = drop >= least and self._together(step.h, best.h) >= together
+        # The reported errors are those without the free terms: they have to fall, too.
+        material = material and self._together(step.h, best.h, free=False) > 1.0
         if gain < LEAST_ODDS or not (material or plausible >= LEAST_ODDS):
             return None
         others = [s for s in found if _differs(s.h, best.h)]
@@ -220,14 +223,14 @@ class Search:
         rivals = (*step.rivals, tuple(equal))
         return replace(best, rivals=rivals, probability=(*step.probability, share))
 
-    def _together(self, old: Hypothesis, new: Hypothesis) -> float:
+    def _together(self, old: Hypothesis, new: Hypothesis, *, free: bool = True) -> float:
         """Factor by which the structured residual shares of all moving joints together fall.
 
         The covariance of neighbouring residuals is the power of their structured part, without white noise.
         """
         sums = []
         for h in (old, new):
-            residual, torque = fit(self.bench, h).residual, self.bench.torque(h.shift)
+            residual, torque = fit(self.bench, h, free=free).residual, self.bench.torque(h.shift)
             power = np.maximum((torque**2).sum(axis=0), 1e-300)
             white = WHITE * (residual**2).sum(axis=0)
             shares = np.maximum((residual[1:] * residual[:-1]).sum(axis=0), white) / power
