@@ -157,10 +157,11 @@ class Search:
         starts.sort(key=lambda s: s.rank)
         for k, step in enumerate(starts):
             other = self._greedy(step)
-            better = self._gain(best, other, self.bench.everywhere)[0] > 0
+            needed = 0.0 if best.families else LEAST_ODDS
+            better = self._gain(best, other, self.bench.everywhere)[0] > needed
             if better and self._together(first.h, other.h) >= LEAST_TOGETHER:
                 best = other
-            clear = all(0.5 * RANKED_ROWS * (other.rank - step.rank) > LEAST_ODDS for other in starts[k + 1 : k + 2])
+            clear = all(0.5 * RANKED_ROWS * (s.rank - step.rank) > LEAST_ODDS for s in starts[k + 1 : k + 2])
             if clear and self._understood(best.h):
                 break
         return best
