@@ -207,7 +207,8 @@ def _units(robot: RobotConfig, joints: Sequence[int]) -> Iterator[Move]:
 
 
 def _names(robot: RobotConfig, joints: Sequence[int]) -> str:
-    return " and ".join(robot.joints[j].name for j in joints)
+    *others, last = (robot.joints[j].name for j in joints)
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def scaled(n: int, joint: int, factor: float) -> Array:
