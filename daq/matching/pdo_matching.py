@@ -14,8 +14,8 @@ at every SYNC and no frame is known to be missing, the buses are delayed and not
 ``LONG_WINDOW`` SYNCs.
 
 Answers to discarded rows, of a drive that was silent or a bus that was off, may still arrive. Until such a drive has
-answered each of some consecutive SYNCs, equal numbers of answers and SYNCs prove nothing; the first surplus answers
-belong to discarded rows.
+answered each of some consecutive SYNCs, or has kept its largest surplus of answers at as many SYNCs of a longer time,
+equal numbers of answers and SYNCs prove nothing; the first surplus answers belong to discarded rows.
 
 Several buses carry the same SYNC numbers: a row is one SYNC of all axes. If SYNC comes from another master, buses are
 aligned by its counter and receive time. A bus without SYNC while others receive SYNCs is silent: its SYNCs are

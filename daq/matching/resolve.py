@@ -11,6 +11,8 @@ from armident.daq.matching.state import (
     AMBIGUOUS,
     BALANCE,
     BALANCE_AT,
+    BALANCE_COUNT,
+    BALANCE_LAST,
     BALANCE_RUN,
     BASE,
     COUNTED_AT,
@@ -117,15 +119,32 @@ def _update_progress(m: MatcherState, s: int, j: int) -> None:
     head = m.head[m.bus_of[j], s]
     balance = m.pending[s, j] - (head - m.settled[s, j])
     best = m.progress[s, j, BALANCE]
-    if balance > best or (balance < best and head - m.progress[s, j, BALANCE_AT] > m.config[s, SHORT_WINDOW]):
-        m.progress[s, j, BALANCE], m.progress[s, j, BALANCE_AT], m.progress[s, j, BALANCE_RUN] = balance, head, 0
+    if balance > best or (balance < best and head - m.progress[s, j, BALANCE_LAST] > m.config[s, SHORT_WINDOW]):
+        m.progress[s, j, BALANCE], m.progress[s, j, BALANCE_AT] = balance, head
+        m.progress[s, j, BALANCE_RUN], m.progress[s, j, BALANCE_COUNT] = 0, 0
     if m.progress[s, j, COUNTED_AT] == head:
         return
     m.progress[s, j, COUNTED_AT] = head
-    m.progress[s, j, BALANCE_RUN] = m.progress[s, j, BALANCE_RUN] + 1 if balance == m.progress[s, j, BALANCE] else 0
+    at_best = balance == m.progress[s, j, BALANCE]
+    if at_best:
+        m.progress[s, j, BALANCE_LAST] = head
+    m.progress[s, j, BALANCE_RUN] = m.progress[s, j, BALANCE_RUN] + 1 if at_best else 0
+    m.progress[s, j, BALANCE_COUNT] += at_best
     m.progress[s, j, IN_STEP_RUN] = (
         m.progress[s, j, IN_STEP_RUN] + 1 if balance == 0 and not m.progress[s, j, STALE] else 0
     )
+
+
+@njit(cache=True, nogil=True)
+def _is_aligned(m: MatcherState, s: int, j: int, head: int) -> bool:
+    """Return True if the surplus of answers is the number of those to discarded rows: a drive never answers early.
+
+    The surplus is then the largest one, which the drive reaches whenever it is prompt.
+    """
+    if m.progress[s, j, BALANCE_RUN] >= ALIGNED_SYNCS:
+        return True
+    lasting = head - m.progress[s, j, BALANCE_AT] >= m.config[s, SHORT_WINDOW] // 2
+    return bool(lasting and m.progress[s, j, BALANCE_RUN] > 0 and m.progress[s, j, BALANCE_COUNT] >= ALIGNED_SYNCS)
 
 
 @njit(cache=True, nogil=True)
@@ -185,7 +204,7 @@ def _settle(m: MatcherState, s: int, j: int, final: bool, peer_in_step: bool) ->
     m.since_sync[s, j] = 0
     balance, balance_run = m.pending[s, j] - outstanding, m.progress[s, j, BALANCE_RUN]
     # If answers to discarded rows may arrive, equal numbers prove nothing until the drive is in step.
-    if (balance == 0 and not stale) or (balance >= 0 and stale and balance_run >= ALIGNED_SYNCS):
+    if (balance == 0 and not stale) or (balance >= 0 and stale and _is_aligned(m, s, j, head)):
         if balance > 0:
             _drop_stale(m, s, j, balance)
         elif not stale and not final and m.progress[s, j, HELD_AT] != head - 1 and _may_hold_repetition(m, s, j):

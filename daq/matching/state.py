@@ -29,11 +29,14 @@ TOP, BASE, ALL_BEHIND, EMITTED = range(4)
 # Columns of MatcherState.progress, per stream and joint: recent maximum of answers minus rows; row at which it was
 # reached; number of consecutive rows at this maximum; number of consecutive rows without outstanding answers; row at
 # which these were counted last; 1 if answers to discarded rows may still arrive; row at which late answers were held
-# back because one of them may be a repetition.
-BALANCE, BALANCE_AT, BALANCE_RUN, IN_STEP_RUN, COUNTED_AT, STALE, HELD_AT = range(7)
+# back because one of them may be a repetition; number of rows at this maximum since it was
+# reached, and the last of them.
+BALANCE, BALANCE_AT, BALANCE_RUN, IN_STEP_RUN, COUNTED_AT, STALE, HELD_AT, BALANCE_COUNT, BALANCE_LAST = range(9)
 
 ALIGNED_SYNCS = 8
-"""Number of consecutive rows with unchanged balance after which a drive counts as answering every SYNC."""
+"""Number of consecutive rows with unchanged balance after which a drive counts as answering every SYNC.
+
+A drive that is often a row late seldom has as many: then rows that are not consecutive count, for a longer time."""
 
 LONGEST_LOSS = 3
 """Number of consecutive unanswered rows above which a drive has paused rather than lost each answer."""
@@ -102,7 +105,7 @@ class MatcherState(NamedTuple):
     gap_end
         Row before which a frame is known to be missing, (B, S).
     progress
-        Progress of each drive (`BALANCE` and following), (S, n, 7).
+        Progress of each drive (`BALANCE` and following), (S, n, 9).
     settled
         Rows settled, (S, n).
     pending
@@ -257,7 +260,7 @@ def new_state(
         writes_to=writes_to,
         head=np.zeros((buses, streams), np.int64),
         gap_end=np.zeros((buses, streams), np.int64),
-        progress=np.tile(np.array([NEVER, 0, 0, 0, 0, 0, NEVER]), (streams, n, 1)),
+        progress=np.tile(np.array([NEVER, 0, 0, 0, 0, 0, NEVER, 0, 0]), (streams, n, 1)),
         settled=np.zeros((streams, n), np.int64),
         pending=np.zeros((streams, n), np.int64),
         since_sync=np.zeros((streams, n), np.int64),

@@ -148,6 +148,23 @@ def test_after_an_outage_late_answers_are_matched_and_stale_ones_dropped(stale: 
     assert {g.reason for g in bench.gaps} == ({"lost", SYNC_LOST} if stale else {SYNC_LOST})
 
 
+def test_a_bus_whose_answers_are_often_one_sync_late_recovers_from_an_outage() -> None:
+    """After the outage one old answer arrives, and every third answer only after the next SYNC."""
+    bench, queue = Bench(buses=2), [299]
+    for k in range(1001):
+        if k in (300, 500):
+            bench.assembler.set_bus_down(1, k == 300)
+        if 300 <= k < 500:
+            bench._take(bench.assembler.push(frames_of(k, answers(k)), sent=k + 1, bus=0))
+            continue
+        late = k >= 500 and k % 3 == 0
+        sent = [] if k == 299 or late else [*(queue if k >= 500 else []), k]
+        queue = [*queue, k] if late else ([299] if k < 500 else [])
+        bench.push(k, answers(k), [(cob, i) for i in sent for cob in (0x181, 0x182)])
+    bench.finish(1001)
+    assert set(range(299, 500)) <= bench.missing(1001) <= set(range(299, 540))
+
+
 @pytest.mark.parametrize("burst", [0, 60])
 def test_drives_on_separate_buses_do_not_prove_losses_of_each_other(burst: int) -> None:
     """All drives pause for 150 SYNCs, and the host with them: each bus is read in long batches."""
