@@ -6,17 +6,17 @@ import numpy as np
 
 from armident.configs import RobotConfig
 from armident.configs.schema.robot import Effect as Entry
-from armident.identify.diagnosis.candidates import Candidate, ColumnCache, Shapes
+from armident.identify.diagnosis.candidates import ColumnCache, Shapes
 from armident.identify.diagnosis.model_state import ModelState, fitted_in_loop_of, with_entries, without_entry
-from armident.identify.diagnosis.screening import refined, screened
 from armident.identify.effects.effect import SIGN_TOLERANCE, Place
 from armident.identify.effects.friction import TRANSITION
 from armident.identify.effects.registry import known
 from armident.identify.effects.terms import entry_of
-from armident.identify.regression.ar_noise import ArModel
 
-FINER = (1.2, 1.1, 1.05, 1.02)
-"""Factors of the last refinement of a velocity: what the score statistic proposes is a linearisation."""
+STEPS = tuple(0.5**k for k in range(1, 6))
+"""Steps of the pattern search: logarithm of the velocity, and lead in samples. The last one is 3 %."""
+ROUNDS = 4
+"""Most rounds with one step."""
 CLEAR = 3.0
 """Gain of log-likelihood from which a joint has a transition: odds of 20 to 1."""
 
@@ -34,7 +34,9 @@ def with_transitions(state: ModelState, model: Model) -> ModelState:
 
     The smoothed sign of the model approaches its limits slowly. Beside another law of the reversal it looks like
     friction that depends on the velocity (Stribeck), or like a torque that is early. All joints are tried at once; each
-    keeps what predicts its own torque best. A score statistic proposes values between those of the grid.
+    keeps what predicts its own torque best. A pattern search goes on from the best values of a grid (Hooke, Jeeves
+    1961, J. ACM 8(2)): the likelihood of a smooth reversal is narrow in its velocity, that of a joint that sticks in
+    its lead.
 
     Parameters
     ----------
@@ -46,13 +48,9 @@ def with_transitions(state: ModelState, model: Model) -> ModelState:
     search = _Search(state)
     for number in range(search.count):
         search.tried({place: grid[number] for place, grid in search.grids.items()}, state)
-    made = search.tried(search.chosen, state)
+    made = search.converged(state)
     if made is None:
         return state
-    search.tried({place: search.proposed(made, place) for place in search.chosen}, made)
-    made = search.tried(search.chosen, made) or made
-    for factor in (f for finer in FINER for f in (finer, 1.0 / finer)):
-        search.tried({place: _scaled(shapes, factor) for place, shapes in search.chosen.items()}, made)
     made = model(with_entries(state.robot, list(search.entries(search.chosen).values())), state)
     if made is None:
         return state
@@ -78,12 +76,9 @@ class _Search:
         present = {entry.joint for entry in state.robot.effects if entry.effect == TRANSITION}
         motion = ColumnCache(state.study, state.fit.theta).motion(state.study.train[0], "measured")
         places = [Place(j) for j, name in enumerate(state.study.joints) if name not in present]
-        self.whole = {place: self.effect.grid(motion, place) for place in places}
-        # Velocities with the shortest lead.
-        self.grids = {
-            place: grid[:: len(self.effect.trial_values(motion, place)[1])] for place, grid in self.whole.items()
-        }
+        self.grids = {place: self.effect.grid(motion, place) for place in places}
         self.count = min(map(len, self.grids.values()), default=0)
+        self.sample = motion.dt
         self.best: dict[Place, tuple[float, Shapes]] = {}
 
     @property
@@ -122,26 +117,34 @@ class _Search:
                 self.best[place] = score, shapes[place]
         return made
 
-    def proposed(self, made: ModelState, place: Place) -> Shapes:
-        """Nonlinear parameters with the largest score statistic beside the transitions of the other joints.
+    def converged(self, state: ModelState) -> ModelState | None:
+        """Model with the transitions that a pattern search finds from the best ones so far.
 
         Parameters
         ----------
-        made
-            Model with the best transitions so far.
-        place
-            Joint of the transition.
+        state
+            Model that gives the noise models.
         """
-        best = self.chosen[place]
-        less = fitted_in_loop_of(made, without_entry(made.robot, self.entries({place: best})[place]))
-        return best if less is None else self._largest(less, place, made.weights) or best
+        made = self.tried(self.chosen, state)
+        for step in STEPS if made else ():
+            for _ in range(ROUNDS):
+                before = self.chosen
+                # Scores of the transitions together; those so far are beside other transitions of the other joints.
+                self.best = {place: (-np.inf, shapes) for place, shapes in before.items()}
+                made = self.tried(before, state)
+                for factor, samples in ((step, 0.0), (-step, 0.0), (0.0, step), (0.0, -step)):
+                    self.tried({p: self._moved(p, one, factor, samples) for p, one in before.items()}, state)
+                if self.chosen == before:
+                    break
+        return made
 
-    def _largest(self, state: ModelState, place: Place, weights: tuple[ArModel, ...]) -> Shapes | None:
-        column_cache = ColumnCache(state.study, state.fit.theta)
-        candidate = Candidate(self.effect, place, self.whole[place])
-        noise = state.fit.renoised(weights)
-        found = screened(noise, candidate, column_cache)
-        return None if found is None else refined(noise, candidate, column_cache, found)
+    def _moved(self, place: Place, shapes: Shapes, factor: float, samples: float) -> Shapes:
+        """Return a transition beside another one, within the range of velocities of the grid."""
+        given = dict(shapes)
+        tried = [dict(one)["velocity"] for one in self.grids[place]]
+        velocity = float(np.clip(given["velocity"] * np.exp(factor), min(tried), max(tried)))
+        lead = max(given["lead"] + samples * self.sample, 0.0)
+        return (("velocity", velocity), ("lead", lead))
 
 
 def _clear(state: ModelState, less: ModelState | None, entry: Entry, joint: int) -> bool:
@@ -169,9 +172,3 @@ def _possible(state: ModelState, entry: Entry, joint: int) -> bool:
     direction[own], direction[names.index(dry)] = 1.0, -LARGEST
     std = float(np.sqrt(direction @ state.fit.covariance @ direction))
     return bool(direction @ state.fit.theta <= SIGN_TOLERANCE * std)
-
-
-def _scaled(shapes: Shapes, factor: float) -> Shapes:
-    """The same transition over another range of velocities."""
-    (name, velocity), *rest = shapes
-    return ((name, factor * velocity), *rest)

@@ -1,7 +1,10 @@
 """Transitions of dry friction: found as they are, and no place for friction that falls with the velocity."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import signal
 
 from armident.configs import RobotConfig
 from armident.identify.diagnosis.model_state import ModelState, fitted
@@ -9,6 +12,7 @@ from armident.identify.diagnosis.study import build_study
 from armident.identify.diagnosis.transitions import with_transitions
 from armident.identify.effects.effect import Place
 from armident.identify.effects.registry import known
+from armident.identify.effects.terms import arm_model
 from tests.fixtures import setups
 from tests.fixtures.setups import random_arm
 
@@ -36,7 +40,29 @@ def test_transitions_predict_the_torques_of_their_joints_better(base: ModelState
         dry = float(state.fit.theta[state.study.model.base.names.index(f"fc{joint + 1}")])
         assert gains[joint] > 0.0
         assert 0.0 < value < 2.0 * dry + 4.0 * std
-        assert entry.parameters["lead"] > 0.0
+        assert entry.parameters["lead"] >= 0.0
+
+
+@pytest.mark.parametrize("share", [0.004, 0.009, 0.017])
+def test_the_velocity_of_a_smooth_reversal_is_found_between_the_values_of_the_grid(share: float) -> None:
+    """Dry friction ``fc tanh(v / (share top speed))``, without a lead."""
+    robot = random_arm(3, 3)
+    experiments = setups.record(robot, 0, noise=0.003)
+    model, theta = arm_model(robot), setups.physical_parameters(robot, 0)
+    dry = theta[[list(model.names).index(f"fc{j + 1}") for j in range(3)]]
+    made, speeds = [], []
+    for e in experiments:
+        v = np.gradient(e.q, e.dt, axis=0)
+        speeds.append(np.abs(v).max(axis=0))
+        change = np.tanh(v / (share * speeds[0])) - 2 / np.pi * np.arctan(model.smoothing * v)
+        made.append(replace(e, tau=e.tau + dry * signal.lfilter([0.5, 0.5], [1.0], change, axis=0)))
+    study = build_study(made, [], robot)
+    state = with_transitions(fitted(study, study.robot, None), lambda one, before: fitted(study, one, before))
+    entries = {e.joint: e.parameters for e in state.robot.effects if e.effect == "coulomb_transition"}
+    assert set(entries) == set(study.joints)
+    for joint, top in zip(study.joints, speeds[0], strict=True):
+        assert entries[joint]["velocity"] == pytest.approx(share * top, rel=0.1)
+        assert entries[joint]["lead"] < 0.3 * study.dt
 
 
 def test_the_lead_moves_the_reversal_of_friction_to_earlier_times(base: ModelState) -> None:
