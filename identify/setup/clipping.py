@@ -30,6 +30,10 @@ LEAST_EXCESS = 1.04
 LEAST_IMPROVEMENT = 1.5
 """Factor by which the residual power of the rows below the level must fall without the rows near it."""
 
+MOST_LEVERAGE = 4.0
+"""Largest median leverage of the rows near the level, by the other rows: from there on the fit does not determine the
+torque that is needed there, and extrapolates. The predicted torque is then twice as uncertain as a row."""
+
 MOST_SLOPE = 0.3
 """Largest slope of recorded over predicted torques near the level: 0 where they are clipped, near 1 elsewhere."""
 
@@ -95,6 +99,8 @@ def clipped_torques(bench: Bench, h: Hypothesis) -> list[Clip]:
         below = fit_rows(x, y, used, physical, bench.moving)
         residual = [np.mean((y[~near, k] - x[~near, k] @ theta) ** 2) for theta in (whole, below)]
         needed = float(np.median((x[near, k] @ below) * np.sign(y[near, k]))) / level
+        if _leverage(x, used, near, int(k)) > MOST_LEVERAGE:
+            continue
         flat = _slope(np.abs(x[near, k] @ below), np.abs(y[near, k])) < MOST_SLOPE
         if not (flat and needed > LEAST_EXCESS and residual[0] > LEAST_IMPROVEMENT * residual[1]):
             continue
@@ -120,6 +126,15 @@ def _soft_error(x: Array, y: Array, k: int, physical: Array, moving: NDArray[np.
         given = needed / (1.0 + loss * np.abs(needed) ** power) ** (1.0 / power)
         errors.append(float(np.mean((y[:, k] - given) ** 2)))
     return min(errors)
+
+
+def _leverage(x: Array, used: NDArray[np.bool_], near: NDArray[np.bool_], k: int) -> float:
+    """Median leverage of the rows near the level: variance of their predicted torque over that of an error."""
+    rows = x[used]
+    size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+    inverse = np.linalg.pinv((rows / size).T @ (rows / size), rcond=1e-12, hermitian=True)
+    at = x[near, k] / size
+    return float(np.median(np.einsum("mi,ij,mj->m", at, inverse, at)))
 
 
 def _slope(x: Array, y: Array) -> float:
