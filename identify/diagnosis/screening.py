@@ -173,9 +173,8 @@ def refined(fit: Fit, candidate: Candidate, column_cache: ColumnCache, best: tup
     """
     found = best
     for k, free in enumerate(candidate.effect.refinable(fit.study.robot, candidate.place)):
-        # A value of zero, as that of a lead, has no neighbours on this scale.
-        values = sorted({grid[k][1] for grid in candidate.grid} - {0.0})
-        if not free or len(values) < 2 or found[1][k][1] == 0.0:
+        values = sorted({grid[k][1] for grid in candidate.grid})
+        if not free or len(values) < 2:
             continue
         at = int(np.argmin(np.abs(np.array(values) - found[1][k][1])))
         low, high = values[max(at - 1, 0)], values[min(at + 1, len(values) - 1)]

@@ -139,11 +139,14 @@ class _Search:
         return made
 
     def _moved(self, place: Place, shapes: Shapes, factor: float, samples: float) -> Shapes:
-        """Return a transition beside another one, within the range of velocities of the grid."""
+        """Return a transition beside another one, with velocity and lead no less than those of the grid.
+
+        No lead would be a value that is certain; the smallest one of the grid has a standard deviation.
+        """
         given = dict(shapes)
-        tried = [dict(one)["velocity"] for one in self.grids[place]]
-        velocity = float(np.clip(given["velocity"] * np.exp(factor), min(tried), max(tried)))
-        lead = max(given["lead"] + samples * self.sample, 0.0)
+        velocities, leads = ([dict(one)[name] for one in self.grids[place]] for name in ("velocity", "lead"))
+        velocity = float(np.clip(given["velocity"] * np.exp(factor), min(velocities), max(velocities)))
+        lead = max(given["lead"] + samples * self.sample, min(leads))
         return (("velocity", velocity), ("lead", lead))
 
 

@@ -70,9 +70,9 @@ class CoulombTransition(Effect):
         return (np.tanh(reversal / shapes["velocity"]) - motion.sign[:, j])[:, None]
 
     def trial_values(self, motion: Motion, place: Place) -> Trials:
-        """Return velocities from 0.06 to 3 % of the joint's top speed, and leads from none to four samples."""
+        """Return velocities from 0.06 to 3 % of the joint's top speed, and leads from hardly any to four samples."""
         velocities = float(motion.top_speed[place.joint]) * np.geomspace(0.0006, SLOWEST, 7)
-        return velocities, motion.dt * np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0])
+        return velocities, motion.dt * np.array([0.01, 0.25, 0.5, 1.0, 2.0, 4.0])
 
     def is_convention(self, values: Array, uncertain: float) -> bool:
         """Return True: every model of dry friction has some transition, so that it is no missing effect."""

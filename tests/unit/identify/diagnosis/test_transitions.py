@@ -40,7 +40,7 @@ def test_transitions_predict_the_torques_of_their_joints_better(base: ModelState
         dry = float(state.fit.theta[state.study.model.base.names.index(f"fc{joint + 1}")])
         assert gains[joint] > 0.0
         assert 0.0 < value < 2.0 * dry + 4.0 * std
-        assert entry.parameters["lead"] >= 0.0
+        assert entry.parameters["lead"] > 0.0
 
 
 @pytest.mark.parametrize("share", [0.004, 0.009, 0.017])
