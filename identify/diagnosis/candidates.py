@@ -100,6 +100,22 @@ class ColumnCache:
             self._motions[key] = self.study.motion(stretch, kind, self.theta)
         return self._motions[key]
 
+    def joints(self, candidate: Candidate) -> list[int]:
+        """Joints on whose torques a candidate acts.
+
+        Parameters
+        ----------
+        candidate
+            The candidate.
+        """
+        effect, place = candidate.effect, candidate.place
+        if not candidate.grid:
+            return [place.joint]
+        (made,) = self._bands(effect, place, candidate.grid[:1], "train", "simulated", keep=False)
+        if made[0][1]:
+            return [place.joint]
+        return sorted({j for columns, _ in made for j in joints_of(columns)})
+
     def band(
         self, effect: Effect, place: Place, shapes: Shapes, part: str, kind: str, *, keep: bool = True
     ) -> tuple[Array, ...]:

@@ -5,7 +5,8 @@
    estimated with instruments from that loop.
 3. Ranking by cross-validated log-likelihood (`armident.identify.diagnosis.comparison`).
 4. Admission of the best one that is significant, material and physically possible; then the next step.
-5. Findings that later ones made superfluous are removed, and each finding competes with all others once more.
+5. Findings that later ones made superfluous are removed. Each finding competes once more with the effects that act on a
+   joint on which it acts.
 6. Report part: a finding stays if the data that chose nothing confirm it (`armident.identify.diagnosis.confirmation`).
 """
 
@@ -26,6 +27,7 @@ from armident.identify.diagnosis.corrections import screened_correction
 from armident.identify.diagnosis.criteria import Criteria
 from armident.identify.diagnosis.model_state import (
     ModelState,
+    acted_on,
     fitted,
     viscous_friction_rises,
     with_entries,
@@ -103,6 +105,22 @@ class Selected:
         return effect.is_convention(values, uncertain)
 
 
+@dataclass(frozen=True, eq=False)
+class Contested:
+    """A finding with which other effects compete.
+
+    Parameters
+    ----------
+    gain
+        Its gain of log-likelihood beside the other findings, nats.
+    joints
+        Joints on whose torques it acts, (n,). An effect that acts on none of them cannot take its place.
+    """
+
+    gain: float
+    joints: NDArray[np.bool_]
+
+
 @dataclass
 class StepwiseSelection:
     """Selection of the effects of one diagnosis.
@@ -178,13 +196,15 @@ class StepwiseSelection:
             found = (*found, Selected(best.entry, step, best))
             state, found = self._reduced(best.state, found)
             state = with_first_motions(state)
-        # Removing a finding changes the comparison of the others.
+        # Removing a finding changes the comparison of the others of its joints.
+        changed: NDArray[np.bool_] | None = None
         while True:
-            state, found = self._exchanged(state, found)
-            state, kept = self._confirmed(state, found)
+            state, found = self._exchanged(state, found, changed)
+            less, kept = self._confirmed(state, found)
             if len(kept) == len(found):
-                return (self._final(state), kept) if kept else (first, ())
-            found = kept
+                return (self._final(less), kept) if kept else (first, ())
+            changed = acted_on(state, less)
+            state, found = less, kept
 
     def _final(self, state: ModelState) -> ModelState:
         """Model with noise models of its own residual, and with the controller that its corrected torques identify."""
@@ -193,21 +213,21 @@ class StepwiseSelection:
                 state = fitted(state.study.with_own_controller(), state.robot, state)
         return with_own_noise(state)
 
-    def step(self, state: ModelState, present: float = 0.0) -> Step:
+    def step(self, state: ModelState, contested: Contested | None = None) -> Step:
         """Compare all candidates in a model.
 
         Parameters
         ----------
         state
             Model without them.
-        present
-            Gain of log-likelihood of an effect that they could take the place of. Those that promise much less are left
-            out.
+        contested
+            Finding that the model is without, if only effects that could take its place are compared: those that act
+            on a joint on which it acts, and do not promise much less.
         """
         key = _key(state.robot)
         if key in self._steps:
             return self._steps[key]
-        shortlist, tests = self._shortlist(state, present)
+        shortlist, tests = self._shortlist(state, contested)
         made: list[Made] = []
         for k, one in enumerate(shortlist):
             self.tested(k / len(shortlist))
@@ -216,7 +236,7 @@ class StepwiseSelection:
                 return Step(state, (), (), (), tests)
             made += [m for m in (self._made(state, *one),) if m is not None]
         step = compared(state, made, tests, self.passes)
-        if not present:
+        if contested is None:
             self._steps[key] = step
         self._release()
         return step
@@ -326,7 +346,9 @@ class StepwiseSelection:
         study = models[best].study
         return replace(models[best], study=replace(study, warnings=(*study.warnings, line)))
 
-    def _shortlist(self, state: ModelState, present: float) -> tuple[list[tuple[Candidate, Shapes, Starts]], int]:
+    def _shortlist(
+        self, state: ModelState, contested: Contested | None
+    ) -> tuple[list[tuple[Candidate, Shapes, Starts]], int]:
         """Candidates with the highest statistics less their numbers of parameters, and the number of all.
 
         Each has its nonlinear parameters, or the values from which its correction of recorded torques starts.
@@ -337,9 +359,11 @@ class StepwiseSelection:
         tests, hidden = 0, set()
         for every in candidates(column_cache):
             candidate = every
+            tests += 1
+            if contested is not None and not contested.joints[column_cache.joints(candidate)].any():
+                continue
             if isinstance(candidate.effect, MotorOrder):
                 candidate = replace(candidate, grid=motor_orders(state.study, state.fit.theta, candidate.place.joint))
-            tests += 1
             found: tuple[float, Shapes] | None
             starts: Starts = ()
             if isinstance(candidate.effect, Correction):
@@ -356,6 +380,7 @@ class StepwiseSelection:
         # A score statistic is twice the gain of log-likelihood that it promises. A correction needs all of it: its
         # likelihood also rewards smaller noise.
         needed, promising = self._needed(tests), self.criteria.promising
+        present = 0.0 if contested is None else contested.gain
         looks = [x for x in looks if 0.5 * x[2][0] > max(needed * (1.0 if x[3] else promising), promising * present)]
         looks.sort(key=lambda look: -look[0])
         named = [x for x in looks if x[1].effect.name != UNNAMED][: self.criteria.shortlist]
@@ -474,19 +499,31 @@ class StepwiseSelection:
         material = share >= self.criteria.least_share and changed >= self.criteria.material_pct
         return not material or gain(state, less) < self._needed(tests)
 
-    def _exchanged(self, state: ModelState, found: tuple[Selected, ...]) -> tuple[ModelState, tuple[Selected, ...]]:
-        """Model whose findings have competed with all other effects beside the findings made after them.
+    def _exchanged(
+        self, state: ModelState, found: tuple[Selected, ...], changed: NDArray[np.bool_] | None = None
+    ) -> tuple[ModelState, tuple[Selected, ...]]:
+        """Model whose findings have competed with the other effects on their joints, beside the findings made later.
 
         A rival makes the finding superfluous; an effect beside which it stays explains something else. No exchange
         returns to an earlier model: each could prefer its own noise models.
+
+        Parameters
+        ----------
+        state, found
+            Model with the findings, and the findings.
+        changed
+            Joints whose models changed since the findings last competed, (n,); ``None`` for all.
         """
         self._visited.add(_key(state.robot))
         for one in found:
             less = None if self._late() else self._without(state, one.entry)
             if less is None:
                 continue
+            joints = acted_on(state, less)
+            if changed is not None and not joints[changed].any():
+                continue
             self.progress(f"exchanging {one.entry.effect.replace('_', ' ')} of {one.entry.joint}")
-            step = self.step(less, gain(state, less))
+            step = self.step(less, Contested(gain(state, less), joints))
             best = self.admitted(step)
             if best is None or best.family == one.addition.family or _key(best.state.robot) in self._visited:
                 continue

@@ -45,6 +45,24 @@ class Term:
         every = self.effect.torque(motion, self.place, self.shapes)
         return every if len(self.kept) == every.shape[2] else every[:, :, list(self.kept)]
 
+    def add_torque(self, motion: Motion, values: Array, torque: Array) -> None:
+        """Add the torque of the term.
+
+        Parameters
+        ----------
+        motion
+            The motion, N samples.
+        values
+            Values of the linear parameters, (k,).
+        torque
+            Torques of all joints, (N, n), N m or N; changed in place.
+        """
+        columns = self.effect.columns(motion, self.place, {**self.effect.defaults, **self.shapes})
+        if columns.ndim == 3:
+            torque += columns @ self.of_effect(values)
+        else:
+            torque[:, self.place.joint] += columns @ self.of_effect(values)
+
     @property
     def linear(self) -> tuple[Linear, ...]:
         """Linear parameters of the term."""

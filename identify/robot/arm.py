@@ -189,7 +189,7 @@ class ArmModel:
         torque, first = np.zeros((motion.samples, self.n)), 0
         for term in self.terms:
             last = first + len(term.names)
-            torque += term.columns(motion) @ values[first:last]
+            term.add_torque(motion, values[first:last], torque)
             first = last
         return torque
 

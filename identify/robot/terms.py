@@ -33,3 +33,6 @@ class ModelTerm(Protocol):
 
     def columns(self, motion: Motion) -> NDArray[np.float64]:
         """Return the torques (N m or N) of all n joints per unit of each linear parameter, (N, n, k)."""
+
+    def add_torque(self, motion: Motion, values: NDArray[np.float64], torque: NDArray[np.float64]) -> None:
+        """Add the torque with these values (k,) of the linear parameters to ``torque`` (N, n), in place."""

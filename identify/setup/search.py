@@ -154,7 +154,8 @@ class Search:
             # Several mistakes may be one that a set of joints shares.
             if not understood or len(best.families) > 1:
                 starts += self._sets(first)
-        starts.sort(key=lambda s: s.rank)
+        # An order or a set that explains no more than the configuration is no part of an explanation.
+        starts = sorted((s for s in starts if s.rank < first.rank), key=lambda s: s.rank)
         for k, step in enumerate(starts):
             other = self._greedy(step)
             needed = 0.0 if best.families else LEAST_ODDS

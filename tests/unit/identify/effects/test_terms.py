@@ -65,6 +65,19 @@ def test_viscous_friction_as_a_term_moves_the_simulated_arm_like_that_of_the_mod
     assert np.linalg.norm(found.tau - expected.tau) < 0.002 * np.linalg.norm(expected.tau)
 
 
+def test_the_torque_of_terms_is_their_regressor_times_their_values(robot: RobotConfig, theta: Any) -> None:
+    ripple = Effect(effect="cogging_torque", joint="joint_6", parameters={"harmonic": 6.0})
+    friction = Effect(effect="nonlinear_viscous_friction", joint="joint_2", parameters={"velocity": 0.3})
+    model = arm_model(with_effects(robot, ripple, friction))
+    q = reference(robot)
+    qd = np.gradient(q, DT, axis=0)
+    motion = model.motion(q, qd, np.gradient(qd, DT, axis=0), DT)
+    values = np.array([0.3, -0.7, 5.0])
+    torque = model.term_torque(motion, values)
+    assert np.ptp(torque, axis=0)[[1, 4, 5]].min() > 0.1
+    np.testing.assert_allclose(torque, model.term_regressor(motion) @ values, atol=1e-12)
+
+
 @pytest.mark.parametrize("wrong", [False, True], ids=["own motion", "motion of another amplitude"])
 def test_a_simulation_that_begins_at_a_motion_ends_where_the_one_without_does(
     robot: RobotConfig, theta: Any, wrong: bool
