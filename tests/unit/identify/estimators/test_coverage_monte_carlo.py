@@ -106,10 +106,10 @@ def test_runs_of_other_settings_are_not_taken_for_these() -> None:
     assert len({fingerprint("idim-piv", 1.0), fingerprint("idim-iv", 1.0), fingerprint("idim-piv", 2.0)}) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.proof
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("count", [3, pytest.param(12, marks=pytest.mark.proof)])
-def test_intervals_of_idim_piv_cover_the_truth_of_the_virtual_tx40(count: int, tmp_path: Path) -> None:
+def test_intervals_of_idim_piv_cover_the_truth_of_the_virtual_tx40(tmp_path: Path) -> None:
+    count = 12
     runs = campaign(range(FIRST_SEED, FIRST_SEED + count), tmp_path)
     rows = coverage(runs)
     report = table(runs, rows)
