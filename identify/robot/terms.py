@@ -35,4 +35,14 @@ class ModelTerm(Protocol):
         """Return the torques (N m or N) of all n joints per unit of each linear parameter, (N, n, k)."""
 
     def add_torque(self, motion: Motion, values: NDArray[np.float64], torque: NDArray[np.float64]) -> None:
-        """Add the torque with these values (k,) of the linear parameters to ``torque`` (N, n), in place."""
+        """Add the torque of the term.
+
+        Parameters
+        ----------
+        motion
+            The motion, N samples.
+        values
+            Values of the linear parameters, (k,).
+        torque
+            Torques of all joints, (N, n), N m or N; changed in place.
+        """
