@@ -299,7 +299,7 @@ def viscous_friction_rises(state: ModelState, term: Term) -> bool:
 def acted_on(with_it: ModelState, without: ModelState) -> NDArray[np.bool_]:
     """Return the joints on whose torques the terms act that a model has and another one has not, (n,).
 
-    All joints if the models differ in corrections of the recordings alone.
+    All joints if the models differ in a correction of the recordings.
 
     Parameters
     ----------
@@ -309,7 +309,9 @@ def acted_on(with_it: ModelState, without: ModelState) -> NDArray[np.bool_]:
     known = set(without.study.model.base.names)
     added = [k for k, name in enumerate(with_it.study.model.base.names) if name not in known]
     joints = with_it.fit.equations.joints
-    return np.array([not added or bool(np.isin(added, joint.x).any()) for joint in joints])
+    if not added or with_it.study.recorded != without.study.recorded:
+        return np.ones(len(joints), np.bool_)
+    return np.array([bool(np.isin(added, joint.x).any()) for joint in joints])
 
 
 def _iterated(found: Fit) -> Fit:

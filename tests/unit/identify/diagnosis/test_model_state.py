@@ -5,7 +5,7 @@ import pytest
 
 from armident.configs.schema.robot import Effect
 from armident.configs.schema.scenario import HiddenEffect
-from armident.identify.diagnosis.model_state import padded, viscous_friction_rises, with_report_part
+from armident.identify.diagnosis.model_state import acted_on, padded, viscous_friction_rises, with_report_part
 from armident.identify.effects.terms import arm_model
 from tests.fixtures.arms import hide
 from tests.fixtures.diagnoses import SPRING, selection, with_effects
@@ -36,6 +36,21 @@ def test_a_larger_model_begins_with_the_rigid_parameters_of_the_smaller_one() ->
     rigid = state.study.model.base.b - state.study.model.e
     np.testing.assert_array_equal(start[:rigid], first.fit.theta[:rigid])
     assert not start[rigid:].any()
+
+
+def test_a_correction_of_the_recordings_acts_on_all_joints_also_beside_a_term() -> None:
+    first = selection(
+        5, hide("asymmetric_viscous_friction", "joint_2", ratio=0.3), arm="tx40", motion="tx40_excitation"
+    )[1]
+    term = Effect(effect="asymmetric_viscous_friction", joint="joint_2")
+    correction = Effect(effect="drive_gain_error", joint="joint_4", parameters={"gain_error": 0.05})
+    with_term = with_effects(first, term)
+    np.testing.assert_array_equal(acted_on(with_term, first), np.arange(6) == 1)
+    assert acted_on(with_effects(first, correction), first).all()
+    assert acted_on(with_effects(first, term, correction), first).all()
+    np.testing.assert_array_equal(
+        acted_on(with_effects(first, term, correction), with_effects(first, correction)), np.arange(6) == 1
+    )
 
 
 def test_the_report_part_changes_no_parameter() -> None:
