@@ -6,17 +6,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.identify.diagnosis.stretch import Stretch
+from armident.identify.diagnosis.regressor_cache import Arrays
+from armident.identify.diagnosis.stretch import KINDS, Stretch
 from armident.identify.diagnosis.study import Study
-from armident.identify.effects.terms import effect_terms
+from armident.identify.effects.terms import Term, effect_terms
 from armident.identify.regression.equations import InstrumentedEquations
 from armident.identify.regression.iv import JointEquations
+from armident.identify.robot.motion import Motion
+from armident.identify.signals.differentiate import Derivatives
 
 Array = NDArray[np.float64]
-
-RIGID_KEPT = 32
-"""Rigid regressors kept, one per stretch and kind of signal. Limits the memory, changes no result: measured signals of
-up to eight recordings and the latest simulations stay."""
 
 HELD_AT_ZERO = 1e-10
 """Weight by which the parameters of terms are held at zero. Where rigid model and terms give the same torque, as the
@@ -101,44 +100,107 @@ def regressors(study: Study, stretch: Stretch, theta: Array | None) -> tuple[Arr
     theta
         Parameters (b,) that predict the torques on which terms depend; ``None`` if no term does.
     """
-    out: list[Array] = []
-    terms: dict[str, Array] = {}
-    for kind in ("measured", "simulated"):
-        signals = getattr(stretch, kind)
-        key = (id(signals), study.model.base.names[: -study.model.e or None], tuple(study.robot.sign_smoothing))
-        # Kept with the signals: their identity is the key only while they exist.
-        kept = study.rigid.pop(key, None) or (
-            signals,
-            study.decimation(study.model.rigid_regressor(signals.q, signals.qd, signals.qdd)),
-        )
-        study.rigid[key] = kept
-        while len(study.rigid) > RIGID_KEPT:
-            # The one that was not used for the longest time: a simulation of a model that was rejected.
-            del study.rigid[next(iter(study.rigid))]
-        rigid = kept[1]
-        if study.model.e:
-            terms[kind] = _filtered_terms(study, stretch, kind, theta)
-            made = terms[kind]
-            if out:
-                every = [t.effect for t in effect_terms(study.model) for _ in t.names]
-                sudden = np.flatnonzero([e.instrument_signals == "measured" for e in every])
-                made[:, :, sudden] = terms["measured"][:, :, sudden]
-                # Measured signals differentiated twice carry more noise than such an effect has torque.
-                dynamic = np.flatnonzero([e.regressor_signals == "simulated" for e in every])
-                first = out[0].shape[2] - study.model.e
-                moving = stretch.moving[:, :, None]
-                out[0][:, :, first + dynamic] = made[:, :, dynamic] * moving
-            rigid = np.concatenate([rigid, made], axis=2)
-        out.append(rigid * stretch.moving[:, :, None])
-    return out[0], out[1]
+    model = study.model
+    terms = effect_terms(model)
+    first = model.base.b - model.e
+    motions = {kind: _Signals(study, stretch, kind, None if theta is None else theta[:first]) for kind in KINDS}
+    x, z = (np.empty((*stretch.y.shape, model.base.b)) for _ in KINDS)
+    for whole, kind in zip((x, z), KINDS, strict=True):
+        whole[:, :, :first] = motions[kind].rigid
+    for term in terms:
+        last = first + len(term.names)
+        instruments = term.effect.instrument_signals
+        # Measured signals differentiated twice carry more noise than a dynamic effect has torque.
+        own = instruments if term.effect.regressor_signals == "simulated" else "measured"
+        for whole, kind in ((x, own), (z, instruments)):
+            motions[kind].fill(term, whole[:, :, first:last])
+        first = last
+    for whole in (x, z):
+        whole *= stretch.moving[:, :, None]
+    return x, z
 
 
-def _filtered_terms(study: Study, stretch: Stretch, kind: str, theta: Array | None) -> Array:
-    """Columns (M, n, e) of the model's terms in the band of the comparison; those of one joint are filtered alone."""
-    columns = study.terms(stretch, kind, theta)
-    acts = np.flatnonzero(np.any(columns, axis=0))
-    flat = columns.reshape(columns.shape[0], -1)[:, acts]
-    band = study.decimation(np.ascontiguousarray(flat))
-    whole = np.zeros((band.shape[0], columns.shape[1] * columns.shape[2]))
-    whole[:, acts] = band
-    return whole.reshape(band.shape[0], *columns.shape[1:])
+@dataclass(frozen=True)
+class _Signals:
+    """One kind of signals of a stretch, with the regressors computed from them.
+
+    Parameters
+    ----------
+    study
+        Data with the model.
+    stretch
+        A stretch of the study.
+    kind
+        ``measured`` or ``simulated``.
+    theta
+        Parameters of the rigid model that predict the torques on which terms depend; ``None`` if no term does.
+    """
+
+    study: Study
+    stretch: Stretch
+    kind: str
+    theta: Array | None
+
+    @cached_property
+    def motion(self) -> Motion:
+        """The motion from which terms compute their columns, with that before the stretch."""
+        theta = self.theta
+        if theta is not None:
+            theta = np.concatenate([theta, np.zeros(self.study.model.e)])
+        return self.study.motion(self.stretch, self.kind, theta)
+
+    @property
+    def rigid(self) -> Array:
+        """Regressor of the rigid model in the band of the comparison, (M, n, b - e)."""
+        model, signals = self.study.model, self._own
+        key = (id(signals), model.base.names[: -model.e or None], self._smoothing)
+
+        def made() -> Arrays:
+            return (self.study.decimation(model.rigid_regressor(signals.q, signals.qd, signals.qdd)),)
+
+        return self.study.regressors.get(key, signals, made)[0]
+
+    def fill(self, term: Term, out: Array) -> None:
+        """Write the columns of a term in the band of the comparison; those of one joint are filtered alone.
+
+        Parameters
+        ----------
+        term
+            Term of the model.
+        out
+            Output array, (M, n, k).
+        """
+        signals, model = self._signals, self.study.model
+        torques = (model.base.names[: -model.e or None], self._theta_bytes) if term.depends_on_torque else None
+        place = (term.effect.key, term.place.joint, term.place.other, tuple(term.shapes.items()), term.kept)
+        key = (*map(id, signals), place, self._smoothing, torques)
+
+        def made() -> Arrays:
+            columns = term.columns(self.motion)[self.motion.lead :]
+            flat = columns.reshape(columns.shape[0], -1)
+            acts = np.flatnonzero(np.any(flat, axis=0))
+            return acts, self.study.decimation(np.ascontiguousarray(flat[:, acts]))
+
+        acts, band = self.study.regressors.get(key, signals, made)
+        whole = np.zeros((out.shape[0], out.shape[1] * out.shape[2]))
+        whole[:, acts] = band
+        out[...] = whole.reshape(out.shape)
+
+    @property
+    def _own(self) -> Derivatives:
+        signals: Derivatives = getattr(self.stretch, self.kind)
+        return signals
+
+    @property
+    def _signals(self) -> tuple[Derivatives, ...]:
+        """The signals of the stretch, and those before it."""
+        before = self.stretch.before
+        return (self._own,) if before is None else (self._own, before[KINDS.index(self.kind)])
+
+    @property
+    def _smoothing(self) -> tuple[float, ...]:
+        return tuple(self.study.robot.sign_smoothing)
+
+    @property
+    def _theta_bytes(self) -> bytes:
+        return b"" if self.theta is None else self.theta.tobytes()

@@ -9,6 +9,7 @@ from scipy import signal
 
 from armident.configs import DataError, RobotConfig
 from armident.configs.schema.robot import Effect as Entry
+from armident.identify.diagnosis.regressor_cache import RegressorCache
 from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distances, moving_rows, rows_before
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.recorded import of_recording, put_right
@@ -95,7 +96,7 @@ class Study:
     volume
         Logarithm of the volume by which the corrections of a joint's torques scale its noise, per row, (n,): see
         `log_volume`.
-    rigid
+    regressors
         Cache of the regressors that all models of the study share; see
         `armident.identify.diagnosis.equations.regressors`.
     """
@@ -115,9 +116,7 @@ class Study:
     volume: Array
     warnings: tuple[str, ...] = ()
     sign_given: bool = True
-    rigid: dict[tuple[int, tuple[str, ...], tuple[float, ...]], tuple[Derivatives, Array]] = field(
-        default_factory=dict, repr=False, compare=False
-    )
+    regressors: RegressorCache = field(default_factory=RegressorCache, repr=False, compare=False)
 
     @property
     def recorded(self) -> tuple[Entry, ...]:

@@ -1,0 +1,53 @@
+"""Cache of the regressors that the models of one diagnosis share, limited in memory."""
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from typing import Any
+
+from numpy.typing import NDArray
+
+Arrays = tuple[NDArray[Any], ...]
+
+MOST_BYTES = 2**28
+"""Memory for the arrays of the cache, bytes. It changes no result."""
+
+
+@dataclass
+class RegressorCache:
+    """Arrays computed from signals, the most recently used ones.
+
+    Parameters
+    ----------
+    most_bytes
+        Memory for the arrays, bytes.
+    """
+
+    most_bytes: int = MOST_BYTES
+    _kept: dict[Hashable, tuple[object, Arrays]] = field(default_factory=dict)
+    _bytes: int = 0
+
+    def get(self, key: Hashable, signals: object, made: Callable[[], Arrays]) -> Arrays:
+        """Return the arrays of a key; computed where the cache does not have them.
+
+        Parameters
+        ----------
+        key
+            All that the arrays depend on, with the identity of the signals.
+        signals
+            The signals. The cache keeps them: their identity is theirs only while they exist.
+        made
+            Computes the arrays.
+        """
+        kept = self._kept.pop(key, None)
+        if kept is None:
+            kept = signals, made()
+            self._bytes += _size(kept[1])
+        self._kept[key] = kept
+        while self._bytes > self.most_bytes and len(self._kept) > 1:
+            # The one that was not used for the longest time: of a simulation of a model that was rejected.
+            self._bytes -= _size(self._kept.pop(next(iter(self._kept)))[1])
+        return kept[1]
+
+
+def _size(arrays: Arrays) -> int:
+    return sum(array.nbytes for array in arrays)
