@@ -14,7 +14,7 @@ from armident.identify.diagnosis.stretch import KINDS, Stretch, at_rows, distanc
 from armident.identify.effects.drive import Correction
 from armident.identify.effects.recorded import of_recording, put_right
 from armident.identify.effects.registry import known
-from armident.identify.effects.terms import arm_model
+from armident.identify.effects.terms import arm_model, terms_of
 from armident.identify.effects.wiring import Wiring
 from armident.identify.estimators.auxiliary_model import AuxiliaryModel
 from armident.identify.estimators.idim_ls import idim_ls
@@ -134,7 +134,7 @@ class Study:
         DataError
             If no closed loop can be simulated with other wiring.
         """
-        changed = replace(self, robot=robot, model=arm_model(robot))
+        changed = replace(self, robot=robot, model=self.model.with_effects_of(robot, terms_of(robot)))
         if changed.recorded == self.recorded:
             return changed
         wiring = [[s for s in study.recorded if isinstance(known(s.effect), Wiring)] for study in (self, changed)]

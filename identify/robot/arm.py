@@ -126,6 +126,28 @@ class ArmModel:
         """Return the model whose terms predict torques with ``theta``, standard (p,) or base (b,); SI."""
         return replace(self, anchor=np.asarray(theta, dtype=np.float64))
 
+    def with_effects_of(self, robot: RobotConfig, terms: tuple[ModelTerm, ...]) -> Self:
+        """Return the model of a configuration; faster than `from_config` if only the effects differ.
+
+        Parameters
+        ----------
+        robot
+            The configuration.
+        terms
+            Its terms.
+        """
+        if robot.model_copy(update={"effects": self.robot.effects}) != self.robot:
+            return self.from_config(robot, terms)
+        rigid, further = self.without_terms(), tuple(name for term in terms for name in term.names)
+        return replace(
+            rigid,
+            robot=robot,
+            names=rigid.names + further,
+            base=with_terms(rigid.base, further),
+            terms=terms,
+            anchor=None,
+        )
+
     def without_terms(self) -> Self:
         """Return the model without its additional terms."""
         if not self.terms:

@@ -1,5 +1,7 @@
 """Bandpass filtering of the thesis: zero-phase Butterworth filter and central differences (section 2.3.1)."""
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
@@ -35,9 +37,16 @@ def butterworth(
     padlen = 3 * order if padlen is None else padlen
     if x.shape[0] <= padlen:
         raise DataError(f"filtering needs more than {padlen} samples, got {x.shape[0]}")
-    sections = signal.butter(order, 2 * cutoff_hz * dt, output="sos")
+    sections = _sections(order, 2 * cutoff_hz * dt)
     filtered: NDArray[np.float64] = signal.sosfiltfilt(sections, x, axis=0, padlen=padlen)
     return filtered
+
+
+@cache
+def _sections(order: int, cutoff: float) -> NDArray[np.float64]:
+    """Second-order sections of a low-pass; ``cutoff`` relative to half the sampling rate."""
+    sections: NDArray[np.float64] = signal.butter(order, cutoff, output="sos")
+    return sections
 
 
 def central_difference(x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
