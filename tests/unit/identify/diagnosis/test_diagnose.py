@@ -18,9 +18,8 @@ from tests.fixtures.diagnoses import diagnosis
 MOTION = "tx40_excitation"
 WORN = HiddenEffect(effect="asymmetric_viscous_friction", joint="joint_2", parameters={"ratio": 0.2})
 
-RATES = [pytest.param(FAST, 1, id="1 kHz"), pytest.param(None, 3, id="5 kHz")]
+RATES = [pytest.param(FAST, 1, id="1 kHz"), pytest.param(None, 3, id="5 kHz", marks=pytest.mark.proof)]
 """One repetition at 1 kHz, and three at the rate of the drives."""
-RATES_OF_PROOF = [RATES[0], pytest.param(None, 3, id="5 kHz", marks=pytest.mark.proof)]
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +28,7 @@ def robot() -> RobotConfig:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("period", "repeats"), RATES_OF_PROOF)
+@pytest.mark.parametrize(("period", "repeats"), RATES)
 def test_a_plant_without_hidden_effects_has_no_gap(period: float | None, repeats: int) -> None:
     document = diagnosis("tx40", MOTION, 1, period=period, repeats=repeats).document
     assert document.verdict == "no_gap"
@@ -49,7 +48,7 @@ def test_a_worn_joint_is_named_and_its_size_is_right(period: float | None, repea
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("period", "repeats"), RATES_OF_PROOF)
+@pytest.mark.parametrize(("period", "repeats"), RATES)
 def test_a_cogging_motor_is_named_with_its_harmonic(period: float | None, repeats: int) -> None:
     cogging = HiddenEffect(effect="cogging_torque", joint="joint_3", parameters={"amplitude": 1.2, "harmonic": 1.0})
     finding = diagnosis("tx40", MOTION, 1, cogging, period=period, repeats=repeats).document.findings[0]

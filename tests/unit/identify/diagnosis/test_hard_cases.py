@@ -223,6 +223,7 @@ def test_noise_of_the_measured_positions_does_not_speak_against_a_finding(case: 
     assert [found["effect"], found["joint"]] == case.split()[:2]
 
 
+@proof
 @MISSED
 def test_a_rotor_that_is_missing_is_no_wrong_sign(tmp_path: Path) -> None:
     """Both signs of the wrist's roll exchanged leave a little less than the model with the rotor."""

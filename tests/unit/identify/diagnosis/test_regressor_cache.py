@@ -9,6 +9,7 @@ from armident.configs import load_robot
 from armident.configs.schema.robot import Effect
 from armident.identify.diagnosis.equations import regressors
 from armident.identify.diagnosis.regressor_cache import Arrays, RegressorCache
+from armident.identify.diagnosis.stretch import KINDS
 from armident.identify.diagnosis.study import Study, build_study
 from armident.identify.effects.terms import arm_model
 from armident.identify.identification.from_recording import experiments_from_recording
@@ -66,9 +67,7 @@ def test_terms_use_the_signals_that_their_effect_asks_for(study: Study) -> None:
     theta = np.concatenate([[95.0, 203.0, 20.0, 0.0], np.zeros(changed.model.e)])
     (stretch,) = changed.train
     x, z = regressors(changed, stretch, theta)
-    measured, simulated = (
-        changed.decimation(changed.terms(stretch, kind, theta)) for kind in ("measured", "simulated")
-    )
+    measured, simulated = (changed.decimation(changed.terms(stretch, kind, theta)) for kind in KINDS)
     moving = stretch.moving[:, :, None]
     for found, wanted in ((x, (measured, simulated, measured)), (z, (simulated, simulated, measured))):
         for k, columns in enumerate(wanted):
