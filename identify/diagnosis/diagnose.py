@@ -17,6 +17,7 @@ from armident.identify.diagnosis.findings import (
     experiment_to_separate,
     findings_of,
     gap_of,
+    less_certain,
     negligible,
     noise_floor,
     undetectable,
@@ -229,20 +230,18 @@ def _diagnose(
     conventional = [one for one in every if one.conventional(final, 0.0 if stage.shift_known else final.study.sample)]
     selected = [one for one in every if one not in conventional]
     after = gap_of(final, held=True)
-    named = findings_of(final, selected)
+    steps("unexplained dependences")
+    dependences = unexplained(final, criteria)
+    rest = [
+        Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
+        for d in dependences
+    ]
+    named = less_certain(findings_of(final, selected), rest)
     places = {id(f): k for k, f in enumerate(named)}
     findings = stage.named(named, after)
     stopped = _stopped(selection, len(named))
     chosen_for = [selected[places[id(f)]] if id(f) in places else None for f in findings]
-    steps("unexplained dependences")
-    dependences = unexplained(final, criteria)
-    left = stage.left(
-        [
-            Unexplained(joint=d.joint, share_of_residual=d.share, varies_with=d.varies_with, hint=d.hint)
-            for d in dependences
-        ],
-        after,
-    )
+    left = stage.left(rest, after)
     if baseline is not None:
         steps("changed parameters")
         alpha = criteria.alpha["changed_parameters"]

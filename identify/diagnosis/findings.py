@@ -18,6 +18,7 @@ from armident.identify.document import Alternative, Finding, Gap, Negligible, No
 from armident.identify.effects.effect import Effect
 from armident.identify.effects.numbers import ParameterChange
 from armident.identify.effects.registry import catalogue, known, of_entry
+from armident.identify.effects.unnamed import NAME as UNNAMED
 from armident.identify.effects.wiring import Wiring
 
 Array = NDArray[np.float64]
@@ -90,6 +91,39 @@ def _finding(final: ModelState, one: Selected, parameters: Mapping[str, float], 
             "ambiguous_with": [key[0] for key, ratio in odds.items() if addition.named and ratio * STRONG > 1.0],
         },
     )
+
+
+def less_certain(findings: Sequence[Finding], left: Sequence[Unexplained]) -> list[Finding]:
+    """Return findings whose confidence allows for an effect outside the catalogue.
+
+    Odds compare the effects of the catalogue. What depends on the motion and has no name may be the rest of another
+    effect, of which a finding has taken a part. Of the power of its joint's error that is known not to be noise, the
+    finding explains a share. That share limits the probability of its name; a term without a name claims no cause.
+
+    Parameters
+    ----------
+    findings
+        Findings of the selection.
+    left
+        Unexplained dependences of the residual of the final model.
+    """
+    known_shares = _known_shares(left)
+    found = []
+    for one in findings:
+        rest = known_shares.get(one.evidence["gap_joint"], 0.0) * one.gap_after**2
+        taken = max(one.gap_before**2 - one.gap_after**2, 0.0)
+        share = taken / (taken + rest) if one.effect != UNNAMED and rest > 0.0 else 1.0
+        evidence = {**one.evidence, "share_explained": share}
+        found.append(one.model_copy(update={"confidence": share * one.confidence, "evidence": evidence}))
+    return found
+
+
+def _known_shares(left: Sequence[Unexplained]) -> dict[str, float]:
+    """Share of each joint's remaining error power that is known not to be noise, by name; dependences may overlap."""
+    shares: dict[str, float] = {}
+    for entry in left:
+        shares[entry.joint] = min(1.0, max(shares.get(entry.joint, 0.0), entry.share_of_residual))
+    return shares
 
 
 def tempered_odds(step: Step, one: Addition) -> dict[Key, float]:
@@ -196,9 +230,7 @@ def noise_floor(final: ModelState, left: Sequence[Unexplained]) -> Gap:
         Dependences of its residual.
     """
     gap = gap_of(final, held=True)
-    known_shares = {name: 0.0 for name in gap.by_joint}
-    for entry in left:
-        known_shares[entry.joint] = min(1.0, max(known_shares[entry.joint], entry.share_of_residual))
+    known_shares = {name: 0.0 for name in gap.by_joint} | _known_shares(left)
     by_joint = {name: error * float(np.sqrt(1.0 - known_shares[name])) for name, error in gap.by_joint.items()}
     rms = {name: gap.rms[name] * float(np.sqrt(1.0 - known_shares[name])) for name in by_joint}
     torque = {name: gap.rms[name] / max(gap.by_joint[name], 1e-300) for name in by_joint}

@@ -290,8 +290,8 @@ DIAGNOSIS_TERMS: tuple[Entry, ...] = (
           "must reduce the error there."),
     Entry("training data", "Data that the models are fitted to."),
     Entry("noise floor", "Torque error that noise alone leaves: the remaining error less its unexplained part."),
-    Entry("confidence", "Probability of a finding compared with all alternatives in its place, times the share of the "
-          "joint's model error that it explains."),
+    Entry("confidence", "Probability of a finding compared with all alternatives in its place. Where a part of the "
+          "joint's error is unexplained, it is multiplied by the share that the finding explains of both."),
     Entry("ambiguous", "Alternatives whose likelihood is within a factor of twenty of the finding's. The next "
           "experiment separates them."),
     Entry("alternatives", "Other effects in place of a finding, with their scores."),
