@@ -250,8 +250,10 @@ class Motion:
         if links not in self._still:
             theta = self.links if links else self._theta
             masses = self.model.mass_matrix(theta, self.q)
-            known = self.transmitted if links else self.torque
-            here = self.model.inverse_dynamics(theta, self.q, self.qd, self.qdd) if self.sharp else known
+            if self.sharp:
+                here = self.model.inverse_dynamics(theta, self.q, self.qd, self.qdd)
+            else:
+                here = self.transmitted if links else self.torque
             self._still[links] = here, np.ascontiguousarray(masses.transpose(2, 0, 1))
         return self._still[links]
 

@@ -1,6 +1,6 @@
 """Bandpass filtering of the thesis: zero-phase Butterworth filter and central differences (section 2.3.1)."""
 
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ def butterworth(
     return filtered
 
 
-@cache
+@lru_cache(maxsize=64)
 def _sections(order: int, cutoff: float) -> NDArray[np.float64]:
     """Second-order sections of a low-pass; ``cutoff`` relative to half the sampling rate."""
     sections: NDArray[np.float64] = signal.butter(order, cutoff, output="sos")
