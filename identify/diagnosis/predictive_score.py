@@ -5,6 +5,11 @@ parameters did not see. The training data are cut into `BLOCKS` blocks of equal 
 left out in turn. The instrumental-variable estimate of the other blocks predicts it. The autoregressive noise model
 turns these errors into innovations. They carry all the information that serially correlated errors have about the model
 (Box, Jenkins 1976, chapter 7).
+
+Coarse encoders make measured accelerations noisy. Their noise times the inertia is an error of the prediction, so that
+a model with a smaller inertia would predict better. The torque of the rigid model is therefore predicted without that
+noise, see `noise_of_motion`. How much of the motion is noise is estimated once, before effects are added: all models
+of a diagnosis are compared with the same noise.
 """
 
 from collections.abc import Sequence
@@ -18,6 +23,7 @@ from armident.identify.diagnosis.regression import MAX_AR_ORDER, Fit
 from armident.identify.effects.tables import FreeShape
 from armident.identify.effects.terms import effect_terms
 from armident.identify.regression.ar_noise import ArModel, ar_models
+from armident.identify.regression.iv import JointEquations
 
 Array = NDArray[np.float64]
 
@@ -27,6 +33,12 @@ SUMS = 20
 """Blocks of the block sums: long beside the memory of the noise, enough for a variance with 19 degrees of freedom."""
 FOLDS = 10
 """Folds of the cross-validation (Hastie, Tibshirani, Friedman 2009, section 7.10)."""
+
+LAGS = 5
+"""Samples to either side in the filter between simulated and measured motion: half a period of the loop's bandwidth,
+see `armident.identify.diagnosis.study.BAND`."""
+LEAST_ROWS = 10 * (2 * LAGS + 1)
+"""Rows of a stretch from which that filter is estimated: ten for each of its coefficients."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,17 +105,28 @@ class PredictiveScore:
     @cached_property
     def _parts(self) -> tuple[tuple[Array, ...], ...]:
         found = []
-        for joint in self.fit.equations.joints:
+        for joint, reference in zip(self.fit.equations.joints, self._reference, strict=True):
             width = joint.x.size
             total = sum(len(part) for part in joint.parts)
             fold, begin, parts = fold_of(total), 0, []
             for part in joint.parts:
-                rows = part[:]
-                own = self.folds[fold[begin : begin + len(part)]][:, joint.x]
-                parts.append(rows[:, -1] - np.einsum("mi,mi->m", rows[:, :width], own))
+                rows, own = part[:], fold[begin : begin + len(part)]
+                errors = rows[:, -1] - np.einsum("mi,mi->m", rows[:, :width], self.folds[own][:, joint.x])
+                if reference is not None:
+                    noise = noise_of_motion(joint, rows, self.folds[:, : reference.size] - reference)
+                    errors += noise[np.arange(own.size), own]
+                parts.append(errors)
                 begin += len(part)
             found.append(tuple(parts))
         return tuple(found)
+
+    @property
+    def _reference(self) -> Sequence[Array | None]:
+        """Rigid parameters of each joint whose torque is predicted at the measured motion, (b - e,) each."""
+        study = self.fit.study
+        rigid = self.fit.theta.size - study.model.e
+        known = study.reference
+        return [None] * study.robot.n if known is None or known.shape[1] != rigid else list(known)
 
     def innovations(self, noise: Sequence[ArModel]) -> Array:
         """Mean squares of the innovations of each joint under noise models, (N m)^2 or N^2, (n,).
@@ -219,3 +242,54 @@ def fold_of(rows: int) -> NDArray[np.int64]:
         Number of rows, R.
     """
     return np.arange(rows) * BLOCKS // max(rows, 1) % FOLDS
+
+
+def reference_of(fit: Fit) -> Array:
+    """Rigid parameters of each joint whose torque is predicted at the measured motion, (n, b - e).
+
+    They are the parameters of a fit, times the share of the motion beyond the simulated one that is no measurement
+    noise. Measurement noise of the motion appears in the errors of a fit with the opposite sign, and real motion does
+    not appear (errors in variables: Fuller 1987, section 1.2).
+
+    Parameters
+    ----------
+    fit
+        Fit of the model to which nothing is added yet.
+    """
+    rigid = fit.theta.size - fit.study.model.e
+    found = np.zeros((fit.study.robot.n, rigid))
+    for j, (joint, ar) in enumerate(zip(fit.equations.joints, fit.noise, strict=True)):
+        along = power = 0.0
+        for part in joint.parts:
+            rows = part[:]
+            noise = ar.whiten(noise_of_motion(joint, rows, fit.theta[None, :rigid])[:, 0])
+            along -= float(noise @ ar.whiten(rows[:, -1] - rows[:, : joint.x.size] @ fit.theta[joint.x]))
+            power += float(noise @ noise)
+        found[j] = (1.0 - np.clip(along / max(power, 1e-300), 0.0, 1.0)) * fit.theta[:rigid]
+    return found
+
+
+def noise_of_motion(joint: JointEquations, rows: Array, theta: Array) -> Array:
+    """Torque of the rigid model at measured signals beyond that at simulated ones, (M, k).
+
+    Simulated torques follow the measured ones through a short filter, as simulated and real loop differ a little. What
+    that filter does not give is noise of the measured motion, or motion that disturbances caused.
+
+    Parameters
+    ----------
+    joint
+        Equations of the joint.
+    rows
+        Their rows in one stretch, (M, x + z + 1).
+    theta
+        Sets of rigid parameters, (k, b - e).
+    """
+    if rows.shape[0] < LEAST_ROWS:
+        return np.zeros((rows.shape[0], theta.shape[0]))
+    x, z = (columns[columns < theta.shape[1]] for columns in (joint.x, joint.z))
+    simulated = rows[:, joint.x.size :][:, : z.size] @ theta[:, z].T
+    apart = rows[:, : x.size] @ theta[:, x].T - simulated
+    padded = np.pad(simulated, ((LAGS, LAGS), (0, 0)), mode="edge")
+    shifted = np.lib.stride_tricks.sliding_window_view(padded, 2 * LAGS + 1, axis=0)
+    taps = np.linalg.lstsq(shifted.mean(axis=1), apart.mean(axis=1), rcond=1e-10)[0]
+    return np.asarray(apart - shifted @ taps)

@@ -33,6 +33,7 @@ from armident.identify.diagnosis.model_state import (
     with_entries,
     with_first_motions,
     with_own_noise,
+    with_reference,
     with_report_part,
     without_entry,
 )
@@ -166,8 +167,10 @@ class StepwiseSelection:
         self.study = state.study
         if not self.study.sign_given:
             state = with_own_noise(with_transitions(state, self._state))
-        state = with_first_motions(state)
-        self.study = replace(self.study, robot=state.robot, model=state.study.model)
+        state = with_reference(with_first_motions(state))
+        self.study = replace(
+            self.study, robot=state.robot, model=state.study.model, reference=state.study.reference
+        )
         self._states[_key(state.robot)] = state
         return state
 
@@ -318,7 +321,7 @@ class StepwiseSelection:
 
     def _superseded(self, addition: Addition, step: Step) -> bool:
         """True if an explanation of the same joint that does not pass is clearly better than an addition."""
-        better = (a for a in step.rivals(addition) if a not in step.passing)
+        better = (a for a in step.rivals(addition) if a not in step.passing and a.share > 0.0)
         return any(a.log_likelihood > addition.log_likelihood + self.criteria.close for a in better)
 
     def _late(self) -> bool:

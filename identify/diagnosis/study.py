@@ -99,6 +99,9 @@ class Study:
     regressors
         Cache of the regressors that all models of the study share; see
         `armident.identify.diagnosis.equations.regressors`.
+    reference
+        Rigid parameters whose torque is predicted at the measured motion, for each joint, (n, b - e); ``None`` before
+        the first fit. See `armident.identify.diagnosis.predictive_score.reference_of`.
     """
 
     robot: RobotConfig
@@ -117,6 +120,7 @@ class Study:
     warnings: tuple[str, ...] = ()
     sign_given: bool = True
     regressors: RegressorCache = field(default_factory=RegressorCache, repr=False, compare=False)
+    reference: Array | None = None
 
     @property
     def recorded(self) -> tuple[Entry, ...]:
