@@ -37,6 +37,8 @@ FOLDS = 10
 LAGS = 5
 """Samples to either side in the filter between simulated and measured motion: half a period of the loop's bandwidth,
 see `armident.identify.diagnosis.study.BAND`."""
+NOISE_SHARE = 0.5
+"""Share of the measured motion beyond the simulated one from which it counts as measurement noise: more than half."""
 LEAST_ROWS = 10 * (2 * LAGS + 1)
 """Rows of a stretch from which that filter is estimated: ten for each of its coefficients."""
 
@@ -247,9 +249,10 @@ def fold_of(rows: int) -> NDArray[np.int64]:
 def reference_of(fit: Fit) -> Array:
     """Rigid parameters of each joint whose torque is predicted at the measured motion, (n, b - e).
 
-    They are the parameters of a fit, times the share of the motion beyond the simulated one that is no measurement
-    noise. Measurement noise of the motion appears in the errors of a fit with the opposite sign, and real motion does
-    not appear (errors in variables: Fuller 1987, section 1.2).
+    Measured motion beyond the simulated one is measurement noise, or motion that disturbances caused. Measurement noise
+    appears in the errors of a fit with the opposite sign. Real motion does not appear there (errors in variables:
+    Fuller 1987, section 1.2). Where more than half of it is noise, the parameters are zero: all torques of the rigid
+    model are predicted without that noise. Elsewhere they are those of the fit: changes of the parameters are.
 
     Parameters
     ----------
@@ -265,7 +268,7 @@ def reference_of(fit: Fit) -> Array:
             noise = ar.whiten(noise_of_motion(joint, rows, fit.theta[None, :rigid])[:, 0])
             along -= float(noise @ ar.whiten(rows[:, -1] - rows[:, : joint.x.size] @ fit.theta[joint.x]))
             power += float(noise @ noise)
-        found[j] = (1.0 - np.clip(along / max(power, 1e-300), 0.0, 1.0)) * fit.theta[:rigid]
+        found[j] = 0.0 if along > NOISE_SHARE * power else fit.theta[:rigid]
     return found
 
 

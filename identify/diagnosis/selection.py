@@ -168,9 +168,7 @@ class StepwiseSelection:
         if not self.study.sign_given:
             state = with_own_noise(with_transitions(state, self._state))
         state = with_reference(with_first_motions(state))
-        self.study = replace(
-            self.study, robot=state.robot, model=state.study.model, reference=state.study.reference
-        )
+        self.study = replace(self.study, robot=state.robot, model=state.study.model, reference=state.study.reference)
         self._states[_key(state.robot)] = state
         return state
 
