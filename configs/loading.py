@@ -26,7 +26,7 @@ KINDS: dict[str, type[BaseModel]] = {
     "scenario": Scenario,
 }
 """Kinds of files by the word in their ``schema`` key."""
-SHIPPED = ("robots", "cells", "trajectories", "scenarios", "suites", "eds")
+SHIPPED = ("robots", "cells", "trajectories", "scenarios", "suites", "eds", "zenoh")
 """Folders of shipped files, in the order of the search for a bare name."""
 _LONGEST = 80
 """Maximum number of characters of a file that a message quotes."""

@@ -55,6 +55,40 @@ def test_a_shipped_configuration_is_found_by_its_short_names(
     assert load_robot(name).n == 6
 
 
+@pytest.mark.parametrize("given", ["{kind}/{name}", "{name}", "configs/{kind}/{name}", "configs/{name}"])
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("robots", "emps.yaml"),
+        ("cells", "tx40_cell.yaml"),
+        ("trajectories", "tx40_excitation.yaml"),
+        ("scenarios", "tx40_worn_joint2.yaml"),
+        ("suites", "suite.yaml"),
+        ("eds", "cia402_servo.eds"),
+        ("zenoh", "peer.json5"),
+    ],
+)
+def test_shipped_files_of_every_kind_are_found_from_any_folder(
+    kind: str, name: str, given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert config_path(given.format(kind=kind, name=name)) == HERE / kind / name
+
+
+def test_a_session_in_any_folder_finds_shipped_files_by_their_names(tmp_path: Path) -> None:
+    data = yaml.safe_load((HERE / "cells" / "tx40_cell.yaml").read_text())
+    data |= {"robot": "tx40", "zenoh": {"config": "peer.json5"}, "setpoints": {"trajectory": "tx40_1.yaml"}}
+    for drive in data["drives"]:
+        drive["eds"] = "cia402_servo.eds"
+    (tmp_path / "cell.yaml").write_text(yaml.safe_dump(data))
+    session = load_session(tmp_path / "cell.yaml")
+    assert session.setpoints is not None
+    assert session.robot == HERE / "robots" / "tx40.yaml"
+    assert session.drives[3].eds == HERE / "eds" / "cia402_servo.eds"
+    assert session.zenoh.config == HERE / "zenoh" / "peer.json5"
+    assert session.setpoints.trajectory == HERE / "trajectories" / "tx40_1.yaml"
+
+
 def test_a_file_in_the_working_directory_wins_over_the_shipped_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
