@@ -173,7 +173,7 @@ def test_a_data_type_of_the_maker_is_looked_up(tmp_path: Path) -> None:
     own = "[00A0]\nObjectType=6\n[00A0sub1]\nDataType=5\nDefaultValue=0x0003\n"
     known = read_eds(written(tmp_path, PLAIN + own + text.format("Mode", "0xA0")), NODE).objects
     unknown = read_eds(written(tmp_path, PLAIN + text.format("Mode", "0xA1")), NODE).objects
-    assert (variable(known, 0x2001).data_type, unvariable(known, 0x2001).data_type) == (3, eds.DOMAIN_TYPE)
+    assert (variable(known, 0x2001).data_type, variable(unknown, 0x2001).data_type) == (3, eds.DOMAIN_TYPE)
 
 
 def test_copies_of_sections_keep_the_first_values_and_say_a_difference(tmp_path: Path) -> None:
