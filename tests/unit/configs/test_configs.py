@@ -1,5 +1,6 @@
 """Configuration files: accepted values, and one-line messages for every mistake."""
 
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -111,7 +112,10 @@ def test_motor_six_turns_with_joint_five_as_on_the_tx40() -> None:
         (robot_with(bandwidth_hz=float("nan")), "bandwidth_hz: "),
         (robot_with(transmission=[[1.0]]), "transmission: expected 6 rows of 6 numbers"),
         (robot_with(transmission=[[0.0] * 6] * 6), "transmission: the matrix is singular"),
-        (robot_with(joints=[*TX40["joints"][:5], TX40["joints"][4]]), "joints: names must be unique"),
+        (
+            robot_with(joints=[*TX40["joints"][:5], TX40["joints"][4]]),
+            "joints: names must be unique, without regard to case",
+        ),
         (
             robot_with(couplings=[{"name": "m6", "joints": ["joint_5", "joint_7"]}]),
             "couplings: no joint named 'joint_7'",
@@ -128,6 +132,78 @@ def test_a_mistake_is_named_in_one_line_with_file_key_and_expectation(text: str,
     assert message.startswith("robot.yaml:")
     assert expected in message
     assert "\n" not in message
+
+
+def test_all_missing_keys_are_listed_at_once() -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse("joints: [{mdh: {alpha: 0, d: 0}}, {name: j2}]", RobotConfig, "robot.yaml")
+    assert str(caught.value) == (
+        "robot.yaml: schema, name, joints[0].name, joints[0].mdh.theta, joints[0].mdh.r, joints[1].mdh: missing"
+    )
+
+
+def one_joint(tmp_path: Path, **changes: object) -> Path:
+    mdh = {"alpha": 0.0, "d": 0.0, "theta": 0.0, "r": 0.0}
+    data = {"schema": "armident/robot/1", "name": "arm", "joints": [{"name": "j1", "mdh": mdh} | changes]}
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(data))
+    return tmp_path / "arm.yaml"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"mdh": {"alpha": 180, "d": 0, "theta": 0, "r": 0}}, "joints[0].mdh.alpha: 180 looks like degrees"),
+        ({"mdh": {"alpha": 0, "d": 0, "theta": -90, "r": 0}}, "joints[0].mdh.theta: -90 looks like degrees"),
+        (
+            {"mdh": {"alpha": 0, "d": 325, "theta": 0, "r": 0}},
+            "joints[0].mdh.d: 325 looks like millimetres (in m: 0.325)",
+        ),
+        ({"limits": {"position": [-132, 132]}}, "joints[0].limits.position: [-132, 132] looks like degrees"),
+        ({"limits": {"position": [-45.5, 30]}}, "joints[0].limits.position: [-45.5, 30] looks like degrees"),
+        ({"type": "prismatic", "limits": {"position": [0, 500]}}, "[0, 500] looks like millimetres (in m: [0, 0.5])"),
+    ],
+)
+def test_suspected_degrees_and_millimetres_are_named(tmp_path: Path, changes: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_robot(one_joint(tmp_path, **changes))
+    assert said in str(caught.value)
+    assert "arm.yaml: expected rad and m: " in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"limits": {"position": [-62.83, 62.83]}},
+        {"limits": {"position": [-12.5, 12.5]}},
+        {"limits": {"position": [-1e16, 1e16]}},
+        {"limits": {"position": [-math.inf, math.inf]}},
+        {"limits": {"position": [-10000, 10000]}},
+        {"type": "prismatic", "limits": {"position": [0, 60]}},
+        {"mdh": {"alpha": -6.2832, "d": 15, "theta": 0, "r": 0}},
+    ],
+)
+def test_many_turns_and_long_axes_are_no_suspicion(tmp_path: Path, changes: dict[str, object]) -> None:
+    assert load_robot(one_joint(tmp_path, **changes)).n == 1
+
+
+def test_an_endless_joint_has_the_range_of_two_turns(tmp_path: Path) -> None:
+    for none in (1e16, math.inf):
+        joint = load_robot(one_joint(tmp_path, limits={"position": [-none, none]})).joints[0]
+        assert joint.limits.position == pytest.approx((-2 * np.pi, 2 * np.pi))
+
+
+def test_limits_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    for changes in ({"position": [math.nan, 1.0]}, {"position": [1.0, 1.0]}, {"velocity": math.nan}):
+        with pytest.raises(ConfigError, match=r"joints\[0\]\.limits"):
+            load_robot(one_joint(tmp_path, limits=changes))
+
+
+def test_a_drive_finds_its_joint_without_regard_to_case(tmp_path: Path) -> None:
+    data = yaml.safe_load((HERE / "robots" / "tx40.yaml").read_text())
+    data["joints"][0]["name"] = "Joint_1"
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(data))
+    session = load_session(session_with(tmp_path, robot="mine.yaml"))
+    assert [drive.joint for drive in session.drives][:2] == ["Joint_1", "joint_2"]
 
 
 def test_a_missing_file_names_what_is_shipped() -> None:
