@@ -71,7 +71,7 @@ def _position(joint: Joint, place: str) -> Iterator[str]:
 
 
 def _like_degrees(end: float) -> bool:
-    """Whether a position limit is beyond two turns and neither whole quarter turns in rad nor meant as no limit."""
+    """True for a position limit beyond two turns that is no multiple of a quarter turn and not meant as none."""
     if not FEW_TURNS < abs(end) <= LARGEST_DEGREES:
         return False
     quarters = abs(end) / (math.pi / 2)

@@ -100,9 +100,9 @@ def endless(position: object) -> object:
     """
     if not isinstance(position, tuple | list) or len(position) != 2:
         return position
-    low, high = position
     if not all(isinstance(end, int | float) and not isinstance(end, bool) for end in position):
         return position
+    low, high = (float(max(-WRITTEN_NO_LIMIT, min(WRITTEN_NO_LIMIT, end))) for end in position)
     open_low, open_high = low <= -NO_LIMIT, high >= NO_LIMIT
     if open_low and open_high:
         return ENDLESS

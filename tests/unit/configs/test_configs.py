@@ -319,3 +319,45 @@ def test_the_former_name_of_a_key_is_read_with_a_warning(tmp_path: Path, caplog:
     assert "recording.look_hz is now recording.preview_hz" in caplog.text
     with pytest.raises(ConfigError, match=r"recording\.look_hz: unknown key"):
         load_session(session_with(tmp_path, recording={"look_hz": 20.0, "preview_hz": 10.0}))
+
+
+ODD_NUMBERS = [
+    ".nan",
+    ".inf",
+    "-.inf",
+    "1e400",
+    "-1e400",
+    "1" + "0" * 400,
+    "1" * 5000,
+    "0x" + "f" * 300,
+    "1e-400",
+    "!!float 1e9x",
+]
+
+
+@pytest.mark.parametrize("number", ODD_NUMBERS, ids=range(len(ODD_NUMBERS)))
+@pytest.mark.parametrize(
+    ("kind", "line"),
+    [
+        ("robot", "bandwidth_hz: {}"),
+        ("robot", "gravity: [0, 0, {}]"),
+        ("robot", "joints: [{{name: j, mdh: {{alpha: {0}, d: {0}, theta: 0, r: 0}}}}]"),
+        ("robot", "joints: [{{name: j, limits: {{position: [{0}, {0}], torque: {0}}}}}]"),
+        ("robot", "transmission: [[{}]]"),
+        ("session", "sync: {{period_us: {}}}"),
+        ("session", "drives: [{{joint: j, node_id: {}, eds: x.eds}}]"),
+        ("trajectory", "start: [{}]"),
+    ],
+)
+def test_an_odd_number_is_one_line(tmp_path: Path, kind: str, line: str, number: str) -> None:
+    load = {"robot": load_robot, "session": load_session, "trajectory": load_trajectory}[kind]
+    path = tmp_path / "odd.yaml"
+    path.write_text(f"schema: armident/{kind}/1\n{line.format(number)}\n")
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}:")
+    assert "\n" not in message
+    assert len(message) < 700 + len(str(path))
+    assert "limit (4300" not in message
+    assert "Error" not in message
