@@ -136,7 +136,7 @@ class RecordingWriter:
 
         for k, layout in self._layouts.values():
             schema = layout.message_name, "protobuf", layout.descriptor
-            add(k, layout.topic, schema, "protobuf", {LAYOUT_KEY: layout.to_json()})
+            add(k, layout.topic, schema, "protobuf", layout.scale_texts | {LAYOUT_KEY: layout.to_json()})
         for topic, k in self._topics.items():
             properties = {name: {"type": kind} for name, kind in _EVENTS[topic].items()}
             document = json.dumps({"type": "object", "properties": properties}).encode()
