@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from armident import design_trajectory
+from armident import RobotModel, design_trajectory, identify
 from armident.configs import ConfigError, Limits, RobotConfig, Trajectory, load_robot
 from armident.configs.loading import parse
 from armident.configs.mdh import modified_dh
@@ -20,6 +20,7 @@ from armident.configs.urdf_tree import read_chain
 from armident.daq.guard.limits import limits_of
 from armident.daq.recording import Recording, Stream, read_recording, write_recording
 from armident.daq.recording.model import Field
+from armident.identify.effects.drive import NOMINAL_TORQUE, motor_limit
 
 LIMIT = '<limit lower="-2" upper="2" velocity="3" effort="50"/>'
 
@@ -459,3 +460,31 @@ def test_joint_names_keep_their_letters_or_get_a_place(
     assert tuple(j.name for j in joints) == expected
     assert tuple(j.source_name or j.name for j in joints) == names
     assert (joints[1].limits.velocity, joints[0].rotor_inertia) == (1.0, False)
+
+
+def test_an_arm_without_limits_is_identified_from_a_recording(tmp_path: Path) -> None:
+    urdf(
+        tmp_path,
+        joint("Sh", "a b", axis="0 1 0", more=""),
+        joint("El", "b c", axis="0 1 0", xyz="0.4 0 0", more=""),
+        links="a b c",
+    )
+    (tmp_path / "arm.yaml").write_text("schema: armident/robot/1\nname: arm\nurdf: {file: arm.urdf}\n")
+    robot = load_robot(tmp_path / "arm.yaml")
+    model, rng = RobotModel(robot), np.random.default_rng(1)
+    t = np.arange(0.0, 10.0, 0.004)
+    rates, weights = 2.0 * np.pi * 0.1 * np.arange(1, 8), rng.normal(size=(7, 2)) / np.arange(1, 8)[:, None]
+    q, qd = np.sin(t[:, None] * rates) @ weights, np.cos(t[:, None] * rates) @ (weights * rates[:, None])
+    qdd = -np.sin(t[:, None] * rates) @ (weights * rates[:, None] ** 2)
+    theta = rng.uniform(0.5, 2.0, model.regressor(q[:1], qd[:1], qdd[:1]).shape[-1])
+    tau = np.asarray(model.regressor(q, qd, qdd)) @ theta + rng.normal(0.0, 0.05, q.shape)
+    count = np.arange(t.size, dtype=np.int64)
+    fields = {
+        "position": Field("position", "position", "rad", "joint", (1.0, 1.0)),
+        "torque": Field("torque", "torque", "N m", "joint", (1.0, 1.0)),
+    }
+    stream = Stream("samples", 1, count, count * 4_000_000, fields, {"position": q, "torque": tau})
+    write_recording(Recording(None, robot, None, 250.0, {"samples": stream}), tmp_path / "r.mcap")
+    result = identify(tmp_path / "r.mcap", method="idim-ls")
+    np.testing.assert_allclose(result.theta, theta, rtol=0.05, atol=0.05)
+    assert motor_limit(robot, 0) == NOMINAL_TORQUE
