@@ -16,6 +16,13 @@ _BINARY: dict[type[ast.operator], Callable[[float, float], float]] = {
 }
 _FUNCTIONS: dict[str, Callable[[float], float]] = {"abs": abs, "sqrt": math.sqrt, "sin": math.sin, "cos": math.cos}
 _CONSTANTS = {"pi": math.pi}
+_EXPECTED = "numbers, names, + - * / ** and functions of one argument"
+
+LONGEST = 1000
+"""Maximum length of an expression in characters."""
+
+_SHOWN = 80
+"""Maximum number of characters of an expression that a message quotes."""
 
 
 def evaluate(expression: str | float, names: Mapping[str, float], where: str = "expression") -> float:
@@ -35,26 +42,45 @@ def evaluate(expression: str | float, names: Mapping[str, float], where: str = "
     ConfigError
         If the text is not an expression, a name is unknown, or the value is not finite.
     """
-    if not isinstance(expression, str):
-        return float(expression)
+    shown = repr(expression) if isinstance(expression, str) else "the number"
+    shown = shown if len(shown) <= _SHOWN else f"{shown[: _SHOWN - 3]}..."
+    if isinstance(expression, str) and len(expression) > LONGEST:
+        raise ConfigError(f"{where}: {shown}: {len(expression)} characters, expected at most {LONGEST}")
     try:
-        value = _value(ast.parse(expression.strip(), mode="eval").body, names)
-    except (SyntaxError, TypeError, KeyError, ValueError) as error:
-        detail = f"unknown name {error.args[0]!r}" if isinstance(error, KeyError) else str(error)
-        raise ConfigError(f"{where}: {expression!r}: {detail} (names: {', '.join(sorted(names))})") from error
+        value = _value(_parsed(expression), names) if isinstance(expression, str) else float(expression)
+    except KeyError as error:
+        known = ", ".join(sorted(names))
+        raise ConfigError(f"{where}: {shown}: unknown name {error.args[0]!r:.60} (names: {known})") from error
     except ZeroDivisionError as error:
-        raise ConfigError(f"{where}: {expression!r}: division by zero") from error
+        raise ConfigError(f"{where}: {shown}: division by zero") from error
     except OverflowError as error:
-        raise ConfigError(f"{where}: {expression!r}: the number is too large") from error
+        raise ConfigError(f"{where}: {shown}: the number is too large") from error
+    except (RecursionError, MemoryError) as error:
+        raise ConfigError(f"{where}: {shown}: nested too deeply") from error
+    except ValueError as error:
+        raise ConfigError(f"{where}: {shown}: no real number (is it the root of a negative number?)") from error
+    except _NotArithmetic as error:
+        raise ConfigError(f"{where}: {shown}: {error} (names: {', '.join(sorted(names))})") from error
     if not math.isfinite(value):
-        raise ConfigError(f"{where}: {expression!r} is not a finite number")
+        raise ConfigError(f"{where}: {shown} is not a finite number")
     return value
+
+
+class _NotArithmetic(Exception):
+    """Text that is no arithmetic expression."""
+
+
+def _parsed(text: str) -> ast.expr:
+    try:
+        return ast.parse(text.strip(), mode="eval").body
+    except (SyntaxError, ValueError) as error:
+        raise _NotArithmetic(f"not an expression; expected {_EXPECTED}") from error
 
 
 def _value(node: ast.expr, names: Mapping[str, float]) -> float:
     match node:
         case ast.Constant(value=bool()):
-            raise ValueError("only numbers, names, + - * / ** and functions of one argument")
+            raise _NotArithmetic(f"expected only {_EXPECTED}")
         case ast.Constant(value=int() | float() as number):
             return float(number)
         case ast.Name(id=name):
@@ -68,4 +94,4 @@ def _value(node: ast.expr, names: Mapping[str, float]) -> float:
             return result
         case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]):
             return _FUNCTIONS[name](_value(argument, names))
-    raise ValueError("only numbers, names, + - * / ** and functions of one argument")
+    raise _NotArithmetic(f"expected only {_EXPECTED}")

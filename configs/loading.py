@@ -11,9 +11,10 @@ from pydantic import BaseModel, ValidationError
 from armident.configs.errors import ConfigError
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.scenario import Scenario
-from armident.configs.schema.session import RENAMED, SessionConfig
+from armident.configs.schema.session import RENAMED, DriveNode, SessionConfig
 from armident.configs.schema.suite import SuiteConfig
 from armident.configs.schema.trajectory import Trajectory
+from armident.configs.suspected_units import suspected_units
 from armident.configs.urdf import UrdfGeometry, geometry_from_urdf
 from armident.configs.yaml_loader import is_file, read_yaml
 
@@ -26,10 +27,12 @@ KINDS: dict[str, type[BaseModel]] = {
     "scenario": Scenario,
 }
 """Kinds of files by the word in their ``schema`` key."""
-SHIPPED = ("robots", "cells", "trajectories", "scenarios", "suites", "eds")
+SHIPPED = ("robots", "cells", "trajectories", "scenarios", "suites", "eds", "zenoh")
 """Folders of shipped files, in the order of the search for a bare name."""
 _LONGEST = 80
 """Maximum number of characters of a file that a message quotes."""
+_LISTED = 12
+"""Maximum number of missing keys that a message lists."""
 T = TypeVar("T", bound=BaseModel)
 
 log = logging.getLogger(__name__)
@@ -89,11 +92,21 @@ def load_robot(name: str | Path) -> RobotConfig:
     """
     path = config_path(name)
     data = _read_mapping(_read_text(path), str(path))
+    file_keys = data.keys()
     if "urdf" in data:
         concerned = {key: data[key] for key in UrdfGeometry.model_fields if key in data}
         geometry = geometry_from_urdf(_checked(concerned, UrdfGeometry, str(path)), path)
         data = {key: value for key, value in data.items() if key not in concerned} | geometry
-    return _checked(data, RobotConfig, str(path))
+    robot = _checked(data, RobotConfig, str(path))
+    suspected = suspected_units(robot, geometry="urdf" not in file_keys)
+    if suspected:
+        raise ConfigError(f"{path}: expected rad and m: {'; '.join(suspected[:3])}{_others(len(suspected) - 3)}")
+    return robot
+
+
+def _others(count: int) -> str:
+    """Remark on entries that are not listed."""
+    return f" (and {count} more)" if count > 0 else ""
 
 
 def load_trajectory(name: str | Path) -> Trajectory:
@@ -157,14 +170,19 @@ def load_session(name: str | Path) -> SessionConfig:
     if session.zenoh.config is not None:
         changes["zenoh"] = session.zenoh.model_copy(update={"config": resolved(session.zenoh.config, "zenoh.config")})
     session = session.model_copy(update=changes)
-    joints = {j.name for j in load_robot(session.robot).joints}
+    return session.model_copy(update={"drives": _with_known_joints(session, path)})
+
+
+def _with_known_joints(session: SessionConfig, path: Path) -> tuple[DriveNode, ...]:
+    """Drives with the names of their joints as the robot writes them; case does not count."""
+    joints = {j.name.lower(): j.name for j in load_robot(session.robot).joints}
     for k, drive in enumerate(session.drives):
-        if drive.joint not in joints:
+        if drive.joint.lower() not in joints:
             raise ConfigError(
                 f"{path}: drives[{k}].joint: {drive.joint!r} is not a joint of {session.robot.name} "
-                f"({', '.join(sorted(joints))})"
+                f"({', '.join(sorted(joints.values()))})"
             )
-    return session
+    return tuple(d.model_copy(update={"joint": joints[d.joint.lower()]}) for d in session.drives)
 
 
 def load_suite(name: str | Path) -> SuiteConfig:
@@ -296,22 +314,32 @@ def _boolean_mismatch(given: Any, parsed: Any, key: str) -> str | None:
 def _first_problem(error: ValidationError, kind: type[BaseModel], data: dict[str, Any]) -> str:
     problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     first = problems[0]
-    key = ""
-    for part in first["loc"]:
-        key += f"[{part}]" if isinstance(part, int) else f".{_shown(part)}" if key else _shown(part)
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    key = _key_of(first["loc"])
+    more = _others(len(problems) - 1)
     if first["type"] == "extra_forbidden":
         missing = [str(p["loc"][-1]) for p in problems if p["type"] == "missing"]
         offered = _keys(kind) | (_keys(UrdfGeometry) if kind is RobotConfig else set())
         near = difflib.get_close_matches(str(first["loc"][-1])[:_LONGEST], missing + sorted(offered), n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         return f"{key}: unknown key{hint}{more}"
+    missing = [_key_of(p["loc"]) for p in problems if p["type"] == "missing"]
+    if first["type"] == "missing" and len(missing) > 1:
+        listed = ", ".join(missing[:_LISTED])
+        return f"{_shown(listed, 500)}{_others(len(missing) - _LISTED)}: missing"
     value = first.get("input")
     found = f", found {_shown(repr(value))}" if isinstance(value, str | float | bool) or value is None else ""
     if isinstance(value, int) and not isinstance(value, bool):
         found = f", found {value}" if abs(value) < 10**20 else ", found a number of more than 20 digits"
     message = " ".join(first["msg"].removeprefix("Value error, ").split())
     return f"{key + ': ' if key else ''}{_shown(message[0].lower() + message[1:], 500)}{found}{more}"
+
+
+def _key_of(place: tuple[int | str, ...]) -> str:
+    """Key of a problem, such as ``joints[0].mdh``."""
+    key = ""
+    for part in place:
+        key += f"[{part}]" if isinstance(part, int) else f".{_shown(part)}" if key else _shown(part)
+    return key
 
 
 def _shown(text: object, longest: int = _LONGEST) -> str:

@@ -86,5 +86,9 @@ def read_yaml(text: str, where: str) -> Any:
         raise ConfigError(f"{where}:{line} not valid YAML: {problem[:200]}") from error
     except RecursionError as error:
         raise ConfigError(f"{where}: not valid YAML: brackets or indentation too deep") from error
-    except (ValueError, OverflowError, AttributeError) as error:
-        raise ConfigError(f"{where}: not valid YAML: {str(error)[:200]}") from error
+    except (ValueError, OverflowError) as error:
+        raise ConfigError(
+            f"{where}: not valid YAML: a number with too many digits, or a key that is no word"
+        ) from error
+    except AttributeError as error:
+        raise ConfigError(f"{where}: not valid YAML: a tag that does not fit its value") from error

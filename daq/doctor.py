@@ -25,10 +25,11 @@ from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
 from armident.daq.capture.files import chunk_duration_ns
 from armident.daq.matching.streams import captured_streams
-from armident.daq.streaming.session import configuration, endpoints
+from armident.daq.streaming.session import configuration, endpoints, unreadable_files
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
 from armident.drivers.canopen.bus_load import check_fits
+from armident.drivers.canopen.eds import read_eds
 from armident.drivers.vcan.interfaces import NETWORK, have_socketcan, is_up
 
 Verdict = Literal["ok", "warning", "failed"]
@@ -62,31 +63,50 @@ class Check:
 def run_checks(config: str | Path) -> list[Check]:
     """Check everything that a capture of a session needs.
 
-    Nothing is sent to the buses, and only a probe file is written. If the configuration is invalid, the checks are that
-    and the clock.
+    Nothing is sent to the buses, and only a probe file is written. If the configuration is invalid, the checks are
+    that, the data sheets of the drives if the session could be read, and the clock.
 
     Parameters
     ----------
     config
         Session configuration.
     """
-    checks: list[Check] = []
     try:
         session = load_session(config)
+    except ArmidentError as error:
+        return [Check("configuration", "failed", str(error)), _clock()]
+    try:
         robot = load_robot(session.robot)
         captured_streams(session, robot)
         if session.setpoints is not None:
             trajectory = load_trajectory(session.setpoints.trajectory)
             trajectory.check(robot, str(session.setpoints.trajectory))
-        checks.append(Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}"))
     except ArmidentError as error:
-        return [Check("configuration", "failed", str(error)), _clock()]
-    checks.append(_bus_load(session, config))
+        return [Check("configuration", "failed", str(error)), *_data_sheets(session), _clock()]
+    checks = [Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}")]
+    checks += [*_data_sheets(session), _bus_load(session, config)]
     for bus in session.all_buses:
         checks += _interface(bus)
     checks.append(_clock())
     checks += [*_disk(session, robot), _zenoh(session)]
     return checks
+
+
+def _data_sheets(session: SessionConfig) -> Iterator[Check]:
+    """Check that the EDS of every drive can be read, and repeat what it leaves out."""
+    nodes: dict[Path, int] = {}
+    for drive in session.drives:
+        nodes.setdefault(drive.eds, drive.node_id)
+    for file, node_id in nodes.items():
+        try:
+            sheet = read_eds(file, node_id)
+        except ConfigError as error:
+            yield Check("eds", "failed", str(error))
+            continue
+        if sheet.remarks:
+            yield Check("eds", "warning", f"{file}: {'; '.join(sheet.remarks)}")
+        else:
+            yield Check("eds", "ok", f"{file.name}: {len(sheet.objects)} objects")
 
 
 def _bus_load(session: SessionConfig, config: str | Path) -> Check:
@@ -261,9 +281,11 @@ def _speed(times: list[float], span_s: float) -> Check:
 def _zenoh(session: SessionConfig) -> Check:
     """Check the configuration of Zenoh, and that the port of the capture is free."""
     try:
-        configuration(session, "capture")
+        unreadable = unreadable_files(configuration(session, "capture"))
     except ConfigError as error:
         return Check("zenoh", "failed", str(error))
+    if unreadable:
+        return Check("zenoh", "failed", f"{session.zenoh.config}: cannot be read: {', '.join(unreadable)}")
     if session.zenoh.config is not None or session.zenoh.listen:
         return Check("zenoh", "ok", "configured by the session")
     host, _, port = endpoints(session)["capture"].removeprefix("tcp/").rpartition(":")

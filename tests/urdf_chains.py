@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armident.configs.mdh import MdhChain
-from armident.configs.urdf import UrdfJoint, rotation
+from armident.configs.urdf_origin import rotation
+from armident.configs.urdf_tree import UrdfJoint
 
 Floats = NDArray[np.float64]
 

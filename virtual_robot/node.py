@@ -16,6 +16,7 @@ from canopen.sdo.server import SdoServer
 
 from armident.configs import ConfigError
 from armident.configs.schema.robot import Joint
+from armident.drivers.canopen.eds import read_objects
 from armident.drivers.canopen.objects import (
     COB_HEARTBEAT,
     COB_SDO_REQUEST,
@@ -205,10 +206,7 @@ class Drive(canopen.LocalNode):
         fd: bool = False,
     ) -> None:
         self.fd = fd
-        try:
-            super().__init__(node_id, str(eds))
-        except (OSError, ValueError, KeyError) as error:
-            raise ConfigError(f"{eds}: not a readable EDS: {error}") from error
+        super().__init__(node_id, read_objects(eds, node_id))
         for needed in NEEDED:
             if needed not in self.object_dictionary:
                 raise ConfigError(f"{eds}: object {needed:04X}h is missing")

@@ -1,15 +1,33 @@
 """Schema of a robot: geometry, transmission, drives and the terms of its dynamic model."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from armident.configs.errors import ConfigError
 from armident.configs.schema.base import FrozenModel
+from armident.configs.schema.limits import Limits, Positive, endless
+
+__all__ = [
+    "Controller",
+    "Coupling",
+    "Drive",
+    "Effect",
+    "Friction",
+    "Joint",
+    "JointName",
+    "Limits",
+    "Mdh",
+    "Name",
+    "Positive",
+    "Preprocessing",
+    "RobotConfig",
+]
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=64)]
-Positive = Annotated[float, Field(gt=0)]
+JointName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=64)]
 
 NOMINAL_SIGN_SMOOTHING = {"revolute": 150.0, "prismatic": 5000.0}
 """``g`` of the smoothed sign by type of joint where neither a value nor a motion is known, s/rad and s/m.
@@ -36,31 +54,6 @@ class Mdh(FrozenModel):
     d: float = Field(description="m")
     theta: float = Field(description="rad")
     r: float = Field(description="m")
-
-
-class Limits(FrozenModel):
-    """Limits of a joint, joint side.
-
-    Parameters
-    ----------
-    position
-        Lower and upper limit, rad or m.
-    velocity, acceleration
-        Largest magnitudes, rad/s or m/s, and rad/s^2 or m/s^2.
-    torque
-        Largest magnitude, N m or N.
-    """
-
-    position: tuple[float, float]
-    velocity: Positive
-    acceleration: Positive
-    torque: Positive
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.position[0] >= self.position[1]:
-            raise ValueError("position: the lower limit must be below the upper one")
-        return self
 
 
 class Drive(FrozenModel):
@@ -102,14 +95,28 @@ class Joint(FrozenModel):
         Drive of the joint's motor.
     rotor_inertia
         ``True`` if the rotor inertia ``ia`` is a separate parameter of the model.
+    source_name
+        Name of the joint in the file that the geometry comes from, if that is not ``name``.
     """
 
-    name: Name
+    name: JointName
     type: Literal["revolute", "prismatic"] = "revolute"
     mdh: Mdh
-    limits: Limits
+    limits: Limits = Limits()
     drive: Drive = Drive()
     rotor_inertia: bool = True
+    source_name: str | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _endless(cls, data: Any) -> Any:
+        """Give a revolute joint whose position limits are no limits the range of an endless one."""
+        if not isinstance(data, dict) or data.get("type", "revolute") != "revolute":
+            return data
+        limits = data.get("limits")
+        if not isinstance(limits, dict) or "position" not in limits:
+            return data
+        return {**data, "limits": {**limits, "position": endless(limits["position"])}}
 
 
 class Coupling(FrozenModel):
@@ -124,7 +131,7 @@ class Coupling(FrozenModel):
     """
 
     name: Name
-    joints: tuple[Name, Name]
+    joints: tuple[JointName, JointName]
 
 
 class Effect(FrozenModel):
@@ -146,8 +153,8 @@ class Effect(FrozenModel):
 
     effect: Name
     law: str = ""
-    joint: Name
-    other: Name | None = None
+    joint: JointName
+    other: JointName | None = None
     parameters: dict[str, float] = Field(default_factory=dict)
     without: tuple[Name, ...] = ()
 
@@ -227,7 +234,7 @@ class RobotConfig(FrozenModel):
     joints
         Joints from base to tip, length n.
     transmission
-        Matrix ``R`` with ``q_motor = R q``, n rows (motors) of n numbers (joints).
+        Matrix ``R`` with ``q_motor = R q``, n rows (motors) of n numbers (joints); ``None``: the identity.
     couplings
         Friction and inertia between joints.
     effects
@@ -249,7 +256,7 @@ class RobotConfig(FrozenModel):
     description: str = ""
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     joints: Annotated[tuple[Joint, ...], Field(min_length=1)]
-    transmission: tuple[tuple[float, ...], ...]
+    transmission: tuple[tuple[float, ...], ...] | None = None
     couplings: tuple[Coupling, ...] = ()
     effects: tuple[Effect, ...] = ()
     friction: Friction = Friction()
@@ -264,12 +271,13 @@ class RobotConfig(FrozenModel):
     def _consistent(self) -> Self:
         n = len(self.joints)
         names = [j.name for j in self.joints]
-        if len(set(names)) != n:
-            raise ValueError("joints: names must be unique")
-        if len(self.transmission) != n or any(len(row) != n for row in self.transmission):
-            raise ValueError(f"transmission: expected {n} rows of {n} numbers (motor rows, joint columns)")
-        if abs(np.linalg.det(np.array(self.transmission))) < 1e-12:
-            raise ValueError("transmission: the matrix is singular")
+        if len({name.lower() for name in names}) != n:
+            raise ValueError("joints: names must be unique, without regard to case")
+        if self.transmission is not None:
+            if len(self.transmission) != n or any(len(row) != n for row in self.transmission):
+                raise ValueError(f"transmission: expected {n} rows of {n} numbers (motor rows, joint columns)")
+            if abs(np.linalg.det(np.array(self.transmission))) < 1e-12:
+                raise ValueError("transmission: the matrix is singular")
         for coupling in self.couplings:
             for joint in coupling.joints:
                 if joint not in names:
@@ -307,4 +315,29 @@ class RobotConfig(FrozenModel):
     @property
     def transmission_matrix(self) -> NDArray[np.float64]:
         """Matrix ``R`` of shape (n, n): ``q_motor = R q`` and ``tau = R' tau_motor`` (thesis equation 2.14)."""
+        if self.transmission is None:
+            return np.eye(self.n)
         return np.array(self.transmission, dtype=np.float64)
+
+    def check_movable(self, where: str = "") -> None:
+        """Refuse to move an arm whose limits or transmission are not known.
+
+        Parameters
+        ----------
+        where
+            Name of the configuration or trajectory in messages; empty: the robot's.
+
+        Raises
+        ------
+        ConfigError
+            If something is missing; lists everything.
+        """
+        lacking: dict[str, list[str]] = {}
+        for joint in self.joints:
+            for quantity in joint.limits.missing():
+                lacking.setdefault(quantity, []).append(joint.name)
+        needs = [f"limits.{quantity} of {', '.join(joints)}" for quantity, joints in lacking.items()]
+        needs += [f"transmission ({self.n} rows of {self.n} numbers)"] if self.transmission is None else []
+        if needs:
+            place = where or f"robot {self.name}"
+            raise ConfigError(f"{place}: to move the arm, the robot configuration needs also {'; '.join(needs)}")

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from armident.configs.schema.base import FrozenModel
-from armident.configs.schema.robot import Name
+from armident.configs.schema.robot import JointName, Name
 
 
 class HiddenEffect(FrozenModel):
@@ -22,8 +22,8 @@ class HiddenEffect(FrozenModel):
     """
 
     effect: Name
-    joint: Name
-    other: Name | None = None
+    joint: JointName
+    other: JointName | None = None
     parameters: dict[Name, float] = Field(default_factory=dict)
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from armident.configs.schema.base import FrozenModel
-from armident.configs.schema.robot import Name, Positive
+from armident.configs.schema.robot import JointName, Name, Positive
 
 ObjectName = Literal["position", "velocity", "current", "torque", "demand", "status"]
 Every = Annotated[int, Field(ge=1, le=240)]
@@ -104,7 +104,7 @@ class DriveNode(FrozenModel):
         Object that holds the drive's temperature; ``None``: not polled.
     """
 
-    joint: Name
+    joint: JointName
     node_id: Annotated[int, Field(ge=1, le=127)]
     eds: Path
     bus: str | None = None

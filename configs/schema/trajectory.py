@@ -169,8 +169,9 @@ class Trajectory(FrozenModel):
         Raises
         ------
         ConfigError
-            If a limit is exceeded; names joint, limit and value.
+            If a limit is exceeded or not known; names joint, limit and value.
         """
+        robot.check_movable(where)
         if len(self.start) != robot.n:
             raise ConfigError(f"{where}: {len(self.start)} joints, but {robot.name} has {robot.n}")
         period = 1e-3

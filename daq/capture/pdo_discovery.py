@@ -11,7 +11,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
-import canopen
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +20,7 @@ from armident.drivers.can.frames import FD_FRAME, STANDARD_ID_MASK, Frames, fd_l
 from armident.drivers.can.receiver import Receiver
 from armident.drivers.can.udp import open_bus
 from armident.drivers.canopen import objects as od
+from armident.drivers.canopen.eds import read_objects
 from armident.drivers.canopen.objects import COB_SYNC, OBJECTS, TpdoLayout
 
 SYNC_WAIT_S = 10.0
@@ -224,10 +224,7 @@ def default_mapping(drive: DriveNode, tpdo: int) -> tuple[int, tuple[str, ...] |
     ConfigError
         If the EDS cannot be read.
     """
-    try:
-        known = canopen.import_od(str(drive.eds), drive.node_id)
-    except Exception as error:
-        raise ConfigError(f"{drive.eds}: not a valid EDS file: {error}") from error
+    known = read_objects(drive.eds, drive.node_id)
     cob_id = _default(known, od.TPDO_COMMUNICATION + tpdo - 1, 1)
     cob_id = od.tpdo_cob(tpdo, drive.node_id) if cob_id is None else cob_id & STANDARD_ID_MASK
     mapping = od.TPDO_MAPPING + tpdo - 1

@@ -58,7 +58,13 @@ def limits_of(robot: RobotConfig, following_s: float = FOLLOWING_S) -> Limits:
         Robot whose joints have limits.
     following_s
         Largest following error, as the time of motion at the velocity limit, s.
+
+    Raises
+    ------
+    ConfigError
+        If the robot lacks a limit.
     """
+    robot.check_movable()
     limits = [joint.limits for joint in robot.joints]
     velocity = np.array([limit.velocity for limit in limits])
     return Limits(

@@ -1,5 +1,6 @@
 """Streams of a session: their TPDOs on the bus and their fields in the recording."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,8 @@ from armident.daq.recording import Field, StreamLayout
 from armident.daq.recording.model import Quantity
 from armident.drivers.can.frames import fd_length
 from armident.drivers.canopen.objects import OBJECTS, TpdoLayout, tpdo_cob
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,8 @@ def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[Captur
     """
     nodes = node_ids(session, robot)
     fd = all(bus.fd for bus in session.all_buses)
+    if robot.transmission is None:
+        log.warning("robot %s: no transmission given, so each motor is taken to turn as its joint", robot.name)
     streams = []
     for name, stream in session.streams.items():
         tpdo = TpdoLayout.of(stream.objects, f"streams.{name}", stream.pack, fd)

@@ -95,6 +95,18 @@ class StreamLayout:
         return f"/{self.name}"
 
     @property
+    def scale_texts(self) -> dict[str, str]:
+        """Unit, side and scale factors of each field as text, for channel metadata that viewers show."""
+        texts = {}
+        for f, dtype in zip(self.fields, self.dtypes, strict=True):
+            if all(scale == 1.0 for scale in f.scale):
+                texts[f.name] = f"{f.unit}, {f.side} side"
+            else:
+                factors = ", ".join(f"{joint} {scale:.9g}" for joint, scale in zip(self.joints, f.scale, strict=True))
+                texts[f.name] = f"{f.unit}, {f.side} side = raw {dtype} times: {factors}"
+        return texts
+
+    @property
     def message_name(self) -> str:
         """Full name of the protobuf message."""
         return f"armident.{self.name.title().replace('_', '')}"

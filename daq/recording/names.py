@@ -24,6 +24,9 @@ CHECK = "armident.check"
 The first one covers the head of the file. Those at the end continue the head's CRC, so that they fit this file alone.
 """
 
+ROWS_OF = "rows "
+"""Key of `CHECK` at the end of a file, followed by a topic: the number of its messages."""
+
 RECOVERED = "armident.recovered"
 """Metadata of a recovered file: a description of the missing parts."""
 

@@ -17,6 +17,9 @@ from armident.daq.recording.model import Field
 PREFIX = "si_"
 """Prefix of the topics: ``/si_samples`` shows ``/samples``."""
 
+JOINT_TORQUE = "joint_torque"
+"""Field with the torque at the joints that follows from the reported currents or voltages."""
+
 
 @dataclass(frozen=True)
 class PreviewChannel:
@@ -28,10 +31,13 @@ class PreviewChannel:
         Layout of the preview; ``layout.every`` is the number of SYNCs between two samples.
     matrices
         Of each field, the matrix (n, n) that maps raw values to SI units.
+    sources
+        Of each field, the name of the raw field of the stream.
     """
 
     layout: StreamLayout
     matrices: tuple[NDArray[np.float64], ...]
+    sources: tuple[str, ...]
 
     @classmethod
     def of_stream(
@@ -51,7 +57,9 @@ class PreviewChannel:
             Highest rate of the preview, 1/s.
         """
         every = stream.every * max(1, -(-round(sample_rate_hz) // round(max(rate_hz, 1.0) * stream.every)))
-        fields, matrices = [], []
+        fields: list[Field] = []
+        matrices: list[NDArray[np.float64]] = []
+        sources: list[str] = []
         for field in stream.fields:
             if field.quantity == "status":
                 continue
@@ -64,10 +72,16 @@ class PreviewChannel:
                 scale, side = robot.transmission_matrix.T @ scale, "joint"
             fields.append(Field(field.name, field.quantity, field.unit, side, (1.0,) * len(stream.joints)))
             matrices.append(scale)
+            sources.append(field.name)
+        torque = _joint_torque(stream, robot)
+        if torque is not None:
+            fields.append(Field(JOINT_TORQUE, "torque", _torque_unit(robot), "joint", (1.0,) * len(stream.joints)))
+            matrices.append(torque[1])
+            sources.append(torque[0])
         if not fields:
             return None
         layout = StreamLayout(PREFIX + stream.name, every, stream.joints, tuple(fields), ("float64",) * len(fields))
-        return cls(layout, tuple(matrices))
+        return cls(layout, tuple(matrices), tuple(sources))
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -96,7 +110,27 @@ class PreviewChannel:
         """
         shown = np.flatnonzero((sync + 1) % self.layout.every == 0)
         values = {
-            field.name: raw[field.name][shown].astype(np.float64) @ matrix.T
-            for field, matrix in zip(self.layout.fields, self.matrices, strict=True)
+            field.name: raw[source][shown].astype(np.float64) @ matrix.T
+            for field, source, matrix in zip(self.layout.fields, self.sources, self.matrices, strict=True)
         }
         return sync[shown], t_ns[shown], values
+
+
+def _joint_torque(stream: StreamLayout, robot: RobotConfig) -> tuple[str, NDArray[np.float64]] | None:
+    """Return the field with the drives' effort, and the matrix (n, n) from its raw values to torques at the joints.
+
+    ``tau_joint = R' diag(gain) signal`` (thesis equation 2.14); ``None`` if the stream has a torque or no such field.
+    """
+    signals = {joint.drive.signal for joint in robot.joints}
+    if len(signals) != 1 or any(field.quantity == "torque" for field in stream.fields):
+        return None
+    for field in stream.fields:
+        if field.quantity in signals and field.side == "motor":
+            gains = np.array([joint.drive.gain for joint in robot.joints])
+            return field.name, robot.transmission_matrix.T @ np.diag(gains * np.array(field.scale))
+    return None
+
+
+def _torque_unit(robot: RobotConfig) -> str:
+    kinds = {joint.type for joint in robot.joints}
+    return "N m" if kinds == {"revolute"} else "N" if kinds == {"prismatic"} else "N m|N"

@@ -2,10 +2,14 @@
 
 import json
 import mmap
+import struct
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from pydantic import ValidationError
 
 from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig
@@ -78,9 +82,20 @@ def is_recording(path: Path) -> bool:
     """
     try:
         with path.open("rb") as file:
-            return RECORDING.encode() in file.read(_HEAD)
+            head = file.read(_HEAD)
+            return RECORDING.encode() in head or (head.startswith(mcap.MAGIC) and _is_listed(file))
     except OSError:
         return False
+
+
+def _is_listed(file: BinaryIO) -> bool:
+    """Return True if the summary of an MCAP file, as other tools write it, lists the metadata of a recording."""
+    file.seek(0)
+    try:
+        summary = make_reader(file).get_summary()
+    except (McapError, ValueError, struct.error, EOFError):
+        return False
+    return summary is not None and any(index.name == RECORDING for index in summary.metadata_indexes)
 
 
 def recovered_words(metadata: dict[str, dict[str, str]]) -> list[str]:
@@ -101,16 +116,26 @@ class _Content:
 
     scan: RecordingScan
     most_rows: int
-    rows: dict[int, Rows] = field(default_factory=dict)
+    rows: dict[str, Rows] = field(default_factory=dict)
+    layouts: dict[str, StreamLayout] = field(default_factory=dict)
     gaps: list[Gap] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
 
     def rows_of(self, channel: int) -> Rows:
-        """Return the rows of a channel with a layout."""
-        if channel not in self.rows:
+        """Return the rows of a channel with a layout; channels of one stream share them.
+
+        Raises
+        ------
+        DataError
+            If another channel of the same stream has another layout.
+        """
+        layout = self.scan.layouts[channel]
+        if layout.name not in self.rows:
             expected = min((self.scan.expected or {}).get(channel, 0), self.most_rows)
-            self.rows[channel] = Rows(self.scan.layouts[channel], expected)
-        return self.rows[channel]
+            self.rows[layout.name], self.layouts[layout.name] = Rows(layout, expected), layout
+        if self.layouts[layout.name] != layout:
+            raise DataError(f"topic {layout.topic} has two channels with different layouts")
+        return self.rows[layout.name]
 
     def add_chunk(self, chunk: ChunkItem) -> None:
         """Add all messages of a chunk."""
@@ -161,12 +186,18 @@ def _recording(path: Path, content: _Content) -> Recording:
     head = scan.metadata.get(RECORDING)
     if head is None:
         reason = f"no metadata {RECORDING!r}" if scan.finished else "truncated before its first chunk"
+        if scan.finished and scan.layouts:
+            reason = "another tool left out its metadata; copy them too, as mcap filter --include-metadata does"
         raise DataError(f"{path}: an MCAP file, but not a recording of armident ({reason})")
-    if head.get("check") == CHECK and scan.head_crc is None:
+    if head.get("check") == CHECK and scan.head_crc is None and not scan.rewritten:
         raise DataError(f"{path}: truncated before its first chunk, or its head is damaged")
     if head.get("schema") != SCHEMA:
         raise DataError(f"{path}: a recording of schema {head.get('schema')!r}, this version reads {SCHEMA}")
-    streams = {layout.name: _stream(content.rows_of(k), layout) for k, layout in scan.layouts.items()}
+    first = {layout.name: k for k, layout in reversed(scan.layouts.items())}
+    streams = {
+        name: _stream(content.rows_of(k), scan.layouts[k], scan.rewritten)
+        for name, k in sorted(first.items(), key=_by_channel)
+    }
     if "samples" not in streams:
         raise DataError(f"{path}: no topic /samples")
     try:
@@ -197,8 +228,16 @@ def _recording(path: Path, content: _Content) -> Recording:
     )
 
 
-def _stream(rows: Rows, layout: StreamLayout) -> Stream:
+def _by_channel(entry: tuple[str, int]) -> int:
+    return entry[1]
+
+
+def _stream(rows: Rows, layout: StreamLayout, rewritten: bool) -> Stream:
+    """Return the rows of a stream; those of a file that another tool has sorted by time are put in order again."""
     sync, t_ns, raw = rows.arrays()
+    if rewritten and np.any(sync[1:] < sync[:-1]):
+        order = np.argsort(sync, kind="stable")
+        sync, t_ns, raw = sync[order], t_ns[order], {name: values[order] for name, values in raw.items()}
     if np.any(sync[1:] <= sync[:-1]):
         raise DataError(f"topic {layout.topic}: SYNC numbers do not increase")
     return Stream(layout.name, layout.every, sync, t_ns, {f.name: f for f in layout.fields}, raw)

@@ -15,7 +15,14 @@ from armident.configs import ArmidentError, ConfigError, DataError
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.names import COUNTERS, RECORDING, RECOVERED
 from armident.daq.recording.reader import recovered_words
-from armident.daq.recording.scan import ChunkItem, DamageItem, MessageIndexContent, RecordingScan, RecordItem
+from armident.daq.recording.scan import (
+    ChunkItem,
+    DamageItem,
+    LooseMessage,
+    MessageIndexContent,
+    RecordingScan,
+    RecordItem,
+)
 from armident.daq.recording.summary import Summary
 from armident.daq.recording.writer import checksum_record
 
@@ -80,6 +87,10 @@ def recover_recording(path: Path | str) -> Recovered:
             found = _scan(path, data)
             if found.missing is None:
                 return Recovered(path, None)
+            if found.scan.rewritten:
+                raise DataError(
+                    f"{path}: {found.missing}. Another tool has written this file; try: mcap recover {path}"
+                )
             if found.cuts:
                 return Recovered(path, found.missing, _rewrite(path, data, found))
             file.truncate(found.end)
@@ -206,6 +217,8 @@ class _Contents:
         for item in self.scan:
             if isinstance(item, DamageItem):
                 self._add_damage(item)
+            elif isinstance(item, LooseMessage):
+                self._note_last_sync(item)
             elif isinstance(item, ChunkItem):
                 self._add_chunk(item)
             elif isinstance(item.content, MessageIndexContent):
@@ -257,10 +270,7 @@ class _Contents:
     def _add_chunk(self, item: ChunkItem) -> None:
         self._end_chunk()
         self._after_damaged_chunk = False
-        for run in item.runs:
-            layout = self.scan.layouts.get(run.channel_id)
-            if layout is not None and layout.name == "samples":
-                self._last_sync = layout.last_sync(item.raw, run.start, run.number)
+        self._note_last_sync(item)
         content = mcap.read_chunk(item.body)
         index = ChunkIndex(
             chunk_length=item.end - item.start,
@@ -274,6 +284,12 @@ class _Contents:
             uncompressed_size=content.size,
         )
         self._last = _Chunk(index, item.raw, item.message_counts(), item.end)
+
+    def _note_last_sync(self, item: ChunkItem) -> None:
+        for run in item.runs:
+            layout = self.scan.layouts.get(run.channel_id)
+            if layout is not None and layout.name == "samples":
+                self._last_sync = layout.last_sync(item.raw, run.start, run.number)
 
     def _add_record(self, item: RecordItem, data: memoryview) -> None:
         self._end_chunk()

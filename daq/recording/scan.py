@@ -5,8 +5,9 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import lz4.frame
 import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Statistics
@@ -14,10 +15,13 @@ from mcap.records import Channel, Metadata, Statistics
 from armident.configs import DataError
 from armident.daq.recording import mcap_records as mcap
 from armident.daq.recording.layout import StreamLayout
-from armident.daq.recording.names import CHECK, COUNTERS, LAYOUT_KEY
+from armident.daq.recording.names import CHECK, COUNTERS, LAYOUT_KEY, RECOVERED, ROWS_OF
 
 _LARGEST_CHUNK = 1 << 28
 """Largest uncompressed chunk that is read, bytes."""
+_PIECE = 1 << 20
+"""Bytes that are decompressed at a time where the size is not known beforehand."""
+_lz4_decompressor: Any = lz4.frame.LZ4FrameDecompressor
 _WORKERS, _CHUNKS_AHEAD = 2, 16
 """Threads that decompress, and chunks they may be ahead of the scan."""
 _IN_DATA = frozenset(
@@ -124,6 +128,11 @@ class ChunkItem:
 
 
 @dataclass(frozen=True)
+class LooseMessage(ChunkItem):
+    """A valid message outside a chunk, as other tools write it; ``raw`` is its record, and ``body`` its content."""
+
+
+@dataclass(frozen=True)
 class DamageItem:
     """Damaged record.
 
@@ -148,7 +157,8 @@ class RecordingScan:
     """Iterates over the records up to the end of the data, and collects the content of those other than chunks.
 
     A damaged record behind the head is skipped and described in ``damage``. Other threads decompress chunks ahead of
-    the iteration.
+    the iteration. In a file that another MCAP tool has written from a recording, the checksums of bytes say nothing; it
+    is judged by the checksums of its chunks, by the numbers of its messages, and by what its metadata states.
 
     Parameters
     ----------
@@ -171,6 +181,8 @@ class RecordingScan:
         CRC-32 of the head; ``None`` before its checksum record.
     finished
         True if the file has its data end and closing magic.
+    rewritten
+        True if another tool has written the file: its checksum records are not where they were made.
     end
         End of the last complete record, bytes.
 
@@ -190,7 +202,7 @@ class RecordingScan:
         self.expected = expected_messages(data)
         self.damage: list[str] = []
         self.head_crc: int | None = None
-        self.finished = False
+        self.finished = self.rewritten = False
         self.end = 0
         self._data = data
 
@@ -209,7 +221,10 @@ class RecordingScan:
                 end = start + mcap.RECORD_HEAD.size + len(body)
                 item: Item | None = None
                 try:
-                    if chunk is None:
+                    if opcode == Opcode.MESSAGE:
+                        record = bytes(self._data[start:end])
+                        item = LooseMessage(start, end, body, record, self._runs(record))
+                    elif chunk is None:
                         item = RecordItem(opcode, start, end, self._decoded(opcode, start, body))
                     elif (raw := chunk.result()) is not None:
                         item = ChunkItem(start, end, body, raw, self._runs(raw))
@@ -246,12 +261,31 @@ class RecordingScan:
                 for k, count in (self.expected or {}).items()
                 if k in self.channels and count != self.messages.get(k, 0)
             ]
+        if self.rewritten:
+            words += self._lost_in_rewriting()
         if not self.finished:
             since = "from the start" if last_sync is None else f"after SYNC {last_sync}"
             words.append(
                 f"the file was not finished: rows {since} and the counters are missing"
                 f" ({len(self._data) - self.end} bytes of an incomplete record left out)"
             )
+        return words
+
+    def _lost_in_rewriting(self) -> list[str]:
+        """Return descriptions of the parts that a recording had, or lacked, before another tool rewrote it."""
+        words = []
+        if self.finished and COUNTERS not in self.metadata and RECOVERED not in self.metadata:
+            words.append(
+                "the recording was not finished when another tool rewrote it: its last rows and counters are missing"
+            )
+        for key, value in self.metadata.get(CHECK, {}).items():
+            topic = key.removeprefix(ROWS_OF)
+            if topic != key and value.isdecimal():
+                found = sum(n for k, n in self.messages.items() if self.channels[k].topic == topic)
+                if found != int(value):
+                    words.append(
+                        f"{found} of {value} messages of topic {topic} are left since another tool rewrote the file"
+                    )
         return words
 
     def _read_ahead(self, pool: ThreadPoolExecutor) -> Iterator[_Pending]:
@@ -289,12 +323,24 @@ class RecordingScan:
         if opcode == Opcode.METADATA:
             metadata = mcap.decode(Metadata, body)
             if metadata.name == CHECK:
-                crc = self._verified(metadata.metadata, at)
-                self.head_crc = crc if self.head_crc is None else self.head_crc
-            self.metadata[metadata.name] = metadata.metadata
+                self.rewritten = self.rewritten or (self.head_crc is None and self._is_moved(metadata.metadata, at))
+                if not self.rewritten:
+                    crc = self._verified(metadata.metadata, at)
+                    self.head_crc = crc if self.head_crc is None else self.head_crc
+                self.metadata[CHECK] = self.metadata.get(CHECK, {}) | metadata.metadata
+            else:
+                self.metadata[metadata.name] = metadata.metadata
             return metadata
         self.finished = opcode == Opcode.DATA_END
         return None
+
+    def _is_moved(self, entries: dict[str, str], at: int) -> bool:
+        """Return True if the first checksum record, at byte ``at``, was made at another place of another file.
+
+        It covers all bytes before it. If one of its two numbers is damaged, the other one still fits them.
+        """
+        size, crc = entries.get("bytes", ""), entries.get("crc32", "")
+        return size.isdecimal() and crc.isdecimal() and int(size) != at and int(crc) != zlib.crc32(self._data[:at])
 
     def _verified(self, entries: dict[str, str], at: int) -> int:
         """Return the CRC-32 that a checksum record at byte ``at`` states, if it is right."""
@@ -383,20 +429,58 @@ def _uncompressed(body: memoryview, checked: bool) -> bytes | None:
         return None
     if chunk.size > _LARGEST_CHUNK:
         return None
-    if chunk.compression == mcap.COMPRESSION:
-        try:
-            # Memory is reserved by the size in the zstd frame, never by that in the chunk's head alone.
-            if zstandard.frame_content_size(chunk.data) not in (-1, chunk.size):
-                return None
-            raw = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.size)
-        except zstandard.ZstdError:
-            return None
-    elif chunk.compression == "":
-        raw = bytes(chunk.data)
-    elif chunk.compression == "lz4":
-        raise DataError("compressed with lz4; recordings are compressed with zstd")
-    else:
+    raw = _decompressed(chunk)
+    if raw is None:
         return None
     if len(raw) != chunk.size or ((checked or chunk.crc) and zlib.crc32(raw) != chunk.crc):
         return None
     return raw
+
+
+def _decompressed(chunk: mcap.ChunkContent) -> bytes | None:
+    """Return the records in a chunk of any compression that MCAP has, or ``None`` if they cannot be decompressed."""
+    if chunk.compression == "":
+        return bytes(chunk.data)
+    if chunk.compression == "lz4":
+        return _from_lz4(chunk)
+    if chunk.compression != mcap.COMPRESSION:
+        return None
+    try:
+        # Memory is reserved by the size in the zstd frame, never by that in the chunk's head alone.
+        size = zstandard.frame_content_size(chunk.data)
+        if size == chunk.size:
+            return zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.size)
+        # Other tools write several frames, or frames without their size. Memory grows with what is in them.
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True) as reader:
+            return _limited(iter(lambda: reader.read(_PIECE), b""), chunk.size)
+    except zstandard.ZstdError:
+        return None
+
+
+def _from_lz4(chunk: mcap.ChunkContent) -> bytes | None:
+    """Return the records in a chunk that another tool has compressed with lz4."""
+    decompressor: Any = _lz4_decompressor()
+
+    def pieces() -> Iterator[bytes]:
+        data = bytes(chunk.data)
+        while not decompressor.eof:
+            piece = decompressor.decompress(data, max_length=_PIECE)
+            if not piece and not data:
+                return
+            data = b""
+            yield piece
+
+    try:
+        return _limited(pieces(), chunk.size)
+    except (RuntimeError, EOFError, ValueError):
+        return None
+
+
+def _limited(pieces: Iterator[bytes], most: int) -> bytes:
+    """Return pieces in one, up to the first that goes beyond ``most`` bytes."""
+    whole = bytearray()
+    for piece in pieces:
+        whole += piece
+        if len(whole) > most:
+            break
+    return bytes(whole)

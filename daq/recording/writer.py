@@ -33,6 +33,7 @@ from armident.daq.recording.names import (
     MARKS_TOPIC,
     RECORDING,
     ROBOT,
+    ROWS_OF,
     SCHEMA,
     SESSION,
 )
@@ -135,7 +136,7 @@ class RecordingWriter:
 
         for k, layout in self._layouts.values():
             schema = layout.message_name, "protobuf", layout.descriptor
-            add(k, layout.topic, schema, "protobuf", {LAYOUT_KEY: layout.to_json()})
+            add(k, layout.topic, schema, "protobuf", layout.scale_texts | {LAYOUT_KEY: layout.to_json()})
         for topic, k in self._topics.items():
             properties = {name: {"type": kind} for name, kind in _EVENTS[topic].items()}
             document = json.dumps({"type": "object", "properties": properties}).encode()
@@ -298,7 +299,9 @@ class RecordingWriter:
             # If the last rows could not be written, their gaps may still fit on the disk.
             self.flush()
             entries = {key: str(value) for key, value in counters.items()}
-            self._add_metadata(checksum_record(self._add_metadata(Metadata(COUNTERS, entries)), self._head_crc))
+            check = checksum_record(self._add_metadata(Metadata(COUNTERS, entries)), self._head_crc)
+            check.metadata |= {f"{ROWS_OF}/{name}": str(number) for name, number in self.rows.items()}
+            self._add_metadata(check)
             self._append(self._summary.encode(self._position))
             os.fsync(self._file)
         except OSError as error:

@@ -14,6 +14,9 @@ Role = Literal["capture", "worker", "observer"]
 _FIRST_PORT = 17_000
 _CELLS = 5_000
 
+_FILE_KEYS = ("_certificate", "_private_key", "_file")
+"""Endings of the keys of a Zenoh configuration that name files."""
+
 
 def endpoints(session: SessionConfig) -> dict[Role, str]:
     """Return the default endpoints of a cell's capture and worker: two loopback ports derived from the cell's name."""
@@ -85,6 +88,30 @@ def open_session(session: SessionConfig, role: Role) -> zenoh.Session:
             f"zenoh: cannot open a session as {role} at {place}, "
             f"is another {role} of cell {session.cell} running? ({_short(error)})"
         ) from error
+
+
+def unreadable_files(config: zenoh.Config) -> list[str]:
+    """Files named in a Zenoh configuration that cannot be opened: certificates, private keys, lists of users.
+
+    Parameters
+    ----------
+    config
+        Zenoh configuration.
+
+    Returns
+    -------
+    list
+        Key and path of each file, with the reason.
+    """
+    found: list[str] = []
+    for section in ("transport/link/tls", "transport/auth/usrpwd", "transport/auth/pubkey"):
+        for key, value in (json.loads(config.get_json(section)) or {}).items():
+            if isinstance(value, str) and value and key.endswith(_FILE_KEYS):
+                try:
+                    Path(value).open("rb").close()
+                except OSError as error:
+                    found.append(f"{section}/{key} {value} ({error.strerror})")
+    return found
 
 
 def _from_file(path: Path) -> zenoh.Config:

@@ -18,6 +18,7 @@ from armident.drivers.can.filtered_socket import FilteredSocket
 from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown
 from armident.drivers.can.socketcan import RawSocket
 from armident.drivers.canopen import objects as od
+from armident.drivers.canopen.eds import read_objects
 from armident.drivers.canopen.emcy import Emergency, read_emergencies
 from armident.drivers.canopen.heartbeat_monitor import HeartbeatSocket
 from armident.drivers.canopen.objects import NmtCommand
@@ -99,10 +100,7 @@ class NodeNetwork:
         ConfigError
             If its EDS cannot be read.
         """
-        try:
-            return self._network.add_node(drive.node_id, str(drive.eds))
-        except Exception as error:
-            raise ConfigError(f"{drive.eds}: not a valid EDS file: {error}") from error
+        return self._network.add_node(drive.node_id, read_objects(drive.eds, drive.node_id))
 
     def on_sdo_write(self, node_id: int, callback: Callable[[int, int], None]) -> None:
         """Call a function for every SDO write of another master to a node.

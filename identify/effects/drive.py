@@ -1,5 +1,6 @@
 """Effects of drives and encoders: reported signals differ from the true ones."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,8 +21,12 @@ LEAST = 0.1
 """Least squared ratio of a recorded torque to the true one in the correction of a saturated report."""
 
 
+NOMINAL_TORQUE = 100.0
+"""Torque limit of a joint (N m, or N) whose configuration has none; it only scales the parameter of a saturation."""
+
+
 def motor_limit(robot: RobotConfig, motor: int) -> float:
-    """Return the largest torque of a motor at its shaft, N m or N.
+    """Return the largest torque of a motor at its shaft, N m or N; that of `NOMINAL_TORQUE` if no limit is known.
 
     Parameters
     ----------
@@ -30,7 +35,9 @@ def motor_limit(robot: RobotConfig, motor: int) -> float:
     motor
         Index of the motor, from 0.
     """
-    return float(robot.joints[motor].limits.torque / np.abs(robot.transmission_matrix[motor]).max())
+    limit = robot.joints[motor].limits.torque
+    torque = limit if math.isfinite(limit) else NOMINAL_TORQUE
+    return float(torque / np.abs(robot.transmission_matrix[motor]).max())
 
 
 class Correction(TorqueDependent):

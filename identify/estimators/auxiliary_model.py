@@ -148,7 +148,7 @@ class AuxiliaryModel:
             Assumed over true gear ratio.
         """
         robot = self.model.robot
-        ratios = tuple(tuple(share * ratio for ratio in row) for row in robot.transmission)
+        ratios = tuple(tuple(share * ratio for ratio in row) for row in robot.transmission_matrix.tolist())
         return replace(
             self.fresh(),
             model=replace(self.model, robot=robot.model_copy(update={"transmission": ratios})),

@@ -123,6 +123,7 @@ def design_trajectory(
     ConfigError
         If the robot cannot make a single move in that time, or an argument is wrong.
     """
+    robot.check_movable()
     model = arm_model(robot)
     limits = [joint.limits for joint in robot.joints]
     sigma = np.array([limit.torque for limit in limits]) if noise is None else np.asarray(noise, dtype=np.float64)

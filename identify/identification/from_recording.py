@@ -6,7 +6,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from armident.configs import DataError, RobotConfig
+from armident.configs import DataError, Joint, RobotConfig
+from armident.configs.schema.limits import ENDLESS
 from armident.daq.recording import Recording, Stream
 from armident.identify.experiment import Experiment
 
@@ -263,6 +264,14 @@ def _signal_notes(experiments: list[Experiment], robot: RobotConfig) -> list[str
     return notes
 
 
+def _usual_range(joint: Joint) -> float:
+    """Width of the position limits of a joint, rad or m; two turns or one metre if it has none."""
+    width = joint.limits.position[1] - joint.limits.position[0]
+    if np.isfinite(width):
+        return width
+    return ENDLESS[1] - ENDLESS[0] if joint.type == "revolute" else 1.0
+
+
 def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[str]:
     """Remarks on joints that do not move; an identification has them in its verdict.
 
@@ -277,7 +286,7 @@ def rest_notes(experiments: Sequence[Experiment], robot: RobotConfig) -> list[st
     return [
         f"{joint.name} does not move: its own parameters cannot be determined from this recording"
         for joint, width in zip(robot.joints, np.ptp(q, axis=0), strict=True)
-        if width < STILL_SHARE * (joint.limits.position[1] - joint.limits.position[0])
+        if width < STILL_SHARE * _usual_range(joint)
     ]
 
 

@@ -66,7 +66,7 @@ def table_6_3(bench: Bench) -> Table:
     refined, plain = lab.run("sep-pem", UNDECIMATED), lab.run("didim", GOOD)
     robot = lab.model.robot
     resolution = [
-        (2 * np.pi / (joint.drive.counts_per_unit or np.nan) / robot.transmission[j][j]) ** 2
+        (2 * np.pi / (joint.drive.counts_per_unit or np.nan) / robot.transmission_matrix[j, j]) ** 2
         for j, joint in enumerate(robot.joints)
     ]
     return figures(

@@ -10,7 +10,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from armident.configs import ConfigError, RobotConfig, load_robot
-from armident.configs.urdf import mdh_of, read_chain
+from armident.configs.urdf import mdh_of
+from armident.configs.urdf_tree import read_chain
 from armident.identify.effects.terms import arm_model
 from armident.identify.robot.base_parameters import independent_columns
 from armident.identify.robot.chain import chain_of, columns_of, standard_names

@@ -1,5 +1,6 @@
 """Configuration files: accepted values, and one-line messages for every mistake."""
 
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -55,6 +56,40 @@ def test_a_shipped_configuration_is_found_by_its_short_names(
     assert load_robot(name).n == 6
 
 
+@pytest.mark.parametrize("given", ["{kind}/{name}", "{name}", "configs/{kind}/{name}", "configs/{name}"])
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("robots", "emps.yaml"),
+        ("cells", "tx40_cell.yaml"),
+        ("trajectories", "tx40_excitation.yaml"),
+        ("scenarios", "tx40_worn_joint2.yaml"),
+        ("suites", "suite.yaml"),
+        ("eds", "cia402_servo.eds"),
+        ("zenoh", "peer.json5"),
+    ],
+)
+def test_shipped_files_of_every_kind_are_found_from_any_folder(
+    kind: str, name: str, given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert config_path(given.format(kind=kind, name=name)) == HERE / kind / name
+
+
+def test_a_session_in_any_folder_finds_shipped_files_by_their_names(tmp_path: Path) -> None:
+    data = yaml.safe_load((HERE / "cells" / "tx40_cell.yaml").read_text())
+    data |= {"robot": "tx40", "zenoh": {"config": "peer.json5"}, "setpoints": {"trajectory": "tx40_1.yaml"}}
+    for drive in data["drives"]:
+        drive["eds"] = "cia402_servo.eds"
+    (tmp_path / "cell.yaml").write_text(yaml.safe_dump(data))
+    session = load_session(tmp_path / "cell.yaml")
+    assert session.setpoints is not None
+    assert session.robot == HERE / "robots" / "tx40.yaml"
+    assert session.drives[3].eds == HERE / "eds" / "cia402_servo.eds"
+    assert session.zenoh.config == HERE / "zenoh" / "peer.json5"
+    assert session.setpoints.trajectory == HERE / "trajectories" / "tx40_1.yaml"
+
+
 def test_a_file_in_the_working_directory_wins_over_the_shipped_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -77,7 +112,10 @@ def test_motor_six_turns_with_joint_five_as_on_the_tx40() -> None:
         (robot_with(bandwidth_hz=float("nan")), "bandwidth_hz: "),
         (robot_with(transmission=[[1.0]]), "transmission: expected 6 rows of 6 numbers"),
         (robot_with(transmission=[[0.0] * 6] * 6), "transmission: the matrix is singular"),
-        (robot_with(joints=[*TX40["joints"][:5], TX40["joints"][4]]), "joints: names must be unique"),
+        (
+            robot_with(joints=[*TX40["joints"][:5], TX40["joints"][4]]),
+            "joints: names must be unique, without regard to case",
+        ),
         (
             robot_with(couplings=[{"name": "m6", "joints": ["joint_5", "joint_7"]}]),
             "couplings: no joint named 'joint_7'",
@@ -94,6 +132,78 @@ def test_a_mistake_is_named_in_one_line_with_file_key_and_expectation(text: str,
     assert message.startswith("robot.yaml:")
     assert expected in message
     assert "\n" not in message
+
+
+def test_all_missing_keys_are_listed_at_once() -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse("joints: [{mdh: {alpha: 0, d: 0}}, {name: j2}]", RobotConfig, "robot.yaml")
+    assert str(caught.value) == (
+        "robot.yaml: schema, name, joints[0].name, joints[0].mdh.theta, joints[0].mdh.r, joints[1].mdh: missing"
+    )
+
+
+def one_joint(tmp_path: Path, **changes: object) -> Path:
+    mdh = {"alpha": 0.0, "d": 0.0, "theta": 0.0, "r": 0.0}
+    data = {"schema": "armident/robot/1", "name": "arm", "joints": [{"name": "j1", "mdh": mdh} | changes]}
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(data))
+    return tmp_path / "arm.yaml"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"mdh": {"alpha": 180, "d": 0, "theta": 0, "r": 0}}, "joints[0].mdh.alpha: 180 looks like degrees"),
+        ({"mdh": {"alpha": 0, "d": 0, "theta": -90, "r": 0}}, "joints[0].mdh.theta: -90 looks like degrees"),
+        (
+            {"mdh": {"alpha": 0, "d": 325, "theta": 0, "r": 0}},
+            "joints[0].mdh.d: 325 looks like millimetres (in m: 0.325)",
+        ),
+        ({"limits": {"position": [-132, 132]}}, "joints[0].limits.position: [-132, 132] looks like degrees"),
+        ({"limits": {"position": [-45.5, 30]}}, "joints[0].limits.position: [-45.5, 30] looks like degrees"),
+        ({"type": "prismatic", "limits": {"position": [0, 500]}}, "[0, 500] looks like millimetres (in m: [0, 0.5])"),
+    ],
+)
+def test_suspected_degrees_and_millimetres_are_named(tmp_path: Path, changes: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_robot(one_joint(tmp_path, **changes))
+    assert said in str(caught.value)
+    assert "arm.yaml: expected rad and m: " in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"limits": {"position": [-62.83, 62.83]}},
+        {"limits": {"position": [-12.5, 12.5]}},
+        {"limits": {"position": [-1e16, 1e16]}},
+        {"limits": {"position": [-math.inf, math.inf]}},
+        {"limits": {"position": [-10000, 10000]}},
+        {"type": "prismatic", "limits": {"position": [0, 60]}},
+        {"mdh": {"alpha": -6.2832, "d": 15, "theta": 0, "r": 0}},
+    ],
+)
+def test_many_turns_and_long_axes_are_no_suspicion(tmp_path: Path, changes: dict[str, object]) -> None:
+    assert load_robot(one_joint(tmp_path, **changes)).n == 1
+
+
+def test_an_endless_joint_has_the_range_of_two_turns(tmp_path: Path) -> None:
+    for none in (1e16, math.inf):
+        joint = load_robot(one_joint(tmp_path, limits={"position": [-none, none]})).joints[0]
+        assert joint.limits.position == pytest.approx((-2 * np.pi, 2 * np.pi))
+
+
+def test_limits_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    for changes in ({"position": [math.nan, 1.0]}, {"position": [1.0, 1.0]}, {"velocity": math.nan}):
+        with pytest.raises(ConfigError, match=r"joints\[0\]\.limits"):
+            load_robot(one_joint(tmp_path, limits=changes))
+
+
+def test_a_drive_finds_its_joint_without_regard_to_case(tmp_path: Path) -> None:
+    data = yaml.safe_load((HERE / "robots" / "tx40.yaml").read_text())
+    data["joints"][0]["name"] = "Joint_1"
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(data))
+    session = load_session(session_with(tmp_path, robot="mine.yaml"))
+    assert [drive.joint for drive in session.drives][:2] == ["Joint_1", "joint_2"]
 
 
 def test_a_missing_file_names_what_is_shipped() -> None:
@@ -209,3 +319,45 @@ def test_the_former_name_of_a_key_is_read_with_a_warning(tmp_path: Path, caplog:
     assert "recording.look_hz is now recording.preview_hz" in caplog.text
     with pytest.raises(ConfigError, match=r"recording\.look_hz: unknown key"):
         load_session(session_with(tmp_path, recording={"look_hz": 20.0, "preview_hz": 10.0}))
+
+
+ODD_NUMBERS = [
+    ".nan",
+    ".inf",
+    "-.inf",
+    "1e400",
+    "-1e400",
+    "1" + "0" * 400,
+    "1" * 5000,
+    "0x" + "f" * 300,
+    "1e-400",
+    "!!float 1e9x",
+]
+
+
+@pytest.mark.parametrize("number", ODD_NUMBERS, ids=range(len(ODD_NUMBERS)))
+@pytest.mark.parametrize(
+    ("kind", "line"),
+    [
+        ("robot", "bandwidth_hz: {}"),
+        ("robot", "gravity: [0, 0, {}]"),
+        ("robot", "joints: [{{name: j, mdh: {{alpha: {0}, d: {0}, theta: 0, r: 0}}}}]"),
+        ("robot", "joints: [{{name: j, limits: {{position: [{0}, {0}], torque: {0}}}}}]"),
+        ("robot", "transmission: [[{}]]"),
+        ("session", "sync: {{period_us: {}}}"),
+        ("session", "drives: [{{joint: j, node_id: {}, eds: x.eds}}]"),
+        ("trajectory", "start: [{}]"),
+    ],
+)
+def test_an_odd_number_is_one_line(tmp_path: Path, kind: str, line: str, number: str) -> None:
+    load = {"robot": load_robot, "session": load_session, "trajectory": load_trajectory}[kind]
+    path = tmp_path / "odd.yaml"
+    path.write_text(f"schema: armident/{kind}/1\n{line.format(number)}\n")
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}:")
+    assert "\n" not in message
+    assert len(message) < 700 + len(str(path))
+    assert "limit (4300" not in message
+    assert "Error" not in message

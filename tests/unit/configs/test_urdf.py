@@ -5,12 +5,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from armident.configs import ConfigError, RobotConfig, load_robot
+from armident import RobotModel, design_trajectory, identify
+from armident.configs import ConfigError, Limits, RobotConfig, Trajectory, load_robot
+from armident.configs.loading import parse
 from armident.configs.mdh import modified_dh
-from armident.configs.urdf import mdh_of, read_chain
+from armident.configs.urdf import mdh_of
+from armident.configs.urdf_origin import rotation, rotation_of_quaternion
+from armident.configs.urdf_tree import read_chain
+from armident.daq.guard.limits import limits_of
 from armident.daq.recording import Recording, Stream, read_recording, write_recording
 from armident.daq.recording.model import Field
+from armident.identify.effects.drive import NOMINAL_TORQUE, motor_limit
 
 LIMIT = '<limit lower="-2" upper="2" velocity="3" effort="50"/>'
 
@@ -149,7 +159,8 @@ def test_joints_take_limits_from_the_urdf_and_the_rest_from_the_configuration(tm
     second = "- {name: j2, limits: {acceleration: 8.0, torque: 7.0}}"
     robot = load_robot(configuration(tmp_path, 2, joints=f"{second}\n{first}"))
     one, two = robot.joints
-    assert (one.name, one.type, one.drive.signal, one.rotor_inertia) == ("j_1", "prismatic", "torque", False)
+    assert (one.name, one.type, one.drive.signal, one.rotor_inertia) == ("J_1", "prismatic", "torque", False)
+    assert (one.source_name, two.source_name) == ("J-1", None)
     assert (one.limits.position, one.limits.velocity, one.limits.torque) == ((-2.0, 2.0), 1.0, 50.0)
     assert (two.name, two.type, two.rotor_inertia) == ("j2", "revolute", True)
     assert two.limits.position == pytest.approx((-2 * np.pi, 2 * np.pi))
@@ -224,7 +235,10 @@ MIMIC = LIMIT + '<mimic joint="j1"/>'
         ([joint("x", "c d", axis="0 0 0")], r"joint 'x': axis: expected a direction"),
         ([joint("x", "c d", axis="0 0")], r"joint 'x': axis xyz: expected 3 numbers, found '0 0'"),
         ([joint("x", "c d", xyz="0 0 nan")], r"joint 'x': origin xyz: expected 3 numbers, found '0 0 nan'"),
-        ([joint("x", "c d", rpy="${pi/2} 0 0")], r"joint 'x': origin rpy: .*; expand the xacro first"),
+        (
+            [joint("x", "c d", rpy="${pi/2} 0 0")],
+            r"joint 'x': origin rpy: .*; this is xacro, expand it first: xacro arm\.urdf > arm_expanded\.urdf",
+        ),
         ([joint("x", "c d", more='<limit effort="strong"/>')], r"joint 'x': limit effort: expected a number"),
         ([joint("x", "c c2")], r"joint 'x': child: no link 'c2'"),
         ([joint("x", "a c")], r"link 'c' is moved by two joints, 'j2' and 'x'"),
@@ -270,7 +284,6 @@ def test_a_file_that_is_no_urdf_is_refused(tmp_path: Path, text: str, words: str
         ({"urdf_keys": ", tipp: a"}, r"arm\.yaml: urdf\.tipp: unknown key; did you mean 'tip'\?"),
         ({"joints": "- {name: j9}"}, r"arm\.yaml: joints\[0\]\.name: the chain has no joint 'j9'; it has j1, j2"),
         ({"joints": "- {name: j1}\n- {name: J1}"}, r"arm\.yaml: joints\[1\]\.name: 'J1' is there twice"),
-        ({"joints": "- {name: j1}"}, r"arm\.yaml: joints: j1: limits\.acceleration: not in arm\.urdf, say it here"),
         ({"joints": "- {name: j1, mdh: {r: 1}}"}, r"arm\.yaml: joints\[0\]\.mdh: unknown key"),
         ({"joints": "- {name: j1, limits: {velocity: -1}}"}, r"joints\[0\]\.limits\.velocity: input should be greater"),
         ({"controller": "{kp: [1.0], kv: [1.0]}"}, r"arm\.yaml: controller: expected 2 numbers in kp and in kv"),
@@ -305,3 +318,173 @@ def test_axes_nearly_but_not_quite_parallel_are_refused_with_their_joints(tmp_pa
     two_joints(tmp_path, rpy="3.14 0 0", xyz="0.3 0.1 0")
     with pytest.raises(ConfigError, match=r"arm\.urdf: the axes of j1 and j2 are nearly parallel \(0\.0016 rad\)"):
         load_robot(configuration(tmp_path, 2))
+
+
+def test_an_acceleration_and_a_transmission_are_needed_only_where_the_arm_moves(tmp_path: Path) -> None:
+    urdf(tmp_path, joint("j1", "a b"), joint("j2", "b c", more="<limit/>"), links="a b c")
+    file = tmp_path / "arm.yaml"
+    file.write_text("schema: armident/robot/1\nname: arm\nurdf: {file: arm.urdf}\n")
+    robot = load_robot(file)
+    assert robot.transmission is None
+    np.testing.assert_array_equal(robot.transmission_matrix, np.eye(2))
+    assert robot.joints[0].limits.missing() == ("acceleration",)
+    trajectory = Trajectory.model_validate(
+        {"schema": "armident/trajectory/1", "start": [0.0, 0.0], "moves": [{"to": [0.1, 0.1], "duration": 1.0}]}
+    )
+    with pytest.raises(ConfigError) as refused:
+        trajectory.check(robot, "move.yaml")
+    assert str(refused.value) == (
+        "move.yaml: to move the arm, the robot configuration needs also limits.acceleration of j1, j2; "
+        "limits.position of j2; limits.velocity of j2; limits.torque of j2; transmission (2 rows of 2 numbers)"
+    )
+    for needs in (limits_of, design_trajectory):
+        with pytest.raises(ConfigError, match=r"robot arm: to move the arm, .* transmission"):
+            needs(robot)
+
+
+def test_a_robot_without_limits_is_stored_in_its_recording(tmp_path: Path) -> None:
+    urdf(tmp_path, joint("J-1", "a b", more=""), joint("j2", "b c", "prismatic", more=OPEN_ABOVE), links="a b c")
+    robot = load_robot(configuration(tmp_path, 2, joints="- {name: j2}"))
+    assert robot.joints[0].limits == Limits()
+    assert robot.joints[1].limits.position == (-0.5, np.inf)
+    assert RobotConfig.model_validate_json(robot.model_dump_json(by_alias=True)) == robot
+    assert parse(yaml.safe_dump(robot.model_dump(mode="json", by_alias=True)), RobotConfig, "arm") == robot
+
+
+OPEN_ABOVE = '<limit lower="-0.5" upper="1e16" velocity="-1" effort="inf"/>'
+
+
+@pytest.mark.parametrize("none", ["1e16", "1e+16", "inf", "1.7976931348623157e308", "1e400", "INFINITY"])
+def test_a_huge_limit_is_none(tmp_path: Path, none: str) -> None:
+    limit = f'<limit lower="-{none}" upper="{none}" velocity="{none}" effort="{none}"/>'
+    half = f'<limit lower="-2" upper="{none}" velocity="3" effort="50"/>'
+    urdf(tmp_path, joint("j1", "a b", more=limit), joint("j2", "b c", more=half), links="a b c")
+    said = load_robot(configuration(tmp_path, 2, joints="- {name: j1, limits: {position: [-3, 3], torque: 9}}")).joints
+    plain = load_robot(configuration(tmp_path, 2, joints="- {name: j2}")).joints
+    assert plain[0].limits.position == pytest.approx((-2 * np.pi, 2 * np.pi))
+    assert plain[0].limits.missing() == ("velocity", "acceleration", "torque")
+    assert plain[1].limits.position == pytest.approx((-2.0, 2 * np.pi))
+    assert (said[0].limits.position, said[0].limits.torque) == ((-3.0, 3.0), 9.0)
+
+
+def test_a_limit_that_is_no_number_is_refused(tmp_path: Path) -> None:
+    file = urdf(tmp_path, joint("j1", "a b", more='<limit lower="nan" upper="1"/>'), links="a b")
+    with pytest.raises(ConfigError, match="joint 'j1': limit lower: expected a number, found 'nan'"):
+        read_chain(file)
+
+
+def test_a_quaternion_is_the_orientation_of_an_origin(tmp_path: Path) -> None:
+    two_joints(tmp_path, xyz="0.3 0 0.2", rpy="1.5707963267948966 0 0")
+    angles = load_robot(configuration(tmp_path, 2)).joints
+    file = tmp_path / "arm.urdf"
+    text = file.read_text()
+    for quaternion in ("0.7071067811865476 0 0 0.7071067811865476", "0.7071 0 0 0.7071", "-0.707 0 0 -0.707"):
+        file.write_text(text.replace('rpy="1.5707963267948966 0 0"', f'quat_xyzw="{quaternion}"'))
+        assert load_robot(configuration(tmp_path, 2)).joints == angles
+
+
+@given(st.tuples(*[st.floats(-3.1, 3.1)] * 3))
+def test_quaternions_and_angles_give_the_same_rotation(angles: tuple[float, float, float]) -> None:
+    matrix = rotation(*angles)
+    quaternion: list[float] = Rotation.from_matrix(matrix).as_quat().tolist()
+    assert np.abs(rotation_of_quaternion(quaternion) - matrix).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("origin", "words"),
+    [
+        ('rpy="0 0 0" quat_xyzw="0 0 0 1"', "both rpy and quat_xyzw"),
+        ('quat_xyzw="0 0 0"', "expected 4 numbers"),
+        ('quat_xyzw="0 0 0 0"', "the length of the quaternion is 0, expected 1"),
+        ('quat_xyzw="0 0 90 1"', "the length of the quaternion is 90.01, expected 1"),
+        ('quat_wxyz="1 0 0 0"', "unknown attribute quat_wxyz; expected xyz, and rpy or quat_xyzw"),
+        ('rpy="90 0 0"', "'90 0 0' looks like degrees; expected rad"),
+    ],
+)
+def test_an_orientation_that_is_none_is_refused(tmp_path: Path, origin: str, words: str) -> None:
+    file = two_joints(tmp_path)
+    file.write_text(file.read_text().replace('rpy="0 0 0"', origin))
+    with pytest.raises(ConfigError, match=r"joint 'j1': origin") as refused:
+        read_chain(file)
+    assert words in str(refused.value)
+
+
+def test_distances_in_millimetres_are_refused_but_for_the_place_of_the_base(tmp_path: Path) -> None:
+    file = urdf(tmp_path, joint("j1", "a b", xyz="500 0 0"), joint("j2", "b c", xyz="0 325 0"), links="a b c")
+    with pytest.raises(ConfigError, match=r"joint 'j2': origin xyz: 325 looks like millimetres; expected m"):
+        read_chain(file)
+
+
+XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f'<robot name="arm" {XACRO}><xacro:include filename="arm_macro.xacro"/></robot>',
+        f'<robot {XACRO}><xacro:property name="l" value="1"/><link name="a"/></robot>',
+        '<robot name="arm"><xacro:arm prefix="left"/></robot>',
+    ],
+)
+def test_a_xacro_file_is_named_with_the_command_that_expands_it(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "arm.urdf.xacro"
+    file.write_text(text)
+    with pytest.raises(ConfigError) as refused:
+        read_chain(file)
+    assert str(refused.value) == f"{file}: this is xacro, expand it first: xacro arm.urdf.xacro > arm_expanded.urdf"
+
+
+def test_an_expanded_file_may_keep_the_namespace_of_xacro(tmp_path: Path) -> None:
+    file = two_joints(tmp_path)
+    file.write_text(file.read_text().replace("<robot ", f"<robot {XACRO} "))
+    assert [j.name for j in read_chain(file)] == ["j1", "j2"]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("Shoulder_Pan", "elbow"), ("Shoulder_Pan", "elbow")),
+        (("肩", "肘"), ("joint_1", "joint_2")),
+        (("關節2", "關節1"), ("joint_2", "joint_1")),
+        (("左軸_1", "右軸_1"), ("joint_1", "joint_2")),
+        (("Gelenk_hängend", "Колено"), ("Gelenk_hangend", "joint_2")),
+        (("left/arm joint", "1"), ("left_arm_joint", "joint_1")),
+    ],
+)
+def test_joint_names_keep_their_letters_or_get_a_place(
+    tmp_path: Path, names: tuple[str, str], expected: tuple[str, str]
+) -> None:
+    urdf(tmp_path, joint(names[0], "a b"), joint(names[1], "b c"), links="a b c")
+    entries = f"- {{name: '{names[1]}', limits: {{velocity: 1}}}}\n- {{name: {expected[0]}, rotor_inertia: false}}"
+    joints = load_robot(configuration(tmp_path, 2, joints=entries)).joints
+    assert tuple(j.name for j in joints) == expected
+    assert tuple(j.source_name or j.name for j in joints) == names
+    assert (joints[1].limits.velocity, joints[0].rotor_inertia) == (1.0, False)
+
+
+def test_an_arm_without_limits_is_identified_from_a_recording(tmp_path: Path) -> None:
+    urdf(
+        tmp_path,
+        joint("Sh", "a b", axis="0 1 0", more=""),
+        joint("El", "b c", axis="0 1 0", xyz="0.4 0 0", more=""),
+        links="a b c",
+    )
+    (tmp_path / "arm.yaml").write_text("schema: armident/robot/1\nname: arm\nurdf: {file: arm.urdf}\n")
+    robot = load_robot(tmp_path / "arm.yaml")
+    model, rng = RobotModel(robot), np.random.default_rng(1)
+    t = np.arange(0.0, 10.0, 0.004)
+    rates, weights = 2.0 * np.pi * 0.1 * np.arange(1, 8), rng.normal(size=(7, 2)) / np.arange(1, 8)[:, None]
+    q, qd = np.sin(t[:, None] * rates) @ weights, np.cos(t[:, None] * rates) @ (weights * rates[:, None])
+    qdd = -np.sin(t[:, None] * rates) @ (weights * rates[:, None] ** 2)
+    theta = rng.uniform(0.5, 2.0, model.regressor(q[:1], qd[:1], qdd[:1]).shape[-1])
+    tau = np.asarray(model.regressor(q, qd, qdd)) @ theta + rng.normal(0.0, 0.05, q.shape)
+    count = np.arange(t.size, dtype=np.int64)
+    fields = {
+        "position": Field("position", "position", "rad", "joint", (1.0, 1.0)),
+        "torque": Field("torque", "torque", "N m", "joint", (1.0, 1.0)),
+    }
+    stream = Stream("samples", 1, count, count * 4_000_000, fields, {"position": q, "torque": tau})
+    write_recording(Recording(None, robot, None, 250.0, {"samples": stream}), tmp_path / "r.mcap")
+    result = identify(tmp_path / "r.mcap", method="idim-ls")
+    np.testing.assert_allclose(result.theta, theta, rtol=0.05, atol=0.05)
+    assert motor_limit(robot, 0) == NOMINAL_TORQUE

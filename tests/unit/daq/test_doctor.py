@@ -51,6 +51,57 @@ def test_an_unknown_key_is_one_check(tmp_path: Path) -> None:
     assert "bus" not in checks
 
 
+def with_sheet(folder: Path, content: bytes) -> Path:
+    """Write the shipped cell, with a data sheet of its own for the third drive."""
+    (folder / "third.eds").write_bytes(content)
+    path = cell(folder)
+    data = yaml.safe_load(path.read_text())
+    data["drives"][2]["eds"] = "third.eds"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("content", "verdict", "said"),
+    [
+        (b"[1000]\nDataType=7\n", "ok", "third.eds: 1 objects"),
+        (b"[1000]\nDataType=7\n[2000]\nObjectType=8\nCompactSubObj=4\n", "warning", "left out: 2000h"),
+        (b"", "failed", "no object in it"),
+        (b"\0\1\2", "failed", "binary"),
+    ],
+)
+def test_every_data_sheet_is_opened(tmp_path: Path, content: bytes, verdict: str, said: str) -> None:
+    path = with_sheet(tmp_path, content)
+    first, second = (check for check in run_checks(path) if check.name == "eds")
+    assert first == Check("eds", "ok", "cia402_servo.eds: 54 objects")
+    assert second.verdict == verdict
+    assert said in second.message
+    shown = CliRunner().invoke(application(["doctor"]), ["doctor", "--config", str(path)])
+    assert ("a capture would not run: eds" in shown.stderr) == (verdict == "failed")
+
+
+def test_data_sheets_are_opened_though_the_robot_is_wrong(tmp_path: Path) -> None:
+    path = with_sheet(tmp_path, b"")
+    data = yaml.safe_load(path.read_text())
+    data["setpoints"] = {"trajectory": str(HERE / "robots" / "tx40.yaml")}
+    path.write_text(yaml.safe_dump(data))
+    verdicts = [(check.name, check.verdict) for check in run_checks(path)]
+    assert verdicts[:3] == [("configuration", "failed"), ("eds", "ok"), ("eds", "failed")]
+
+
+def test_certificates_of_zenoh_are_opened(tmp_path: Path) -> None:
+    for name in ("ca", "cert", "key"):
+        (tmp_path / f"{name}.pem").write_text("PEM")
+    text = (HERE / "zenoh" / "tls.json5").read_text().replace("/etc/armident/tls", str(tmp_path))
+    (tmp_path / "tls.json5").write_text(text)
+    path = cell(tmp_path, zenoh={"config": "tls.json5"})
+    assert checks_of(path)["zenoh"].verdict == "ok"
+    (tmp_path / "ca.pem").unlink()
+    check = checks_of(path)["zenoh"]
+    assert check.verdict == "failed"
+    assert f"root_ca_certificate {tmp_path}/ca.pem (No such file or directory)" in check.message
+
+
 def test_an_overloaded_bus_fails(tmp_path: Path) -> None:
     checks = checks_of(cell(tmp_path, bus={"bitrate": 1_000_000}))
     assert checks["bus load"].verdict == "failed"

@@ -1,12 +1,15 @@
 """Preview channels: SI units at the joints, at a low rate, shown by viewers and ignored by our reader."""
 
+import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from armident.configs.loading import HERE
 from armident.daq.recording import RecordingWriter, StreamLayout, read_recording, recover_recording
 from tests.unit.daq.test_recording import make_recording
 
@@ -73,3 +76,49 @@ def test_a_truncated_file_with_previews_is_recovered(tmp_path: Path) -> None:
     with (tmp_path / "r.mcap").open("rb") as file:
         topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
     assert {"/samples", "/demand", "/si_samples", "/si_demand"} <= topics
+
+
+def test_viewers_see_the_joint_torque_that_follows_from_the_currents(tmp_path: Path) -> None:
+    written(tmp_path / "r.mcap", 50.0)
+    recording = make_recording(ROWS)
+    robot, samples = recording.robot, recording.samples
+    gains = np.array([joint.drive.gain for joint in robot.joints])
+    with (tmp_path / "r.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        _, channel, _, message = next(reader.iter_decoded_messages(["/si_samples"]))
+    row = int(np.flatnonzero(samples.sync == message.sync)[0])
+    expected = robot.transmission_matrix.T @ (gains * samples.si("current")[row])
+    assert channel.metadata["joint_torque"] == "N m, joint side"
+    for joint, torque in zip(robot.joints, expected, strict=True):
+        assert getattr(message, joint.name).joint_torque == pytest.approx(torque, rel=1e-12)
+
+
+def test_channels_say_the_scale_factors_of_their_raw_values(tmp_path: Path) -> None:
+    written(tmp_path / "r.mcap", 0.0)
+    with (tmp_path / "r.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    (channel,) = (c for c in summary.channels.values() if c.topic == "/samples")
+    scale = make_recording(10).samples.fields["current"].scale
+    assert channel.metadata["current"].startswith(f"A, motor side = raw int16 times: joint_1 {scale[0]:.9g}, joint_2 ")
+
+
+def test_layouts_of_viewers_show_fields_that_recordings_have(tmp_path: Path) -> None:
+    written(tmp_path / "r.mcap", 50.0)
+    with (tmp_path / "r.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        topics = {channel.topic for channel in summary.channels.values()}
+        known: set[str] = set()
+        for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            if channel.topic.startswith("/si_"):
+                joints = [(f.name, getattr(message, f.name)) for f in message.DESCRIPTOR.fields if f.message_type]
+                known |= {f"{channel.topic}/{name}/{f.name}" for name, one in joints for f in one.DESCRIPTOR.fields}
+    foxglove = json.loads((HERE / "viewers" / "foxglove.json").read_text())
+    panels = foxglove["configById"].values()
+    shown = [path["value"] for panel in panels for path in panel.get("paths", [])]
+    assert {panel["topicPath"] for panel in panels if "topicPath" in panel} <= topics
+    curves = [curve.attrib["name"] for curve in ElementTree.parse(HERE / "viewers" / "plotjuggler.xml").iter("curve")]
+    assert len(curves) == len(shown) == 24
+    assert {value.replace(".", "/") for value in shown} | set(curves) <= known
+    assert known == set(curves)

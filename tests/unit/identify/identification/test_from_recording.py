@@ -125,7 +125,7 @@ def test_a_recording_of_another_robot_is_refused_naming_both(tx40: RobotConfig) 
 
 
 def test_another_transmission_is_another_robot(tx40: RobotConfig) -> None:
-    rows = [list(row) for row in tx40.transmission]
+    rows = tx40.transmission_matrix.tolist()
     rows[0][0] = 33.0
     other = tx40.model_copy(update={"transmission": tuple(tuple(row) for row in rows)})
     with pytest.raises(DataError, match="transmission"):

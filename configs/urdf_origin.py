@@ -1,0 +1,90 @@
+"""Placement of joints in URDF: fixed-axis angles and quaternions, exact where rounded right angles are meant."""
+
+import math
+from collections.abc import Sequence
+from decimal import Decimal
+
+import numpy as np
+from numpy.typing import NDArray
+
+WRITTEN_DECIMALS = 4
+"""Minimum number of decimals of an angle that is rounded to the multiple of 15 degrees with the same decimals."""
+
+LENGTH_TOLERANCE = 0.01
+"""Largest deviation of the length of a quaternion from 1; two written decimals make 0.01."""
+
+EXACT = 1e-12
+"""Largest distance of an element of a rotation matrix from 0 or 1 that is rounding of double precision."""
+
+Floats = NDArray[np.float64]
+
+
+def rotation(roll: float, pitch: float, yaw: float) -> Floats:
+    """Rotation matrix of URDF's fixed-axis angles, exact for right angles: ``Rot(z, y) Rot(y, p) Rot(x, r)``.
+
+    Parameters
+    ----------
+    roll, pitch, yaw
+        Angles, rad.
+
+    Returns
+    -------
+    ndarray
+        Rotation matrix, shape (3, 3).
+    """
+    (cr, sr), (cp, sp), (cy, sy) = (_cos_sin(angle) for angle in (roll, pitch, yaw))
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    matrix: Floats = about_z @ about_y @ about_x
+    return matrix
+
+
+def _cos_sin(angle: float) -> tuple[float, float]:
+    c, s = math.cos(angle), math.sin(angle)
+    return (float(round(c)), float(round(s))) if min(abs(c), abs(s)) < 1e-15 else (c, s)
+
+
+def rounded_angle(word: str) -> float:
+    """Angle (rad) as written, or the multiple of 15 degrees of which it is a rounded or truncated value."""
+    value = float(word)
+    multiple = round(value / (math.pi / 12)) * (math.pi / 12)
+    exponent = Decimal(word).as_tuple().exponent
+    if isinstance(exponent, int) and exponent <= -WRITTEN_DECIMALS and abs(value - multiple) < 10.0**exponent:
+        return multiple
+    return value
+
+
+def rotation_of_quaternion(quaternion: Sequence[float]) -> Floats:
+    """Rotation matrix of a quaternion, exact for right angles.
+
+    Parameters
+    ----------
+    quaternion
+        ``x, y, z, w`` in the order of URDF's ``quat_xyzw``, of length 1 but for rounding.
+
+    Returns
+    -------
+    ndarray
+        Rotation matrix, shape (3, 3).
+
+    Raises
+    ------
+    ValueError
+        If the length of the quaternion is not 1.
+    """
+    values = np.array(quaternion, dtype=np.float64)
+    length = float(np.linalg.norm(values))
+    if not abs(length - 1.0) <= LENGTH_TOLERANCE:
+        raise ValueError(f"the length of the quaternion is {length:.4g}, expected 1")
+    x, y, z, w = values / length
+    matrix = np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+    whole = np.round(matrix)
+    exact: Floats = np.where(np.abs(matrix - whole) < EXACT, whole + 0.0, matrix)
+    return exact

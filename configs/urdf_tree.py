@@ -1,0 +1,379 @@
+"""Tree of links and joints of a URDF file, and the chain of moving joints between two links."""
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armident.configs.errors import ConfigError
+from armident.configs.suspected_units import FULL_TURN, LONGEST_LINK
+from armident.configs.urdf_origin import rotation, rotation_of_quaternion, rounded_angle
+
+MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+"""Joint type of the model by URDF joint type; a chain may have these and ``fixed``."""
+
+LONGEST = 500
+"""Maximum length of an attribute in characters; longer ones are refused."""
+
+LARGEST = 1e9
+"""Largest magnitude of a coordinate in a URDF, SI units; larger ones are refused."""
+
+ENDLESS = (-math.inf, math.inf)
+"""Position limits of a joint that has none."""
+
+XACRO = "xacro}"
+"""End of the namespace of xacro elements, such as ``{http://www.ros.org/wiki/xacro}macro``."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """A moving joint of a chain.
+
+    Parameters
+    ----------
+    name, type
+        As in the file.
+    placement
+        Frame of the joint, and of the link it moves, in the base link with all variables zero, shape (4, 4).
+    axis
+        Unit vector in that frame, shape (3,).
+    limits
+        Limits of the file: ``position`` (rad or m), ``velocity`` (rad/s or m/s), ``torque`` (N m or N).
+    """
+
+    name: str
+    type: str
+    placement: Floats
+    axis: Floats
+    limits: Mapping[str, Any] = field(default_factory=dict)
+
+
+def read_chain(file: Path, base: str | None = None, tip: str | None = None) -> tuple[UrdfJoint, ...]:
+    """Moving joints between two links of a URDF, with fixed joints merged into the placements.
+
+    Side branches that cannot move belong to the link they are fixed to. Branches at the base are ignored, and links
+    after the tip are its load.
+
+    Parameters
+    ----------
+    file
+        Path of the URDF.
+    base
+        First link of the chain; ``None``: the root of the tree.
+    tip
+        Last link of the chain; ``None``: the chain ends with its last moving joint.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not a URDF or not a tree, if the chain branches, or if a joint is not of a serial chain.
+        Names file and element.
+    """
+    tree = _read_tree(file)
+    base = tree.root() if base is None else tree.known(base, "urdf.base")
+    path = tree.path_to(base, tree.known(tip, "urdf.tip")) if tip is not None else list(tree.only_way(base))
+    placement, chain = np.eye(4), []
+    for element in path:
+        placement = placement @ tree.origin(element)
+        if tree.type_of(element) != "fixed":
+            chain.append(tree.moving_joint(element, placement))
+    if not chain:
+        raise ConfigError(f"{file}: no joint moves between link {base!r} and {'its end' if tip is None else repr(tip)}")
+    return tuple(chain)
+
+
+@dataclass(frozen=True)
+class _Tree:
+    """Joint elements by child link (``above``) and by parent link (``below``)."""
+
+    file: Path
+    links: frozenset[str]
+    above: Mapping[str, ET.Element]
+    below: Mapping[str, list[ET.Element]]
+
+    def known(self, link: str, key: str) -> str:
+        """Return the name of a link that the file contains.
+
+        Parameters
+        ----------
+        link
+            Name of the link.
+        key
+            Key of the configuration that names the link, for messages.
+
+        Raises
+        ------
+        ConfigError
+            If the file has no such link.
+        """
+        if link not in self.links:
+            raise ConfigError(f"{self.file}: no link {link!r} ({key}); links are {', '.join(sorted(self.links))}")
+        return link
+
+    def root(self) -> str:
+        """Return the only link that no joint moves."""
+        roots = sorted(self.links - self.above.keys())
+        if len(roots) != 1:
+            found = f"{len(roots)} ({', '.join(roots)})" if roots else "none: the joints form a loop"
+            raise ConfigError(f"{self.file}: expected one link that no joint moves, found {found}")
+        return roots[0]
+
+    def path_to(self, base: str, tip: str) -> list[ET.Element]:
+        """Joints from base to tip; branches that move are refused on the way.
+
+        Parameters
+        ----------
+        base, tip
+            First and last link of the chain.
+
+        Raises
+        ------
+        ConfigError
+            If the base does not move the tip, or a second moving joint branches off.
+        """
+        path: list[ET.Element] = []
+        link = tip
+        while link != base:
+            element = self.above.get(link)
+            if element is None:
+                raise ConfigError(f"{self.file}: link {tip!r} (urdf.tip) is not moved by link {base!r}")
+            path.insert(0, element)
+            link = _end(element, "parent")
+        carried = False
+        for element, following in pairwise(path):
+            carried = carried or self.type_of(element) != "fixed"
+            link = _end(element, "child")
+            if carried:
+                self._refuse_branch(link, [following, *(j for j in self.below[link] if j is not following)])
+        return path
+
+    def only_way(self, base: str) -> Iterator[ET.Element]:
+        """Joints from base to the last that moves."""
+        link = base
+        while True:
+            ways = [element for element in self.below.get(link, []) if self._moves(element)]
+            if not ways:
+                return
+            self._refuse_branch(link, ways)
+            yield ways[0]
+            link = _end(ways[0], "child")
+
+    def _refuse_branch(self, link: str, joints: list[ET.Element]) -> None:
+        """Refuse a second moving joint or subtree at a link; the first one given is the chain's."""
+        others = [element for element in joints[1:] if self._moves(element)]
+        if others:
+            names = " and ".join(repr(element.get("name")) for element in [joints[0], *others])
+            raise ConfigError(
+                f"{self.file}: link {link!r} branches into joints {names}; only serial chains can be identified "
+                "(urdf.base and urdf.tip choose a part)"
+            )
+
+    def _moves(self, element: ET.Element) -> bool:
+        """Return True if this joint or any joint after it moves."""
+        return self.type_of(element) != "fixed" or any(
+            self._moves(after) for after in self.below.get(_end(element, "child"), [])
+        )
+
+    def type_of(self, element: ET.Element) -> str:
+        """Return the URDF type of a joint."""
+        return element.get("type", "")
+
+    def origin(self, element: ET.Element) -> Floats:
+        """Placement of a joint in its parent link, homogeneous, shape (4, 4)."""
+        found = element.find("origin")
+        frame = np.eye(4)
+        if found is not None:
+            frame[:3, :3] = self._orientation(element, found)
+            frame[:3, 3] = [float(w) for w in self._words(element, found, "xyz")]
+            self._refuse_millimetres(element, frame[:3, 3])
+        return frame
+
+    def _orientation(self, element: ET.Element, origin: ET.Element) -> Floats:
+        """Rotation of a joint's frame in its parent link, by ``rpy`` or (URDF 1.1) ``quat_xyzw``, shape (3, 3)."""
+        where = f"{self.file}: joint {element.get('name')!r}: origin"
+        for key in sorted(set(origin.keys()) - {"xyz", "rpy", "quat_xyzw"}):
+            if re.search("quat|rpy|rot|euler", key, re.IGNORECASE):
+                raise ConfigError(f"{where}: unknown attribute {key:.40}; expected xyz, and rpy or quat_xyzw")
+        if origin.get("quat_xyzw") is None:
+            angles = [rounded_angle(w) for w in self._words(element, origin, "rpy")]
+            if max(abs(angle) for angle in angles) > FULL_TURN:
+                raise ConfigError(f"{where} rpy: {origin.get('rpy')!r:.80} looks like degrees; expected rad")
+            return rotation(*angles)
+        if origin.get("rpy") is not None:
+            raise ConfigError(f"{where}: both rpy and quat_xyzw; expected one of them")
+        try:
+            return rotation_of_quaternion([float(w) for w in self._words(element, origin, "quat_xyzw", count=4)])
+        except ValueError as error:
+            raise ConfigError(f"{where} quat_xyzw: {error}") from error
+
+    def _refuse_millimetres(self, element: ET.Element, xyz: Floats) -> None:
+        """Refuse a distance between joints that no arm has; the frame of the first joint may be anywhere."""
+        farthest = float(np.abs(xyz).max())
+        if farthest > LONGEST_LINK and _end(element, "parent") in self.above:
+            where = f"{self.file}: joint {element.get('name')!r}: origin xyz"
+            raise ConfigError(f"{where}: {farthest:g} looks like millimetres; expected m")
+
+    def moving_joint(self, element: ET.Element, placement: Floats) -> UrdfJoint:
+        """Return a moving joint of the chain.
+
+        Parameters
+        ----------
+        element
+            Element of the joint.
+        placement
+            Frame of the joint in the base link with all variables zero, shape (4, 4).
+
+        Raises
+        ------
+        ConfigError
+            If the joint is of another type, follows another joint, or has no usable axis.
+        """
+        where = f"{self.file}: joint {element.get('name')!r}"
+        kind = self.type_of(element)
+        if kind not in MOVING:
+            raise ConfigError(f"{where}: type {kind!r} cannot be identified; expected {', '.join(MOVING)} or fixed")
+        if element.find("mimic") is not None:
+            raise ConfigError(f"{where}: follows another joint (mimic), which a serial chain does not")
+        found = element.find("axis")
+        axis = np.array([1.0, 0.0, 0.0])
+        if found is not None:
+            axis = np.array([float(w) for w in self._words(element, found, "xyz", default=None)])
+        length = float(np.linalg.norm(axis))
+        if not length > 0.0:
+            raise ConfigError(f"{where}: axis: expected a direction, found 0 0 0")
+        return UrdfJoint(str(element.get("name")), kind, placement, axis / length, self._limits(element))
+
+    def _limits(self, element: ET.Element) -> dict[str, Any]:
+        """Limits of the file; zero and negative velocities and efforts are placeholders."""
+        limits: dict[str, Any] = {}
+        found = element.find("limit")
+        values = {
+            key: self._limit(element, found, key)
+            for key in ("lower", "upper", "velocity", "effort")
+            if found is not None and found.get(key) is not None
+        }
+        if self.type_of(element) == "continuous":
+            limits["position"] = ENDLESS
+        elif values.get("lower", 0.0) != values.get("upper", 0.0):
+            limits["position"] = (values.get("lower", 0.0), values.get("upper", 0.0))
+        for key, quantity in (("velocity", "velocity"), ("effort", "torque")):
+            if values.get(key, 0.0) > 0.0:
+                limits[quantity] = values[key]
+        return limits
+
+    def _limit(self, element: ET.Element, found: ET.Element, key: str) -> float:
+        """Value of a limit; infinite and huge values are placeholders, which the schema of limits takes as none."""
+        text = found.get(key, "").strip()
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if math.isnan(value):
+            self._words(element, found, key, count=1)
+        return value
+
+    def _words(
+        self, element: ET.Element, child: ET.Element, key: str, *, count: int = 3, default: str | None = "0 0 0"
+    ) -> list[str]:
+        """Finite numbers of an attribute, as written."""
+        text = child.get(key, default)
+        words = (text or "").split()
+        if len(words) != count or not all(_is_finite(word) for word in words):
+            expected = "a number" if count == 1 else f"{count} numbers"
+            hint = f"; {expand(self.file)}" if "$" in (text or "") else ""
+            where = f"{self.file}: joint {element.get('name')!r}: {child.tag} {key}"
+            raise ConfigError(f"{where}: expected {expected}, found {text!r:.80}{hint}")
+        return words
+
+
+def expand(file: Path) -> str:
+    """Text with the command that makes a URDF of a xacro file.
+
+    Parameters
+    ----------
+    file
+        Path of the file.
+    """
+    stem = file.name.split(".")[0]
+    return f"this is xacro, expand it first: xacro {file.name} > {stem}_expanded.urdf"
+
+
+def _parse(file: Path) -> ET.Element:
+    """Root element of a URDF file; xacro is refused by its name."""
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror or 'input error'}") from error
+    try:
+        root = ET.fromstring(content)
+    except ET.ParseError as error:
+        if b"xacro:" in content and "unbound prefix" in str(error):
+            raise ConfigError(f"{file}: {expand(file)}") from error
+        line, column = error.position
+        raise ConfigError(f"{file}: not valid XML: line {line}, column {column + 1}") from error
+    except (LookupError, ValueError) as error:
+        raise ConfigError(f"{file}: not valid XML: unknown encoding") from error
+    if any(XACRO in element.tag for element in root.iter()):
+        raise ConfigError(f"{file}: {expand(file)}")
+    return root
+
+
+def _read_tree(file: Path) -> _Tree:
+    root = _parse(file)
+    for element in root.iter():
+        for key, value in element.items():
+            if len(value) > LONGEST:
+                raise ConfigError(f"{file}: {element.tag:.40} {key:.40}: {len(value)} characters, expected {LONGEST}")
+    if root.tag != "robot":
+        raise ConfigError(f"{file}: expected a URDF with the root element robot, found {root.tag:.40}")
+    links = frozenset(str(link.get("name")) for link in root.findall("link"))
+    above: dict[str, ET.Element] = {}
+    below: dict[str, list[ET.Element]] = {}
+    names: set[str] = set()
+    for k, element in enumerate(root.findall("joint"), start=1):
+        name = element.get("name")
+        if not name:
+            raise ConfigError(f"{file}: joint number {k}: has no name")
+        if name in names:
+            raise ConfigError(f"{file}: joint {name!r}: there are two of this name")
+        names.add(name)
+        for end in ("parent", "child"):
+            if _end(element, end) not in links:
+                raise ConfigError(f"{file}: joint {name!r}: {end}: no link {_end(element, end)!r}")
+        child = _end(element, "child")
+        if child in above:
+            raise ConfigError(
+                f"{file}: link {child!r} is moved by two joints, {above[child].get('name')!r} and {name!r}"
+            )
+        above[child] = element
+        below.setdefault(_end(element, "parent"), []).append(element)
+    tree = _Tree(file, links, above, below)
+    reached = [tree.root()]
+    for link in reached:
+        reached += [_end(element, "child") for element in below.get(link, [])]
+    if len(reached) < len(links):
+        raise ConfigError(f"{file}: links {', '.join(sorted(links - set(reached)))} form a loop")
+    return tree
+
+
+def _is_finite(word: str) -> bool:
+    try:
+        return abs(Decimal(word)) <= LARGEST
+    except InvalidOperation:
+        return False
+
+
+def _end(element: ET.Element, end: str) -> str:
+    """Name of the ``parent`` or ``child`` link of a joint; empty if it has none."""
+    found = element.find(end)
+    return "" if found is None else found.get("link", "")
