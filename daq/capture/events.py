@@ -40,7 +40,9 @@ class EventHandler:
         self._plan, self._assembler, self._sink = plan, assembler, sink
         self._reported: set[tuple[str, str]] = set()
         self._timeout_s = max(SYNC_STOPPED_S, SYNC_STOPPED * plan.session.sync_period)
-        self._last_sync, self._last_sync_s, self._stopped = -1, 0.0, False
+        self._last_sync, self._last_sync_s = -1, 0.0
+        self.sync_stopped = False
+        """True while SYNC of another master has stopped."""
 
     def change(self, session: SessionConfig) -> None:
         """Apply the triggers of a reloaded session."""
@@ -110,14 +112,14 @@ class EventHandler:
         """
         last, silent = self._assembler.last_sync, now - self._last_sync_s
         if last == self._last_sync:
-            if last >= 0 and not self._stopped and silent > self._timeout_s:
-                self._stopped = True
+            if last >= 0 and not self.sync_stopped and silent > self._timeout_s:
+                self.sync_stopped = True
                 self.counts["sync_stopped"] += 1
                 self._note(f"no SYNC for {silent:.1f} s")
             return
-        if self._stopped:
+        if self.sync_stopped:
             self._note(f"SYNC is back after {silent:.1f} s")
-        self._last_sync, self._last_sync_s, self._stopped = last, now, False
+        self._last_sync, self._last_sync_s, self.sync_stopped = last, now, False
 
     def check_mappings(self) -> None:
         """Warn once of every TPDO whose length differs from its mapping."""

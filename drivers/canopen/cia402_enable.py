@@ -38,13 +38,15 @@ def read_state(sdo: DriveSdo) -> DriveState | None:
 def hold_position(sdo: DriveSdo) -> None:
     """Command cyclic synchronous position mode and the present position as target.
 
+    The target is not read back: in some drives it follows the position until they are enabled.
+
     Parameters
     ----------
     sdo
         The drive, before it is enabled.
     """
     sdo.write(od.MODE_OF_OPERATION, 0, od.CYCLIC_SYNCHRONOUS_POSITION, "b")
-    sdo.write(od.TARGET_POSITION, 0, sdo.read(od.POSITION_ACTUAL, 0, "i"), "i")
+    sdo.command(od.TARGET_POSITION, 0, sdo.read(od.POSITION_ACTUAL, 0, "i"), "i")
 
 
 def enable_drive(sdo: DriveSdo) -> None:
