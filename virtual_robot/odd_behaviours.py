@@ -8,6 +8,7 @@ from armident.virtual_robot.node import Drive
 from armident.virtual_robot.odd_objects import (
     Absent,
     Bit30,
+    CobFixed,
     HeartbeatRounds,
     ModeLate,
     PdoFixed,
@@ -42,6 +43,7 @@ BEHAVIOURS: Mapping[str, Factory] = {
     "bit30_demanded": lambda drive, session: Bit30(demanded=True),
     "pdo_fixed": PdoFixed,
     "pdo_fixed_other": lambda drive, session: PdoFixed(drive, None),
+    "cob_fixed": CobFixed,
     "write_late": lambda drive, session: WriteLate(drive, 0.05),
     "mode_when_enabled": lambda drive, session: ModeLate(drive, 0, 0.05),
     "mode_unknown": lambda drive, session: ModeLate(drive, -1, 1.5),

@@ -111,6 +111,38 @@ class PdoFixed(Oddity):
         return data
 
 
+class CobFixed(Oddity):
+    """Read-only COB-IDs of PDOs.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    session
+        Session whose streams and set points have the COB-IDs.
+    """
+
+    def __init__(self, drive: Drive, session: SessionConfig) -> None:
+        self._drive, node = drive, drive.node_id
+        tpdos = [stream.tpdo for stream in session.streams.values()]
+        self._cobs = {od.TPDO_COMMUNICATION + tpdo - 1: od.tpdo_cob(tpdo, node) for tpdo in tpdos}
+        if session.setpoints is not None:
+            rpdo = session.setpoints.rpdo
+            self._cobs[od.RPDO_COMMUNICATION + rpdo - 1] = od.rpdo_cob(rpdo, node)
+
+    def preset(self) -> None:
+        """Enable the PDOs of the session."""
+        for index, cob in self._cobs.items():
+            self._drive.preset(index, 1, cob)
+
+    def write(self, index: int, subindex: int, data: bytes) -> bytes:
+        """Refuse to change a COB-ID."""
+        tpdo = od.TPDO_COMMUNICATION <= index < od.TPDO_MAPPING
+        if subindex == 1 and (tpdo or od.RPDO_COMMUNICATION <= index < od.RPDO_MAPPING):
+            raise SdoAbortedError(ABORT_READ_ONLY)
+        return data
+
+
 class WriteLate(Oddity):
     """Written values read back late.
 

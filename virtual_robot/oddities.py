@@ -23,6 +23,7 @@ ODDITIES: Mapping[str, str] = {
     "bit30_demanded": "COB-IDs of TPDOs are refused without bit 30 (no RTR)",
     "pdo_fixed": "PDO mapping is read-only, and is that of the session",
     "pdo_fixed_other": "PDO mapping is read-only, and is the default of the EDS",
+    "cob_fixed": "COB-IDs of PDOs are read-only, and are those of the session",
     "write_late": "a written value reads back only 50 ms later",
     "mode_when_enabled": "mode of operation (6061h) is 0 until 50 ms after enabling",
     "mode_unknown": "mode of operation (6061h) is -1 until 1.5 s after enabling",

@@ -102,6 +102,14 @@ class EventHandler:
         """
         self._note(f"{dropped} frames were dropped by the kernel at the end: up to {syncs} SYNCs may be missing there")
 
+    def note_unknown_phase(self) -> None:
+        """Note that SYNC of another master has no counter, by which its drives choose the SYNCs of slower streams."""
+        session = self._plan.session
+        slow = [name for name, stream in session.streams.items() if max(stream.every, stream.pack) > 1]
+        if session.sync.counter == 0 and slow:
+            text = f"{', '.join(slow)}: SYNC of another master has no counter (sync.counter: 0), so it is unknown"
+            self._note(f"{text} which SYNCs are answered: times may be wrong by less than one interval of the stream")
+
     def check_sync(self, now: float) -> None:
         """Note that SYNC of another master has stopped or is back.
 

@@ -138,6 +138,8 @@ class Recorder:
         """Configure and enable the drives, and start SYNC; the stack stops them when it unwinds."""
         plan, session = self._plan, self._plan.session
         self.health.serve(stack)
+        if not plan.produces_sync:
+            self._events.note_unknown_phase()
         if plan.listen_only:
             return
         self._master = self._reports = stack.enter_context(DriveMaster(session, plan.robot))

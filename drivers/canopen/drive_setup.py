@@ -95,8 +95,8 @@ def set_heartbeat(sdo: DriveSdo, period_ms: int) -> None:
     sdo.heartbeat_ms = found or None
 
 
-def set_sync_counter(sdo: DriveSdo, overflow: int) -> bool:
-    """Set the overflow of the SYNC counter (1019h); return ``False`` if the drive has none or refuses it.
+def set_sync_counter(sdo: DriveSdo, overflow: int) -> str | None:
+    """Set the overflow of the SYNC counter (1019h).
 
     Parameters
     ----------
@@ -104,6 +104,11 @@ def set_sync_counter(sdo: DriveSdo, overflow: int) -> bool:
         The drive.
     overflow
         Overflow of the counter; 0: SYNC without a counter.
+
+    Returns
+    -------
+    str or None
+        Reason why SYNC with a counter does not suit the drive; ``None`` if it does.
 
     Raises
     ------
@@ -115,11 +120,8 @@ def set_sync_counter(sdo: DriveSdo, overflow: int) -> bool:
     try:
         sdo.write(od.SYNC_COUNTER_OVERFLOW, 0, overflow, "B")
     except SdoRefusedError as error:
-        if overflow:
-            reason = "has no SYNC counter (1019h)" if error.absent else f"does not take the SYNC counter: {error}"
-            sdo.remark(reason)
-        return False
-    return True
+        return "has no SYNC counter (1019h)" if error.absent else f"does not take the SYNC counter: {error}"
+    return None
 
 
 def await_mode(drives: list[DriveSdo]) -> None:

@@ -288,15 +288,18 @@ class DriveMaster:
     def _agree_on_sync_counter(self) -> None:
         """Set the SYNC counter (1019h) of all drives; if one has none and SYNC is sent here, that of no drive."""
         wanted = self._session.sync.counter
-        has_counter = [set_sync_counter(sdo, wanted) for sdo in self._drives]
+        reasons = [set_sync_counter(sdo, wanted) for sdo in self._drives]
         self.sync_counter = wanted
-        if wanted and self._session.sync.role == "producer" and not all(has_counter):
+        if not wanted or not any(reasons):
+            return
+        produces = self._session.sync.role == "producer"
+        for sdo, reason in zip(self._drives, reasons, strict=True):
+            if reason is not None:
+                sdo.remark(f"{reason}: {'SYNC is sent without one' if produces else 'it may not take SYNC with one'}")
+            elif produces:
+                set_sync_counter(sdo, 0)
+        if produces:
             self.sync_counter = 0
-            for sdo, has in zip(self._drives, has_counter, strict=True):
-                if has:
-                    set_sync_counter(sdo, 0)
-                else:
-                    sdo.remark("SYNC is sent without a counter")
 
     def _send_controls(self, controls: tuple[Control, ...]) -> None:
         # A lost drive would cost a timeout each; NMT is sent to it anyway.

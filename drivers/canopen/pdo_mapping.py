@@ -104,18 +104,23 @@ def _map_pdo(sdo: DriveSdo, communication: int, mapping: int, cob: int, entries:
     """
     before = sdo.read(communication, 1, "I")
     mapped = read_mapping(sdo, mapping)
-    if mapped == entries and not (before ^ cob) & ~od.NO_RTR and sdo.read(communication, 2, "B") == every:
+    right = mapped == entries and not (before ^ cob) & ~od.NO_RTR
+    if right and sdo.read(communication, 2, "B") == every:
         return
     cob |= before & od.NO_RTR
-    _write_cob(sdo, communication, cob | od.PDO_NOT_VALID)
-    if mapped != entries:
-        try:
+    try:
+        _write_cob(sdo, communication, cob | od.PDO_NOT_VALID)
+        if mapped != entries:
             sdo.write(mapping, 0, 0, "B")
             for k, entry in enumerate(entries):
                 sdo.write(mapping, k + 1, entry, "I")
             sdo.write(mapping, 0, len(entries), "B")
-        except SdoRefusedError as error:
+    except SdoRefusedError as error:
+        if not right:
             raise SdoRefusedError(f"{error}; {_difference(mapping, mapped, entries)}", error.code) from error
+        # The COB-ID is read-only, and right.
+        sdo.write(communication, 2, every, "B")
+        return
     sdo.write(communication, 2, every, "B")
     _write_cob(sdo, communication, cob)
 
@@ -156,6 +161,8 @@ def _difference(mapping: int, mapped: tuple[int, ...], wanted: tuple[int, ...]) 
         names = {known.entry: f" ({known.name})" for known in od.OBJECTS.values()}
         return ", ".join(f"{entry:08X}h{names.get(entry, '')}" for entry in entries) or "nothing"
 
+    if mapped == wanted:
+        return "its COB-ID differs from that of the predefined connection set (CiA 301)"
     return f"{mapping:04X}h maps {text(mapped)}, the session {text(wanted)}; adapt the streams of the session"
 
 

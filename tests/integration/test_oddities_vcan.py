@@ -29,7 +29,7 @@ REST = [0.0, 0.0, 1.57, 0.0, 0.0, 0.0]
 AWAY = [0.05, 0.0, 1.57, 0.0, 0.0, 0.0]
 
 SAID: dict[str, str | None] = {
-    "no1019": "has no SYNC counter (1019h)",
+    "no1019": "has no SYNC counter (1019h): SYNC is sent without one",
     "no60c0": None,
     "no60c2": "has no interpolation time (60C2h)",
     "no608f": "has no encoder resolution (608Fh)",
@@ -149,6 +149,13 @@ def test_a_read_only_mapping_that_differs_is_refused_with_the_difference(vcan_bu
         recorded(session)
 
 
+def test_a_read_only_pdo_that_is_right_is_not_written(vcan_bus: str, tmp_path: Path) -> None:
+    """Only the transmission type differs from that of the session."""
+    session = odd_session(tmp_path, vcan_bus, "fixed")
+    with robot(session, "pdo_fixed", "cob_fixed"):
+        recorded(session)
+
+
 def test_a_drive_that_needs_longer_than_its_time_to_boot_is_named(vcan_bus: str, tmp_path: Path) -> None:
     session = odd_session(tmp_path, vcan_bus, "boots", boot_timeout_s=0.5, sdo_timeout_s=0.2)
     silent = rf"node 3 \(joint_3\): does not answer on {vcan_bus} within 0.5 s"
@@ -181,4 +188,4 @@ def test_sync_without_a_counter_needs_no_odd_drive(vcan_bus: str, tmp_path: Path
 
 
 def test_every_oddity_has_its_test() -> None:
-    assert set(SAID) | {"emcy_burst", "pdo_fixed_other"} == set(ODDITIES)
+    assert set(SAID) | {"emcy_burst", "pdo_fixed_other", "cob_fixed"} == set(ODDITIES)
