@@ -24,7 +24,7 @@ from armident.configs import (
 from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
 from armident.daq.capture.files import chunk_duration_ns
-from armident.daq.matching.streams import captured_streams
+from armident.daq.matching.streams import captured_streams, unknown_phase
 from armident.daq.streaming.session import configuration, endpoints
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
@@ -81,6 +81,9 @@ def run_checks(config: str | Path) -> list[Check]:
         checks.append(Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}"))
     except ArmidentError as error:
         return [Check("configuration", "failed", str(error)), _clock()]
+    phase = unknown_phase(session) if session.sync.role == "consumer" else None
+    if phase is not None:
+        checks.append(Check("sync", "warning", phase))
     checks.append(_bus_load(session, config))
     for bus in session.all_buses:
         checks += _interface(bus)

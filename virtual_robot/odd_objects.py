@@ -55,6 +55,16 @@ class HeartbeatRounds(Oddity):
         return (-(-int.from_bytes(data, "little") // 64) * 64).to_bytes(2, "little")
 
 
+class InterpolationRounds(Oddity):
+    """Interpolation time in steps of 3 of its units."""
+
+    def write(self, index: int, subindex: int, data: bytes) -> bytes:
+        """Round the value up."""
+        if (index, subindex) != (od.INTERPOLATION_PERIOD, 1):
+            return data
+        return bytes([-(-data[0] // 3) * 3])
+
+
 class Bit30(Oddity):
     """Bit 30 of the COB-IDs of TPDOs.
 

@@ -13,6 +13,7 @@ ODDITIES: Mapping[str, str] = {
     "no1019": "no SYNC counter (1019h)",
     "no60c0": "no interpolation sub-mode (60C0h)",
     "no60c2": "no interpolation time (60C2h): set points are interpolated by the time set before",
+    "interpolation_rounds": "interpolation time (60C2h) in steps of 3 of its units",
     "no608f": "no encoder resolution (608Fh)",
     "no6075": "no rated current (6075h)",
     "no_product_code": "no product code (1018h:2)",

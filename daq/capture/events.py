@@ -6,6 +6,7 @@ from armident.configs import ArmidentError, SessionConfig
 from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Assembler
+from armident.daq.matching.streams import unknown_phase
 from armident.drivers.can.receiver import BusEvent
 from armident.drivers.canopen.master import DriveEvent
 
@@ -104,11 +105,9 @@ class EventHandler:
 
     def note_unknown_phase(self) -> None:
         """Note that SYNC of another master has no counter, by which its drives choose the SYNCs of slower streams."""
-        session = self._plan.session
-        slow = [name for name, stream in session.streams.items() if max(stream.every, stream.pack) > 1]
-        if session.sync.counter == 0 and slow:
-            text = f"{', '.join(slow)}: SYNC of another master has no counter (sync.counter: 0), so it is unknown"
-            self._note(f"{text} which SYNCs are answered: times may be wrong by less than one interval of the stream")
+        text = unknown_phase(self._plan.session)
+        if text is not None:
+            self._note(text)
 
     def check_sync(self, now: float) -> None:
         """Note that SYNC of another master has stopped or is back.

@@ -70,6 +70,23 @@ def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[Captur
     return tuple(streams)
 
 
+def unknown_phase(session: SessionConfig) -> str | None:
+    """Return a message if it is unknown on which SYNCs of another master slower streams are sent; else ``None``.
+
+    Parameters
+    ----------
+    session
+        Configuration of the capture.
+    """
+    slow = [name for name, stream in session.streams.items() if max(stream.every, stream.pack) > 1]
+    if session.sync.counter or not slow:
+        return None
+    return (
+        f"{', '.join(slow)}: SYNC of another master has no counter (sync.counter: 0), so it is unknown which SYNCs are "
+        "answered: times may be wrong by less than one interval of the stream"
+    )
+
+
 def node_ids(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
     """Return the node ID of each joint's drive, in the robot's order.
 

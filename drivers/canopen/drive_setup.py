@@ -8,7 +8,7 @@ from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.cia402_enable import POLL_INTERVAL
 from armident.drivers.canopen.sdo import DriveSdo, SdoRefusedError
 
-MODE_TIMEOUT = 5.0
+MODE_TIMEOUT = 10.0
 """Longest wait until enabled drives report their mode of operation (6061h), s."""
 
 

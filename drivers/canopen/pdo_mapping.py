@@ -5,6 +5,9 @@ from armident.configs.schema.session import SessionConfig
 from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.sdo import DriveSdo, SdoRefusedError
 
+ROUNDING_US = 0.5
+"""Difference of interpolation times that is an error of rounding, us: half of the unit of a session."""
+
 
 def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
     """Write the session's TPDOs and the RPDO of its set points, and read them back.
@@ -40,7 +43,7 @@ def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
         k, every = session.setpoints.rpdo - 1, session.setpoints.every
         cob = od.rpdo_cob(k + 1, node)
         _map_pdo(sdo, od.RPDO_COMMUNICATION + k, od.RPDO_MAPPING + k, cob, (od.SETPOINT.entry,), every)
-        _set_interpolation(sdo, session.sync.period_us * every)
+        _set_interpolation(sdo, session.sync.period_us * every, session.sync.period_us)
         _map_stop(sdo, od.stop_rpdo(session.setpoints.rpdo))
 
 
@@ -166,8 +169,8 @@ def _difference(mapping: int, mapped: tuple[int, ...], wanted: tuple[int, ...]) 
     return f"{mapping:04X}h maps {text(mapped)}, the session {text(wanted)}; adapt the streams of the session"
 
 
-def _set_interpolation(sdo: DriveSdo, period_us: int) -> None:
-    """Set the interpolation time (60C2h) to the period of the set points."""
+def _set_interpolation(sdo: DriveSdo, period_us: int, sync_us: int) -> None:
+    """Set the interpolation time (60C2h) to the period of the set points; a drive may round it by up to a SYNC."""
     value, exponent = interpolation_period(period_us, sdo.label)
     try:
         found = sdo.write_rounded(od.INTERPOLATION_PERIOD, 1, value, "B")
@@ -178,8 +181,10 @@ def _set_interpolation(sdo: DriveSdo, period_us: int) -> None:
         sdo.remark("has no interpolation time (60C2h): it interpolates set points by its own setting")
         return
     found_us = found * 10.0 ** (power + 6)
-    if abs(found_us - period_us) > 0.5:
+    if abs(found_us - period_us) > sync_us:
         raise ConfigError(f"{sdo.label}: interpolation time (60C2h) is {found_us:g} us after writing {period_us} us")
+    if abs(found_us - period_us) > ROUNDING_US:
+        sdo.remark(f"interpolates set points over {found_us:g} us (60C2h) instead of {period_us} us")
 
 
 def interpolation_period(period_us: int, where: str = "setpoints") -> tuple[int, int]:

@@ -32,6 +32,7 @@ SAID: dict[str, str | None] = {
     "no1019": "has no SYNC counter (1019h): SYNC is sent without one",
     "no60c0": None,
     "no60c2": "has no interpolation time (60C2h)",
+    "interpolation_rounds": "interpolates set points over 21000 us (60C2h) instead of 20000 us",
     "no608f": "has no encoder resolution (608Fh)",
     "no6075": "has no rated current (6075h)",
     "no_product_code": "has no product code (1018h:2)",
