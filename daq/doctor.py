@@ -81,7 +81,8 @@ def run_checks(config: str | Path) -> list[Check]:
         checks.append(Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}"))
     except ArmidentError as error:
         return [Check("configuration", "failed", str(error)), _clock()]
-    phase = unknown_phase(session) if session.sync.role == "consumer" else None
+    foreign = session.sync.role == "consumer" and not session.sync.counter
+    phase = unknown_phase(session) if foreign else None
     if phase is not None:
         checks.append(Check("sync", "warning", phase))
     checks.append(_bus_load(session, config))

@@ -103,12 +103,6 @@ class EventHandler:
         """
         self._note(f"{dropped} frames were dropped by the kernel at the end: up to {syncs} SYNCs may be missing there")
 
-    def note_unknown_phase(self) -> None:
-        """Note that SYNC of another master has no counter, by which its drives choose the SYNCs of slower streams."""
-        text = unknown_phase(self._plan.session)
-        if text is not None:
-            self._note(text)
-
     def check_sync(self, now: float) -> None:
         """Note that SYNC of another master has stopped or is back.
 
@@ -124,6 +118,10 @@ class EventHandler:
                 self.counts["sync_stopped"] += 1
                 self._note(f"no SYNC for {silent:.1f} s")
             return
+        if self._last_sync < 0 and not self._assembler.has_counter:
+            phase = unknown_phase(self._plan.session)
+            if phase is not None:
+                self._note(phase)
         if self.sync_stopped:
             self._note(f"SYNC is back after {silent:.1f} s")
         self._last_sync, self._last_sync_s, self.sync_stopped = last, now, False

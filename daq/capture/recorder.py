@@ -138,8 +138,6 @@ class Recorder:
         """Configure and enable the drives, and start SYNC; the stack stops them when it unwinds."""
         plan, session = self._plan, self._plan.session
         self.health.serve(stack)
-        if not plan.produces_sync:
-            self._events.note_unknown_phase()
         if plan.listen_only:
             return
         self._master = self._reports = stack.enter_context(DriveMaster(session, plan.robot))
@@ -393,15 +391,18 @@ class Recorder:
         """Record until no answer is outstanding, or none has come for ``LATE_S``.
 
         If all drives lag, the host is too busy: the limit is ``STARVED_S`` then, unless a heartbeat is missing or no
-        bus works.
+        bus works. Another master continues to send SYNC: then the limit is ``LATE_S`` in total.
         """
         reported = False
+        begin = time.monotonic()
         last_s, lost = time.monotonic(), self._events.counts["heartbeat_lost"]
         while True:
             if self._drain():
                 last_s = time.monotonic()
             outstanding, silent = self._assembler.outstanding, time.monotonic() - last_s
             if outstanding <= 0 or silent > STARVED_S:
+                return
+            if self._producer is None and time.monotonic() - begin > LATE_S:
                 return
             if silent > LATE_S:
                 self._handle_drive_events()

@@ -197,6 +197,11 @@ class Assembler:
         self._state.bus_state[:, COUNTER] = -1
 
     @property
+    def has_counter(self) -> bool:
+        """True if SYNC with a counter was received, or is sent by this program."""
+        return bool((self._state.bus_state[:, COUNTER] >= 0).any())
+
+    @property
     def last_sync(self) -> int:
         """Number of the last SYNC known; -1 before the first."""
         return int(self._state.bus_state[:, SYNC].max())

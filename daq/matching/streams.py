@@ -71,7 +71,9 @@ def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[Captur
 
 
 def unknown_phase(session: SessionConfig) -> str | None:
-    """Return a message if it is unknown on which SYNCs of another master slower streams are sent; else ``None``.
+    """Return a message about streams that are not sent on every SYNC, for SYNC of another master without a counter.
+
+    Drives send these streams by their own count then, which is unknown. ``None`` if there is no such stream.
 
     Parameters
     ----------
@@ -79,11 +81,11 @@ def unknown_phase(session: SessionConfig) -> str | None:
         Configuration of the capture.
     """
     slow = [name for name, stream in session.streams.items() if max(stream.every, stream.pack) > 1]
-    if session.sync.counter or not slow:
+    if not slow:
         return None
     return (
-        f"{', '.join(slow)}: SYNC of another master has no counter (sync.counter: 0), so it is unknown which SYNCs are "
-        "answered: times may be wrong by less than one interval of the stream"
+        f"{', '.join(slow)}: SYNC of another master has no counter, so it is unknown which SYNCs are answered: times "
+        "may be wrong by less than one interval of the stream"
     )
 
 

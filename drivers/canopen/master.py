@@ -383,7 +383,10 @@ class DriveMaster:
                 if joint in self.unverified_mapping:
                     span = self.unverified_mapping[joint][0], time.time_ns()
                     self.unverified_mapping = {**self.unverified_mapping, joint: span}
-                self._report("configured", sdo, time.time_ns(), "configured again, and started")
+                text = "configured again, and started"
+                if self.sync_counter == 0 and any(max(s.every, s.pack) > 1 for s in self._session.streams.values()):
+                    text += "; without a SYNC counter, its slower streams may answer other SYNCs than before"
+                self._report("configured", sdo, time.time_ns(), text)
         finally:
             self._finish(sdo)
 
