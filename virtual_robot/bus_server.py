@@ -23,6 +23,8 @@ PDO_FILTERS = ((0x180, 0x780), (0x200, 0x700), (0x300, 0x700), (0x400, 0x700), (
 """Filters for the identifiers of PDOs, 180h to 57Fh; a socket does not receive its own frames."""
 BATCH = 1024
 """Maximum number of frames per batch."""
+NOTIFIER_CYCLE_S = 0.1
+"""Longest time for which canopen's thread waits for a frame, and so delays the end of the drives, s."""
 REOPEN_S = 0.02
 """Interval at which a bus that is down is checked, s."""
 
@@ -108,6 +110,7 @@ class DriveBus:
             network.notifier.exception = None
 
         network.listeners[0].on_error = clear
+        network.NOTIFIER_CYCLE = NOTIFIER_CYCLE_S
         network.listeners.append(GuardingListener(self.drives))
         try:
             network.connect(interface=self.config.interface, channel=self.config.channel, can_filters=filters)
