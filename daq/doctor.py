@@ -24,7 +24,7 @@ from armident.configs import (
 from armident.configs.schema.session import Bus
 from armident.daq.capture.clock import clock_state
 from armident.daq.capture.files import chunk_duration_ns
-from armident.daq.matching.streams import captured_streams
+from armident.daq.matching.streams import captured_streams, unknown_phase
 from armident.daq.streaming.session import configuration, endpoints, unreadable_files
 from armident.drivers.can.socketcan import RECEIVE_BUFFER, RawSocket
 from armident.drivers.can.timestamps import has_hardware_timestamps
@@ -84,6 +84,10 @@ def run_checks(config: str | Path) -> list[Check]:
     except ArmidentError as error:
         return [Check("configuration", "failed", str(error)), *_data_sheets(session), _clock()]
     checks = [Check("configuration", "ok", f"{config}: cell {session.cell}, robot {robot.name}")]
+    foreign = session.sync.role == "consumer" and not session.sync.counter
+    phase = unknown_phase(session) if foreign else None
+    if phase is not None:
+        checks.append(Check("sync", "warning", phase))
     checks += [*_data_sheets(session), _bus_load(session, config)]
     for bus in session.all_buses:
         checks += _interface(bus)

@@ -14,7 +14,7 @@ from armident.configs.schema.session import Bus
 from armident.drivers.can.frames import STANDARD_ID_MASK, BusDown, frames
 from armident.drivers.can.socketcan import RECEIVE_TIMEOUT, RawSocket
 from armident.drivers.can.udp import open_bus
-from armident.drivers.canopen.objects import COB_NMT, COB_SDO_REQUEST, COB_SYNC
+from armident.drivers.canopen.objects import COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SYNC
 from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.node import Drive
 from armident.virtual_robot.pdo_exchange import Exchange
@@ -23,8 +23,43 @@ PDO_FILTERS = ((0x180, 0x780), (0x200, 0x700), (0x300, 0x700), (0x400, 0x700), (
 """Filters for the identifiers of PDOs, 180h to 57Fh; a socket does not receive its own frames."""
 BATCH = 1024
 """Maximum number of frames per batch."""
+NOTIFIER_CYCLE_S = 0.1
+"""Longest time for which canopen's thread waits for a frame, and so delays the end of the drives, s."""
 REOPEN_S = 0.02
 """Interval at which a bus that is down is checked, s."""
+
+
+class GuardingListener(can.Listener):
+    """Receives the requests of node guarding (CiA 301), which are remote frames, for the drives of a bus.
+
+    Parameters
+    ----------
+    drives
+        The drives.
+    """
+
+    def __init__(self, drives: Sequence[Drive]) -> None:
+        self._drives = {COB_HEARTBEAT + drive.node_id: drive for drive in drives}
+
+    def on_message_received(self, msg: can.Message) -> None:
+        """Let a drive answer a request.
+
+        Parameters
+        ----------
+        msg
+            The received frame.
+        """
+        if msg.is_remote_frame and msg.arbitration_id in self._drives:
+            self._drives[msg.arbitration_id].nmt.answer_guarding()
+
+    def on_error(self, exc: Exception) -> None:
+        """Accept the error of a bus that is down.
+
+        Parameters
+        ----------
+        exc
+            The error.
+        """
 
 
 class DriveBus:
@@ -64,8 +99,9 @@ class DriveBus:
         self.take(0, 0, 1)
 
     def _connected(self, network: Any) -> Any:
-        """Connect canopen to the bus with a filter for NMT commands and SDO requests."""
-        wanted = [COB_NMT, *(COB_SDO_REQUEST + drive.node_id for drive in self.drives)]
+        """Connect canopen to the bus with a filter for NMT commands, SDO requests and node guarding."""
+        nodes = [drive.node_id for drive in self.drives]
+        wanted = [COB_NMT, *(COB_SDO_REQUEST + node for node in nodes), *(COB_HEARTBEAT + node for node in nodes)]
         filters = [{"can_id": can_id, "can_mask": STANDARD_ID_MASK, "extended": False} for can_id in wanted]
 
         # Clearing the error keeps canopen's receive thread alive: its socket and the kernel's heartbeats work again
@@ -74,6 +110,8 @@ class DriveBus:
             network.notifier.exception = None
 
         network.listeners[0].on_error = clear
+        network.NOTIFIER_CYCLE = NOTIFIER_CYCLE_S
+        network.listeners.append(GuardingListener(self.drives))
         try:
             network.connect(interface=self.config.interface, channel=self.config.channel, can_filters=filters)
         except (OSError, can.CanError) as error:
@@ -85,6 +123,8 @@ class DriveBus:
         for drive in self.drives:
             self._network.add_node(drive)
             drive.nmt.boot()
+            for oddity in drive.oddities:
+                oddity.begin(self.config)
 
     def take(self, start: int, stop: int, sequence: int) -> int:
         """Process the frames of ``batch`` up to the next SYNC, as :meth:`Exchange.take`.
@@ -183,6 +223,8 @@ class DriveBus:
     def close(self) -> None:
         """Stop the drives and release the bus."""
         for drive in self.drives:
+            for oddity in drive.oddities:
+                oddity.end()
             drive.nmt.halt()
         with suppress(can.CanError, OSError):
             self._network.disconnect()

@@ -8,7 +8,9 @@ import typer
 
 def robot(
     config: Annotated[Path, typer.Option(help="Session configuration.")] = Path("tx40_cell.yaml"),
-    scenario: Annotated[Path | None, typer.Option(help="Scenario: effects hidden in the arm.")] = None,
+    scenario: Annotated[
+        Path | None, typer.Option(help="Scenario: effects hidden in the arm, oddities of its drives.")
+    ] = None,
     replay: Annotated[Path | None, typer.Option(help="Recording to replay in place of the plant.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     noise: Annotated[float, typer.Option(min=0.0, help="Factor on the noise amplitude; 0: no noise.")] = 1.0,
@@ -37,6 +39,9 @@ def robot(
     list_effects: Annotated[
         bool, typer.Option("--list-effects", help="List the effects of scenarios with their parameters, and exit.")
     ] = False,
+    list_oddities: Annotated[
+        bool, typer.Option("--list-oddities", help="List the oddities of drives for scenarios, and exit.")
+    ] = False,
 ) -> None:
     """Run a virtual robot arm on a bus: its CiA 402 drives with a simulated plant, or with a recording to replay.
 
@@ -46,6 +51,11 @@ def robot(
         from armident.virtual_robot.effects import describe_effects
 
         print(describe_effects())
+        return
+    if list_oddities:
+        from armident.virtual_robot.oddities import describe_oddities
+
+        print(describe_oddities())
         return
 
     from armident.configs import ConfigError

@@ -1,26 +1,20 @@
-"""Virtual drive as a CANopen node: NMT, SDO server with object dictionary, EMCY, and the states of CiA 402."""
+"""Virtual drive as a CANopen node: object dictionary, EMCY, and the states of CiA 402."""
 
 # mypy: disable-error-code="no-untyped-call"
 # canopen is typed in part only.
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import can
 import canopen
-from canopen.nmt import NmtSlave
 from canopen.objectdictionary import ODArray
 from canopen.sdo.exceptions import SdoAbortedError
-from canopen.sdo.server import SdoServer
 
 from armident.configs import ConfigError
 from armident.configs.schema.robot import Joint
 from armident.drivers.canopen.eds import read_objects
 from armident.drivers.canopen.objects import (
-    COB_HEARTBEAT,
-    COB_SDO_REQUEST,
-    COB_SDO_RESPONSE,
     CONTROLWORD,
     CURRENT_ACTUAL,
     CYCLIC_SYNCHRONOUS_POSITION,
@@ -46,12 +40,12 @@ from armident.drivers.canopen.objects import (
     TPDO_COMMUNICATION,
     TPDO_MAPPING,
     DriveState,
-    NmtCommand,
-    NmtState,
     rated_milliamperes,
 )
 from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.cia402 import MOVING, next_state, statusword
+from armident.virtual_robot.node_services import Nmt, Sdo
+from armident.virtual_robot.oddities import Oddity
 
 ABORT_UNSUPPORTED = 0x06010000
 ABORT_NOT_MAPPABLE = 0x06040041
@@ -79,93 +73,6 @@ NEEDED = (
     TPDO_COMMUNICATION,
     TPDO_MAPPING,
 )
-
-
-STATE_AFTER: dict[int, NmtState] = {
-    NmtCommand.START: NmtState.OPERATIONAL,
-    NmtCommand.STOP: NmtState.STOPPED,
-    NmtCommand.PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
-}
-
-
-class Nmt(NmtSlave):
-    """NMT slave (CiA 301, section 7.3.2): a reset ends in pre-operational, after a boot-up message."""
-
-    def on_command(self, can_id: int, data: bytes, timestamp: float) -> None:
-        """Execute a command addressed to this node or to all; malformed commands are ignored.
-
-        Parameters
-        ----------
-        can_id, data, timestamp
-            Identifier, data bytes and receive time of the frame.
-        """
-        if len(data) != 2 or data[1] not in (0, self.id):
-            return
-        drive: Drive = self._local_node
-        if data[0] in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION):
-            drive.reset(communication_only=data[0] == NmtCommand.RESET_COMMUNICATION)
-            self.boot()
-        elif data[0] in STATE_AFTER:
-            self._state = int(STATE_AFTER[data[0]])
-            self.update_heartbeat()
-        drive.changed()
-
-    def boot(self) -> None:
-        """Send the boot-up message, enter pre-operational and start the heartbeat (1017h)."""
-        self.stop_heartbeat()
-        self.network.send_message(COB_HEARTBEAT + self.id, b"\0")
-        self._state = int(NmtState.PRE_OPERATIONAL)
-        self.resume()
-
-    def resume(self) -> None:
-        """Start the heartbeat (1017h)."""
-        self.start_heartbeat(int.from_bytes(self._local_node.get_data(HEARTBEAT_PRODUCER, 0), "little"))
-
-    def stop_heartbeat(self) -> None:
-        """Stop the heartbeat, even if its bus is closed already."""
-        try:
-            super().stop_heartbeat()
-        except (can.CanError, OSError):
-            self._send_task = None
-
-    def halt(self) -> None:
-        """Stop the heartbeat."""
-        self.stop_heartbeat()
-
-    @property
-    def operational(self) -> bool:
-        """``True`` if the node is operational and exchanges PDOs."""
-        return bool(self._state == NmtState.OPERATIONAL)
-
-    @property
-    def stopped(self) -> bool:
-        """``True`` if the node is stopped and reacts to NMT only."""
-        return bool(self._state == NmtState.STOPPED)
-
-
-class Sdo(SdoServer):
-    """SDO server that does not answer while the node is stopped, nor requests of other than eight bytes.
-
-    Parameters
-    ----------
-    node
-        The drive.
-    """
-
-    def __init__(self, node: "Drive") -> None:
-        super().__init__(COB_SDO_REQUEST + node.node_id, COB_SDO_RESPONSE + node.node_id, node)
-        self._index = self._subindex = 0
-
-    def on_request(self, can_id: int, data: bytes, timestamp: float) -> None:
-        """Serve one request.
-
-        Parameters
-        ----------
-        can_id, data, timestamp
-            Identifier, data bytes and receive time of the frame.
-        """
-        if len(data) == 8 and not self._node.nmt.stopped:
-            super().on_request(can_id, data, timestamp)
 
 
 class Drive(canopen.LocalNode):
@@ -215,22 +122,46 @@ class Drive(canopen.LocalNode):
         self.changed, self.status_changed = changed, status_changed
         self.nmt: Nmt = Nmt(node_id, self)
         self.sdo: Sdo = Sdo(self)
+        self.oddities: tuple[Oddity, ...] = ()
+        """Deviations from an ordinary drive."""
         self._write_callbacks = [self._check, self.nmt.on_write]
         self.add_read_callback(self._live)
         self.state = DriveState.SWITCH_ON_DISABLED
         self.control = 0
         self._factory()
 
+    def become_odd(self, oddities: Sequence[Oddity]) -> None:
+        """Deviate from an ordinary drive from now on.
+
+        Parameters
+        ----------
+        oddities
+            The deviations.
+        """
+        self.oddities = tuple(oddities)
+        self._factory()
+
     def _factory(self) -> None:
         counts = round(self.joint.drive.counts_per_unit or 0)
-        self._preset(ENCODER_RESOLUTION, 1, counts)
-        self._preset(ENCODER_RESOLUTION, 2, 1)
-        self._preset(RATED_CURRENT, 0, rated_milliamperes(self.joint.drive))
-        self._preset(IDENTITY, 4, self.node_id)
-        self._preset(MODE_OF_OPERATION, 0, CYCLIC_SYNCHRONOUS_POSITION)
-        self._preset(SUPPORTED_MODES, 0, 1 << (CYCLIC_SYNCHRONOUS_POSITION - 1))
+        self.preset(ENCODER_RESOLUTION, 1, counts)
+        self.preset(ENCODER_RESOLUTION, 2, 1)
+        self.preset(RATED_CURRENT, 0, rated_milliamperes(self.joint.drive))
+        self.preset(IDENTITY, 4, self.node_id)
+        self.preset(MODE_OF_OPERATION, 0, CYCLIC_SYNCHRONOUS_POSITION)
+        self.preset(SUPPORTED_MODES, 0, 1 << (CYCLIC_SYNCHRONOUS_POSITION - 1))
+        for oddity in self.oddities:
+            oddity.preset()
 
-    def _preset(self, index: int, subindex: int, value: int) -> None:
+    def preset(self, index: int, subindex: int, value: int) -> None:
+        """Set an object of the dictionary from inside the drive; objects that the EDS lacks are ignored.
+
+        Parameters
+        ----------
+        index, subindex
+            The object.
+        value
+            Its value.
+        """
         if index in self.object_dictionary:
             entry = self._find_object(index, subindex)
             self.data_store.setdefault(index, {})[subindex] = entry.encode_raw(value)
@@ -251,6 +182,23 @@ class Drive(canopen.LocalNode):
             self.control = 0
             self._enter(DriveState.SWITCH_ON_DISABLED)
 
+    def get_data(self, index: int, subindex: int, check_readable: bool = False) -> bytes:
+        """Read an object.
+
+        Parameters
+        ----------
+        index, subindex
+            The object.
+        check_readable
+            Refuse write-only objects: a request over SDO, which oddities may answer.
+        """
+        if check_readable:
+            for oddity in self.oddities:
+                answer = oddity.read(index, subindex)
+                if answer is not None:
+                    return answer
+        return bytes(super().get_data(index, subindex, check_readable))
+
     def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:
         """Write an object; a controlword takes effect at once.
 
@@ -263,6 +211,9 @@ class Drive(canopen.LocalNode):
         check_writable
             Refuse read-only objects.
         """
+        if check_writable:
+            for oddity in self.oddities:
+                data = oddity.write(index, subindex, bytes(data))
         super().set_data(index, subindex, data, check_writable)
         if index == CONTROLWORD:
             self.apply_controlword(int.from_bytes(data, "little"))
@@ -306,14 +257,14 @@ class Drive(canopen.LocalNode):
         if self.state is DriveState.FAULT:
             return
         self._enter(DriveState.FAULT)
-        self._preset(ERROR_REGISTER, 0, register)
-        self._preset(ERROR_HISTORY, 1, code)
+        self.preset(ERROR_REGISTER, 0, register)
+        self.preset(ERROR_HISTORY, 1, code)
         self.emcy.send(code, register)
 
     def _enter(self, state: DriveState) -> None:
         before, self.state = self.state, state
         if before is DriveState.FAULT and state is not DriveState.FAULT:
-            self._preset(ERROR_REGISTER, 0, 0)
+            self.preset(ERROR_REGISTER, 0, 0)
             self.emcy.reset()
         if (before in MOVING) != (state in MOVING):
             self.motion.enable(self.index, state in MOVING)

@@ -15,6 +15,7 @@ from armident.daq.recording import read_recording, write_recording
 from armident.virtual_robot import servo
 from armident.virtual_robot.arm import Arm, DriveBackend
 from armident.virtual_robot.inertias import base_parameters, plant_parameters, rest_posture
+from armident.virtual_robot.oddities import drive_oddities
 from armident.virtual_robot.offline import simulate_recording, with_encoder_counts
 from armident.virtual_robot.plant import Plant
 from armident.virtual_robot.replay import Replay
@@ -40,7 +41,7 @@ def run_robot(
     config
         Session configuration.
     scenario
-        Scenario with hidden effects.
+        Scenario with hidden effects, and oddities of drives.
     replay
         Recording to replay in place of the plant.
     seed, noise
@@ -65,16 +66,17 @@ def run_robot(
     """
     session = load_session(config)
     robot = load_robot(session.robot)
+    hidden = load_scenario(scenario) if scenario is not None else None
+    oddities = drive_oddities(hidden, robot, str(scenario))
     if replay is not None:
         motion = _replay(session, robot, replay)
     else:
-        hidden = load_scenario(scenario) if scenario is not None else None
         motion = Arm(robot, rest_posture(robot), session.sync_period, seed, noise, hidden, velocity_feedback)
         _warm_up(robot, session)
         if truth is not None:
             _write_truth(robot, rest_posture(robot), truth, velocity_feedback)
     stop = _Stop()
-    with Server(session, robot, motion) as server:
+    with Server(session, robot, motion, oddities) as server:
         nodes = ", ".join(str(drive.node_id) for drive in server.drives)
         buses = ", ".join(bus.channel for bus in session.all_buses)
         # On stdout: programs that start the arm wait for this line.
@@ -112,7 +114,7 @@ def record_robot(
     Raises
     ------
     ConfigError
-        If a file is wrong, no trajectory is given, or ``out`` exists already.
+        If a file is wrong, no trajectory is given, the scenario has oddities of drives, or ``out`` exists already.
     """
     if out.exists():
         raise ConfigError(f"{out}: the file exists already")
@@ -124,9 +126,11 @@ def record_robot(
     motion = load_trajectory(trajectory or setpoints.trajectory)
     if encoder_counts is not None:
         robot = with_encoder_counts(robot, encoder_counts)
+    hidden = None if scenario is None else load_scenario(scenario)
+    if hidden is not None and hidden.drives:
+        raise ConfigError(f"{scenario}: drives: --to-file has no bus, on which drives could be odd")
     recording = simulate_recording(
-        robot, motion, seed, noise,
-        None if scenario is None else load_scenario(scenario),
+        robot, motion, seed, noise, hidden,
         session.sync_period, setpoints.every, setpoints.settle_s, velocity_feedback=velocity_feedback,
     )  # fmt: skip
     if truth is not None:

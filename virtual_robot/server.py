@@ -2,7 +2,7 @@
 
 import select
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -17,6 +17,7 @@ from armident.drivers.canopen.objects import DriveState
 from armident.virtual_robot.arm import DriveBackend
 from armident.virtual_robot.bus_server import BATCH, DriveBus
 from armident.virtual_robot.node import Drive
+from armident.virtual_robot.odd_behaviours import make_oddities
 
 TOGETHER_S = 0.05
 """Longest wait of a SYNC of one bus for that of another bus, s."""
@@ -90,6 +91,8 @@ class Server:
         Buses, nodes and SYNC; joints and drives.
     motion
         Plant or recording behind the drives.
+    oddities
+        Names of the oddities of drives, by joint.
 
     Raises
     ------
@@ -97,7 +100,13 @@ class Server:
         If a bus is missing or an EDS is unusable.
     """
 
-    def __init__(self, session: SessionConfig, robot: RobotConfig, motion: DriveBackend) -> None:
+    def __init__(
+        self,
+        session: SessionConfig,
+        robot: RobotConfig,
+        motion: DriveBackend,
+        oddities: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:
         self._session, self._motion = session, motion
         names = [joint.name for joint in robot.joints]
         self._dirty = self._status_dirty = False
@@ -106,11 +115,14 @@ class Server:
         for node in session.drives:
             j = names.index(node.joint)
             fd = session.bus_of(node).fd
-            self.drives.append(Drive(node.node_id, node.eds, j, robot.joints[j], motion, *callbacks, fd))
+            drive = Drive(node.node_id, node.eds, j, robot.joints[j], motion, *callbacks, fd)
+            drive.become_odd(make_oddities((oddities or {}).get(node.joint, ()), drive, session))
+            self.drives.append(drive)
         self._limit = _following_limit(robot)
         self._histogram = np.zeros(DELAY_BINS + 1, np.int64)
         self._latest = 0.0
         self._backlog = self._syncs = 0
+        self._origin, self._operational = 0, False
         self._seconds = self._cpu = 0.0
         self._buses: list[DriveBus] = []
         try:
@@ -132,6 +144,10 @@ class Server:
     def _update_exchange(self) -> None:
         if self._dirty:
             self._dirty = self._status_dirty = False
+            operational = any(drive.nmt.operational for drive in self.drives)
+            if operational and not self._operational:
+                self._origin = self._syncs
+            self._operational = operational
             for drive_bus in self._buses:
                 drive_bus.exchange.rebuild()
         elif self._status_dirty:
@@ -218,7 +234,7 @@ class Server:
         for drive_bus in self._buses:
             assert isinstance(drive_bus.bus, RawSocket)
             poll.register(drive_bus.bus.fileno(), select.POLLIN)
-        half_turn_ns = round(self._session.sync_period * 1e9 * self._session.sync.counter / 2)
+        period_ns = self._session.sync_period * 1e9
         since: float | None = None
         while not over():
             due = [(drive_bus, drive_bus.next_sync()) for drive_bus in self._buses]
@@ -235,7 +251,9 @@ class Server:
             _, counter, stamp = min(waiting, key=lambda one: one[2])
             for drive_bus, other, at in waiting:
                 # A bus that missed a SYNC is ahead of the others: its next one waits for theirs.
-                if other == counter and abs(at - stamp) < half_turn_ns:
+                # Without a counter (0), time alone tells the SYNCs apart.
+                most_ns = period_ns * max(self._session.sync.counter if counter else 1, 1) / 2
+                if other == counter and abs(at - stamp) < most_ns:
                     drive_bus.answer(counter or self._counter)
             if self._syncs % DELAY_SYNCS == 0:
                 self._record_delay(time.time_ns() - stamp)
@@ -243,8 +261,8 @@ class Server:
 
     @property
     def _counter(self) -> int:
-        """Counter of the next SYNC if it carries none."""
-        return self._syncs % self._session.sync.counter + 1
+        """Counter of the next SYNC if it carries none: SYNCs since the first drive became operational."""
+        return self._syncs - self._origin + 1
 
     def _advance(self) -> None:
         self._motion.advance()

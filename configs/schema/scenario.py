@@ -1,8 +1,8 @@
-"""Schema of a scenario: effects that are hidden in a virtual arm and unknown to identification and diagnosis."""
+"""Schema of a scenario: effects that are hidden in a virtual arm, and oddities of its drives."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from armident.configs.schema.base import FrozenModel
 from armident.configs.schema.robot import JointName, Name
@@ -27,8 +27,20 @@ class HiddenEffect(FrozenModel):
     parameters: dict[Name, float] = Field(default_factory=dict)
 
 
+class OddDrive(FrozenModel):
+    """Drive that deviates from an ordinary one within CiA 301 and CiA 402; the virtual arm defines and checks how.
+
+    Parameters
+    ----------
+    oddities
+        Names of the deviations (``armident robot --list-oddities``).
+    """
+
+    oddities: Annotated[tuple[Name, ...], Field(min_length=1)]
+
+
 class Scenario(FrozenModel):
-    """Hidden effects of one virtual arm.
+    """Hidden effects of one virtual arm, and oddities of its drives.
 
     Parameters
     ----------
@@ -37,9 +49,18 @@ class Scenario(FrozenModel):
     description
         Free text.
     effects
-        The hidden effects.
+        The hidden effects, which are unknown to identification and diagnosis.
+    drives
+        Odd drives, by joint.
     """
 
     schema_: Literal["armident/scenario/1"] = Field(alias="schema")
     description: str = ""
-    effects: Annotated[tuple[HiddenEffect, ...], Field(min_length=1)]
+    effects: tuple[HiddenEffect, ...] = ()
+    drives: dict[Name, OddDrive] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Self:
+        if not self.effects and not self.drives:
+            raise ValueError("effects: expected at least one effect, or drives with oddities")
+        return self

@@ -56,15 +56,21 @@ class Sync(FrozenModel):
     period_us
         SYNC period, us.
     counter
-        Overflow of the SYNC counter (1019h).
+        Overflow of the SYNC counter (1019h), 2 to 240; 0: SYNC has no counter.
     source
         Timer of the producer: ``loop`` in this process, or ``kernel`` (CAN_BCM).
     """
 
     role: Literal["producer", "consumer"] = "producer"
     period_us: Annotated[int, Field(ge=100, le=1_000_000)] = 200
-    counter: Annotated[int, Field(ge=2, le=240)] = 240
+    counter: Annotated[int, Field(ge=0, le=240)] = 240
     source: Literal["loop", "kernel"] = "loop"
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.counter == 1:
+            raise ValueError("counter: expected 0 (SYNC without a counter) or 2 to 240 (CiA 301, 1019h)")
+        return self
 
 
 class Temperature(FrozenModel):
@@ -306,6 +312,8 @@ class SessionConfig(FrozenModel):
         Heartbeat period of the drives (1017h), ms.
     sdo_timeout_s
         Longest wait for an SDO answer, s.
+    boot_timeout_s
+        Longest wait at the start of a capture for drives that do not answer yet, s.
     streams
         TPDOs by stream name; ``samples`` is required.
     setpoints
@@ -324,6 +332,7 @@ class SessionConfig(FrozenModel):
     emcy_texts: dict[Annotated[int, Field(ge=0, le=0xFFFF)], str] = Field(default_factory=dict)
     heartbeat_ms: Annotated[int, Field(ge=10, le=60_000)] = 100
     sdo_timeout_s: Positive = 1.0
+    boot_timeout_s: Annotated[float, Field(ge=0, le=600)] = 5.0
     streams: dict[Name, Stream]
     setpoints: Setpoints | None = None
     recording: RecordingOptions = RecordingOptions()
@@ -346,7 +355,7 @@ class SessionConfig(FrozenModel):
         if self.setpoints is not None:
             intervals["setpoints.every"] = self.setpoints.every
         for label, interval in intervals.items():
-            if self.sync.counter % interval:
+            if self.sync.counter and self.sync.counter % interval:
                 raise ValueError(f"{label}: {interval} does not divide sync.counter {self.sync.counter}")
         for name, stream in self.streams.items():
             if stream.pack > 1 and stream.every > 1:

@@ -6,6 +6,7 @@ from armident.configs import ArmidentError, SessionConfig
 from armident.daq.capture.plan import CapturePlan
 from armident.daq.capture.sink import Sink
 from armident.daq.matching.assembler import Assembler
+from armident.daq.matching.streams import unknown_phase
 from armident.drivers.can.receiver import BusEvent
 from armident.drivers.canopen.master import DriveEvent
 
@@ -40,7 +41,9 @@ class EventHandler:
         self._plan, self._assembler, self._sink = plan, assembler, sink
         self._reported: set[tuple[str, str]] = set()
         self._timeout_s = max(SYNC_STOPPED_S, SYNC_STOPPED * plan.session.sync_period)
-        self._last_sync, self._last_sync_s, self._stopped = -1, 0.0, False
+        self._last_sync, self._last_sync_s = -1, 0.0
+        self.sync_stopped = False
+        """True while SYNC of another master has stopped."""
 
     def change(self, session: SessionConfig) -> None:
         """Apply the triggers of a reloaded session."""
@@ -110,14 +113,18 @@ class EventHandler:
         """
         last, silent = self._assembler.last_sync, now - self._last_sync_s
         if last == self._last_sync:
-            if last >= 0 and not self._stopped and silent > self._timeout_s:
-                self._stopped = True
+            if last >= 0 and not self.sync_stopped and silent > self._timeout_s:
+                self.sync_stopped = True
                 self.counts["sync_stopped"] += 1
                 self._note(f"no SYNC for {silent:.1f} s")
             return
-        if self._stopped:
+        if self._last_sync < 0 and not self._assembler.has_counter:
+            phase = unknown_phase(self._plan.session)
+            if phase is not None:
+                self._note(phase)
+        if self.sync_stopped:
             self._note(f"SYNC is back after {silent:.1f} s")
-        self._last_sync, self._last_sync_s, self._stopped = last, now, False
+        self._last_sync, self._last_sync_s, self.sync_stopped = last, now, False
 
     def check_mappings(self) -> None:
         """Warn once of every TPDO whose length differs from its mapping."""

@@ -9,6 +9,8 @@ BIN_NS = 1_000
 """Width of a bin of the histogram, ns."""
 BINS = 50_000
 """Number of bins; the last one also counts all larger deviations."""
+LONGEST_WITHOUT_COUNTER = 240
+"""Longest interval that counts where SYNC has no counter, SYNC periods: a longer one is a pause of the master."""
 PERCENTILES = (50.0, 99.0, 99.9)
 """Reported percentiles of the absolute deviation, %."""
 
@@ -21,7 +23,7 @@ class SyncJitter:
     period_ns
         SYNC period, ns.
     overflow
-        Overflow of the SYNC counter (CiA 301, 1019h), by which missing SYNCs are detected.
+        Overflow of the SYNC counter (CiA 301, 1019h), by which missing SYNCs are detected; 0: SYNC has no counter.
     sync_id
         COB-ID of SYNC.
     """
@@ -45,14 +47,14 @@ class SyncJitter:
         if sync.size == 0:
             return
         t_ns = sync["t_ns"].astype(np.int64)
-        counter = np.where(sync["length"] > 0, sync["data"][:, 0].astype(np.int64), -1)
+        counter = np.where((sync["length"] > 0) & (self._overflow > 0), sync["data"][:, 0].astype(np.int64), -1)
         if self._last is not None:
             t_ns, counter = np.r_[self._last[0], t_ns], np.r_[self._last[1], counter]
         self._last = int(t_ns[-1]), int(counter[-1])
         elapsed = np.diff(t_ns)
-        steps = np.where(counter[1:] >= 0, np.diff(counter) % self._overflow, 1)
+        steps = np.where(counter[1:] >= 0, np.diff(counter) % (self._overflow or 1), 1)
         # A repeated SYNC, or a loss of a whole turn of the counter, gives no interval.
-        near = (steps > 0) & (elapsed < self._overflow * self._period)
+        near = (steps > 0) & (elapsed < (self._overflow or LONGEST_WITHOUT_COUNTER) * self._period)
         error = (elapsed - steps * self._period)[near].astype(np.float64)
         if error.size == 0:
             return

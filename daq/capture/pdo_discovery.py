@@ -199,7 +199,7 @@ def _stream(session: SessionConfig, drive: DriveNode, tpdo: int, bus: BusStatist
             f"{sender}: {drive.eds.name} maps {size} bytes by default ({', '.join(objects) or 'nothing'}), "
             "and no stream has this length and interval; add the objects of the TPDO to streams"
         )
-    if session.sync.counter % sent.every:
+    if session.sync.counter and session.sync.counter % sent.every:
         raise ConfigError(f"{sender}: its interval does not divide sync.counter {session.sync.counter}")
     return Stream.model_validate({"tpdo": tpdo, "every": sent.every, "objects": objects})
 

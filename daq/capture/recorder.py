@@ -143,6 +143,8 @@ class Recorder:
         self._master = self._reports = stack.enter_context(DriveMaster(session, plan.robot))
         log.info("configuring %d drives on %s", len(session.drives), ", ".join(self._receiver.channels))
         self._master.configure()
+        if plan.produces_sync and self._master.sync_counter == 0:
+            self._assembler.ignore_counter()
         now = time.time_ns()
         for joint in plan.robot.joints:
             self._assembler.mark_unverified(joint.name, now, now)
@@ -156,7 +158,7 @@ class Recorder:
             self._motion = plan_setpoints(session, plan.robot, plan.trajectory, actual)
             self._events.moving = True
         if plan.produces_sync:
-            timing = session.sync.period_us, session.sync.counter
+            timing = session.sync.period_us, self._master.sync_counter
             if session.sync.source == "kernel":
                 self._producer = KernelSync(session.all_buses[0], *timing)
             else:
@@ -250,6 +252,9 @@ class Recorder:
                 self._events.check_mappings()
                 self.health.report(now - reported, self._events.counts)
                 reported = now
+            if deadline is not None and now > deadline and self._events.sync_stopped:
+                log.info("the duration is over, and SYNC has stopped: the capture ends")
+                break
             if deadline is not None and now > deadline and self._assembler.last_sync < 0:
                 names = ", ".join(self._receiver.channels)
                 raise ArmidentError(f"bus {names}: no SYNC within {self._plan.duration:g} s")
@@ -386,15 +391,18 @@ class Recorder:
         """Record until no answer is outstanding, or none has come for ``LATE_S``.
 
         If all drives lag, the host is too busy: the limit is ``STARVED_S`` then, unless a heartbeat is missing or no
-        bus works.
+        bus works. Another master continues to send SYNC: then the limit is ``LATE_S`` in total.
         """
         reported = False
+        begin = time.monotonic()
         last_s, lost = time.monotonic(), self._events.counts["heartbeat_lost"]
         while True:
             if self._drain():
                 last_s = time.monotonic()
             outstanding, silent = self._assembler.outstanding, time.monotonic() - last_s
             if outstanding <= 0 or silent > STARVED_S:
+                return
+            if self._producer is None and time.monotonic() - begin > LATE_S:
                 return
             if silent > LATE_S:
                 self._handle_drive_events()

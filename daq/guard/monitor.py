@@ -343,8 +343,9 @@ def check_batch(  # type: ignore[no-untyped-def]
             sync[SINCE, bus] += 1
         elif kind == HEARTBEAT and lengths[k] >= 1:
             beat[j] = now
-            if state[ARMED] and data[k, 0] != ARMED_STATE:
-                value[0] = data[k, 0]
+            # The highest bit alternates in the answers of node guarding.
+            if state[ARMED] and data[k, 0] & 0x7F != ARMED_STATE:
+                value[0] = data[k, 0] & 0x7F
                 return STATE
         elif kind == EMCY and lengths[k] >= 2:
             error = np.int64(data[k, 0]) | np.int64(data[k, 1]) << 8

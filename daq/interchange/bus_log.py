@@ -278,7 +278,7 @@ def _messages(recording: Recording, session: SessionConfig, streams: Sequence[Ca
         at = {name: place[number] for name, place in places.items() if number in place}
         name = next(iter(at))
         t_ns = int(recording.streams[name].t_ns[at[name]])
-        counter = bytes([number % overflow + 1])
+        counter = bytes([number % overflow + 1]) if overflow else b""
         for channel in channels:
             yield can.Message(t_ns * 1e-9, COB_SYNC, False, data=counter, channel=channel)
         for stream in streams:

@@ -136,7 +136,7 @@ class Assembler:
     period_ns
         SYNC period, ns.
     overflow
-        Synchronous counter overflow value (CiA 301, 1019h).
+        Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
     first_counter
         Counter of SYNC 0 if it is known (own producer); ``None``: the first SYNC received is SYNC 0.
     sync_id
@@ -178,7 +178,7 @@ class Assembler:
         self._state = new_state(self._shapes, window, long_window, short_window, buses, channel_of, writes_to)
         self._slack = int(self._state.slack[0])
         if first_counter is not None:
-            self._state.bus_state[:, COUNTER] = (first_counter - 1) % overflow
+            self._state.bus_state[:, COUNTER] = (first_counter - 1) % overflow if overflow else -1
             self._state.bus_state[:, ORIGIN] = first_counter
         self._lossy = np.zeros(len(channel_of), bool)
         self.send_times: Callable[[int], tuple[int, NDArray[np.int64]]] | None = None
@@ -189,6 +189,17 @@ class Assembler:
         self._totals = dict.fromkeys(
             [f"{s.name}.{what}" for s in streams for what in ("expected", "rows", "in_gaps", "discarded")], 0
         )
+
+    def ignore_counter(self) -> None:
+        """Take SYNC as one without a counter; call it before the first frame."""
+        sync_id, period_ns, _ = self._timing
+        self._timing = sync_id, period_ns, 0
+        self._state.bus_state[:, COUNTER] = -1
+
+    @property
+    def has_counter(self) -> bool:
+        """True if SYNC with a counter was received, or is sent by this program."""
+        return bool((self._state.bus_state[:, COUNTER] >= 0).any())
 
     @property
     def last_sync(self) -> int:

@@ -168,7 +168,7 @@ def count_sync(
     period_ns
         SYNC period, ns.
     overflow
-        Synchronous counter overflow value (CiA 301, 1019h).
+        Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
     bus
         Number of the bus.
     longest
@@ -179,7 +179,7 @@ def count_sync(
     total, bus_state = 0, m.bus_state.copy()
     for i in range(count):
         if can_id[i] == sync_id:
-            counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 else -1
+            counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 and overflow > 0 else -1
             total += max(0, advance(bus_state, m, bus, counter, t_ns[i], period_ns, overflow, longest))
     return int(total)
 
@@ -204,7 +204,7 @@ def match(
     period_ns
         SYNC period, ns.
     overflow
-        Synchronous counter overflow value (CiA 301, 1019h).
+        Synchronous counter overflow value (CiA 301, 1019h); 0: SYNC has no counter.
     bus
         Number of the bus.
     longest
@@ -220,7 +220,7 @@ def match(
         m.counts[FRAMES] += 1
         identifier = np.int64(can_id[i])
         if identifier == sync_id:
-            counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 else -1
+            counter = int(np.int64(data[i, 0] & np.uint64(0xFF))) if length[i] > 0 and overflow > 0 else -1
             last = m.bus_state[bus, SYNC]
             step = advance(m.bus_state, m, bus, counter, t_ns[i], period_ns, overflow, longest)
             if step <= 0:

@@ -75,6 +75,25 @@ def captured_streams(session: SessionConfig, robot: RobotConfig) -> tuple[Captur
     return tuple(streams)
 
 
+def unknown_phase(session: SessionConfig) -> str | None:
+    """Return a message about streams that are not sent on every SYNC, for SYNC of another master without a counter.
+
+    Drives send these streams by their own count then, which is unknown. ``None`` if there is no such stream.
+
+    Parameters
+    ----------
+    session
+        Configuration of the capture.
+    """
+    slow = [name for name, stream in session.streams.items() if max(stream.every, stream.pack) > 1]
+    if not slow:
+        return None
+    return (
+        f"{', '.join(slow)}: SYNC of another master has no counter, so it is unknown which SYNCs are answered: times "
+        "may be wrong by less than one interval of the stream"
+    )
+
+
 def node_ids(session: SessionConfig, robot: RobotConfig) -> tuple[int, ...]:
     """Return the node ID of each joint's drive, in the robot's order.
 

@@ -241,8 +241,11 @@ def advance(buses: Any, m: Any, bus: int, counter: int, t_ns: int, period_ns: in
         step = _first_step(buses, m.sync_times, bus, counter, t_ns, period_ns, overflow)
     elif counter >= 0 and buses[bus, COUNTER] >= 0:
         step = _step_by_counter(buses, m, bus, counter, t_ns, period_ns, overflow, longest)
-    elif counter < 0 and buses.shape[0] > 1:
-        # Without a counter, time alone keeps the buses together.
+    elif counter < 0 and m.sends_known[0] > buses[bus, SYNC]:
+        step = _step_by_send_time(m.send_times, m.sends_known[0], buses[bus, SYNC], 1, t_ns, period_ns // 2, 1)
+        step = max(1, step)
+    elif counter < 0 and (buses.shape[0] > 1 or buses[bus, INCOMPLETE]):
+        # Without a counter, time alone keeps the buses together, and shows how many of the lost frames were SYNCs.
         elapsed = (t_ns - buses[bus, TIME]) / period_ns if buses[bus, TIME] != NEVER else 0.0
         step = min(max(1, int(np.rint(elapsed))), max(1, longest))
     else:

@@ -154,7 +154,8 @@ def bus_loads(session: SessionConfig, bus: Bus, period_us: int | None = None) ->
             low, high = (bits / bitrate for bits in frame_bits(data_bytes))
         return Load(message, rate, low * rate, high * rate, bus.channel)
 
-    sync = [exact_bits(COB_SYNC, bytes([k])) for k in range(1, session.sync.counter + 1)]
+    contents = [bytes([k]) for k in range(1, session.sync.counter + 1)] or [b""]
+    sync = [exact_bits(COB_SYNC, data) for data in contents]
     shares = sum(sync) / len(sync) / period / bitrate, max(sync) / period / bitrate
     rows = [Load("SYNC", 1 / period, *shares, bus.channel)]
     for name, stream in session.streams.items():
@@ -328,7 +329,7 @@ def _packs(session: SessionConfig) -> list[int]:
         return [stream.pack]
     size = TpdoLayout.of(stream.objects).size if len(stream.objects) else 1
     most = min(FD_PDO_BYTES // size, MAPPED_OBJECTS // len(stream.objects))
-    return [k for k in range(stream.pack, most + 1) if session.sync.counter % k == 0]
+    return [k for k in range(stream.pack, most + 1) if not session.sync.counter or session.sync.counter % k == 0]
 
 
 def _with_pack(session: SessionConfig, pack: int) -> SessionConfig | None:

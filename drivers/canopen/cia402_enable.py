@@ -23,6 +23,9 @@ TO_ENABLED: dict[DriveState, tuple[Control, DriveState]] = {
 }
 """Command and next state on the way to operation enabled (CiA 402 part 2, state machine)."""
 
+LADDER = (DriveState.SWITCH_ON_DISABLED, DriveState.READY, DriveState.SWITCHED_ON, DriveState.ENABLED)
+"""States on the way to operation enabled, in order; some drives pass several of them at one command."""
+
 
 def read_state(sdo: DriveSdo) -> DriveState | None:
     """State of the drive from its statusword (6041h); ``None`` for a pattern that CiA 402 does not define.
@@ -38,13 +41,15 @@ def read_state(sdo: DriveSdo) -> DriveState | None:
 def hold_position(sdo: DriveSdo) -> None:
     """Command cyclic synchronous position mode and the present position as target.
 
+    The target is not read back: in some drives it follows the position until they are enabled.
+
     Parameters
     ----------
     sdo
         The drive, before it is enabled.
     """
     sdo.write(od.MODE_OF_OPERATION, 0, od.CYCLIC_SYNCHRONOUS_POSITION, "b")
-    sdo.write(od.TARGET_POSITION, 0, sdo.read(od.POSITION_ACTUAL, 0, "i"), "i")
+    sdo.command(od.TARGET_POSITION, 0, sdo.read(od.POSITION_ACTUAL, 0, "i"), "i")
 
 
 def enable_drive(sdo: DriveSdo) -> None:
@@ -70,7 +75,7 @@ def enable_drive(sdo: DriveSdo) -> None:
             # The reset acts on the rising edge of its bit.
             sdo.command(od.CONTROLWORD, 0, Control.DISABLE_VOLTAGE, "H")
         sdo.command(od.CONTROLWORD, 0, control, "H")
-        state = _await_state(sdo, wanted)
+        state = _await_state(sdo, *LADDER[LADDER.index(wanted) :])
 
 
 def _await_state(sdo: DriveSdo, *wanted: DriveState) -> DriveState:

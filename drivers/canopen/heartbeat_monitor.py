@@ -7,6 +7,7 @@ import numpy as np
 
 from armident.configs.schema.session import Bus
 from armident.drivers.can.filtered_socket import FilteredSocket
+from armident.drivers.can.frames import STANDARD_ID_MASK
 from armident.drivers.canopen.objects import COB_HEARTBEAT
 
 DELAYED_S = 0.1
@@ -38,6 +39,8 @@ class HeartbeatSocket:
         """Node id and time (s, monotonic clock) of the received heartbeats; none while the bus is down or removed."""
         found: list[tuple[int, float]] = []
         for batch in self._socket.read():
+            # Remote frames are requests of node guarding, and not answers to them.
+            batch = batch[batch["can_id"] <= STANDARD_ID_MASK]
             # Stamps are wall-clock times, which may be stepped: only their age is used.
             ages = (time.time_ns() - batch["t_ns"]) * 1e-9
             received = time.monotonic() - np.maximum(ages, 0.0)

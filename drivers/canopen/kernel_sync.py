@@ -18,19 +18,20 @@ _FRAME = "=IBBBB8s"
 
 
 def setup_message(period_us: int, counter: int) -> bytes:
-    """Message that makes the kernel send SYNC with counter 1 to its overflow, cyclically.
+    """Message that makes the kernel send SYNC cyclically, with counter 1 to its overflow if there is one.
 
     Parameters
     ----------
     period_us
         SYNC period, us.
     counter
-        Overflow of the SYNC counter (1019h).
+        Overflow of the SYNC counter (1019h); 0: none.
     """
+    contents = [bytes([k]) for k in range(1, counter + 1)] or [b""]
     head = struct.pack(
-        _HEAD, TX_SETUP, SETTIMER | STARTTIMER, 0, 0, 0, *divmod(period_us, 1_000_000), COB_SYNC, counter
+        _HEAD, TX_SETUP, SETTIMER | STARTTIMER, 0, 0, 0, *divmod(period_us, 1_000_000), COB_SYNC, len(contents)
     )
-    return head + b"".join(struct.pack(_FRAME, COB_SYNC, 1, 0, 0, 0, bytes([k])) for k in range(1, counter + 1))
+    return head + b"".join(struct.pack(_FRAME, COB_SYNC, len(data), 0, 0, 0, data) for data in contents)
 
 
 class KernelSync:
@@ -47,7 +48,7 @@ class KernelSync:
     period_us
         SYNC period, us.
     counter
-        Overflow of the SYNC counter (1019h).
+        Overflow of the SYNC counter (1019h); 0: none.
     """
 
     sent: int | None = None

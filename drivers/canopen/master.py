@@ -12,29 +12,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Self
 
-from armident.configs.errors import ArmidentError, ConfigError
+from armident.configs.errors import ArmidentError
 from armident.configs.schema.robot import RobotConfig
 from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.drivers.can.frames import BusDown
 from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.cia402_enable import POLL_INTERVAL, enable_drive, hold_position, read_state
-from armident.drivers.canopen.heartbeat_monitor import HeartbeatMonitor
+from armident.drivers.canopen.drive_setup import await_mode, check_drive, set_heartbeat, set_sync_counter
 from armident.drivers.canopen.network import NodeNetwork
+from armident.drivers.canopen.node_supervision import NodeSupervision
 from armident.drivers.canopen.objects import Control, DriveState, NmtCommand, NmtState
-from armident.drivers.canopen.pdo_mapping import check_drive, map_drive, mapping_differs
-from armident.drivers.canopen.sdo import DriveSdo
-
-NMT_TIMEOUT = 2.0
-"""Longest wait for a heartbeat that reports the NMT state commanded, s."""
-
-HEARTBEATS_MISSED = 3
-"""Number of heartbeat periods without heartbeat after which a drive is lost."""
-
-HEARTBEAT_MARGIN = 0.1
-"""Additional time for delays of this machine before a drive is lost, s."""
-
-HEARTBEAT_CHECK_S = 0.02
-"""Interval at which heartbeats are checked, s."""
+from armident.drivers.canopen.pdo_mapping import map_drive, mapping_differs
+from armident.drivers.canopen.sdo import DriveSdo, NoAnswerError
 
 RETRY_S = 0.5
 """Time until the next attempt to reconfigure a drive, s."""
@@ -46,8 +35,9 @@ NEVER = 2**63 - 1
 """End time of an interval that has not ended, ns."""
 
 EventKind = Literal[
-    "emcy", "heartbeat_lost", "heartbeat_back", "nmt_state", "rebooted", "mapping_changed", "configured", "failed"
-]
+    "emcy", "heartbeat_lost", "heartbeat_back", "nmt_state", "rebooted", "mapping_changed", "configured", "failed",
+    "remark",
+]  # fmt: skip
 
 log = logging.getLogger(__name__)
 
@@ -104,14 +94,12 @@ class DriveMaster:
         self._session = session
         self._robot = robot
         self._events: queue.SimpleQueue[DriveEvent] = queue.SimpleQueue()
-        self._nmt: dict[str, int] = {}
-        self._limit = HEARTBEATS_MISSED * session.heartbeat_ms * 1e-3 + HEARTBEAT_MARGIN
-        self._lost: set[str] = set()
         self._joints = {(session.bus_of(d).channel, d.node_id): d.joint for d in session.drives}
-        self._heartbeats: HeartbeatMonitor | None = None
         self._threads: dict[str, threading.Thread] = {}
         self.unverified_mapping: dict[str, tuple[int, int]] = {}
         """Start and end (ns, UTC) of the time in which a joint's TPDOs may be mapped otherwise; replaced on change."""
+        self.sync_counter = session.sync.counter
+        """Overflow of the SYNC counter that all drives take; 0: SYNC has no counter, because a drive lacks 1019h."""
         self._written: dict[str, float] = {}
         self._started = False
         self._started_ns = 0
@@ -120,6 +108,7 @@ class DriveMaster:
         try:
             for bus in session.all_buses:
                 self._networks[bus.channel] = NodeNetwork(bus, session.drives_on(bus))
+            self._supervision = NodeSupervision(session, self._networks)
             self._drives = [self._add(drive) for drive in session.drives]
         except BaseException:
             self.close()
@@ -128,6 +117,7 @@ class DriveMaster:
     def _add(self, drive: DriveNode) -> DriveSdo:
         node = self._network_of(drive).add(drive)
         sdo = DriveSdo(node, drive, self._session)
+        sdo.on_remark = lambda text: self._report("remark", sdo, time.time_ns(), text)
         node.nmt.add_heartbeat_callback(lambda state: self._on_heartbeat(sdo, state))
         network = self._network_of(drive)
         network.on_sdo_write(drive.node_id, lambda index, t_ns: self._on_foreign_write(sdo, index, t_ns))
@@ -139,6 +129,9 @@ class DriveMaster:
     def configure(self) -> None:
         """Check every drive against the robot, then map and enable the TPDOs of the session.
 
+        Drives that do not answer yet are waited for (``boot_timeout_s``). What is unusual about a drive, but does not
+        prevent its use, becomes an event ``remark``.
+
         Raises
         ------
         ConfigError
@@ -148,9 +141,14 @@ class DriveMaster:
         """
         for sdo in self._drives:
             self._command(NmtCommand.PRE_OPERATIONAL, sdo)
+        until = time.monotonic() + self._session.boot_timeout_s
+        for sdo in self._drives:
+            self._await_boot(sdo, until)
         for sdo in self._drives:
             check_drive(sdo, self._robot)
+        self._agree_on_sync_counter()
         for sdo in self._drives:
+            set_heartbeat(sdo, self._session.heartbeat_ms)
             map_drive(sdo, self._session)
 
     def start(self, enable: bool = True) -> None:
@@ -171,9 +169,9 @@ class DriveMaster:
         for sdo in self._drives:
             self._command(NmtCommand.START, sdo)
         for sdo in self._drives:
-            self._await_operational(sdo)
-        self._new_heartbeats()
-        self._heartbeats = HeartbeatMonitor(self._joints.values(), time.monotonic())
+            self._supervision.add(sdo)
+            self._supervision.await_operational(sdo)
+        self._supervision.begin()
         self._started, self._started_ns = True, time.time_ns()
         if not enable:
             return
@@ -182,10 +180,7 @@ class DriveMaster:
             hold_position(sdo)
         for sdo in self._drives:
             enable_drive(sdo)
-        for sdo in self._drives:
-            mode = sdo.read(od.MODE_DISPLAY, 0, "b")
-            if mode != od.CYCLIC_SYNCHRONOUS_POSITION:
-                raise ConfigError(f"{sdo.label}: stays in mode of operation {mode} (6061h), 8 was commanded")
+        await_mode(self._drives)
 
     def supervise(self) -> list[DriveEvent]:
         """Events since the last call: EMCY, lost and returned heartbeats, NMT states, reboots, changed mappings.
@@ -201,8 +196,9 @@ class DriveMaster:
         alive = {channel: network.reopen() for channel, network in self._networks.items()}
         if not any(alive.values()):
             raise BusDown(f"bus {', '.join(alive)}: went down")
-        if self._started and self._heartbeats is not None:
-            self._check_heartbeats(self._heartbeats)
+        if self._started:
+            for lost in self._supervision.check(self._drives):
+                self._report(lost.kind, lost.sdo, time.time_ns(), lost.text)
         self.collect_reports()
         events = []
         while not self._events.empty():
@@ -272,17 +268,42 @@ class DriveMaster:
         """Stop the drives and release the buses."""
         self.close()
 
-    def _await_operational(self, sdo: DriveSdo) -> None:
-        deadline = time.monotonic() + NMT_TIMEOUT + self._session.heartbeat_ms * 1e-3
-        while self._nmt.get(sdo.drive.joint) != NmtState.OPERATIONAL:
-            self._network_of(sdo.drive).check()
-            if time.monotonic() > deadline:
-                raise ArmidentError(f"{sdo.label}: does not report operational after NMT start")
-            time.sleep(POLL_INTERVAL)
+    def _await_boot(self, sdo: DriveSdo, until: float) -> None:
+        """Wait until a drive answers; it has missed the NMT command if it has booted meanwhile."""
+        waited = False
+        while True:
+            try:
+                sdo.read(od.DEVICE_TYPE, 0, "I")
+            except NoAnswerError:
+                if time.monotonic() >= until:
+                    raise sdo.no_answer(self._session.boot_timeout_s) from None
+                if not waited:
+                    log.info("%s: does not answer yet; waiting for its boot", sdo.label)
+                waited = True
+                continue
+            if waited:
+                self._command(NmtCommand.PRE_OPERATIONAL, sdo)
+            return
+
+    def _agree_on_sync_counter(self) -> None:
+        """Set the SYNC counter (1019h) of all drives; if one has none and SYNC is sent here, that of no drive."""
+        wanted = self._session.sync.counter
+        reasons = [set_sync_counter(sdo, wanted) for sdo in self._drives]
+        self.sync_counter = wanted
+        if not wanted or not any(reasons):
+            return
+        produces = self._session.sync.role == "producer"
+        for sdo, reason in zip(self._drives, reasons, strict=True):
+            if reason is not None:
+                sdo.remark(f"{reason}: {'SYNC is sent without one' if produces else 'it may not take SYNC with one'}")
+            elif produces:
+                set_sync_counter(sdo, 0)
+        if produces:
+            self.sync_counter = 0
 
     def _send_controls(self, controls: tuple[Control, ...]) -> None:
         # A lost drive would cost a timeout each; NMT is sent to it anyway.
-        for sdo in [sdo for sdo in self._drives if sdo.drive.joint not in self._lost]:
+        for sdo in [sdo for sdo in self._drives if sdo.drive.joint not in self._supervision.lost]:
             try:
                 for control in controls:
                     sdo.command(od.CONTROLWORD, 0, control, "H")
@@ -292,38 +313,13 @@ class DriveMaster:
     def _command(self, command: NmtCommand, sdo: DriveSdo) -> None:
         self._network_of(sdo.drive).command(command, sdo.drive.node_id)
 
-    def _new_heartbeats(self) -> list[tuple[str, float]]:
-        """Joint and time of the heartbeats since the last call."""
-        return [
-            (self._joints[channel, node], at)
-            for channel, network in self._networks.items()
-            for node, at in network.heartbeats.read()
-        ]
-
-    def _check_heartbeats(self, monitor: HeartbeatMonitor) -> None:
-        """Report lost and returned heartbeats by their receive times."""
-        if time.monotonic() - monitor.updated < HEARTBEAT_CHECK_S:
-            return
-        # Heartbeats that wait in the sockets count.
-        monitor.update(self._new_heartbeats(), time.monotonic())
-        for sdo in self._drives:
-            joint = sdo.drive.joint
-            silence, ended = monitor.silence(joint), monitor.ended_silence(joint)
-            if joint not in self._lost and max(silence, ended) > self._limit:
-                self._lost.add(joint)
-                self._report("heartbeat_lost", sdo, time.time_ns(), f"no heartbeat for {max(silence, ended):.2f} s")
-            if joint in self._lost and silence <= self._limit:
-                self._lost.discard(joint)
-                self._report("heartbeat_back", sdo, time.time_ns(), "heartbeat is back")
-
     def _report(self, kind: EventKind, sdo: DriveSdo, t_ns: int, text: str, code: int = 0) -> None:
         drive = sdo.drive
         self._events.put(DriveEvent(kind, drive.joint, drive.node_id, t_ns, f"{sdo.label}: {text}", code))
 
     def _on_heartbeat(self, sdo: DriveSdo, state: int) -> None:
-        joint = sdo.drive.joint
-        before = self._nmt.get(joint)
-        self._nmt[joint] = state
+        before = self._supervision.nmt.get(sdo.drive.joint)
+        self._supervision.nmt[sdo.drive.joint] = state
         if not self._started:
             return
         if state == NmtState.BOOT_UP:
@@ -387,7 +383,10 @@ class DriveMaster:
                 if joint in self.unverified_mapping:
                     span = self.unverified_mapping[joint][0], time.time_ns()
                     self.unverified_mapping = {**self.unverified_mapping, joint: span}
-                self._report("configured", sdo, time.time_ns(), "configured again, and started")
+                text = "configured again, and started"
+                if self.sync_counter == 0 and any(max(s.every, s.pack) > 1 for s in self._session.streams.values()):
+                    text += "; without a SYNC counter, its slower streams may answer other SYNCs than before"
+                self._report("configured", sdo, time.time_ns(), text)
         finally:
             self._finish(sdo)
 
@@ -411,11 +410,13 @@ class DriveMaster:
         begun = time.monotonic()
         try:
             check_drive(sdo, self._robot)
+            set_sync_counter(sdo, self.sync_counter)
+            set_heartbeat(sdo, self._session.heartbeat_ms)
             map_drive(sdo, self._session)
             if not self._started:
                 return False
             self._command(NmtCommand.START, sdo)
-            self._await_operational(sdo)
+            self._supervision.await_operational(sdo)
             if self._enabled:
                 hold_position(sdo)
                 enable_drive(sdo)

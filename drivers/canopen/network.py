@@ -22,6 +22,7 @@ from armident.drivers.canopen.eds import read_objects
 from armident.drivers.canopen.emcy import Emergency, read_emergencies
 from armident.drivers.canopen.heartbeat_monitor import HeartbeatSocket
 from armident.drivers.canopen.objects import NmtCommand
+from armident.drivers.canopen.sdo_client import SdoNode
 
 REOPEN_S = 0.25
 """Interval at which a bus that is down is tried, s."""
@@ -100,7 +101,7 @@ class NodeNetwork:
         ConfigError
             If its EDS cannot be read.
         """
-        return self._network.add_node(drive.node_id, read_objects(drive.eds, drive.node_id))
+        return self._network.add_node(SdoNode(drive.node_id, read_objects(drive.eds, drive.node_id)))
 
     def on_sdo_write(self, node_id: int, callback: Callable[[int, int], None]) -> None:
         """Call a function for every SDO write of another master to a node.
@@ -155,6 +156,31 @@ class NodeNetwork:
         try:
             self._network.send_message(od.COB_NMT, bytes([command, node_id]))
         except (can.CanError, OSError, RuntimeError) as error:
+            raise self._bus_down(error) from error
+
+    def guard(self, node_id: int) -> None:
+        """Ask a node for its NMT state (node guarding, CiA 301): a remote frame, which it answers as a heartbeat.
+
+        Parameters
+        ----------
+        node_id
+            Node id of the drive.
+
+        Raises
+        ------
+        BusDown
+            If the bus is down.
+        """
+        request = can.Message(
+            arbitration_id=od.COB_HEARTBEAT + node_id, is_extended_id=False, is_remote_frame=True, dlc=1
+        )
+        bus = self._network.bus
+        if bus is None:
+            raise BusDown(f"bus {self.bus.channel}: closed")
+        try:
+            with self._network.send_lock:
+                bus.send(request)
+        except (can.CanError, OSError) as error:
             raise self._bus_down(error) from error
 
     def check(self) -> None:

@@ -28,6 +28,9 @@ holds the value at the i-th SYNC of the last pack; the last sub-index belongs to
 PDO_NOT_VALID = 1 << 31
 """Bit of a PDO's COB-ID entry (sub-index 1) that disables the PDO (CiA 301 section 7.5.2.35)."""
 
+NO_RTR = 1 << 30
+"""Bit of a TPDO's COB-ID entry (sub-index 1) that forbids RTR (CiA 301 section 7.5.2.35); some drives keep it set."""
+
 COB_NMT = 0x000
 COB_SYNC = 0x080
 COB_EMCY = 0x080
@@ -61,7 +64,6 @@ TORQUE_ACTUAL = 0x6077
 CURRENT_ACTUAL = 0x6078
 TARGET_POSITION = 0x607A
 ENCODER_RESOLUTION = 0x608F
-INTERPOLATION_MODE = 0x60C0
 INTERPOLATION_PERIOD = 0x60C2
 
 DEVICE_PROFILE_CIA402 = 402

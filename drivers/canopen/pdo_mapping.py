@@ -1,87 +1,34 @@
-"""Configuration of one drive over SDO: identity and scales, PDO mapping, heartbeat and SYNC counter."""
-
-import logging
+"""PDO mapping of one drive over SDO: the TPDOs of the streams, and the RPDOs of set points and stop."""
 
 from armident.configs.errors import ConfigError
-from armident.configs.schema.robot import Joint, RobotConfig
 from armident.configs.schema.session import SessionConfig
 from armident.drivers.canopen import objects as od
-from armident.drivers.canopen.sdo import DriveSdo
+from armident.drivers.canopen.sdo import DriveSdo, SdoRefusedError
 
-log = logging.getLogger(__name__)
-
-
-def check_drive(sdo: DriveSdo, robot: RobotConfig) -> None:
-    """Refuse a node that is not the drive of the robot configuration.
-
-    Parameters
-    ----------
-    sdo
-        The drive.
-    robot
-        Expected encoder resolution and rated current.
-
-    Raises
-    ------
-    ConfigError
-        If the node is not a CiA 402 drive, or if product, encoder resolution or rated current differ.
-    """
-    device = sdo.read(od.DEVICE_TYPE, 0, "I")
-    if device & 0xFFFF != od.DEVICE_PROFILE_CIA402:
-        raise ConfigError(
-            f"{sdo.label}: is no CiA 402 drive: device type (1000h) is {device:08X}h, profile {device & 0xFFFF} "
-            "instead of 402"
-        )
-    for sub, what in ((1, "vendor"), (2, "product code")):
-        known = sdo.node.object_dictionary.get_variable(od.IDENTITY, sub)
-        expected = known.default if known is not None else None
-        found = sdo.read(od.IDENTITY, sub, "I")
-        if expected and found != expected:
-            eds = sdo.drive.eds.name
-            raise ConfigError(f"{sdo.label}: {what} (1018h:{sub}) is {found:X}h, {eds} says {expected:X}h")
-    _check_scales(sdo, robot.name, next(j for j in robot.joints if j.name == sdo.drive.joint))
-
-
-def _check_scales(sdo: DriveSdo, robot: str, joint: Joint) -> None:
-    expected = joint.drive.counts_per_unit
-    # Counts per metre of a prismatic joint do not determine the counts per motor turn.
-    if joint.type == "revolute" and expected is not None:
-        increments = sdo.read(od.ENCODER_RESOLUTION, 1, "I")
-        turns = sdo.read(od.ENCODER_RESOLUTION, 2, "I")
-        if not turns or abs(increments / turns - expected) > 0.5:
-            raise ConfigError(
-                f"{sdo.label}: encoder has {increments}/{turns} counts per turn (608Fh), "
-                f"robot {robot} says {expected:g}; check drive and robot configuration"
-            )
-    if joint.drive.signal == "current":
-        rated = sdo.read(od.RATED_CURRENT, 0, "I")
-        if rated != od.rated_milliamperes(joint.drive):
-            raise ConfigError(
-                f"{sdo.label}: rated current is {rated} mA (6075h), robot {robot} says "
-                f"{od.rated_milliamperes(joint.drive)} mA; check drive and robot configuration"
-            )
+ROUNDING_US = 0.5
+"""Difference of interpolation times that is an error of rounding, us: half of the unit of a session."""
 
 
 def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
-    """Write heartbeat, SYNC counter, the session's TPDOs and the RPDO of its set points, and read them back.
+    """Write the session's TPDOs and the RPDO of its set points, and read them back.
 
-    Other TPDOs are disabled.
+    A PDO that is right already is not written. Other TPDOs are disabled.
 
     Parameters
     ----------
     sdo
         The drive, in pre-operational.
     session
-        Heartbeat, SYNC, streams and set points.
+        SYNC, streams and set points.
 
     Raises
     ------
     ConfigError
         If the drive refuses an object or a mapping; names both, with the text of the SDO abort.
+    BusDown
+        If the bus is down.
     """
     node = sdo.drive.node_id
-    sdo.write(od.HEARTBEAT_PRODUCER, 0, session.heartbeat_ms, "H")
-    sdo.write(od.SYNC_COUNTER_OVERFLOW, 0, session.sync.counter, "B")
     streams = {s.tpdo: (name, s) for name, s in session.streams.items()}
     for tpdo in range(1, 5):
         communication = od.TPDO_COMMUNICATION + tpdo - 1
@@ -91,17 +38,12 @@ def map_drive(sdo: DriveSdo, session: SessionConfig) -> None:
             cob, interval = od.tpdo_cob(tpdo, node), max(stream.every, stream.pack)
             _map_pdo(sdo, communication, od.TPDO_MAPPING + tpdo - 1, cob, entries, interval)
         elif communication in sdo.node.object_dictionary:
-            cob = sdo.read(communication, 1, "I")
-            if not cob & od.PDO_NOT_VALID:
-                sdo.write(communication, 1, cob | od.PDO_NOT_VALID, "I")
+            _disable_tpdo(sdo, communication)
     if session.setpoints is not None:
         k, every = session.setpoints.rpdo - 1, session.setpoints.every
         cob = od.rpdo_cob(k + 1, node)
         _map_pdo(sdo, od.RPDO_COMMUNICATION + k, od.RPDO_MAPPING + k, cob, (od.SETPOINT.entry,), every)
-        sdo.write(od.INTERPOLATION_MODE, 0, 0, "h")
-        value, exponent = interpolation_period(session.sync.period_us * every, sdo.label)
-        sdo.write(od.INTERPOLATION_PERIOD, 1, value, "B")
-        sdo.write(od.INTERPOLATION_PERIOD, 2, exponent, "b")
+        _set_interpolation(sdo, session.sync.period_us * every, session.sync.period_us)
         _map_stop(sdo, od.stop_rpdo(session.setpoints.rpdo))
 
 
@@ -127,9 +69,20 @@ def mapping_differs(sdo: DriveSdo, session: SessionConfig) -> str | None:
         expected.append((communication, 2, max(stream.every, stream.pack), "B"))
         expected.append((communication, 1, od.tpdo_cob(stream.tpdo, sdo.drive.node_id), "I"))
         for index, sub, value, code in expected:
-            if (found := sdo.read(index, sub, code)) != value:
+            ignored = od.NO_RTR if (index, sub) == (communication, 1) else 0
+            if ((found := sdo.read(index, sub, code)) ^ value) & ~ignored:
                 return f"object {index:04X}h:{sub} is {found:X}h instead of {value:X}h"
     return None
+
+
+def _disable_tpdo(sdo: DriveSdo, communication: int) -> None:
+    """Disable a TPDO that the session does not use; a drive without it, or that keeps it, is accepted."""
+    try:
+        cob = sdo.read_optional(communication, 1, "I")
+        if cob is not None and not cob & od.PDO_NOT_VALID:
+            sdo.write(communication, 1, cob | od.PDO_NOT_VALID, "I", ignored=od.NO_RTR)
+    except SdoRefusedError as error:
+        sdo.remark(f"keeps a TPDO that the session does not use: {error}")
 
 
 def _map_stop(sdo: DriveSdo, rpdo: int) -> None:
@@ -143,19 +96,95 @@ def _map_stop(sdo: DriveSdo, rpdo: int) -> None:
     cob = od.rpdo_cob(rpdo, sdo.drive.node_id)
     try:
         _map_pdo(sdo, communication, mapping, cob, (od.CONTROL_ENTRY,), od.EVENT_DRIVEN)
-    except ConfigError as error:
-        log.warning("%s", error)
+    except SdoRefusedError as error:
+        sdo.remark(f"is stopped by SDO, not by RPDO{rpdo}: {error}")
 
 
 def _map_pdo(sdo: DriveSdo, communication: int, mapping: int, cob: int, entries: tuple[int, ...], every: int) -> None:
-    """Configure a PDO in the order of CiA 301 (section 7.5.2.36)."""
-    sdo.write(communication, 1, cob | od.PDO_NOT_VALID, "I")
-    sdo.write(mapping, 0, 0, "B")
-    for k, entry in enumerate(entries):
-        sdo.write(mapping, k + 1, entry, "I")
-    sdo.write(mapping, 0, len(entries), "B")
+    """Configure a PDO in the order of CiA 301 (section 7.5.2.36), as far as it differs.
+
+    Bit 30 of the COB-ID (no RTR) stays as the drive has it: it does not concern PDOs that answer SYNC.
+    """
+    before = sdo.read(communication, 1, "I")
+    mapped = read_mapping(sdo, mapping)
+    right = mapped == entries and not (before ^ cob) & ~od.NO_RTR
+    if right and sdo.read(communication, 2, "B") == every:
+        return
+    cob |= before & od.NO_RTR
+    try:
+        _write_cob(sdo, communication, cob | od.PDO_NOT_VALID)
+        if mapped != entries:
+            sdo.write(mapping, 0, 0, "B")
+            for k, entry in enumerate(entries):
+                sdo.write(mapping, k + 1, entry, "I")
+            sdo.write(mapping, 0, len(entries), "B")
+    except SdoRefusedError as error:
+        if not right:
+            raise SdoRefusedError(f"{error}; {_difference(mapping, mapped, entries)}", error.code) from error
+        # The COB-ID is read-only, and right.
+        sdo.write(communication, 2, every, "B")
+        return
     sdo.write(communication, 2, every, "B")
-    sdo.write(communication, 1, cob, "I")
+    _write_cob(sdo, communication, cob)
+
+
+def _write_cob(sdo: DriveSdo, communication: int, cob: int) -> None:
+    """Write the COB-ID of a PDO; with bit 30 (no RTR) if the drive refuses it without."""
+    try:
+        sdo.write(communication, 1, cob, "I", ignored=od.NO_RTR)
+    except SdoRefusedError:
+        if cob & od.NO_RTR:
+            raise
+        sdo.write(communication, 1, cob | od.NO_RTR, "I")
+
+
+def read_mapping(sdo: DriveSdo, mapping: int) -> tuple[int, ...]:
+    """Return the mapping entries of a PDO.
+
+    Parameters
+    ----------
+    sdo
+        The drive.
+    mapping
+        Index of the mapping record (1600h, 1A00h and following).
+
+    Raises
+    ------
+    ConfigError
+        If the drive does not answer, or has no such PDO.
+    BusDown
+        If the bus is down.
+    """
+    count = min(sdo.read(mapping, 0, "B"), od.MAPPED_OBJECTS)
+    return tuple(sdo.read(mapping, k, "I") for k in range(1, count + 1))
+
+
+def _difference(mapping: int, mapped: tuple[int, ...], wanted: tuple[int, ...]) -> str:
+    def text(entries: tuple[int, ...]) -> str:
+        names = {known.entry: f" ({known.name})" for known in od.OBJECTS.values()}
+        return ", ".join(f"{entry:08X}h{names.get(entry, '')}" for entry in entries) or "nothing"
+
+    if mapped == wanted:
+        return "its COB-ID differs from that of the predefined connection set (CiA 301)"
+    return f"{mapping:04X}h maps {text(mapped)}, the session {text(wanted)}; adapt the streams of the session"
+
+
+def _set_interpolation(sdo: DriveSdo, period_us: int, sync_us: int) -> None:
+    """Set the interpolation time (60C2h) to the period of the set points; a drive may round it by up to a SYNC."""
+    value, exponent = interpolation_period(period_us, sdo.label)
+    try:
+        found = sdo.write_rounded(od.INTERPOLATION_PERIOD, 1, value, "B")
+        power = sdo.write_rounded(od.INTERPOLATION_PERIOD, 2, exponent, "b")
+    except SdoRefusedError as error:
+        if not error.absent:
+            raise
+        sdo.remark("has no interpolation time (60C2h): it interpolates set points by its own setting")
+        return
+    found_us = found * 10.0 ** (power + 6)
+    if abs(found_us - period_us) > sync_us:
+        raise ConfigError(f"{sdo.label}: interpolation time (60C2h) is {found_us:g} us after writing {period_us} us")
+    if abs(found_us - period_us) > ROUNDING_US:
+        sdo.remark(f"interpolates set points over {found_us:g} us (60C2h) instead of {period_us} us")
 
 
 def interpolation_period(period_us: int, where: str = "setpoints") -> tuple[int, int]:

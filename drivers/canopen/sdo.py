@@ -3,6 +3,9 @@
 import logging
 import struct
 import threading
+import time
+from collections.abc import Callable
+from typing import Any
 
 import can
 import canopen
@@ -12,13 +15,52 @@ from armident.configs.errors import ArmidentError, ConfigError
 from armident.configs.schema.session import DriveNode, SessionConfig
 from armident.drivers.can.frames import BusDown
 from armident.drivers.can.socketcan import RawSocket
+from armident.drivers.canopen.sdo_client import OtherAnswersError
 
 for _logger in ("canopen", "can"):
     # Their warnings on stderr would repeat the text of our exceptions.
     logging.getLogger(_logger).addHandler(logging.NullHandler())
 
+ABORT_ABSENT = frozenset((0x06020000, 0x06090011))
+"""Abort codes of an object or a sub-index that does not exist (CiA 301, SDO abort codes)."""
+ABORT_BUSY = frozenset((0x08000020, 0x08000021, 0x08000022))
+"""Abort codes of a transfer that is impossible at present: store, local control, device state (CiA 301)."""
+BUSY_S = 1.0
+"""Time for which a transfer with such an abort is repeated, s."""
+BUSY_RETRY_S = 0.02
+"""Interval of these repetitions, s."""
+SETTLE_S = 0.3
+"""Longest time until a value reads back as written, s."""
+_SETTLE_RETRY_S = 0.01
 _EXPEDITED, _LARGEST = 4, 8
 """Maximum size (bytes) of a value in an expedited answer, and of the objects read here."""
+
+log = logging.getLogger(__name__)
+
+
+class SdoRefusedError(ConfigError):
+    """A drive refuses an SDO transfer.
+
+    Parameters
+    ----------
+    message
+        Message that names drive, object and reason.
+    code
+        Abort code (CiA 301, SDO abort codes).
+    """
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.code = code
+
+    @property
+    def absent(self) -> bool:
+        """``True`` if the drive has no such object."""
+        return self.code in ABORT_ABSENT
+
+
+class NoAnswerError(ConfigError):
+    """A drive does not answer."""
 
 
 class DriveSdo:
@@ -46,6 +88,23 @@ class DriveSdo:
         self._timeout = node.sdo.RESPONSE_TIMEOUT = session.sdo_timeout_s
         # An SDO channel carries one transfer at a time.
         self._lock = threading.RLock()
+        self.heartbeat_ms: int | None = None
+        """Heartbeat period that the drive reports, ms; ``None`` without heartbeat."""
+        self.on_remark: Callable[[str], None] = lambda text: log.warning("%s: %s", self.label, text)
+        """Takes what is unusual about the drive, but does not prevent its use."""
+        self._remarks: set[str] = set()
+
+    def remark(self, text: str) -> None:
+        """Report once what is unusual about the drive, but does not prevent its use.
+
+        Parameters
+        ----------
+        text
+            Message without the name of the drive.
+        """
+        if text not in self._remarks:
+            self._remarks.add(text)
+            self.on_remark(text)
 
     def read(self, index: int, sub: int, code: str) -> int:
         """Read an object.
@@ -60,22 +119,60 @@ class DriveSdo:
         Raises
         ------
         ConfigError
-            If the drive does not answer or refuses.
+            If the drive does not answer (`NoAnswerError`) or refuses (`SdoRefusedError`).
         BusDown
             If the bus is down.
         """
-        try:
-            with self._lock:
-                data = self._upload(index, sub, struct.calcsize("<" + code))
-        except SdoAbortedError as error:
-            raise ConfigError(f"{self.label}: refuses to read {_name(index, sub)}: {_abort(error)}") from error
-        except SdoCommunicationError as error:
-            raise self._no_answer() from error
-        except (struct.error, IndexError) as error:
-            raise self._invalid_answer(index, sub) from error
-        except (can.CanError, OSError) as error:
-            raise self._bus_down(error) from error
+        return self._read(index, sub, code, BUSY_S)
+
+    def _read(self, index: int, sub: int, code: str, busy_s: float) -> int:
+        size = struct.calcsize("<" + code)
+        what = f"refuses to read {_name(index, sub)}"
+        data: bytes = self._transfer(index, sub, what, lambda: self._upload(index, sub, size), busy_s)
         return int(struct.unpack("<" + code, data)[0])
+
+    def read_optional(self, index: int, sub: int, code: str) -> int | None:
+        """Read an object; ``None`` if the drive does not have it.
+
+        Parameters
+        ----------
+        index, sub, code
+            As in `read`.
+
+        Raises
+        ------
+        ConfigError, BusDown
+            As `read` does.
+        """
+        try:
+            return self.read(index, sub, code)
+        except SdoRefusedError as error:
+            if error.absent:
+                return None
+            raise
+
+    def _transfer(self, index: int, sub: int, what: str, transfer: Callable[[], Any], busy_s: float) -> Any:
+        """Carry out a transfer, again for ``busy_s`` while the drive is busy; errors name drive and object."""
+        until = time.monotonic() + busy_s
+        while True:
+            try:
+                with self._lock:
+                    return transfer()
+            except SdoAbortedError as error:
+                if error.code not in ABORT_BUSY or time.monotonic() >= until:
+                    raise SdoRefusedError(f"{self.label}: {what}: {_abort(error)}", error.code) from error
+            except OtherAnswersError as error:
+                raise ConfigError(
+                    f"{self.label}: answered only other requests within {self._timeout:g} s, not that for "
+                    f"{_name(index, sub)}; is another program using its SDO channel?"
+                ) from error
+            except SdoCommunicationError as error:
+                raise self.no_answer() from error
+            except (struct.error, IndexError) as error:
+                raise self._invalid_answer(index, sub) from error
+            except (can.CanError, OSError) as error:
+                raise self._bus_down(error) from error
+            time.sleep(BUSY_RETRY_S)
 
     def poll(self, index: int, sub: int, code: str, answer_s: float) -> int | None:
         """Read an object unless another SDO transfer is in progress; ``None`` in that case.
@@ -96,7 +193,7 @@ class DriveSdo:
             return None
         try:
             self.node.sdo.RESPONSE_TIMEOUT = min(answer_s, self._timeout)
-            return self.read(index, sub, code)
+            return self._read(index, sub, code, 0.0)
         finally:
             self.node.sdo.RESPONSE_TIMEOUT = self._timeout
             self._lock.release()
@@ -133,20 +230,12 @@ class DriveSdo:
         BusDown
             If the bus is down.
         """
-        try:
-            with self._lock:
-                self.node.sdo.download(index, sub, struct.pack("<" + code, value))
-        except SdoAbortedError as error:
-            raise ConfigError(f"{self.label}: refuses {_name(index, sub)} = {value:X}h: {_abort(error)}") from error
-        except SdoCommunicationError as error:
-            raise self._no_answer() from error
-        except (struct.error, IndexError) as error:
-            raise self._invalid_answer(index, sub) from error
-        except (can.CanError, OSError) as error:
-            raise self._bus_down(error) from error
+        data = struct.pack("<" + code, value)
+        what = f"refuses {_name(index, sub)} = {_hex(value, code)}"
+        self._transfer(index, sub, what, lambda: self.node.sdo.download(index, sub, data), BUSY_S)
 
-    def write(self, index: int, sub: int, value: int, code: str) -> None:
-        """Write an object and read it back.
+    def write(self, index: int, sub: int, value: int, code: str, ignored: int = 0) -> None:
+        """Write an object and read it back; a read-only object that holds the value already is accepted.
 
         Parameters
         ----------
@@ -154,6 +243,8 @@ class DriveSdo:
             As in `read`.
         value
             Value to write.
+        ignored
+            Bits that may read back otherwise.
 
         Raises
         ------
@@ -162,20 +253,59 @@ class DriveSdo:
         BusDown
             If the bus is down.
         """
-        self.command(index, sub, value, code)
-        found = self.read(index, sub, code)
-        if found != value:
-            raise ConfigError(f"{self.label}: {_name(index, sub)} reads {found:X}h after writing {value:X}h")
+        found = self.write_rounded(index, sub, value, code, ignored)
+        if (found ^ value) & ~ignored:
+            written = _hex(value, code)
+            raise ConfigError(f"{self.label}: {_name(index, sub)} reads {_hex(found, code)} after writing {written}")
 
-    def _no_answer(self) -> ArmidentError:
+    def write_rounded(self, index: int, sub: int, value: int, code: str, ignored: int = 0) -> int:
+        """Write an object and return the value that it reads back, which the drive may have rounded.
+
+        Parameters
+        ----------
+        index, sub, code, value, ignored
+            As in `write`.
+
+        Raises
+        ------
+        ConfigError
+            If the drive does not answer, or refuses the value and holds another one.
+        BusDown
+            If the bus is down.
+        """
+        try:
+            self.command(index, sub, value, code)
+        except SdoRefusedError as refused:
+            try:
+                found = self.read(index, sub, code)
+            except SdoRefusedError:
+                raise refused from None
+            if (found ^ value) & ~ignored:
+                raise
+            return found
+        # A value may take effect late, and a repeated answer may hold the value from before.
+        until = time.monotonic() + SETTLE_S
+        while ((found := self.read(index, sub, code)) ^ value) & ~ignored and time.monotonic() < until:
+            time.sleep(_SETTLE_RETRY_S)
+        return found
+
+    def no_answer(self, within_s: float | None = None) -> ArmidentError:
+        """Return the error of a drive that does not answer, or of its bus if that is down.
+
+        Parameters
+        ----------
+        within_s
+            Time that was waited, s; default: the SDO timeout.
+        """
         if self._bus.interface == "socketcan":
             # A bus that is down looks like a silent drive; opening it distinguishes the two.
             try:
                 RawSocket(self._bus.channel, filters=(), receive_buffer=4096).close()
             except ArmidentError as error:
                 return error
-        return ConfigError(
-            f"{self.label}: does not answer on {self._bus.channel} within {self._timeout:g} s; "
+        waited = max(within_s or 0.0, self._timeout)
+        return NoAnswerError(
+            f"{self.label}: does not answer on {self._bus.channel} within {waited:g} s; "
             "check its supply and its node id"
         )
 
@@ -188,6 +318,11 @@ class DriveSdo:
 
 def _name(index: int, sub: int) -> str:
     return f"object {index:04X}h:{sub}"
+
+
+def _hex(value: int, code: str) -> str:
+    """Return a value as the unsigned hexadecimal number that an object of this type shows."""
+    return f"{value & (1 << 8 * struct.calcsize('<' + code)) - 1:X}h"
 
 
 def _abort(error: SdoAbortedError) -> str:

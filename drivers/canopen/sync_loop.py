@@ -67,7 +67,7 @@ class Loop:
     descriptors
         Socket of each bus, shape (B,).
     period_ns, counter
-        SYNC period, ns, and overflow of the SYNC counter.
+        SYNC period, ns, and overflow of the SYNC counter; 0: none.
     state, late
         Shared state, shape (STATE_SIZE,), and histogram of the delays, shape (BINS,).
     errors, unsent
@@ -130,7 +130,7 @@ class Loop:
         messages = Messages(buses + cob_ids.size, control=False)
         body = messages.body.view(np.uint32)
         body[first[:-1], 0], body[place, 0] = COB_SYNC, cob_ids
-        messages.body[first[:-1], 4], messages.body[place, 4] = 1, 4
+        messages.body[first[:-1], 4], messages.body[place, 4] = (1 if self._fixed[2] else 0), 4
         shared = messages.address, messages.body.view(np.int32), first.astype(np.int64), place
         _run(*self._fixed, state, *self._shared, *shared, rows, every, self._spec)
 
@@ -227,7 +227,8 @@ def _run(  # type: ignore[no-untyped-def]
             state[ROW] += 1
         refused, code = 0, 0
         for b in range(buses):
-            body[first[b], 2] = k % counter + 1
+            if counter > 0:
+                body[first[b], 2] = k % counter + 1
             count = first[b + 1] - first[b] if due else 1
             attempts = _SEND_ATTEMPTS if buses == 1 else _FEW_ATTEMPTS
             errors[b] = send_messages(descriptors[b], address + 64 * first[b], count, attempts, spec)

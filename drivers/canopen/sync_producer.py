@@ -93,7 +93,7 @@ class SyncProducer:
     period_us
         SYNC period, us.
     counter
-        Overflow of the SYNC counter (1019h).
+        Overflow of the SYNC counter (1019h); 0: SYNC has no counter.
     setpoints
         Set points to play from the start; :meth:`play` sets others later.
 
@@ -311,7 +311,9 @@ class SyncProducer:
             row = int(state[ROW])
             due = row < len(rows) and is_knot(k + 1, every)
             batch = frames(1 + (len(cob_ids) if due else 0))
-            batch["can_id"][0], batch["length"][0], batch["data"][0, 0] = COB_SYNC, 1, k % self._counter + 1
+            batch["can_id"][0] = COB_SYNC
+            if self._counter:
+                batch["length"][0], batch["data"][0, 0] = 1, k % self._counter + 1
             if due:
                 batch["can_id"][1:], batch["length"][1:] = cob_ids, 4
                 batch["data"][1:, :4] = rows[row].astype("<i4").view(np.uint8).reshape(-1, 4)

@@ -19,6 +19,7 @@ from armident.drivers.can.error_frames import summarise
 from armident.drivers.can.frames import FRAME
 from armident.drivers.canopen import objects as od
 from armident.drivers.canopen.sdo import DriveSdo
+from armident.drivers.canopen.sdo_client import SdoNode
 from tests.fuzz.harness import MisreadError, Target
 from tests.fuzz.mutate import spoil_bytes
 from tests.property.test_daq_assembler import JOINTS, PERIOD_NS, STREAMS, Faults, bus
@@ -176,7 +177,7 @@ def new_drive(timeout_s: float = SILENCE_S, temperature: Temperature | None = No
     session = session.model_copy(update={"bus": session.bus.model_copy(update={"interface": "udp_multicast"})})
     network = canopen.Network()
     drive = session.drives[0].model_copy(update={"temperature": temperature})
-    node = network.add_node(drive.node_id, str(drive.eds))
+    node = network.add_node(SdoNode(drive.node_id, str(drive.eds)))
     liar = LyingDrive(network, drive.node_id, {})
     network.bus = cast(Any, liar)
     return liar, DriveSdo(node, drive, session)

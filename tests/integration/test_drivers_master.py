@@ -83,6 +83,7 @@ def cell(vcan: str, nodes: tuple[int, ...] = (1, 2), missing: tuple[int, ...] = 
             "bus": whole.bus.model_copy(update={"channel": vcan}),
             "drives": tuple(d for d in whole.drives if d.node_id in nodes),
             "sdo_timeout_s": 1.0,
+            "boot_timeout_s": 0.0,
         }
     )
     robot = load_robot(session.robot)

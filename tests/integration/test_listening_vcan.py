@@ -28,23 +28,27 @@ SYNC = {"role": "producer", "period_us": 5000, "counter": 240}
 class UnknownDrives:
     """Six drives and their master: SYNC, a TPDO of each drive, and EMCY of node 3 every second.
 
-    ``foreign`` holds the frames that others send on the bus.
+    ``foreign`` holds the frames that others send on the bus. They stop after a number of ``syncs``, if it is given.
     """
 
-    def __init__(self, channel: str, length: int, every: int = 1) -> None:
+    def __init__(
+        self, channel: str, length: int, every: int = 1, syncs: int | None = None, counter: bool = True
+    ) -> None:
         self.foreign: list[Frames] = []
-        self._length, self._every = length, every
+        self._length, self._every, self._syncs, self._counter = length, every, syncs, counter
         self._bus = RawSocket(channel)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
 
     def _run(self) -> None:
         k, batch, begin = 0, frames(256), time.monotonic()
-        while not self._stop.wait(max(0.0, begin + k * PERIOD_S - time.monotonic())):
+        while not self._stop.wait(max(0.0, begin + k * PERIOD_S - time.monotonic())) and k != self._syncs:
             counter = k % 240 + 1
             due = counter % self._every == 0
             out = frames(7 if due else 1)
-            out["can_id"][0], out["length"][0], out["data"][0, 0] = 0x80, 1, counter
+            out["can_id"][0] = 0x80
+            if self._counter:
+                out["length"][0], out["data"][0, 0] = 1, counter
             if due:
                 out["can_id"][1:], out["length"][1:] = 0x180 + np.arange(1, 7), self._length
                 out["data"][1:, :4] = np.full((6, 1), k, "<i4").view(np.uint8)
@@ -94,6 +98,32 @@ def test_streams_of_the_session_are_recorded_and_nothing_is_sent(vcan_bus: str, 
     assert np.all(np.diff(recording.samples.raw["position"][:, 0]) == 1)
     assert "node 3 (joint_3): EMCY 8611h, following error (error register 20h)" in err
     assert recording.counters["emcy"] == len([mark for mark in recording.marks if mark.kind == "emcy"]) >= 1
+
+
+def test_a_capture_ends_after_its_duration_although_sync_has_stopped(vcan_bus: str, tmp_path: Path) -> None:
+    with UnknownDrives(vcan_bus, 8, syncs=1500):
+        code, out, err = listening(vcan_bus, tmp_path, "--duration", "9")
+    assert code == 0, err
+    assert "the duration is over, and SYNC has stopped" in err
+    recording = read_recording(json.loads(out)["recording"])
+    assert "has no counter" not in err
+    assert recording.counters["sync_stopped"] == 1
+    assert 200 <= recording.counters["samples.rows"] <= 1500
+
+
+def test_sync_without_a_counter_is_noted_where_streams_are_slower(vcan_bus: str, tmp_path: Path) -> None:
+    """The session expects a counter; all streams but one are sent on every SYNC."""
+    streams = {
+        "samples": {"tpdo": 1, "objects": ["position", "current", "status"]},
+        "demand": {"tpdo": 2, "every": 5, "objects": ["demand"]},
+    }
+    with UnknownDrives(vcan_bus, 8, counter=False):
+        code, out, err = listening(vcan_bus, tmp_path, streams=streams)
+    assert code == 0, err
+    assert "demand: SYNC of another master has no counter, so it is unknown which SYNCs are answered" in err
+    recording = read_recording(json.loads(out)["recording"])
+    assert recording.counters["samples.rows"] >= 300
+    assert recording.counters["demand.rows"] == 0
 
 
 def test_the_default_mapping_of_an_eds_is_discovered_and_nothing_is_sent(vcan_bus: str, tmp_path: Path) -> None:

@@ -102,6 +102,14 @@ def test_certificates_of_zenoh_are_opened(tmp_path: Path) -> None:
     assert f"root_ca_certificate {tmp_path}/ca.pem (No such file or directory)" in check.message
 
 
+def test_slow_streams_of_another_master_without_sync_counter_are_a_warning(tmp_path: Path) -> None:
+    sync = {"role": "consumer", "counter": 0}
+    check = checks_of(cell(tmp_path, sync=sync))["sync"]
+    assert check.verdict == "warning"
+    assert check.message.startswith("demand: SYNC of another master has no counter")
+    assert "sync" not in checks_of(cell(tmp_path, sync={"counter": 0}))
+
+
 def test_an_overloaded_bus_fails(tmp_path: Path) -> None:
     checks = checks_of(cell(tmp_path, bus={"bitrate": 1_000_000}))
     assert checks["bus load"].verdict == "failed"

@@ -10,7 +10,7 @@ from armident.daq.guard.limits import limits_of
 from armident.daq.guard.monitor import MotionMonitor
 from armident.daq.matching.streams import bus_numbers, node_ids
 from armident.drivers.can.frames import Frames, frames
-from armident.drivers.canopen.objects import COB_SYNC, TpdoLayout, rpdo_cob, tpdo_cob
+from armident.drivers.canopen.objects import COB_HEARTBEAT, COB_SYNC, TpdoLayout, rpdo_cob, tpdo_cob
 
 NOW = 1_000_000_000
 
@@ -106,6 +106,16 @@ def test_the_offending_frame_does_not_depend_on_the_batches(session: SessionConf
             break
     assert k == whole.frame
     assert alarm == type(whole)(whole.text, 0)
+
+
+@pytest.mark.parametrize(("byte", "stops"), [(0x05, False), (0x85, False), (0x7F, True), (0x84, True)])
+def test_answers_of_node_guarding_are_heartbeats(
+    session: SessionConfig, robot: RobotConfig, byte: int, stops: bool
+) -> None:
+    guard = monitor_of(session, robot)
+    assert guard.check(on_the_bus(robot, np.zeros((10, robot.n))), NOW) is None
+    alarm = guard.check(_frames([(COB_HEARTBEAT + 1, bytes([byte]))]), NOW)
+    assert (alarm is not None) == stops
 
 
 def test_missing_heartbeats_are_judged_by_the_time_before_the_frames(

@@ -1,0 +1,210 @@
+"""Oddities of virtual drives in their services: SDO answers, NMT and emergency messages."""
+
+import struct
+import threading
+import time
+from contextlib import suppress
+
+import can
+
+from armident.configs.schema.session import Bus
+from armident.drivers.canopen import objects as od
+from armident.drivers.canopen.objects import NmtCommand, NmtState
+from armident.virtual_robot.node import ABORT_DEVICE_STATE, Drive
+from armident.virtual_robot.oddities import Oddity
+
+BURST = (0x8611, 0xFF05)
+"""Error codes of the emergency messages of a burst, in turn."""
+
+
+class AbortBusy(Oddity):
+    """Every 7th SDO request is aborted.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    """
+
+    def __init__(self, drive: Drive) -> None:
+        self._drive, self._count = drive, 0
+
+    def request(self, data: bytes) -> bool:
+        """Abort a request for the device state."""
+        self._count += 1
+        if self._count % 7:
+            return True
+        self._drive.sdo.send_response(b"\x80" + data[1:4] + struct.pack("<L", ABORT_DEVICE_STATE))
+        return False
+
+
+class Twice(Oddity):
+    """SDO answers come again.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    delay_s
+        Time between both, s.
+    """
+
+    def __init__(self, drive: Drive, delay_s: float) -> None:
+        self._drive, self._delay = drive, delay_s
+
+    def respond(self, data: bytes) -> list[bytes]:
+        """Repeat the answer."""
+        if not self._delay:
+            return [data, data]
+        again = threading.Timer(self._delay, self._again, (data,))
+        again.daemon = True
+        again.start()
+        return [data]
+
+    def _again(self, data: bytes) -> None:
+        with suppress(can.CanError, OSError):
+            self._drive.network.send_message(self._drive.sdo.tx_cobid, data)
+
+
+class SlowSdo(Oddity):
+    """SDO answers take 50 ms."""
+
+    def request(self, data: bytes) -> bool:
+        """Serve the request late."""
+        time.sleep(0.05)
+        return True
+
+
+class ShortAnswer(Oddity):
+    """SDO answers to writes are as long as their contents."""
+
+    def respond(self, data: bytes) -> list[bytes]:
+        """Leave out the bytes that mean nothing."""
+        return [data[:4] if data[0] & 0xE0 == 0x60 else data]
+
+
+class OtherClient(Oddity):
+    """Another client on the SDO channel.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    """
+
+    def __init__(self, drive: Drive) -> None:
+        self._request = can.Message(
+            arbitration_id=od.COB_SDO_REQUEST + drive.node_id,
+            is_extended_id=False,
+            data=struct.pack("<BHBL", 0x40, od.ERROR_REGISTER, 0, 0),
+        )
+        self._over = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def begin(self, bus: Bus) -> None:
+        """Read the error register at 200 Hz."""
+        self._thread = threading.Thread(target=self._run, args=(bus,), daemon=True)
+        self._thread.start()
+
+    def _run(self, bus: Bus) -> None:
+        with can.Bus(bus.channel, interface=bus.interface) as client:
+            while not self._over.wait(0.005):
+                with suppress(can.CanError, OSError):
+                    client.send(self._request)
+
+    def end(self) -> None:
+        """Stop reading."""
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join()
+
+
+class Autostart(Oddity):
+    """The drive becomes operational by itself.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    """
+
+    def __init__(self, drive: Drive) -> None:
+        self._drive = drive
+
+    def nmt(self, command: int) -> bool:
+        """Start 30 ms after a command to pre-operational."""
+        if command == NmtCommand.PRE_OPERATIONAL:
+            timer = threading.Timer(0.03, self._drive.nmt.enter, (NmtState.OPERATIONAL,))
+            timer.daemon = True
+            timer.start()
+        return True
+
+
+class SlowBoot(Oddity):
+    """The drive is silent until some time after the first NMT command.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    boot_s
+        Time to boot, s.
+    """
+
+    def __init__(self, drive: Drive, boot_s: float) -> None:
+        self._drive, self._boot_s = drive, boot_s
+        self._booted: bool | None = None
+
+    def nmt(self, command: int) -> bool:
+        """Begin to boot; commands that come meanwhile are not executed."""
+        if self._booted is None:
+            self._booted = False
+            timer = threading.Timer(self._boot_s, self._boot)
+            timer.daemon = True
+            timer.start()
+        return self._booted
+
+    def request(self, data: bytes) -> bool:
+        """Answer nothing before the end of the boot."""
+        return self._booted is not False
+
+    def _boot(self) -> None:
+        self._booted = True
+        self._drive.nmt.boot()
+
+
+class EmcyBurst(Oddity):
+    """Thousands of emergency messages after NMT start.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    """
+
+    def __init__(self, drive: Drive) -> None:
+        self._drive = drive
+        self._over = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def nmt(self, command: int) -> bool:
+        """Begin the burst, once."""
+        if command == NmtCommand.START and self._thread is None:
+            self._thread = threading.Thread(target=self._send, daemon=True)
+            self._thread.start()
+        return True
+
+    def _send(self) -> None:
+        self._over.wait(0.5)
+        for k in range(3000):
+            if self._over.is_set():
+                return
+            with suppress(can.CanError, OSError):
+                self._drive.emcy.send(BURST[k % 2], 1, struct.pack("<HHB", k, 0, 7))
+            time.sleep(0.0003)
+
+    def end(self) -> None:
+        """Stop the burst."""
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join()
