@@ -54,7 +54,7 @@ def prune(
         old = keep_days is not None and (now - made).total_seconds() > keep_days * 86_400
         if not (old or (min_free_bytes is not None and free(directory) < min_free_bytes)):
             break
-        if _is_being_written(path):
+        if is_being_written(path):
             continue
         path.unlink(missing_ok=True)
         deleted.append(path)
@@ -71,7 +71,14 @@ def _recordings(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.da
     yield from sorted(found, key=lambda entry: entry[0].name)
 
 
-def _is_being_written(path: Path) -> bool:
+def is_being_written(path: Path) -> bool:
+    """Return True if a capture has locked a file for writing.
+
+    Parameters
+    ----------
+    path
+        The file.
+    """
     try:
         with path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -27,7 +27,7 @@ from armident.daq.streaming import (
     encode_event,
     open_session,
 )
-from armident.daq.streaming.codec import end_content, start_content
+from armident.daq.streaming.codec import VERSION, end_content, start_content
 
 ROBOT = load_robot("tx40.yaml")
 JOINTS = tuple(joint.name for joint in ROBOT.joints)
@@ -55,9 +55,10 @@ def blocks(count: int, rows: int = 50) -> list[Block]:
         sync = np.arange(k * rows, (k + 1) * rows, dtype=np.int64)
         position = rng.integers(-(2**31), 2**31, (rows, ROBOT.n)).astype(np.int32)
         current = rng.integers(-(2**15), 2**15, (rows, ROBOT.n)).astype(np.int16)
-        made.append(Block(SAMPLES, 2 * k, sync, sync * 200_000, {"position": position, "current": current}))
+        raw: dict[str, Any] = {"position": position, "current": current}
+        made.append(Block(SAMPLES, 2 * k, sync, sync * 200_000, raw, "c1"))
         fifth = sync[4::5]
-        made.append(Block(DEMAND, 2 * k + 1, fifth, fifth * 200_000, {"demand": position[4::5]}))
+        made.append(Block(DEMAND, 2 * k + 1, fifth, fifth * 200_000, {"demand": position[4::5]}, "c1"))
     return made
 
 
@@ -71,7 +72,7 @@ def events(session: SessionConfig, total: int) -> tuple[dict[str, Any], dict[str
 def test_a_block_is_decoded_to_the_last_bit() -> None:
     for block in blocks(2):
         got = decode_block(encode_block(block))
-        assert (got.layout, got.sequence) == (block.layout, block.sequence)
+        assert (got.capture, got.layout, got.sequence) == ("c1", block.layout, block.sequence)
         assert np.array_equal(got.sync, block.sync)
         assert np.array_equal(got.t_ns, block.t_ns)
         for name, values in block.raw.items():
@@ -100,7 +101,17 @@ def test_a_damaged_block_is_refused(data: st.DataObject) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"rows": -1}, {"rows": 2**40}, {"rows": 49}, {"rows": "x"}, {"layout": {}}, {"layout": None}, {"sequence": None}],
+    [
+        {"rows": -1},
+        {"rows": 2**40},
+        {"rows": 49},
+        {"rows": "x"},
+        {"layout": {}},
+        {"layout": None},
+        {"sequence": None},
+        {"capture": None},
+        {"capture": "../x"},
+    ],
 )
 def test_a_block_with_an_inconsistent_head_is_refused(change: dict[str, Any]) -> None:
     data = encode_block(blocks(1)[0])
@@ -108,7 +119,7 @@ def test_a_block_with_an_inconsistent_head_is_refused(change: dict[str, Any]) ->
     head = json.dumps(json.loads(data[14 : 14 + size]) | change).encode()
     body = head + data[14 + size :]
     with pytest.raises(DataError):
-        decode_block(struct.pack("<4sHII", b"ARMB", 1, len(head), zlib.crc32(body)) + body)
+        decode_block(struct.pack("<4sHII", b"ARMB", VERSION, len(head), zlib.crc32(body)) + body)
 
 
 def test_the_stream_and_the_file_are_the_same_recording(tmp_path: Path) -> None:
