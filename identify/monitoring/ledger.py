@@ -6,6 +6,9 @@ and entered before it is announced. The announcement and its entry are one trans
 """
 
 import json
+import os
+import secrets
+import socket
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -343,6 +346,11 @@ class Ledger:
             raise ArmidentError(
                 f"{self.path}: the ledger is damaged ({error}); move it away and start again, results are found"
             ) from error
+
+
+def unique_owner() -> str:
+    """Return a name for this process in its claims."""
+    return f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def _use_write_ahead_log(db: sqlite3.Connection) -> None:

@@ -1,11 +1,8 @@
 """Identification worker: identifies every recording of a cell once, and announces the results on Zenoh."""
 
 import logging
-import os
 import queue
-import secrets
 import signal
-import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +16,7 @@ from armident.daq.recording import Recording
 from armident.daq.streaming import Keys
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
-from armident.identify.monitoring.ledger import FILE, MOST_ATTEMPTS, Entry, Ledger, LedgerError, State
+from armident.identify.monitoring.ledger import FILE, MOST_ATTEMPTS, Entry, Ledger, LedgerError, State, unique_owner
 from armident.identify.monitoring.recorded import (
     Captured,
     captured_as,
@@ -75,7 +72,7 @@ class Worker:
         self._folders = (session.recording.directory, out)
         self._options = Options(**session.identification.model_dump())
         self._keys = Keys(session.cell, robot.name)
-        self._owner = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
+        self._owner = unique_owner()
         self._results: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._buffer = StreamBuffer()
         self._lock = threading.Lock()
