@@ -1,6 +1,7 @@
 """Zenoh interface: published captures equal their files, and malformed data is refused with a description."""
 
 import json
+import socket
 import struct
 import time
 import zlib
@@ -28,6 +29,7 @@ from armident.daq.streaming import (
     open_session,
 )
 from armident.daq.streaming.codec import VERSION, end_content, start_content
+from armident.daq.streaming.session import endpoints
 
 ROBOT = load_robot("tx40.yaml")
 JOINTS = tuple(joint.name for joint in ROBOT.joints)
@@ -231,3 +233,42 @@ def test_a_second_capture_of_a_cell_is_refused() -> None:
 @pytest.mark.parametrize("name", ["peer", "client", "router", "tls"])
 def test_the_shipped_zenoh_configurations_are_valid(name: str) -> None:
     zenoh.Config.from_file(str(config_path(f"zenoh/{name}.json5")))
+
+
+def test_a_taken_port_does_not_stop_a_capture_and_is_taken_when_it_is_free(caplog: pytest.LogCaptureFixture) -> None:
+    session = cell("port_taken")
+    host, port = endpoints(session)["capture"].removeprefix("tcp/").split(":")
+    with socket.socket() as stranger:
+        stranger.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        stranger.bind((host, int(port)))
+        stranger.listen()
+        publisher = Publisher(session, Keys(session.cell, "tx40"))
+        try:
+            health = lambda: (publisher.is_open, publisher.problem is None)  # noqa: E731
+            assert health() == (False, False)
+            assert "recording continues" in caplog.text
+            for block in blocks(400):
+                publisher.offer(block)
+            assert publisher.depth <= session.zenoh.queue_blocks
+            assert publisher.dropped == 800 - session.zenoh.queue_blocks
+            stranger.close()
+            until = time.monotonic() + 15.0
+            while health() != (True, True):
+                assert time.monotonic() < until
+                time.sleep(0.05)
+        finally:
+            publisher.close()
+
+
+def test_a_second_capture_of_a_robot_is_refused_unless_it_only_listens() -> None:
+    session = cell("two_captures")
+    keys = Keys(session.cell, "tx40")
+    first = Publisher(session, keys)
+    try:
+        with pytest.raises(ConfigError, match="another capture of cell two_captures, robot tx40, is running"):
+            Publisher(session, keys)
+        second = Publisher(session, keys, exclusive=False)
+        assert not second.is_open
+        second.close()
+    finally:
+        first.close()
