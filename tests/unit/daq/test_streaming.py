@@ -244,7 +244,10 @@ def test_a_taken_port_does_not_stop_a_capture_and_is_taken_when_it_is_free(caplo
         stranger.listen()
         publisher = Publisher(session, Keys(session.cell, "tx40"))
         try:
-            health = lambda: (publisher.is_open, publisher.problem is None)  # noqa: E731
+
+            def health() -> tuple[bool, bool]:
+                return publisher.is_open, publisher.problem is None
+
             assert health() == (False, False)
             assert "recording continues" in caplog.text
             for block in blocks(400):
