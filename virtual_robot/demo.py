@@ -197,6 +197,10 @@ def _identify_part(session: SessionConfig, out: Path) -> tuple[Identified, Sessi
     log.info(f"part 1: record a virtual TX40 at {_rate(session)} and identify its dynamic model")
     truth_file = out / "truth.json"
     while True:
+        # The worker waits for the recording that follows; those of earlier attempts and runs are not its work.
+        for path in out.glob("worker.sqlite*"):
+            path.unlink()
+        session = session.model_copy(update={"recording": session.recording.model_copy(update={"directory": out})})
         config = _write_session(session, out, "cell")
         options = ["--config", str(config), "--once", "--out", str(out)]
         with _running("worker", ["worker", *options], out, "worker: ready", PATIENT) as worker:

@@ -19,6 +19,7 @@ from armident.daq.capture.files import (
     chunk_duration_ns,
     kept_around,
     limits,
+    next_time,
     open_series,
 )
 from armident.daq.capture.host_metadata import host_metadata
@@ -91,10 +92,11 @@ def capture(
     Raises
     ------
     ConfigError
-        If the capture could not start: bus, drives, mapping, disk, Zenoh. No file is left behind in that case.
+        If the capture could not start: bus, drives, mapping, disk, another capture. No file is left
+        behind in that case.
     """
     session, robot = plan.session, plan.robot
-    now = datetime.datetime.now(datetime.UTC)
+    now = next_time(plan.directory, robot.name, datetime.datetime.now(datetime.UTC))
     name = f"{robot.name}-{capture_stamp(now)}"
     with ExitStack() as stack:
         receiver = stack.enter_context(Receiver([_opener(bus, k, plan) for k, bus in enumerate(session.all_buses)]))
@@ -113,7 +115,7 @@ def capture(
         try:
             if session.all_buses[0].interface == "udp_multicast":
                 log.info(UDP_WARNING)
-            publisher = Publisher(session, Keys(session.cell, robot.name))
+            publisher = Publisher(session, Keys(session.cell, robot.name), exclusive=not plan.listen_only)
             stack.callback(publisher.close)
             outputs = Outputs(Sink(writer, publisher, plan.streams, name), publisher, notifier)
             recorder = Recorder(plan, receiver, listener, outputs, stop, save or threading.Event())

@@ -1,6 +1,7 @@
 """Files of a capture: creation, rotation, and deletion of old recordings."""
 
 import datetime
+import logging
 import os
 import shutil
 from collections.abc import Sequence
@@ -11,7 +12,12 @@ from armident.configs import RobotConfig, SessionConfig
 from armident.configs.schema.session import RecordingOptions, Trigger
 from armident.daq.matching.streams import CapturedStream
 from armident.daq.recording import QueuedSeries, RecordingSeries, RecordingWriter, TriggeredSeries
-from armident.daq.recording.retention import RetentionThread, prune
+from armident.daq.recording.retention import RetentionThread, prune, recordings_of
+
+log = logging.getLogger(__name__)
+
+_STAMP_STEP = datetime.timedelta(milliseconds=1)
+"""Resolution of the times in the names of recordings."""
 
 
 def open_series(
@@ -60,7 +66,7 @@ def open_series(
         return QueuedSeries(RecordingSeries(begin, directory, name, max_bytes, max_ns), every, chunk_ns)
 
     def event(_: int) -> RecordingSeries:
-        now = capture_stamp(datetime.datetime.now(datetime.UTC))
+        now = capture_stamp(next_time(directory, robot.name, datetime.datetime.now(datetime.UTC)))
         return RecordingSeries(begin, directory, f"{robot.name}-{now}", max_bytes, max_ns)
 
     return QueuedSeries(TriggeredSeries(event, *kept_around(options.trigger)), every, chunk_ns)
@@ -98,6 +104,33 @@ def free_space(directory: Path) -> int | None:
 def capture_stamp(now: datetime.datetime) -> str:
     """Return the time (UTC, to the millisecond) as it stands in the names of recordings."""
     return f"{now:%Y%m%dT%H%M%S}-{now.microsecond // 1000:03d}Z"
+
+
+def next_time(directory: Path, robot: str, now: datetime.datetime) -> datetime.datetime:
+    """Return the time for the name of a new recording: later than that of every recording of the robot.
+
+    After a step of the clock back, names would otherwise collide or come before those of earlier recordings.
+
+    Parameters
+    ----------
+    directory
+        Directory of the recordings.
+    robot
+        Name of the robot.
+    now
+        Time of the clock (UTC).
+    """
+    newest = max((made for _, made in recordings_of(directory, robot)), default=None)
+    if newest is None or now - newest >= _STAMP_STEP:
+        return now
+    if newest - now > _STAMP_STEP:
+        log.warning(
+            "the clock (%s) is behind the newest recording (%s): it has stepped back; the new recording is named after "
+            "the newest one",
+            f"{now:%Y-%m-%d %H:%M:%S}",
+            f"{newest:%Y-%m-%d %H:%M:%S}",
+        )
+    return newest + _STAMP_STEP
 
 
 class RecordingRetention:

@@ -175,6 +175,8 @@ class Health:
             "disk_free_bytes": free_space(self._plan.directory),
             "blocks_dropped": self._publisher.dropped,
             "events_dropped": self._publisher.events_dropped,
+            "zenoh_open": int(self._publisher.is_open),
+            "zenoh_problem": self._publisher.problem,
             **_clock(),
             **{f"temperature_{joint}_c": round(celsius, 2) for joint, celsius in self.temperatures().items()},
             **events,

@@ -1,7 +1,9 @@
 """Publisher of a capture on Zenoh, in a thread of its own: slow subscribers never delay the capture."""
 
 import json
+import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -9,9 +11,10 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from armident.configs import SessionConfig
+from armident.configs import ConfigError, SessionConfig
 from armident.daq.capture.remote_commands import Commands
 from armident.daq.streaming import Block, Keys, encode_block, open_session
+from armident.daq.streaming.session import configuration
 
 _EVENTS_KEPT = 64
 """Events that late subscribers can query."""
@@ -23,6 +26,12 @@ _LINGER_S = 0.5
 """Time for subscribers to query missed samples at the end, s."""
 _LONGEST_CLOSE_S = 5.0
 """Longest wait for the queue at the end, s."""
+RETRY_S = 2.0
+"""Time until the next attempt to open a Zenoh session, s."""
+FIND_S = 1.0
+"""Longest wait for the liveliness token of another capture, s."""
+
+log = logging.getLogger(__name__)
 
 
 class Publisher:
@@ -34,18 +43,26 @@ class Publisher:
 
     Parameters
     ----------
+    A capture does not depend on Zenoh: if no session can be opened, or it fails, the reason is logged and in
+    :attr:`problem`, and the publisher tries again in its thread.
+
+    Parameters
+    ----------
     session
         The cell's configuration.
     keys
         The key expressions of the robot.
+    exclusive
+        Refuse to run beside another capture of the robot, whose master would command the same drives.
 
     Raises
     ------
     ConfigError
-        If no Zenoh session can be opened.
+        If Zenoh's configuration is wrong, or another capture runs.
     """
 
-    def __init__(self, session: SessionConfig, keys: Keys) -> None:
+    def __init__(self, session: SessionConfig, keys: Keys, *, exclusive: bool = True) -> None:
+        configuration(session, "capture")
         self.offered = 0
         self.dropped = 0
         self.events_dropped = 0
@@ -56,14 +73,21 @@ class Publisher:
         self._latest: dict[str, bytes] = {}
         self._ready = threading.Condition()
         self._closing = False
-        self._keys = keys
-        self._session = open_session(session, "capture")
-        self.commands = Commands(self._session, keys, session.zenoh.commands)
-        self._token = self._session.liveliness().declare_token(keys.alive("capture"))
-        self._samples = self._declare_publisher(keys.samples, session.zenoh.cache_blocks, zenoh.CongestionControl.DROP)
-        self._events = self._declare_publisher(keys.events, _EVENTS_KEPT, zenoh.CongestionControl.BLOCK)
+        self._over = threading.Event()
+        self._keys, self._config = keys, session
+        self._session: zenoh.Session | None = None
+        self.problem: str | None = None
+        """Reason why there is no Zenoh session, or ``None``."""
+        self.commands = Commands(keys, session.zenoh.commands)
+        if not self._try_open() and exclusive and _capture_runs(session, keys):
+            raise ConfigError(f"another capture of cell {session.cell}, robot {keys.robot}, is running")
         self._thread = threading.Thread(target=self._run, name="zenoh", daemon=True)
         self._thread.start()
+
+    @property
+    def is_open(self) -> bool:
+        """True if there is a Zenoh session."""
+        return self._session is not None
 
     @property
     def depth(self) -> int:
@@ -109,23 +133,46 @@ class Publisher:
         with self._ready:
             self._closing = True
             self._ready.notify()
+        self._over.set()
         self._thread.join(_LONGEST_CLOSE_S)
+        if self._session is None:
+            return
         with self._ready:
             self._ready.wait(_LINGER_S)
-        self._token.undeclare()
-        self._session.close()
+        self._close_session(self._session)
 
-    def _declare_publisher(
-        self, key: str, kept: int, congestion: zenoh.CongestionControl
-    ) -> zenoh.ext.AdvancedPublisher:
-        return zenoh.ext.declare_advanced_publisher(
-            self._session,
-            key,
-            congestion_control=congestion,
-            cache=zenoh.ext.CacheConfig(max_samples=kept) if kept else None,
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
-            publisher_detection=True,
-        )
+    def _try_open(self) -> bool:
+        """Open a session and declare all that is published; log a failure once."""
+        opened = None
+        try:
+            opened = open_session(self._config, "capture")
+            self.commands.declare(opened)
+            cached = self._config.zenoh.cache_blocks
+            self._samples = _declared(opened, self._keys.samples, cached, zenoh.CongestionControl.DROP)
+            self._events = _declared(opened, self._keys.events, _EVENTS_KEPT, zenoh.CongestionControl.BLOCK)
+            self._token = opened.liveliness().declare_token(self._keys.alive("capture"))
+        except (ConfigError, zenoh.ZError) as error:
+            if opened is not None:
+                self._close_session(opened)
+            self._fail(error)
+            return False
+        if self.problem is not None:
+            log.info("zenoh: the session is open; %d blocks were not published", self.dropped)
+        self._session, self.problem = opened, None
+        return True
+
+    def _fail(self, error: Exception) -> None:
+        self._session = None
+        text = str(error) if isinstance(error, ConfigError) else "zenoh: the session failed"
+        if text != self.problem:
+            log.warning("%s; recording continues, publishing is tried again every %g s", text, RETRY_S)
+        self.problem = text
+
+    def _close_session(self, session: zenoh.Session) -> None:
+        try:
+            session.close()
+        except zenoh.ZError as error:
+            log.debug("zenoh: %s", error)
 
     def _put(self, key: str, data: bytes) -> None:
         with self._ready:
@@ -134,6 +181,10 @@ class Publisher:
 
     def _run(self) -> None:
         while True:
+            if self._session is None and not self._try_open():
+                if self._over.wait(RETRY_S):
+                    return
+                continue
             with self._ready:
                 while not self._queue and not self._latest and not self._closing:
                     self._ready.wait()
@@ -141,16 +192,51 @@ class Publisher:
                 waiting = self._queue.popleft() if self._queue else None
                 if waiting is None and not latest:
                     return
-            for key, data in latest.items():
-                self._session.put(key, data)
-            if waiting is None:
-                continue
-            key, item = waiting
-            if isinstance(item, Block):
-                self._samples.put(encode_block(item))
+            try:
+                self._send(latest, None if waiting is None else waiting[1])
+            except zenoh.ZError as error:
+                self._fail(error)
                 with self._ready:
-                    self._waiting -= 1
-            else:
-                self._events.put(item)
+                    self.dropped += waiting is not None and isinstance(waiting[1], Block)
+            if waiting is not None:
                 with self._ready:
-                    self._events_waiting -= 1
+                    if isinstance(waiting[1], Block):
+                        self._waiting -= 1
+                    else:
+                        self._events_waiting -= 1
+
+    def _send(self, latest: Mapping[str, bytes], waiting: Block | bytes | None) -> None:
+        assert self._session is not None
+        for key, data in latest.items():
+            self._session.put(key, data)
+        if isinstance(waiting, Block):
+            self._samples.put(encode_block(waiting))
+        elif waiting is not None:
+            self._events.put(waiting)
+
+
+def _declared(
+    session: zenoh.Session, key: str, kept: int, congestion: zenoh.CongestionControl
+) -> zenoh.ext.AdvancedPublisher:
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        congestion_control=congestion,
+        cache=zenoh.ext.CacheConfig(max_samples=kept) if kept else None,
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
+        publisher_detection=True,
+    )
+
+
+def _capture_runs(session: SessionConfig, keys: Keys) -> bool:
+    """Return True if the token of another capture of this robot is found."""
+    until = time.monotonic() + FIND_S
+    try:
+        with open_session(session, "observer") as observer:
+            while time.monotonic() < until:
+                if any(reply.ok is not None for reply in observer.liveliness().get(keys.alive("capture"), timeout=0.3)):
+                    return True
+                time.sleep(0.1)
+    except (ConfigError, zenoh.ZError):
+        return False
+    return False

@@ -41,18 +41,20 @@ class Commands:
 
     Parameters
     ----------
-    zenoh_session
-        Zenoh session of the capture.
     keys
         Key expressions of the robot.
     allowed
         Accept commands (``zenoh.commands`` of the session).
     """
 
-    def __init__(self, zenoh_session: zenoh.Session, keys: Keys, allowed: bool) -> None:
+    def __init__(self, keys: Keys, allowed: bool) -> None:
         self._waiting: queue.SimpleQueue[Command] = queue.SimpleQueue()
+        self._keys = keys
         self.allowed = allowed
-        self._queryable = zenoh_session.declare_queryable(keys.command("*"), self._answer)
+
+    def declare(self, zenoh_session: zenoh.Session) -> None:
+        """Answer commands on a Zenoh session, until it is closed."""
+        self._queryable = zenoh_session.declare_queryable(self._keys.command("*"), self._answer)
 
     def pending(self) -> list[Command]:
         """Return the commands since the last call."""

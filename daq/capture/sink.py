@@ -158,7 +158,7 @@ class Sink:
                 continue
             raw = stream.decode(rows)
             self._writer.append(stream.bus.name, rows.sync, rows.t_ns, raw)
-            self._publisher.offer(Block(stream.layout, self._blocks, rows.sync, rows.t_ns, raw))
+            self._publisher.offer(Block(stream.layout, self._blocks, rows.sync, rows.t_ns, raw, self._capture))
             self._blocks += 1
             if stream.bus.name == "samples":
                 if self.first_sync is None:

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-_NAME = re.compile(r"-(\d{8}T\d{6})-\d{3}Z(?:\.\d+)?\.mcap(?:\.damaged)?$")
+_NAME = re.compile(r"-(\d{8}T\d{6})-(\d{3})Z(?:\.\d+)?\.mcap(?:\.damaged)?$")
 EVERY_S = 60.0
 """Interval between two deletions of old recordings, s."""
 
@@ -38,7 +38,8 @@ def prune(
     now
         Current time, with its zone.
     keep_days
-        Age, by the time in the name, at which a recording is deleted, days; ``None``: no limit.
+        Age, by the times in the names, at which a recording is deleted, days; ``None``: no limit. It counts to the
+        newest finished recording that is not in the future: a clock that is ahead deletes nothing younger.
     min_free_bytes
         Free space to keep on the file system, bytes; ``None``: no limit.
     free
@@ -50,28 +51,47 @@ def prune(
         Deleted files, the oldest first.
     """
     deleted = []
-    for path, made in _recordings(directory, robot):
-        old = keep_days is not None and (now - made).total_seconds() > keep_days * 86_400
+    found = [(path, made, is_being_written(path)) for path, made in recordings_of(directory, robot)]
+    # A clock that is ahead must not make all recordings old: they are compared with the newest finished one.
+    newest = max((made for _, made, written in found if not written and made <= now), default=now)
+    for path, made, written in found:
+        old = keep_days is not None and (newest - made).total_seconds() > keep_days * 86_400
         if not (old or (min_free_bytes is not None and free(directory) < min_free_bytes)):
             break
-        if _is_being_written(path):
+        if written:
             continue
         path.unlink(missing_ok=True)
         deleted.append(path)
     return deleted
 
 
-def _recordings(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.datetime]]:
-    """Yield the recordings of a robot with the times in their names, the oldest first."""
+def recordings_of(directory: Path, robot: str) -> Iterator[tuple[Path, datetime.datetime]]:
+    """Yield the recordings of a robot with the times in their names, the oldest first.
+
+    Parameters
+    ----------
+    directory
+        Directory of the recordings; its subdirectories are not searched.
+    robot
+        Name of the robot, with which the file names begin.
+    """
     found = []
     for path in directory.glob(f"{robot}-*.mcap*"):
         match = _NAME.search(path.name)
         if match is not None and path.name[: match.start()] == robot and path.is_file():
-            found.append((path, datetime.datetime.strptime(match[1] + "+0000", "%Y%m%dT%H%M%S%z")))
+            made = datetime.datetime.strptime(f"{match[1]}.{match[2]}+0000", "%Y%m%dT%H%M%S.%f%z")
+            found.append((path, made))
     yield from sorted(found, key=lambda entry: entry[0].name)
 
 
-def _is_being_written(path: Path) -> bool:
+def is_being_written(path: Path) -> bool:
+    """Return True if a capture has locked a file for writing.
+
+    Parameters
+    ----------
+    path
+        The file.
+    """
     try:
         with path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

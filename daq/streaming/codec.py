@@ -1,8 +1,8 @@
 """Binary format of published blocks and events, and their assembly to a recording.
 
-A block is ``ARMB``, version (u16), length of the head (u32), CRC-32 of all that follows it, the head (JSON:
-sequence number, rows, stream layout), then ``sync`` and ``t_ns`` as int64 and every field's raw values, little
-endian, row by row.
+A block is ``ARMB``, version (u16), length of the head (u32), CRC-32 of all that follows it, the head (JSON: name of
+the capture, sequence number, rows, stream layout), then ``sync`` and ``t_ns`` as int64 and every field's raw values,
+little endian, row by row. Version 2 added the name of the capture.
 """
 
 import json
@@ -22,7 +22,7 @@ from armident.configs import DataError, RobotConfig, SessionConfig
 from armident.daq.recording import Gap, Mark, Recording, Stream, StreamLayout
 from armident.daq.recording.model import gap_from, mark_from
 
-VERSION = 1
+VERSION = 2
 EVENT_SCHEMA = "armident/event/1"
 _MAGIC = b"ARMB"
 _CAPTURE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
@@ -57,6 +57,8 @@ class Block:
         Receive times of the SYNCs, ns UTC, (N,).
     raw
         Raw values of every field, (N, n) each.
+    capture
+        Name of the capture, as in its events; empty for a block of none.
     """
 
     layout: StreamLayout
@@ -64,6 +66,7 @@ class Block:
     sync: NDArray[np.int64]
     t_ns: NDArray[np.int64]
     raw: dict[str, NDArray[Any]]
+    capture: str = ""
 
     @property
     def nbytes(self) -> int:
@@ -73,9 +76,8 @@ class Block:
 
 def encode_block(block: Block) -> bytes:
     """Return the bytes of a block."""
-    head = json.dumps(
-        {"sequence": block.sequence, "rows": len(block.sync), "layout": json.loads(block.layout.to_json())}
-    ).encode()
+    content = {"capture": block.capture, "sequence": block.sequence, "rows": len(block.sync)}
+    head = json.dumps(content | {"layout": json.loads(block.layout.to_json())}).encode()
     parts = [head, block.sync.astype("<i8").tobytes(), block.t_ns.astype("<i8").tobytes()]
     for field, dtype in zip(block.layout.fields, block.layout.dtypes, strict=True):
         parts.append(block.raw[field.name].astype(np.dtype(dtype).newbyteorder("<")).tobytes())
@@ -105,7 +107,9 @@ def decode_block(data: bytes) -> Block:
         raise DataError("a block whose checksum is wrong")
     try:
         head = json.loads(bytes(body[:head_size]))
-        sequence, rows = _count(head["sequence"]), _count(head["rows"])
+        capture, sequence, rows = head["capture"], _count(head["sequence"]), _count(head["rows"])
+        if not isinstance(capture, str) or (capture and not _CAPTURE.fullmatch(capture)):
+            raise TypeError(f"a capture named {capture!r:.60}")
         layout = StreamLayout.from_json(json.dumps(head["layout"]))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(f"a block with an invalid head: {_short(error)}") from error
@@ -123,7 +127,7 @@ def decode_block(data: bytes) -> Block:
         values = np.frombuffer(data, dtype, shape[0] * shape[1], at)
         raw[field.name] = values.reshape(shape).astype(dtype.newbyteorder("="))
         at += values.nbytes
-    return Block(layout, sequence, sync, t_ns, raw)
+    return Block(layout, sequence, sync, t_ns, raw, capture)
 
 
 def encode_event(kind: str, content: Mapping[str, Any]) -> bytes:
@@ -276,6 +280,8 @@ def assemble(start: Mapping[str, Any], blocks: Iterable[Block], end: Mapping[str
     ordered = [by_number[k] for k in sorted(by_number)]
     known = {layout.name: layout for layout in layouts}
     for block in ordered:
+        if block.capture != start["capture"]:
+            raise DataError(f"a block of capture {block.capture or 'none'!r:.60}, not of {start['capture']}")
         if known.get(block.layout.name) != block.layout:
             raise DataError(f"a block of stream {block.layout.name!r} does not have the layout of the start event")
     lost = total - len(by_number)

@@ -11,6 +11,10 @@ from armident.configs import ConfigError, SessionConfig
 
 Role = Literal["capture", "worker", "observer"]
 
+ANY_PORT = "tcp/127.0.0.1:0"
+"""Endpoint that listens on a free loopback port."""
+LARGEST_MESSAGE = 32 << 20
+"""Largest message that a session accepts, bytes; Zenoh drops larger ones (its own limit is 1 GiB)."""
 _FIRST_PORT = 17_000
 _CELLS = 5_000
 
@@ -24,7 +28,7 @@ def endpoints(session: SessionConfig) -> dict[Role, str]:
     return {"capture": f"tcp/127.0.0.1:{port}", "worker": f"tcp/127.0.0.1:{port + 1}"}
 
 
-def configuration(session: SessionConfig, role: Role) -> zenoh.Config:
+def configuration(session: SessionConfig, role: Role, *, any_port: bool = False) -> zenoh.Config:
     """Return the Zenoh configuration of a role: the session's file, or peers on the loopback interface.
 
     Parameters
@@ -33,6 +37,8 @@ def configuration(session: SessionConfig, role: Role) -> zenoh.Config:
         Configuration of the cell.
     role
         ``capture`` or ``worker`` (listen), or ``observer``.
+    any_port
+        Listen on a free loopback port in place of that of the role, which other peers learn from those they know.
 
     Raises
     ------
@@ -45,26 +51,28 @@ def configuration(session: SessionConfig, role: Role) -> zenoh.Config:
     else:
         config = zenoh.Config()
         own = endpoints(session)
+        listen = [own[role]] if role in own else []
         defaults = {
             "mode": "peer",
             "scouting/multicast/enabled": False,
             "timestamping/enabled": True,
-            "listen/endpoints": [own[role]] if role in own else [],
-            "connect/endpoints": [place for name, place in own.items() if name != role],
+            "listen/endpoints": [ANY_PORT] if any_port else listen,
+            "connect/endpoints": [place for name, place in own.items() if name != role or any_port],
             "connect/timeout_ms": -1,
             "connect/exit_on_failure": False,
+            "transport/link/rx/max_message_size": LARGEST_MESSAGE,
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
         }
         for key, value in defaults.items():
             config.insert_json5(key, json.dumps(value))
-    if options.listen and role != "observer":
+    if options.listen and role != "observer" and not any_port:
         config.insert_json5("listen/endpoints", json.dumps(options.listen))
     if options.connect:
         config.insert_json5("connect/endpoints", json.dumps(options.connect))
     return config
 
 
-def open_session(session: SessionConfig, role: Role) -> zenoh.Session:
+def open_session(session: SessionConfig, role: Role, *, any_port: bool = False) -> zenoh.Session:
     """Open a Zenoh session; capture and worker may start in any order and restart.
 
     Parameters
@@ -73,13 +81,15 @@ def open_session(session: SessionConfig, role: Role) -> zenoh.Session:
         Configuration of the cell.
     role
         ``capture`` and ``worker`` listen, one each per cell; an ``observer`` only connects to both.
+    any_port
+        Listen on a free loopback port in place of that of the role: for a second worker.
 
     Raises
     ------
     ConfigError
         If Zenoh refuses the configuration or cannot listen (another process of that role runs).
     """
-    config = configuration(session, role)
+    config = configuration(session, role, any_port=any_port)
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

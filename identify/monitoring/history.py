@@ -14,62 +14,21 @@ from armident.configs import ConfigError
 from armident.daq.recording import Recording
 from armident.identify.document import IdentificationDocument, from_json, to_json
 from armident.identify.monitoring.change_test import ParameterChangeTest
+from armident.identify.monitoring.history_schema import (
+    comparisons,
+    engine_for,
+    parameters,
+    reason,
+    recordings,
+    repeated,
+    runs,
+    upgrade,
+    writing,
+)
 
 DEFAULT = "sqlite:///history.sqlite"
 """SQLAlchemy URL of the default database."""
 _STAMP = re.compile(r"(\d{8}T\d{6})-\d{3}Z")
-
-_tables = sa.MetaData()
-_runs = sa.Table(
-    "identifications",
-    _tables,
-    sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("digest", sa.String(64), unique=True, nullable=False),
-    sa.Column("robot", sa.String(128), index=True, nullable=False),
-    sa.Column("recorded", sa.DateTime, index=True, nullable=False),
-    sa.Column("recording", sa.Text),
-    sa.Column("sha256", sa.String(64), nullable=False),
-    sa.Column("samples", sa.Integer, nullable=False),
-    sa.Column("sample_rate_hz", sa.Float, nullable=False),
-    sa.Column("method", sa.String(32), nullable=False),
-    sa.Column("relative_error_pct", sa.Float, nullable=False),
-    sa.Column("converged", sa.Boolean, nullable=False),
-    sa.Column("document", sa.Text, nullable=False),
-)
-_parameters = sa.Table(
-    "parameters",
-    _tables,
-    sa.Column("identification", sa.ForeignKey(_runs.c.id), primary_key=True),
-    sa.Column("name", sa.String(64), primary_key=True),
-    sa.Column("value", sa.Float, nullable=False),
-    sa.Column("std", sa.Float, nullable=False),
-    sa.Column("unit", sa.String(32), nullable=False),
-    sa.Column("essential", sa.Boolean, nullable=False),
-)
-_recordings = sa.Table(
-    "recordings",
-    _tables,
-    sa.Column("sha256", sa.String(64), primary_key=True),
-    sa.Column("path", sa.Text),
-    sa.Column("cell", sa.String(128), index=True),
-    sa.Column("duration_s", sa.Float, nullable=False),
-    sa.Column("in_gaps", sa.Integer),
-    sa.Column("facts", sa.JSON, nullable=False),
-    sa.Column("counters", sa.JSON, nullable=False),
-)
-_comparisons = sa.Table(
-    "comparisons",
-    _tables,
-    sa.Column("identification", sa.ForeignKey(_runs.c.id), primary_key=True),
-    sa.Column("baseline", sa.String(64), primary_key=True),
-    sa.Column("drifted", sa.Boolean, nullable=False),
-    sa.Column("chi_square", sa.Float, nullable=False),
-    sa.Column("degrees", sa.Integer, nullable=False),
-    sa.Column("p_joint", sa.Float, nullable=False),
-    sa.Column("false_alarms", sa.Float, nullable=False),
-    sa.Column("changed", sa.JSON, nullable=False),
-    sa.Column("words", sa.Text, nullable=False),
-)
 
 
 @dataclass(frozen=True)
@@ -82,7 +41,7 @@ class Run:
 
 
 class History:
-    """Identifications in a database; missing tables are created.
+    """Identifications in a database; missing tables are created, and those of a former version upgraded.
 
     Parameters
     ----------
@@ -92,17 +51,18 @@ class History:
     Raises
     ------
     ConfigError
-        If there is no such database, or its driver is not installed.
+        If there is no such database, its driver is not installed, or it is locked, damaged or of a newer version.
     """
 
     def __init__(self, url: str = DEFAULT) -> None:
+        self.url = _shown(url)
         try:
-            self._engine = sa.create_engine(_driven(url))
-            _tables.create_all(self._engine)
-        except (sa.exc.SQLAlchemyError, ImportError, OSError) as error:
+            self._engine = engine_for(_driven(url))
+            upgrade(self._engine)
+        except (sa.exc.SQLAlchemyError, ImportError, OSError, ConfigError) as error:
             missing = getattr(error, "name", None) == "psycopg"
             hint = "; install it with: pip install 'armident[postgresql]'" if missing else ""
-            raise ConfigError(f"{_shown(url)}: cannot be used as history: {_one_line(error)}{hint}") from error
+            raise ConfigError(f"{self.url}: cannot be used as history: {reason(error)}{hint}") from error
 
     def add(self, document: IdentificationDocument, recorded: datetime.datetime) -> bool:
         """Add an identification.
@@ -117,7 +77,7 @@ class History:
         Returns
         -------
         bool
-            False if the history already has it.
+            False if the history has an identification of this recording already, which stays.
 
         Raises
         ------
@@ -141,8 +101,8 @@ class History:
             "document": text,
         }
         try:
-            with self._engine.begin() as connection:
-                done = connection.execute(sa.insert(_runs).values(row))
+            with writing(self._engine) as connection:
+                done = connection.execute(sa.insert(runs).values(row))
                 (number,) = done.inserted_primary_key or (None,)
                 rows = [
                     {
@@ -155,11 +115,11 @@ class History:
                     }
                     for p in document.parameters
                 ]
-                connection.execute(sa.insert(_parameters), rows)
+                connection.execute(sa.insert(parameters), rows)
         except sa.exc.IntegrityError:
             return False
         except sa.exc.SQLAlchemyError as error:
-            raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
+            raise ConfigError(f"{self.url}: the history cannot be written: {reason(error)}") from error
         return True
 
     @staticmethod
@@ -191,7 +151,7 @@ class History:
 
     def describe(self, facts: Mapping[str, Any]) -> None:
         """Add the metadata of a recording unless the history has them already."""
-        self._insert_once(_recordings, facts)
+        self._insert_once(recordings, facts)
 
     def judge(
         self, document: IdentificationDocument, baseline: IdentificationDocument, drift: ParameterChangeTest
@@ -201,13 +161,14 @@ class History:
         Parameters
         ----------
         document
-            Identification, added before.
+            Identification of a recording that was added before.
         baseline
             Identification that it was compared with.
         drift
             Result of the test.
         """
-        number = sa.select(_runs.c.id).where(_runs.c.digest == _digest(document)).scalar_subquery()
+        same = (runs.c.robot == document.robot) & (runs.c.sha256 == document.recording.sha256) & (repeated == 0)
+        number = sa.select(runs.c.id).where(same).scalar_subquery()
         row = {
             "identification": number,
             "baseline": _digest(baseline),
@@ -219,16 +180,16 @@ class History:
             "changed": list(drift.changed),
             "words": drift.words,
         }
-        self._insert_once(_comparisons, row)
+        self._insert_once(comparisons, row)
 
     def _insert_once(self, table: sa.Table, row: Mapping[str, Any]) -> None:
         try:
-            with self._engine.begin() as connection:
+            with writing(self._engine) as connection:
                 connection.execute(sa.insert(table).values(row))
         except sa.exc.IntegrityError:
             return
         except sa.exc.SQLAlchemyError as error:
-            raise ConfigError(f"history: cannot be written: {_one_line(error)}") from error
+            raise ConfigError(f"{self.url}: the history cannot be written: {reason(error)}") from error
 
     def first(self, robot: str, cell: str | None = None) -> Run | None:
         """Return the oldest converged identification of an arm, or ``None``.
@@ -240,7 +201,7 @@ class History:
         cell
             Cell of the robot; ``None``: all. Runs whose cell the history does not know are included.
         """
-        found = self._read(_of(robot, cell).where(_runs.c.converged).limit(1))
+        found = self._read(_of(robot, cell).where(runs.c.converged).limit(1))
         return found[0] if found else None
 
     def runs(self, robot: str | None = None, cell: str | None = None) -> list[Run]:
@@ -258,40 +219,41 @@ class History:
 
     def arms(self) -> list[tuple[str, str | None]]:
         """Return robots and their cells; ``None`` for an unknown cell."""
-        query = sa.select(_runs.c.robot, _recordings.c.cell).select_from(_WHERE).distinct()
-        with self._engine.connect() as connection:
-            found = [(robot, cell) for robot, cell in connection.execute(query).all()]
+        query = sa.select(runs.c.robot, recordings.c.cell).select_from(_WHERE).distinct()
+        found = [(robot, cell) for robot, cell in self._rows(query)]
         return sorted(found, key=lambda arm: (arm[0], arm[1] or ""))
 
     def cell(self, document: IdentificationDocument) -> str | None:
         """Return the cell of an identification's recording, ``None`` if the history does not know it."""
-        query = sa.select(_recordings.c.cell).where(_recordings.c.sha256 == document.recording.sha256)
-        with self._engine.connect() as connection:
-            return connection.execute(query).scalar_one_or_none()
+        query = sa.select(recordings.c.cell).where(recordings.c.sha256 == document.recording.sha256)
+        found = self._rows(query)
+        return found[0][0] if found else None
 
-    def _read(self, query: sa.Select[Any]) -> list[Run]:
+    def _rows(self, query: sa.Select[Any]) -> list[Any]:
         try:
             with self._engine.connect() as connection:
-                rows = connection.execute(query).all()
+                return list(connection.execute(query).all())
         except sa.exc.SQLAlchemyError as error:
-            raise ConfigError(f"history: cannot be read: {_one_line(error)}") from error
+            raise ConfigError(f"{self.url}: the history cannot be read: {reason(error)}") from error
+
+    def _read(self, query: sa.Select[Any]) -> list[Run]:
         return [
             Run(number, recorded.replace(tzinfo=datetime.UTC), from_json(text, IdentificationDocument, f"run {number}"))
-            for number, recorded, text in rows
+            for number, recorded, text in self._rows(query)
         ]
 
 
-_WHERE = _runs.outerjoin(_recordings, _runs.c.sha256 == _recordings.c.sha256)
+_WHERE = runs.outerjoin(recordings, runs.c.sha256 == recordings.c.sha256)
 
 
 def _of(robot: str | None, cell: str | None) -> sa.Select[Any]:
     """Return the query of the runs of an arm in the order of their recordings."""
-    query = sa.select(_runs.c.id, _runs.c.recorded, _runs.c.document).select_from(_WHERE)
+    query = sa.select(runs.c.id, runs.c.recorded, runs.c.document).select_from(_WHERE).where(repeated == 0)
     if robot is not None:
-        query = query.where(_runs.c.robot == robot)
+        query = query.where(runs.c.robot == robot)
     if cell is not None:
-        query = query.where(sa.or_(_recordings.c.cell == cell, _recordings.c.cell.is_(None)))
-    return query.order_by(_runs.c.recorded, _runs.c.id)
+        query = query.where(sa.or_(recordings.c.cell == cell, recordings.c.cell.is_(None)))
+    return query.order_by(runs.c.recorded, runs.c.id)
 
 
 def _digest(document: IdentificationDocument) -> str:
@@ -322,7 +284,3 @@ def _driven(url: str) -> str:
 def _shown(url: str) -> str:
     """Return the URL with its password masked."""
     return re.sub(r"(://[^:/@]*):[^@]*@", r"\1:***@", url)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]

@@ -1,109 +1,56 @@
-"""Identification worker: identifies every experiment from the samples and events on Zenoh, publishes the result."""
+"""Identification worker: identifies every recording of a cell once, and announces the results on Zenoh."""
 
-import json
 import logging
-import math
 import queue
 import signal
 import threading
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any
-
-import zenoh
-import zenoh.ext
+from typing import TypeVar
 
 from armident.configs import ArmidentError, DataError, RobotConfig, SessionConfig, load_robot, load_session
-from armident.configs.yaml_loader import is_file
-from armident.daq.recording import Recording, join_parts, read_recording
-from armident.daq.streaming import Block, Keys, assemble, decode_block, decode_event, open_session
-from armident.identify.document import to_json
+from armident.daq.recording import Recording
+from armident.daq.streaming import Keys
 from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
+from armident.identify.monitoring.ledger import FILE, MOST_ATTEMPTS, Entry, Ledger, LedgerError, State, unique_owner
+from armident.identify.monitoring.recorded import (
+    Captured,
+    captured_as,
+    captured_in,
+    is_of,
+    result_of,
+)
+from armident.identify.monitoring.stream_buffer import LARGEST_BLOCK, LARGEST_EVENT, Assembly, StreamBuffer
+from armident.identify.monitoring.worker_link import LinkDown, WorkerLink
 from armident.identify.report.files import write_identification
 
 log = logging.getLogger(__name__)
 
-MAX_WAITING_S = 10.0
-"""Longest wait for missing blocks after the end event of an experiment, s."""
-MOST_BYTES = 1 << 30
-"""Largest size of the samples in memory: an hour of six axes at 5 kHz. A longer capture is read from its file."""
-HISTORY_BLOCKS = 100_000
-"""Number of blocks that a worker requests from the capture's cache when it starts: all of it."""
+POLL_S = 1.0
+"""Interval at which the ledger is looked at, and at which leases are renewed, s."""
+SCAN_S = 5.0
+"""Interval at which folders are searched for recordings whose capture announced no end, s."""
+RETRY_S, LONGEST_RETRY_S = 1.0, 30.0
+"""First and longest wait before a write is tried again, s."""
+MOST_STREAMS = 8
+"""Largest number of streams without a file that wait in memory."""
+
+T = TypeVar("T")
 
 
-@dataclass
-class Assembly:
-    """Events and blocks of one capture, in any order of arrival.
-
-    Parameters
-    ----------
-    capture
-        Name of the capture.
-    start, end
-        Start and end event, when received.
-    most_bytes
-        Largest size of the samples in memory, bytes. No block is kept above it: captures may last months, and a sender
-        may be malicious.
-    """
-
-    capture: str
-    start: Mapping[str, Any] | None = None
-    end: Mapping[str, Any] | None = None
-    most_bytes: int = MOST_BYTES
-    blocks: dict[int, Block] = field(default_factory=dict)
-    last_ns: int = -1
-    too_long: bool = False
-    _bytes: int = 0
-
-    def add(self, block: Block) -> None:
-        """Store a block, unless the memory limit is exceeded."""
-        self.last_ns = max(self.last_ns, int(block.t_ns[-1])) if block.t_ns.size else self.last_ns
-        if self.too_long or block.sequence in self.blocks:
-            return
-        self.blocks[block.sequence] = block
-        self._bytes += block.nbytes
-        if self._bytes > self.most_bytes:
-            self.too_long = True
-            self.blocks.clear()
-
-    @property
-    def complete(self) -> bool:
-        """True if both events and all blocks have arrived, or the samples will be read from the file."""
-        if self.start is None or self.end is None:
-            return False
-        return self.too_long or len(self.blocks) >= int(self.end["blocks"])
-
-    def recording(self) -> Recording:
-        """Return the recording from the stream, or from its file if blocks are missing.
-
-        Raises
-        ------
-        DataError
-            If blocks are missing and the file cannot be read.
-        """
-        if self.start is None or self.end is None:
-            raise DataError(
-                f"capture {self.capture}: its {'start' if self.start is None else 'end'} event was not received"
-            )
-        missing: str | None = "the capture exceeds the memory limit"
-        if not self.too_long:
-            recording = assemble(self.start, self.blocks.values(), self.end)
-            missing = recording.missing
-            if missing is None:
-                return recording
-        paths = [Path(path) for path in self.end["paths"]]
-        absent = [str(path) for path in paths if not is_file(path)]
-        if absent or not paths:
-            where = f"its file {absent[0]} is not here" if absent else "it was not written to a file"
-            raise DataError(f"capture {self.capture}: {missing}, and {where}")
-        return join_parts([read_recording(path) for path in paths])
+class _Closing(Exception):
+    """The worker is being closed while it waits."""
 
 
 class Worker:
-    """Subscribes to one robot of one cell and identifies every experiment in a separate thread.
+    """Identifies every recording of one robot in one cell.
+
+    It finds recordings by the events on Zenoh and in the folders of the cell. A ledger in the folder of the results
+    says which have a result: a worker that was absent or killed continues there, and several workers share the work.
 
     Parameters
     ----------
@@ -112,175 +59,334 @@ class Worker:
     robot
         Configuration of its robot.
     out
-        Folder of the results; each capture has a subfolder.
+        Folder of the results; each recording has a subfolder. The ledger is there.
+
+    Raises
+    ------
+    ConfigError
+        If Zenoh's configuration is wrong.
     """
 
     def __init__(self, session: SessionConfig, robot: RobotConfig, out: Path) -> None:
-        self._robot = robot
-        self._out = out
+        self._robot, self._cell, self._out = robot, session.cell, out
+        self._folders = (session.recording.directory, out)
         self._options = Options(**session.identification.model_dump())
         self._keys = Keys(session.cell, robot.name)
-        self._ready: queue.Queue[Assembly | None] = queue.Queue()
-        self._results: queue.Queue[int] = queue.Queue()
-        self._current: Assembly | None = None
-        self._early = Assembly("", most_bytes=MOST_BYTES)
-        self._refused = 0
-        self._finished_ns = -1
-        self._done: set[str] = set()
-        self._timer: threading.Timer | None = None
+        self._owner = unique_owner()
+        self._results: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._buffer = StreamBuffer()
         self._lock = threading.Lock()
+        self._known: dict[Path, str] = {}
+        self._streams: dict[str, Recording] = {}
         self._last: bytes | None = None
-        self._session = open_session(session, "worker")
-        self._thread = threading.Thread(target=self._identify_all, name="identify", daemon=True)
+        self._problem: str | None = None
+        self._wake, self._closing = threading.Event(), threading.Event()
+        self._ledger: Ledger | None = None
+        limits = LARGEST_EVENT, LARGEST_BLOCK
+        self._link = WorkerLink(session, self._keys, self._on_event, self._on_block, limits, lambda: self._last)
+        self._threads = [
+            threading.Thread(target=self._identify_all, name="identify", daemon=True),
+            threading.Thread(target=self._keep_alive, name="lease", daemon=True),
+        ]
 
     def __enter__(self) -> "Worker":
-        """Subscribe, answer queries, and declare the liveliness token."""
-        self._thread.start()
-        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=HISTORY_BLOCKS)
-        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
-        self._subscribers = [
-            zenoh.ext.declare_advanced_subscriber(
-                self._session, key, handler, history=history, recovery=recovery, subscriber_detection=True
-            )
-            for key, handler in ((self._keys.samples, self._on_block), (self._keys.events, self._on_event))
-        ]
-        self._queryable = self._session.declare_queryable(self._keys.identification, self._on_query)
-        self._token = self._session.liveliness().declare_token(self._keys.alive("worker"))
-        self._status("waiting")
+        """Subscribe, answer queries, declare the liveliness token, and begin to work."""
+        self._link.check()
+        self._link.status("waiting")
+        for thread in self._threads:
+            thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the session; a running identification is abandoned."""
-        if self._timer is not None:
-            self._timer.cancel()
-        self._ready.put(None)
-        self._token.undeclare()
-        self._session.close()
+        """Close the session; a running identification is abandoned, and free for other workers."""
+        self._closing.set()
+        self._wake.set()
+        self._threads[1].join()
+        self._threads[0].join(POLL_S)
+        self._link.close()
+        if self._ledger is not None:
+            try:
+                self._ledger.release()
+            except ArmidentError as error:
+                log.warning("%s", error)
 
     def result(self, timeout: float | None = None) -> int | None:
-        """Wait for the exit code of the next experiment; ``None`` after ``timeout``, s."""
+        """Wait for the exit code of the next recording; ``None`` after ``timeout``, s."""
         try:
             return self._results.get(timeout=timeout)
         except queue.Empty:
             return None
 
-    def _on_event(self, sample: zenoh.Sample) -> None:
-        try:
-            event = decode_event(bytes(sample.payload))
-        except DataError as error:
-            self._refuse(error)
-            return
-        if event["kind"] not in ("experiment_start", "experiment_end"):
-            return
-        capture = str(event.get("capture"))
+    def _on_event(self, data: bytes | None, size: int) -> None:
         with self._lock:
-            if capture in self._done:
-                return
-            if self._current is None or self._current.capture != capture:
-                self._current = Assembly(capture, most_bytes=MOST_BYTES)
-            if event["kind"] == "experiment_start":
-                self._current.start = event
-                self._status("recording", capture=capture)
-            else:
-                self._current.end = event
-                self._timer = threading.Timer(MAX_WAITING_S, self._hand_over, [capture])
-                self._timer.daemon = True
-                self._timer.start()
-            self._hand_over_if_complete()
-
-    def _on_block(self, sample: zenoh.Sample) -> None:
-        try:
-            block = decode_block(bytes(sample.payload))
-        except DataError as error:
-            self._refuse(error)
+            event = self._buffer.take_event(data, size)
+        if event is None:
             return
+        if event["kind"] == "experiment_start":
+            self._link.status("recording", capture=event["capture"])
+        self._wake.set()
+
+    def _on_block(self, data: bytes | None, size: int) -> None:
         with self._lock:
-            if block.t_ns.size and int(block.t_ns[-1]) <= self._finished_ns:
-                return
-            (self._early if self._current is None else self._current).add(block)
-            self._hand_over_if_complete()
+            self._buffer.take_block(data, size)
 
-    def _refuse(self, error: DataError) -> None:
-        """Report an invalid message: the first one, the tenth, the hundredth, and so on."""
-        self._refused += 1
-        if math.log10(self._refused).is_integer():
-            times = f" ({self._refused} times)" if self._refused > 1 else ""
-            log.warning("%s%s", error, times)
-
-    def _hand_over_if_complete(self) -> None:
-        current = self._current
-        if current is None:
-            return
-        for block in self._early.blocks.values():
-            current.add(block)
-        self._early = Assembly("", most_bytes=MOST_BYTES)
-        if current.complete:
-            self._finish(current)
-
-    def _hand_over(self, capture: str) -> None:
-        with self._lock:
-            if self._current is not None and self._current.capture == capture:
-                self._finish(self._current)
-
-    def _finish(self, assembly: Assembly) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        self._done.add(assembly.capture)
-        # Blocks carry times, not names: a late one must not count for the next capture.
-        self._finished_ns = assembly.last_ns
-        self._current = None
-        self._ready.put(assembly)
-
-    def _on_query(self, query: zenoh.Query) -> None:
-        if self._last is None:
-            query.reply_err(b"no identification yet")
-        else:
-            query.reply(self._keys.identification, self._last)
+    def _keep_alive(self) -> None:
+        """Renew the leases, and keep the Zenoh session open; in a thread of its own."""
+        while not self._closing.wait(POLL_S):
+            try:
+                if self._ledger is not None:
+                    self._ledger.renew()
+            except ArmidentError as error:
+                log.debug("lease not renewed: %s", error)
+            self._link.check()
 
     def _identify_all(self) -> None:
-        while (assembly := self._ready.get()) is not None:
-            code = 1
+        scanned = -SCAN_S
+        while not self._closing.is_set():
+            self._wake.clear()
             try:
-                code = self._identify(assembly)
-            except ArmidentError as error:
-                code = error.exit_code
-                log.error("%s", error)
-                self._status("failed", capture=assembly.capture, message=str(error))
+                ledger = self._opened()
+                with self._lock:
+                    ended = self._buffer.take_ended()
+                for assembly in ended:
+                    self._take_stream(ledger, assembly)
+                if time.monotonic() - scanned >= SCAN_S:
+                    self._add_files(ledger, captured_in(self._folders, self._robot.name))
+                    scanned = time.monotonic()
+                entry = ledger.claim(held=tuple(self._streams), announce=self._link.is_open)
+                self._problem = None
+                if entry is not None:
+                    self._process(ledger, entry)
+                    continue
+            except _Closing:
+                return
+            except (ArmidentError, OSError) as error:
+                self._say_problem(str(error) if isinstance(error, ArmidentError) else _reason(error))
             except Exception as error:
-                # The worker must survive any failure of one experiment.
-                log.error("%s: %s", type(error).__name__, error)
-                self._status("failed", capture=assembly.capture, message=f"{type(error).__name__}: {error}")
+                # The worker must survive any failure of one recording.
+                self._say_problem(f"internal error ({type(error).__name__})")
+                log.debug("internal error", exc_info=True)
+            self._wake.wait(POLL_S)
+
+    def _opened(self) -> Ledger:
+        if self._ledger is None:
+            self._ledger = Ledger(self._out / FILE, self._owner)
+            last = self._ledger.last_result()
+            if last is not None and last.is_file():
+                self._last = last.read_bytes()
+        return self._ledger
+
+    def _say_problem(self, text: str) -> None:
+        """Report a problem once while it lasts; the work is tried again."""
+        if text != self._problem:
+            self._problem = text
+            log.warning("%s; trying again", text)
+            self._link.status("waiting", message=text)
+
+    def _take_stream(self, ledger: Ledger, assembly: Assembly) -> None:
+        """Enter the files of a capture that has ended; without them the stream itself."""
+        found = captured_as(assembly.files)
+        if any(not captured.finished for captured in found):
+            with self._lock:
+                self._buffer.keep(assembly)
+                self._buffer.refuse("early", f"capture {assembly.capture}: its file is being written, its end is not")
+            return
+        try:
+            streamed = None
+            if not found or (assembly.complete and not assembly.too_long and not assembly.triggered):
+                streamed = assembly.recording()
+        except DataError as error:
+            if not found:
+                self._refuse_stream(assembly, error)
+                return
+            log.warning("%s", error)
+        if found:
+            self._add_files(ledger, found, None if streamed is None else streamed.sha256, announced=True)
+        elif streamed is not None:
+            digest = streamed.sha256
+            self._streams[digest] = streamed
+            while len(self._streams) > MOST_STREAMS:
+                lost = next(iter(self._streams))
+                del self._streams[lost]
+                log.warning("more than %d captures without a file wait; one is given up", MOST_STREAMS)
+            name = assembly.capture if streamed.path is None else streamed.path.name.removesuffix(".mcap")
+            ledger.add(digest, name, ())
+
+    def _refuse_stream(self, assembly: Assembly, error: DataError) -> None:
+        paths = [str(path) for path in (assembly.end or {}).get("paths", ())]
+        where = f"its file {paths[0]} is not here" if paths else "it was not written to a file"
+        message = f"{error}, and {where}"
+        log.error("%s", message)
+        self._link.status("failed", capture=assembly.capture, message=message)
+        self._results.put(error.exit_code)
+
+    def _add_files(
+        self, ledger: Ledger, found: Sequence[Captured], streamed: str | None = None, *, announced: bool = False
+    ) -> None:
+        """Enter finished recordings of this cell that the ledger does not know.
+
+        ``streamed`` is the hash of the stream of these files. ``announced`` is true for files that were announced on
+        the keys of this cell.
+        """
+        for captured in found:
+            try:
+                stamp = captured.stamp
+            except OSError:
+                continue
+            first = captured.paths[0]
+            if (self._known.get(first) == stamp and not announced) or not captured.finished:
+                continue
+            known = ledger.file_hash(first, stamp)
+            if announced and known == (None,):
+                known = None
+            digest = known[0] if known else self._read_and_enter(ledger, captured, announced)
+            self._known[first] = stamp
+            if known is None:
+                ledger.enter_file(first, stamp, digest)
+            if streamed is not None and digest is not None and streamed != digest:
+                log.warning("%s: the stream has other samples than the file, which counts", first)
+
+    def _read_and_enter(self, ledger: Ledger, captured: Captured, announced: bool) -> str | None:
+        """Return the hash of a recording after entering it; ``None`` if it is not one of this cell."""
+        try:
+            recording = captured.read()
+            if not is_of(recording, None if announced else self._cell, self._robot.name):
+                return None
+        except ArmidentError as error:
+            log.warning("%s", error)
+            return None
+        digest = recording.sha256
+        found = result_of(digest, self._folder(captured.name))
+        if found is not None and ledger.entry(digest) is None:
+            ledger.adopt(digest, captured.name, captured.paths, found[0], found[1].verdict or "")
+        elif ledger.add(digest, captured.name, captured.paths):
+            log.debug("found %s", captured.name)
+        return digest
+
+    def _folder(self, name: str) -> Path:
+        return self._out / f"{name}.identification"
+
+    def _folder_of(self, entry: Entry) -> Path:
+        """Return the folder of a result; another one if a recording of the same name has a result there."""
+        plain = self._folder(entry.name)
+        taken = (plain / "identification.json").is_file() and result_of(entry.sha256, plain) is None
+        return self._folder(f"{entry.name}.{entry.sha256[:8]}") if taken else plain
+
+    def _process(self, ledger: Ledger, entry: Entry) -> None:
+        """Identify a recording, enter and announce the result; what was done before is not repeated."""
+        code = _exit_code(entry.state, entry.message)
+        if entry.state == "waiting":
+            try:
+                if entry.attempts > MOST_ATTEMPTS:
+                    raise DataError(f"{entry.name}: {MOST_ATTEMPTS} workers have ended while they identified it")
+                path, verdict = self._identify(entry)
+            except _Closing:
+                raise
+            except ArmidentError as error:
+                self._fail(ledger, entry, str(error))
+                code = error.exit_code
+            except Exception as error:
+                self._fail(ledger, entry, f"{entry.name}: internal error ({type(error).__name__})")
+                log.debug("internal error", exc_info=True)
+                code = 1
+            else:
+                if not self._enter(ledger, entry, "done", path, verdict):
+                    return
+                code = _exit_code("done", verdict)
+        self._streams.pop(entry.sha256, None)
+        # Without Zenoh the other recordings come first; the next claim is for the announcement.
+        with suppress(LinkDown):
+            self._until_possible("announcement", lambda: self._announce(ledger, entry.sha256))
             self._results.put(code)
 
-    def _identify(self, assembly: Assembly) -> int:
-        recording = assembly.recording()
-        source = "stream" if assembly.complete and not assembly.too_long else "file"
+    def _fail(self, ledger: Ledger, entry: Entry, message: str) -> None:
+        log.error("%s", message)
+        self._enter(ledger, entry, "failed", None, message)
+
+    def _enter(self, ledger: Ledger, entry: Entry, state: State, path: Path | None, message: str) -> bool:
+        mine = self._until_possible("ledger", lambda: ledger.finish(entry.sha256, state, path, message))
+        if not mine:
+            log.warning("%s: another worker took over after this one was held up; its result counts", entry.name)
+        return mine
+
+    def _identify(self, entry: Entry) -> tuple[Path, str]:
+        """Return the file of the result and its verdict; a result that a killed worker has written is used."""
+        folder = self._folder_of(entry)
+        found = result_of(entry.sha256, folder)
+        if found is not None:
+            return found[0], found[1].verdict or ""
+        recording = Captured(entry.name, entry.paths).read() if entry.paths else self._streams[entry.sha256]
+        source = "file" if entry.paths else "stream"
         print(f"worker: {recording.samples.sync.size} samples from the {source}, identifying", flush=True)
 
         def progress(stage: str, share: float) -> None:
-            self._status("identifying", capture=assembly.capture, stage=stage, share=share)
+            self._link.status("identifying", capture=entry.name, stage=stage, share=share)
 
         outcome = identify_recording(recording, self._robot, self._options, progress)
-        self._last = to_json(outcome.document).encode()
-        self._session.put(self._keys.identification, self._last)
-        name = assembly.capture if recording.path is None else recording.path.name.removesuffix(".mcap")
-        document, report = write_identification(outcome, self._out / f"{name}.identification")
-        level = outcome.result.verdict.level
-        self._status("done", capture=assembly.capture, result=str(document), verdict=level)
+        document, report = self._until_possible("result", lambda: write_identification(outcome, folder))
         for reason in outcome.result.verdict.reasons:
             log.warning("%s: %s. Next: %s", reason.level, reason.message, reason.next_step)
         for warning in outcome.document.warnings:
             log.warning("%s", warning)
+        level = outcome.result.verdict.level
         print(
             f"worker: {level}, relative torque error {outcome.document.relative_error_pct:.2f} %\n"
             f"result: {document}\nreport: {report}",
             flush=True,
         )
-        return DataError.exit_code if level == "unusable" else 0
+        return document, level
 
-    def _status(self, state: str, **more: Any) -> None:
-        self._session.put(self._keys.status, json.dumps({"component": "worker", "state": state, **more}).encode())
+    def _announce(self, ledger: Ledger, sha256: str) -> None:
+        """Publish the result or the failure; the entry in the ledger and the messages are one transaction."""
+        entry = ledger.entry(sha256)
+        if entry is None or entry.announced or entry.state == "waiting":
+            return
+        text, message = None, entry.message
+        if entry.result is not None:
+            try:
+                text = entry.result.read_bytes()
+            except FileNotFoundError:
+                message = f"{entry.result}: the result was removed before it was announced"
+        about = {"capture": entry.name, "sha256": sha256}
+        if not self._link.is_open:
+            raise LinkDown("zenoh: no session")
+        with ledger.announcement(sha256) as mine:
+            if mine and text is not None:
+                self._link.announce(self._keys.identification, text)
+                self._link.status("done", result=str(entry.result), verdict=entry.message, **about)
+            elif mine:
+                self._link.status("failed", message=message, **about)
+        if mine and text is not None:
+            self._last = text
+
+    def _until_possible(self, what: str, action: Callable[[], T]) -> T:
+        """Return the result of an action that is tried again while disk, ledger or Zenoh refuse it."""
+        wait, said = RETRY_S, ""
+        while True:
+            try:
+                done = action()
+            except (OSError, LedgerError) as error:
+                reason = _reason(error) if isinstance(error, OSError) else str(error)
+            else:
+                if said:
+                    log.info("%s: done after all", what)
+                return done
+            if reason != said:
+                log.warning("%s: %s; trying again", what, reason)
+                self._link.status("waiting", message=f"{what}: {reason}")
+            said = reason
+            if self._closing.wait(wait):
+                raise _Closing
+            wait = min(2 * wait, LONGEST_RETRY_S)
+
+
+def _exit_code(state: State, message: str | None) -> int:
+    return DataError.exit_code if state == "failed" or message == "unusable" else 0
+
+
+def _reason(error: OSError) -> str:
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or type(error).__name__}"
 
 
 def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
@@ -291,7 +397,7 @@ def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
     config
         Session configuration.
     once
-        End after one experiment with its exit code.
+        End after one recording with its exit code.
     out
         Folder of the results; ``None``: the recording directory of the session.
 
@@ -303,7 +409,7 @@ def run_worker(config: Path, *, once: bool, out: Path | None) -> int:
     Raises
     ------
     ConfigError
-        If the configuration is wrong or another worker of this cell runs.
+        If the configuration is wrong.
     """
     session = load_session(config)
     robot = load_robot(session.robot)

@@ -27,8 +27,9 @@ def write_identification(outcome: IdentificationOutcome, out: Path) -> tuple[Pat
     from armident.identify.report.identification import identification_report
 
     document, report = out / "identification.json", out / "report.html"
-    write_atomically(document, to_json(outcome.document))
+    # The document comes last: where there is one, the report is there, too.
     write_atomically(report, identification_report(outcome.recordings, outcome.robot, outcome.result, outcome.document))
+    write_atomically(document, to_json(outcome.document))
     return document, report
 
 

@@ -14,6 +14,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from armident.daq.recording import mcap_records as mcap
+from armident.daq.streaming.codec import VERSION
 
 Mutator = Callable[[random.Random, Sequence[bytes]], bytes]
 """Makes an input of some that are known."""
@@ -143,7 +144,7 @@ def forge_block(rng: random.Random, seeds: Sequence[bytes]) -> bytes:
         head = spoil_text(rng, [head])
     else:
         body = spoil_bytes(rng, [body])
-    return struct.pack("<4sHII", b"ARMB", 1, len(head), zlib.crc32(head + body)) + head + body
+    return struct.pack("<4sHII", b"ARMB", VERSION, len(head), zlib.crc32(head + body)) + head + body
 
 
 def either(*mutators: Mutator) -> Mutator:

@@ -20,7 +20,7 @@ def _blocks() -> list[Block]:
 
 def _same(one: Block, other: Block) -> bool:
     return (
-        (one.layout, one.sequence) == (other.layout, other.sequence)
+        (one.capture, one.layout, one.sequence) == (other.capture, other.layout, other.sequence)
         and np.array_equal(one.sync, other.sync)
         and np.array_equal(one.t_ns, other.t_ns)
         and all(np.array_equal(one.raw[name], values) for name, values in other.raw.items())

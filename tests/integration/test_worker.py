@@ -68,7 +68,7 @@ def blocks_of(recording: Recording) -> Iterator[Block]:
         for first in range(0, stream.sync.size, BLOCK_ROWS):
             rows = slice(first, first + BLOCK_ROWS)
             raw = {name: values[rows] for name, values in stream.raw.items()}
-            yield Block(layout, sequence, stream.sync[rows], stream.t_ns[rows], raw)
+            yield Block(layout, sequence, stream.sync[rows], stream.t_ns[rows], raw, "c1")
             sequence += 1
 
 
@@ -128,9 +128,10 @@ def test_an_unusable_result_is_published_with_its_verdict_and_ends_with_exit_cod
     name = samples.named("voltage")
     assert name is not None
     turned = replace(samples.fields[name], scale=tuple(-scale for scale in samples.fields[name].scale))
-    wrong = replace(samples, fields={**samples.fields, name: turned})
+    wrong = replace(captured, streams={"samples": replace(samples, fields={**samples.fields, name: turned})})
+    write_recording(wrong, tmp_path / "emps-turned.mcap")
     with Worker(session, captured.robot, tmp_path) as worker:
-        publish(replace(captured, streams={**captured.streams, "samples": wrong}), session)
+        publish(wrong, session, path=tmp_path / "emps-turned.mcap")
         assert worker.result(LONGEST_S) == 3
         replies = answers(session, Keys(session.cell, "emps").identification)
     assert replies[0].ok is not None
@@ -146,7 +147,7 @@ def test_a_capture_too_long_for_the_memory_is_read_from_its_file(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("armident.identify.monitoring.worker.MOST_BYTES", 10 * next(blocks_of(captured)).nbytes)
+    monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MOST_BYTES", 10 * next(blocks_of(captured)).nbytes)
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session)
         assert worker.result(LONGEST_S) == 0
@@ -175,7 +176,7 @@ def test_invalid_messages_are_logged_once_and_then_at_powers_of_ten(
 def test_a_block_that_never_comes_is_fetched_from_the_file(
     captured: Recording, session: SessionConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("armident.identify.monitoring.worker.MAX_WAITING_S", 1.0)
+    monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MAX_WAITING_S", 1.0)
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session, leave_out=3)
         assert worker.result(LONGEST_S) == 0
@@ -190,12 +191,12 @@ def test_missing_blocks_without_a_file_end_with_exit_code_3_and_say_how_many(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr("armident.identify.monitoring.worker.MAX_WAITING_S", 1.0)
+    monkeypatch.setattr("armident.identify.monitoring.stream_buffer.MAX_WAITING_S", 1.0)
     with Worker(session, captured.robot, tmp_path) as worker:
         publish(captured, session, leave_out=3, path=tmp_path / "gone.mcap")
         assert worker.result(LONGEST_S) == 3
     assert "1 of " in caplog.text
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.glob("*.identification")) == []
 
 
 def test_payloads_that_are_not_ours_do_no_harm(captured: Recording, session: SessionConfig, tmp_path: Path) -> None:

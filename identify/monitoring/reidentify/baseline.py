@@ -24,7 +24,7 @@ class Baseline:
         return f"first run of {document.robot}: it is now the baseline, saved as {self.file}"
 
 
-def baseline_of(file: Path | None, history: History, robot: str, cell: str) -> Baseline:
+def baseline_of(file: Path | None, history: History | None, robot: str, cell: str) -> Baseline:
     """Return the baseline of the robot in a cell.
 
     Parameters
@@ -32,7 +32,7 @@ def baseline_of(file: Path | None, history: History, robot: str, cell: str) -> B
     file
         Baseline given by the user; ``None``: the first run in the history.
     history
-        Database of identifications.
+        Database of identifications; ``None`` if it cannot be read, with a file that exists.
     robot, cell
         Names of robot and cell.
 
@@ -43,7 +43,7 @@ def baseline_of(file: Path | None, history: History, robot: str, cell: str) -> B
     DataError
         If it is of another robot.
     """
-    first = history.first(robot, cell)
+    first = None if history is None else history.first(robot, cell)
     if file is None:
         if first is None:
             return Baseline(None, "none yet")

@@ -33,6 +33,19 @@ def reidentify(
     workers: Annotated[
         int | None, typer.Option(min=1, help="With --recordings and no scheduler: number of local processes.")
     ] = None,
+    material: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=100.0,
+            metavar="PCT",
+            help="Least change of a joint's torque by a finding of the diagnosis, percent. [default: that of diagnose]",
+        ),
+    ] = None,
+    time_limit: Annotated[
+        float | None,
+        typer.Option(min=0.0, metavar="S", help="End the search of the diagnosis after this time, s."),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print only the result document on stdout.")] = False,
 ) -> None:
     """Move an arm along its exciting trajectory, identify it, and test for a change since its baseline.
@@ -43,7 +56,7 @@ def reidentify(
 
     Example: armident reidentify --config cell.yaml --store sqlite:///history.sqlite
     """
-    asked = ReidentifyOptions(config, baseline, store, out, false_alarms, scheduler, workers)
+    asked = ReidentifyOptions(config, baseline, store, out, false_alarms, scheduler, workers, material, time_limit)
     if recordings is None:
         from armident.identify.monitoring.reidentify.run import reidentify_command
 

@@ -22,6 +22,10 @@ class ReidentifyOptions:
         Probability of a false alarm per run.
     scheduler, workers
         Address of a Dask scheduler, or number of processes on this machine, for recordings.
+    material
+        Least change of a joint's torque by a finding of the diagnosis, percent; ``None``: its default.
+    time_limit_s
+        Time after which the diagnosis ends its search, s; ``None``: none.
     """
 
     config: Path | None
@@ -31,3 +35,5 @@ class ReidentifyOptions:
     false_alarms: float
     scheduler: str | None = None
     workers: int | None = None
+    material: float | None = None
+    time_limit_s: float | None = None

@@ -24,16 +24,15 @@ from armident.identify.document import DiagnosisDocument, IdentificationDocument
 from armident.identify.effects.terms import arm_model
 from armident.identify.excitation.point_to_point import sample_trajectory
 from armident.identify.excitation.previous_estimate import previous_estimate
-from armident.identify.identification.api import identify_recording
 from armident.identify.identification.options import Options
 from armident.identify.monitoring.change_test import Inconclusive, ParameterChangeTest, compare
-from armident.identify.monitoring.history import History
 from armident.identify.monitoring.reidentify.baseline import Baseline, baseline_of
+from armident.identify.monitoring.reidentify.identify_once import identify_once
+from armident.identify.monitoring.reidentify.keep import HistoryEntry, history_or_reason, kept
 from armident.identify.monitoring.reidentify.options import ReidentifyOptions
 from armident.identify.monitoring.reidentify.publish import StatusPublisher
 from armident.identify.monitoring.reidentify.record_run import Say, record_run, start_process
 from armident.identify.monitoring.reidentify.summary import change_lines, finding_lines
-from armident.identify.report.files import write_identification
 from armident.processes import Start
 
 DRIFTED = 4
@@ -52,9 +51,12 @@ class Job:
     session: SessionConfig
     robot: RobotConfig
     baseline: Baseline
-    history: History
+    store: str
     out: Path
     false_alarms: float
+    material: float | None = None
+    time_limit_s: float | None = None
+    warning: str | None = None
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,7 @@ def reidentify_command(asked: ReidentifyOptions, *, as_json: bool) -> int:
     if asked.config is None:
         raise ConfigError("--config: give the session of the cell, or --recordings")
     job = prepare(asked.config, asked.baseline, asked.store, asked.out, asked.false_alarms)
+    job = replace(job, material=asked.material, time_limit_s=asked.time_limit_s)
 
     def say(line: str) -> None:
         print(f"reidentify: {line}", file=sys.stderr, flush=True)
@@ -150,10 +153,11 @@ def prepare(config: Path, baseline: Path | None, store: str, out: Path | None, f
         raise ConfigError(
             f"{config}: recording.trigger: records only events; remove it, the job needs the whole motion"
         )
-    history = History(store)
+    history, warning = history_or_reason(store, needed=baseline is None or not baseline.exists())
     chosen = baseline_of(baseline, history, robot.name, session.cell)
     check_trajectory(session, robot, chosen)
-    return Job(config, session, robot, chosen, history, out or session.recording.directory, false_alarms)
+    folder = out or session.recording.directory
+    return Job(config, session, robot, chosen, store, folder, false_alarms, warning=warning)
 
 
 def check_trajectory(session: SessionConfig, robot: RobotConfig, baseline: Baseline) -> None:
@@ -218,23 +222,22 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
         If the motion was stopped, or the recording cannot be identified or compared.
     """
     say(f"{job.robot.name} in cell {job.session.cell}; baseline: {job.baseline.name}")
+    if job.warning is not None:
+        say(f"warning: {job.warning}; the run goes on with the baseline that is given")
     announcer.status("moving")
     job.out.mkdir(parents=True, exist_ok=True)
     recording = record_run(job.config, job.out, say, start)
     say(f"recorded {recording.path}")
     announcer.status("identifying", recording=str(recording.path))
     options = Options(**job.session.identification.model_dump())
-    done = identify_recording(recording, job.robot, options)
-    folder = _beside(recording, job.out, "identification")
-    path, _ = write_identification(done, folder)
-    document = done.document
+    done = identify_once(recording, job.robot, options, job.out, announcer.result, say)
+    document, path = done.document, done.path
     for reason in document.reasons:
         say(f"{reason.level}: {reason.message}. Next: {reason.next_step}")
     for warning in document.warnings:
         say(f"warning: {warning}")
     say(f"identified: relative torque error {document.relative_error_pct:.2f} %")
     if document.verdict == "unusable" or not document.converged:
-        keep(job.history, recording, document, path, None, None)
         defect = document.reasons[0].message if document.reasons else document.stop_reason
         return _unexpected(
             job, recording, document, path, f"the identification is not usable ({defect})", announcer, say
@@ -242,10 +245,21 @@ def carry_out(job: Job, announcer: StatusPublisher, say: Say, start: Start = sta
     try:
         drift = None if job.baseline.document is None else compare(job.baseline.document, document, job.false_alarms)
     except Inconclusive as error:
-        keep(job.history, recording, document, path, None, None)
         return _unexpected(job, recording, document, path, str(error), announcer, say)
-    keep(job.history, recording, document, path, job.baseline.document, drift)
-    announcer.result(to_json(document))
+    with kept(HistoryEntry(job.store, recording, document, path, job.baseline.document, drift), say):
+        return _concluded(job, recording, document, path, drift, announcer, say)
+
+
+def _concluded(
+    job: Job,
+    recording: Recording,
+    document: IdentificationDocument,
+    path: Path,
+    drift: ParameterChangeTest | None,
+    announcer: StatusPublisher,
+    say: Say,
+) -> Outcome:
+    """Return the outcome of a comparison, after the diagnosis if the arm has changed, and publish it."""
     if drift is not None and drift.residuals.reason:
         say(f"warning: {drift.residuals.reason}")
     if drift is None:
@@ -278,42 +292,17 @@ def _unexpected(
     # The diagnosis decides what the comparison left open.
     defect = defect.removesuffix(": whether the arm has changed is unknown")
     unknown = DataError(f"{recording.path}: {defect}: whether the arm has changed is unknown (result: {path})")
-    if job.baseline.document is None:
-        raise unknown
-    say(f"{defect}; diagnosing")
-    announcer.status("diagnosing", words=defect)
-    outcome = _diagnosed(job, recording, Outcome(document, path, None, (defect,), unusable=True), say)
-    if outcome.diagnosis is None or not outcome.findings:
-        raise unknown
-    announcer.diagnosis(outcome.diagnosis.read_text(encoding="utf-8"))
-    announcer.status("done", drifted=True, words=list(outcome.words), findings=list(outcome.findings))
-    return outcome
-
-
-def keep(
-    history: History,
-    recording: Recording,
-    document: IdentificationDocument,
-    path: Path,
-    baseline: IdentificationDocument | None,
-    drift: ParameterChangeTest | None,
-) -> None:
-    """Add a run, the metadata of its recording and its comparison to the history.
-
-    Parameters
-    ----------
-    history
-        Database.
-    recording, document, path
-        Recording, its identification, and the file of that.
-    baseline, drift
-        Baseline and result of the comparison, if there was one.
-    """
-    facts = History.facts(recording)
-    history.describe(facts)
-    history.add(document, History.began(facts, document, path))
-    if drift is not None and baseline is not None:
-        history.judge(document, baseline, drift)
+    with kept(HistoryEntry(job.store, recording, document, path), say):
+        if job.baseline.document is None:
+            raise unknown
+        say(f"{defect}; diagnosing")
+        announcer.status("diagnosing", words=defect)
+        outcome = _diagnosed(job, recording, Outcome(document, path, None, (defect,), unusable=True), say)
+        if outcome.diagnosis is None or not outcome.findings:
+            raise unknown
+        announcer.diagnosis(outcome.diagnosis.read_text(encoding="utf-8"))
+        announcer.status("done", drifted=True, words=list(outcome.words), findings=list(outcome.findings))
+        return outcome
 
 
 def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Outcome:
@@ -324,6 +313,8 @@ def _diagnosed(job: Job, recording: Recording, outcome: Outcome, say: Say) -> Ou
     numbers = folder / "baseline.json"
     numbers.write_text(to_json(job.baseline.document), encoding="utf-8")
     command = ["diagnose", str(recording.path), "--config", str(job.session.robot), "--baseline", str(numbers)]
+    for option, value in (("--material", job.material), ("--time-limit", job.time_limit_s)):
+        command += [] if value is None else [option, f"{value:g}"]
     try:
         done = subprocess.run(
             [sys.executable, "-m", "armident.daq.cli", *command, "--out", str(folder), "--json"],

@@ -23,7 +23,8 @@ def session(commands: bool) -> SessionConfig:
 def test_commands_arrive_in_order_with_their_texts() -> None:
     cell = session(True)
     with open_session(cell, "capture") as own:
-        commands = Commands(own, Keys(cell.cell, "tx40"), True)
+        commands = Commands(Keys(cell.cell, "tx40"), True)
+        commands.declare(own)
         for command in (Command("mark", "gripper changed"), Command("save"), Command("stop")):
             send_command(cell, "tx40", command)
         assert commands.pending() == [Command("mark", "gripper changed"), Command("save"), Command("stop")]
@@ -36,7 +37,8 @@ def test_commands_arrive_in_order_with_their_texts() -> None:
 def test_the_number_of_waiting_commands_is_limited() -> None:
     cell = session(True)
     with open_session(cell, "capture") as own:
-        commands = Commands(own, Keys(cell.cell, "tx40"), True)
+        commands = Commands(Keys(cell.cell, "tx40"), True)
+        commands.declare(own)
         with open_session(cell, "observer") as flooding:
             querier = flooding.declare_querier(Keys(cell.cell, "tx40").command("mark"), timeout=5.0)
             until = time.monotonic() + 10
@@ -54,7 +56,8 @@ def test_the_number_of_waiting_commands_is_limited() -> None:
 def test_commands_are_refused_if_the_session_does_not_permit_them() -> None:
     cell = session(False)
     with open_session(cell, "capture") as own:
-        commands = Commands(own, Keys(cell.cell, "tx40"), cell.zenoh.commands)
+        commands = Commands(Keys(cell.cell, "tx40"), cell.zenoh.commands)
+        commands.declare(own)
         with pytest.raises(DataError, match=r"commands are not enabled; set zenoh\.commands"):
             send_command(cell, "tx40", Command("stop"))
         assert commands.pending() == []

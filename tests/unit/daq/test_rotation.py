@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from armident.configs import ConfigError
+from armident.daq.capture.files import capture_stamp, next_time
 from armident.daq.recording import (
     Mark,
     QueuedSeries,
@@ -197,8 +198,33 @@ def test_the_oldest_recordings_are_deleted_until_there_is_enough_space(tmp_path:
     assert prune(tmp_path, "tx40", NOW, None, 500, free) == []
 
 
+def test_a_clock_that_is_ahead_deletes_nothing_younger_than_the_newest_recording_allows(tmp_path: Path) -> None:
+    old = made(tmp_path, "20261001T000000")
+    kept = [made(tmp_path, "20261102T000000"), made(tmp_path, "20261115T000000")]
+    ahead = made(tmp_path, "20990101T000000")
+    with ahead.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert prune(tmp_path, "tx40", NOW.replace(year=2099), 30.0, None) == [old]
+    assert all(path.exists() for path in kept)
+    # The clock is right again: the recording of the future does not count.
+    assert prune(tmp_path, "tx40", NOW, 30.0, None) == []
+
+
+def test_after_a_step_of_the_clock_back_a_recording_is_named_after_the_newest_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert next_time(tmp_path, "tx40", NOW) == NOW
+    newest = made(tmp_path, "20261120T130000")
+    stamp = capture_stamp(next_time(tmp_path, "tx40", NOW))
+    assert stamp == "20261120T130000-001Z"
+    assert newest.name < f"tx40-{stamp}.mcap"
+    assert "it has stepped back" in caplog.text
+    assert next_time(tmp_path, "tx40", NOW.replace(hour=14)) == NOW.replace(hour=14)
+
+
 def test_a_file_that_is_being_written_is_not_deleted(tmp_path: Path) -> None:
     first, second = made(tmp_path, "20261001T000000"), made(tmp_path, "20261002T000000")
+    made(tmp_path, "20261119T000000")
     with first.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         assert prune(tmp_path, "tx40", NOW, 30.0, None) == [second]

@@ -1,6 +1,7 @@
 """Zenoh interface: published captures equal their files, and malformed data is refused with a description."""
 
 import json
+import socket
 import struct
 import time
 import zlib
@@ -27,7 +28,8 @@ from armident.daq.streaming import (
     encode_event,
     open_session,
 )
-from armident.daq.streaming.codec import end_content, start_content
+from armident.daq.streaming.codec import VERSION, end_content, start_content
+from armident.daq.streaming.session import endpoints
 
 ROBOT = load_robot("tx40.yaml")
 JOINTS = tuple(joint.name for joint in ROBOT.joints)
@@ -55,9 +57,10 @@ def blocks(count: int, rows: int = 50) -> list[Block]:
         sync = np.arange(k * rows, (k + 1) * rows, dtype=np.int64)
         position = rng.integers(-(2**31), 2**31, (rows, ROBOT.n)).astype(np.int32)
         current = rng.integers(-(2**15), 2**15, (rows, ROBOT.n)).astype(np.int16)
-        made.append(Block(SAMPLES, 2 * k, sync, sync * 200_000, {"position": position, "current": current}))
+        raw: dict[str, Any] = {"position": position, "current": current}
+        made.append(Block(SAMPLES, 2 * k, sync, sync * 200_000, raw, "c1"))
         fifth = sync[4::5]
-        made.append(Block(DEMAND, 2 * k + 1, fifth, fifth * 200_000, {"demand": position[4::5]}))
+        made.append(Block(DEMAND, 2 * k + 1, fifth, fifth * 200_000, {"demand": position[4::5]}, "c1"))
     return made
 
 
@@ -71,7 +74,7 @@ def events(session: SessionConfig, total: int) -> tuple[dict[str, Any], dict[str
 def test_a_block_is_decoded_to_the_last_bit() -> None:
     for block in blocks(2):
         got = decode_block(encode_block(block))
-        assert (got.layout, got.sequence) == (block.layout, block.sequence)
+        assert (got.capture, got.layout, got.sequence) == ("c1", block.layout, block.sequence)
         assert np.array_equal(got.sync, block.sync)
         assert np.array_equal(got.t_ns, block.t_ns)
         for name, values in block.raw.items():
@@ -100,7 +103,17 @@ def test_a_damaged_block_is_refused(data: st.DataObject) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"rows": -1}, {"rows": 2**40}, {"rows": 49}, {"rows": "x"}, {"layout": {}}, {"layout": None}, {"sequence": None}],
+    [
+        {"rows": -1},
+        {"rows": 2**40},
+        {"rows": 49},
+        {"rows": "x"},
+        {"layout": {}},
+        {"layout": None},
+        {"sequence": None},
+        {"capture": None},
+        {"capture": "../x"},
+    ],
 )
 def test_a_block_with_an_inconsistent_head_is_refused(change: dict[str, Any]) -> None:
     data = encode_block(blocks(1)[0])
@@ -108,7 +121,7 @@ def test_a_block_with_an_inconsistent_head_is_refused(change: dict[str, Any]) ->
     head = json.dumps(json.loads(data[14 : 14 + size]) | change).encode()
     body = head + data[14 + size :]
     with pytest.raises(DataError):
-        decode_block(struct.pack("<4sHII", b"ARMB", 1, len(head), zlib.crc32(body)) + body)
+        decode_block(struct.pack("<4sHII", b"ARMB", VERSION, len(head), zlib.crc32(body)) + body)
 
 
 def test_the_stream_and_the_file_are_the_same_recording(tmp_path: Path) -> None:
@@ -220,3 +233,45 @@ def test_a_second_capture_of_a_cell_is_refused() -> None:
 @pytest.mark.parametrize("name", ["peer", "client", "router", "tls"])
 def test_the_shipped_zenoh_configurations_are_valid(name: str) -> None:
     zenoh.Config.from_file(str(config_path(f"zenoh/{name}.json5")))
+
+
+def test_a_taken_port_does_not_stop_a_capture_and_is_taken_when_it_is_free(caplog: pytest.LogCaptureFixture) -> None:
+    session = cell("port_taken")
+    host, port = endpoints(session)["capture"].removeprefix("tcp/").split(":")
+    with socket.socket() as stranger:
+        stranger.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        stranger.bind((host, int(port)))
+        stranger.listen()
+        publisher = Publisher(session, Keys(session.cell, "tx40"))
+        try:
+
+            def health() -> tuple[bool, bool]:
+                return publisher.is_open, publisher.problem is None
+
+            assert health() == (False, False)
+            assert "recording continues" in caplog.text
+            for block in blocks(400):
+                publisher.offer(block)
+            assert publisher.depth <= session.zenoh.queue_blocks
+            assert publisher.dropped == 800 - session.zenoh.queue_blocks
+            stranger.close()
+            until = time.monotonic() + 15.0
+            while health() != (True, True):
+                assert time.monotonic() < until
+                time.sleep(0.05)
+        finally:
+            publisher.close()
+
+
+def test_a_second_capture_of_a_robot_is_refused_unless_it_only_listens() -> None:
+    session = cell("two_captures")
+    keys = Keys(session.cell, "tx40")
+    first = Publisher(session, keys)
+    try:
+        with pytest.raises(ConfigError, match="another capture of cell two_captures, robot tx40, is running"):
+            Publisher(session, keys)
+        second = Publisher(session, keys, exclusive=False)
+        assert not second.is_open
+        second.close()
+    finally:
+        first.close()

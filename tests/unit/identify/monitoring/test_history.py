@@ -1,8 +1,11 @@
 """Results in a database: each once, in the order of their recordings, and what changed since the first."""
 
 import datetime
+import hashlib
 import json
+import multiprocessing
 import os
+import sqlite3
 import sys
 from pathlib import Path
 
@@ -14,6 +17,7 @@ from typer.testing import CliRunner
 from armident.configs import ConfigError
 from armident.daq.cli import application
 from armident.identify.document import IdentificationDocument, to_json
+from armident.identify.monitoring import history_schema
 from armident.identify.monitoring.history import History, recorded_at
 from tests.unit.identify.monitoring.test_change_test import TRUTH, C, identified
 
@@ -24,7 +28,9 @@ START = datetime.datetime(2026, 1, 5, 6, tzinfo=datetime.UTC)
 def result(week: int, theta: np.ndarray, robot: str = "arm") -> IdentificationDocument:
     document = identified(theta, robot=robot)
     name = f"{robot}-{START + week * WEEK:%Y%m%dT%H%M%S}-000Z.mcap"
-    return document.model_copy(update={"recording": document.recording.model_copy(update={"path": f"/data/{name}"})})
+    digest = hashlib.sha256(name.encode()).hexdigest()
+    source = document.recording.model_copy(update={"path": f"/data/{name}", "sha256": digest})
+    return document.model_copy(update={"recording": source})
 
 
 def written(folder: Path, documents: list[IdentificationDocument]) -> list[str]:
@@ -164,3 +170,87 @@ def test_postgresql_is_reached_by_the_driver_of_our_extra(scheme: str, monkeypat
     monkeypatch.setitem(sys.modules, "psycopg", None)
     with pytest.raises(ConfigError, match=r"install it with: pip install 'armident\[postgresql\]'"):
         History(f"{scheme}://me:secret@127.0.0.1:1/x")
+
+
+def test_a_recording_that_is_identified_again_gets_no_second_entry(url: str, tmp_path: Path) -> None:
+    history = History(url)
+    first, again = result(0, TRUTH), result(0, TRUTH + 0.001)
+    assert history.add(first, recorded_at(first, tmp_path))
+    assert not history.add(again, recorded_at(again, tmp_path))
+    assert [run.document for run in history.runs()] == [first]
+
+
+def former(path: Path, documents: list[IdentificationDocument]) -> None:
+    """A database as version 0.1 has left it: its tables, without a version, and a recording may be there twice."""
+    engine = sa.create_engine(f"sqlite:///{path}")
+    history_schema.tables.create_all(engine)
+    with engine.begin() as connection:
+        for k, document in enumerate(documents):
+            row = {
+                "digest": f"{k:064x}", "robot": document.robot, "recorded": START.replace(tzinfo=None) + k * WEEK,
+                "recording": document.recording.path, "sha256": document.recording.sha256, "samples": 1,
+                "sample_rate_hz": 1.0, "method": "idim-piv", "relative_error_pct": 1.0, "converged": True,
+                "document": to_json(document),
+            }  # fmt: skip
+            connection.execute(sa.insert(history_schema.runs).values(row))
+    engine.dispose()
+
+
+def test_a_database_of_the_former_version_is_upgraded_and_loses_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "h.sqlite"
+    first, repeated, second = result(0, TRUTH), result(0, TRUTH + 0.1), result(1, TRUTH)
+    former(path, [first, repeated, second])
+    history = History(f"sqlite:///{path}")
+    assert [run.document for run in history.runs()] == [first, second]
+    assert not history.add(second, START)
+    with sqlite3.connect(path) as db:
+        assert db.execute("SELECT count(*) FROM identifications").fetchone() == (3,)
+        assert db.execute("PRAGMA user_version").fetchone() == (2,)
+    db.close()
+
+
+def _open_and_add(url: str, week: int) -> None:
+    document = result(week, TRUTH)
+    assert History(url).add(document, START + week * WEEK)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("old", [False, True])
+def test_eight_first_openers_at_once_add_eight_runs(tmp_path: Path, old: bool) -> None:
+    path = tmp_path / "h.sqlite"
+    if old:
+        former(path, [])
+    context = multiprocessing.get_context("fork")
+    openers = [context.Process(target=_open_and_add, args=(f"sqlite:///{path}", k)) for k in range(8)]
+    for process in openers:
+        process.start()
+    for process in openers:
+        process.join(60.0)
+    assert [process.exitcode for process in openers] == [0] * 8
+    assert len(History(f"sqlite:///{path}").runs()) == 8
+
+
+def test_a_locked_damaged_or_newer_database_is_one_line_with_exit_code_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(history_schema, "BUSY_S", 0.1)
+    path = tmp_path / "h.sqlite"
+    (document,) = written(tmp_path, [result(0, TRUTH)])
+    db = sqlite3.connect(path)
+    db.execute("BEGIN EXCLUSIVE")
+    code, _, err = call(document, "--database", f"sqlite:///{path}")
+    db.rollback()
+    assert code == 2
+    assert "locked by another process for more than" in err
+    assert call(document, "--database", f"sqlite:///{path}")[0] == 0
+    db.execute("PRAGMA user_version = 99")
+    db.close()
+    assert "written by a newer armident (version 99" in call("--database", f"sqlite:///{path}")[2]
+    content = bytearray(path.read_bytes())
+    content[100:] = b"x" * (len(content) - 100)
+    content[60:64] = b"\0\0\0\0"
+    path.write_bytes(bytes(content))
+    code, _, err = call("--database", f"sqlite:///{path}")
+    assert code == 2
+    assert "damaged" in err
+    assert len(err.strip().splitlines()) == 1

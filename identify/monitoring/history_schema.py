@@ -1,0 +1,229 @@
+"""Tables of the history, their versions, and their upgrade from former versions.
+
+The version is ``PRAGMA user_version`` of a SQLite file, and a row of ``armident_history_version`` in other databases.
+Databases of version 0.1 have the number 0 and all tables of version 1.
+"""
+
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import sqlalchemy as sa
+
+from armident.configs import ConfigError
+
+BUSY_S = 15.0
+"""Longest wait for another process that writes to the database, s."""
+_LOCK = 0x61726D69
+"""Number of the advisory lock of an upgrade in PostgreSQL."""
+
+tables = sa.MetaData()
+runs = sa.Table(
+    "identifications",
+    tables,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("digest", sa.String(64), unique=True, nullable=False),
+    sa.Column("robot", sa.String(128), index=True, nullable=False),
+    sa.Column("recorded", sa.DateTime, index=True, nullable=False),
+    sa.Column("recording", sa.Text),
+    sa.Column("sha256", sa.String(64), nullable=False),
+    sa.Column("samples", sa.Integer, nullable=False),
+    sa.Column("sample_rate_hz", sa.Float, nullable=False),
+    sa.Column("method", sa.String(32), nullable=False),
+    sa.Column("relative_error_pct", sa.Float, nullable=False),
+    sa.Column("converged", sa.Boolean, nullable=False),
+    sa.Column("document", sa.Text, nullable=False),
+)
+"""Identifications of version 1; version 2 adds ``repeated``."""
+parameters = sa.Table(
+    "parameters",
+    tables,
+    sa.Column("identification", sa.ForeignKey(runs.c.id), primary_key=True),
+    sa.Column("name", sa.String(64), primary_key=True),
+    sa.Column("value", sa.Float, nullable=False),
+    sa.Column("std", sa.Float, nullable=False),
+    sa.Column("unit", sa.String(32), nullable=False),
+    sa.Column("essential", sa.Boolean, nullable=False),
+)
+recordings = sa.Table(
+    "recordings",
+    tables,
+    sa.Column("sha256", sa.String(64), primary_key=True),
+    sa.Column("path", sa.Text),
+    sa.Column("cell", sa.String(128), index=True),
+    sa.Column("duration_s", sa.Float, nullable=False),
+    sa.Column("in_gaps", sa.Integer),
+    sa.Column("facts", sa.JSON, nullable=False),
+    sa.Column("counters", sa.JSON, nullable=False),
+)
+comparisons = sa.Table(
+    "comparisons",
+    tables,
+    sa.Column("identification", sa.ForeignKey(runs.c.id), primary_key=True),
+    sa.Column("baseline", sa.String(64), primary_key=True),
+    sa.Column("drifted", sa.Boolean, nullable=False),
+    sa.Column("chi_square", sa.Float, nullable=False),
+    sa.Column("degrees", sa.Integer, nullable=False),
+    sa.Column("p_joint", sa.Float, nullable=False),
+    sa.Column("false_alarms", sa.Float, nullable=False),
+    sa.Column("changed", sa.JSON, nullable=False),
+    sa.Column("words", sa.Text, nullable=False),
+)
+repeated: sa.ColumnClause[int] = sa.column("repeated", sa.Integer)
+"""Column of `runs`: 1 for a further identification of a recording that the history had already."""
+
+
+def _create_tables(connection: sa.Connection) -> None:
+    tables.create_all(connection)
+
+
+def _one_run_per_recording(connection: sa.Connection) -> None:
+    """Mark all but the first run of each recording as repeated, and allow one that is not."""
+    for statement in (
+        "ALTER TABLE identifications ADD COLUMN repeated INTEGER NOT NULL DEFAULT 0",
+        "UPDATE identifications SET repeated = 1 WHERE EXISTS (SELECT 1 FROM identifications AS earlier WHERE "
+        "earlier.robot = identifications.robot AND earlier.sha256 = identifications.sha256 "
+        "AND earlier.id < identifications.id)",
+        "CREATE UNIQUE INDEX one_run_per_recording ON identifications (robot, sha256) WHERE repeated = 0",
+    ):
+        connection.execute(sa.text(statement))
+
+
+MIGRATIONS: tuple[Callable[[sa.Connection], None], ...] = (_create_tables, _one_run_per_recording)
+"""Steps from version k to k + 1."""
+
+
+def engine_for(url: str) -> sa.Engine:
+    """Return the engine of a database, whose transactions on SQLite wait for other processes.
+
+    Parameters
+    ----------
+    url
+        SQLAlchemy URL.
+    """
+    if not url.startswith("sqlite"):
+        return sa.create_engine(url)
+    engine = sa.create_engine(url, connect_args={"timeout": BUSY_S})
+    # The driver begins transactions late, and none for changes of tables: they are begun here.
+    sa.event.listen(engine, "connect", _without_own_transactions)
+    sa.event.listen(engine, "begin", _begin)
+    return engine
+
+
+def _without_own_transactions(connection: sqlite3.Connection, _record: Any) -> None:
+    connection.isolation_level = None
+
+
+def _begin(connection: sa.Connection) -> None:
+    writes = connection.get_execution_options().get("writes", False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+
+@contextmanager
+def writing(engine: sa.Engine) -> Iterator[sa.Connection]:
+    """Yield a connection in a transaction that writes; it is committed at the end of the block.
+
+    Parameters
+    ----------
+    engine
+        Engine of the database.
+    """
+    with engine.connect().execution_options(writes=True) as connection, connection.begin():
+        yield connection
+
+
+def upgrade(engine: sa.Engine) -> None:
+    """Create the tables, or bring those of a former version to the present one.
+
+    Parameters
+    ----------
+    engine
+        Engine of the database. Any number of processes may upgrade it at once.
+
+    Raises
+    ------
+    ConfigError
+        If the database is of a newer version.
+    """
+    with engine.connect() as connection:
+        if _version(connection) == len(MIGRATIONS):
+            return
+    with writing(engine) as connection:
+        if engine.dialect.name == "postgresql":
+            connection.execute(sa.text(f"SELECT pg_advisory_xact_lock({_LOCK})"))
+        version = _version(connection)
+        if version > len(MIGRATIONS):
+            raise ConfigError(f"written by a newer armident (version {version}, this one knows {len(MIGRATIONS)})")
+        for migrate in MIGRATIONS[version:]:
+            migrate(connection)
+        if version < len(MIGRATIONS):
+            _set_version(connection, len(MIGRATIONS))
+
+
+def _version(connection: sa.Connection) -> int:
+    if connection.dialect.name == "sqlite":
+        return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
+    if not sa.inspect(connection).has_table("armident_history_version"):
+        return 0
+    return int(connection.execute(sa.text("SELECT version FROM armident_history_version")).scalar_one())
+
+
+def _set_version(connection: sa.Connection, version: int) -> None:
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql(f"PRAGMA user_version = {version}")
+        return
+    connection.execute(sa.text("CREATE TABLE IF NOT EXISTS armident_history_version (version INTEGER NOT NULL)"))
+    connection.execute(sa.text("DELETE FROM armident_history_version"))
+    connection.execute(sa.text("INSERT INTO armident_history_version VALUES (:version)"), {"version": version})
+
+
+def reason(error: Exception) -> str:
+    """Return one line that says why a database cannot be used, without the words of the library for known causes.
+
+    Parameters
+    ----------
+    error
+        Error of SQLAlchemy or of the file system.
+    """
+    cause = getattr(error, "orig", None) or error
+    text = " ".join(str(cause).split())[:200]
+    if isinstance(cause, sqlite3.DatabaseError):
+        if "locked" in text:
+            return f"locked by another process for more than {BUSY_S:g} s; try again when that has ended"
+        if "malformed" in text or "not a database" in text:
+            return f"damaged ({text}); restore a copy, or begin a new history and add the results to it"
+        if "readonly" in text:
+            return "it may not be written (read-only)"
+        if "unable to open" in text:
+            return "the file cannot be opened; check the folder and its permissions"
+    return text
+
+
+def wait_and_try(action: Callable[[], None], seconds: float, say: Callable[[str], None]) -> bool:
+    """Try an action again while the database refuses it; return False if the time is over.
+
+    Parameters
+    ----------
+    action
+        Writes to the history.
+    seconds
+        Time after which it is not tried again, s.
+    say
+        Takes a line for each reason of a failure.
+    """
+    until, wait, said = time.monotonic() + seconds, 1.0, ""
+    while True:
+        try:
+            action()
+        except ConfigError as error:
+            if str(error) != said:
+                say(f"warning: {error}")
+            said = str(error)
+            if time.monotonic() + wait > until:
+                return False
+            time.sleep(wait)
+            wait = min(2 * wait, 10.0)
+        else:
+            return True

@@ -1,0 +1,108 @@
+"""Entry of a run in the history, which may be locked, full or damaged: the run does not depend on it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from armident.configs import ConfigError
+from armident.daq.recording import Recording
+from armident.identify.document import IdentificationDocument
+from armident.identify.monitoring.change_test import ParameterChangeTest
+from armident.identify.monitoring.history import History
+from armident.identify.monitoring.history_schema import wait_and_try
+from armident.identify.monitoring.reidentify.record_run import Say
+
+RETRY_S = 60.0
+"""Time for which a refused entry is tried again after the results are published, s."""
+
+
+def history_or_reason(store: str, needed: bool) -> tuple[History | None, str | None]:
+    """Return the history, or ``None`` and the reason why it cannot be opened.
+
+    Parameters
+    ----------
+    store
+        SQLAlchemy URL of the history.
+    needed
+        True if the run needs the history: no other baseline is given.
+
+    Raises
+    ------
+    ConfigError
+        If it is needed and cannot be opened.
+    """
+    try:
+        return History(store), None
+    except ConfigError as error:
+        if needed:
+            raise
+        return None, str(error)
+
+
+@dataclass(frozen=True)
+class HistoryEntry:
+    """A run and its comparison, to be entered in the history.
+
+    Parameters
+    ----------
+    store
+        SQLAlchemy URL of the history.
+    recording, document, path
+        Recording, its identification, and the file of that.
+    baseline, drift
+        Baseline and result of the comparison, if there was one.
+    """
+
+    store: str
+    recording: Recording
+    document: IdentificationDocument
+    path: Path
+    baseline: IdentificationDocument | None = None
+    drift: ParameterChangeTest | None = None
+
+    def write(self) -> None:
+        """Write the entry; what the history has already is not written again.
+
+        Raises
+        ------
+        ConfigError
+            If the database cannot be written.
+        """
+        history = History(self.store)
+        facts = History.facts(self.recording)
+        history.describe(facts)
+        history.add(self.document, History.began(facts, self.document, self.path))
+        if self.drift is not None and self.baseline is not None:
+            history.judge(self.document, self.baseline, self.drift)
+
+    def write_or_say(self, say: Say, seconds: float = 0.0) -> bool:
+        """Write the entry; if the database refuses it, say why and return False.
+
+        Parameters
+        ----------
+        say
+            Takes lines of progress.
+        seconds
+            Time for which a refused entry is tried again, s.
+        """
+        return wait_and_try(self.write, seconds, say)
+
+
+@contextmanager
+def kept(entry: HistoryEntry, say: Say) -> Iterator[None]:
+    """Write an entry before the block, and try a refused one again after it, also if it ends with an error.
+
+    Parameters
+    ----------
+    entry
+        The entry.
+    say
+        Takes lines of progress.
+    """
+    written = entry.write_or_say(say)
+    try:
+        yield
+    finally:
+        if not written and not entry.write_or_say(say, RETRY_S):
+            say(f"warning: the history lacks this run; add it with: armident history {entry.path} --database URL")

@@ -1,0 +1,176 @@
+"""Zenoh session of a worker: opened again after a failure, and beside other workers of the cell."""
+
+import json
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from armident.configs import ArmidentError, ConfigError, SessionConfig
+from armident.daq.streaming import Keys, open_session
+from armident.daq.streaming.session import configuration
+
+log = logging.getLogger(__name__)
+
+HISTORY_BLOCKS = 100_000
+"""Number of blocks that a worker requests from the capture's cache when it starts: all of it."""
+
+
+class LinkDown(ArmidentError):
+    """There is no Zenoh session at present; the worker tries again."""
+
+
+class WorkerLink:
+    """Subscriptions, answers and announcements of a worker.
+
+    The first worker of a cell listens on the port of its role. Others listen on a free port, and one of them takes the
+    port of the role when it is free again. Without a session the worker continues with the files.
+
+    Parameters
+    ----------
+    session
+        Configuration of the cell.
+    keys
+        Keys of its robot.
+    on_event, on_block
+        Take an encoded message (``None`` if it is larger than the limit) and its size, bytes.
+    limits
+        Largest event and block that are passed on, bytes.
+    answer
+        Returns the last result, or ``None``.
+
+    Raises
+    ------
+    ConfigError
+        If Zenoh's configuration is wrong.
+    """
+
+    def __init__(
+        self,
+        session: SessionConfig,
+        keys: Keys,
+        on_event: Callable[[bytes | None, int], None],
+        on_block: Callable[[bytes | None, int], None],
+        limits: tuple[int, int],
+        answer: Callable[[], bytes | None],
+    ) -> None:
+        configuration(session, "worker")
+        self._config, self._keys, self._answer = session, keys, answer
+        self._handlers = ((keys.events, on_event, limits[0]), (keys.samples, on_block, limits[1]))
+        self._session: zenoh.Session | None = None
+        self._beside = False
+        self._problem: str | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def is_open(self) -> bool:
+        """True if there is a session."""
+        return self._session is not None
+
+    def check(self) -> None:
+        """Open the session if there is none, and take the port of the role if another worker has left it."""
+        if self._session is not None and not self._beside:
+            return
+        try:
+            self._use(open_session(self._config, "worker"), beside=False)
+        except ConfigError as error:
+            if self._session is not None:
+                return
+            try:
+                self._use(open_session(self._config, "worker", any_port=True), beside=True)
+                log.info("another worker of cell %s runs; both share the recordings", self._config.cell)
+            except (ConfigError, zenoh.ZError):
+                if str(error) != self._problem:
+                    log.warning("%s; recordings are identified from their files, trying again", error)
+                self._problem = str(error)
+
+    def announce(self, key: str, data: bytes) -> None:
+        """Publish a result.
+
+        Parameters
+        ----------
+        key
+            Key expression.
+        data
+            The document.
+
+        Raises
+        ------
+        LinkDown
+            If there is no session, or it fails.
+        """
+        with self._lock:
+            if self._session is None:
+                raise LinkDown("zenoh: no session")
+            try:
+                # Not batched with later messages, so that it leaves at once.
+                self._session.put(key, data, express=True, congestion_control=zenoh.CongestionControl.BLOCK)
+            except zenoh.ZError as error:
+                raise LinkDown("zenoh: the session failed") from error
+
+    def status(self, state: str, **more: Any) -> None:
+        """Publish the state of the worker if there is a session.
+
+        Parameters
+        ----------
+        state
+            Name of the state.
+        more
+            Further entries.
+        """
+        content = json.dumps({"component": "worker", "state": state, **more}).encode()
+        with self._lock:
+            if self._session is None:
+                return
+            try:
+                self._session.put(self._keys.status, content)
+            except zenoh.ZError as error:
+                log.debug("status not published: %s", error)
+
+    def close(self) -> None:
+        """Close the session."""
+        with self._lock:
+            session, self._session = self._session, None
+        if session is not None:
+            session.close()
+
+    def _use(self, session: zenoh.Session, *, beside: bool) -> None:
+        """Replace the session; the new one is subscribed before the old one is closed."""
+        try:
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=HISTORY_BLOCKS)
+            recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+            kept: list[Any] = [
+                zenoh.ext.declare_advanced_subscriber(
+                    session, key, _limited(take, limit), history=history, recovery=recovery, subscriber_detection=True
+                )
+                for key, take, limit in self._handlers
+            ]
+            kept.append(session.declare_queryable(self._keys.identification, self._on_query))
+            kept.append(session.liveliness().declare_token(self._keys.alive("worker")))
+        except BaseException:
+            session.close()
+            raise
+        with self._lock:
+            old, self._session = self._session, session
+            self._declared, self._beside, self._problem = kept, beside, None
+        if old is not None:
+            old.close()
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        with query:
+            last = self._answer()
+            if last is None:
+                query.reply_err(b"no identification yet")
+            else:
+                query.reply(self._keys.identification, last)
+
+
+def _limited(take: Callable[[bytes | None, int], None], limit: int) -> Callable[[zenoh.Sample], None]:
+    def on_sample(sample: zenoh.Sample) -> None:
+        size = len(sample.payload)
+        take(bytes(sample.payload) if size <= limit else None, size)
+
+    return on_sample

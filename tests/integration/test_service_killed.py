@@ -1,0 +1,21 @@
+"""Capture, workers, re-identification and history, killed at random moments: one result each, announced once."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.faults.service import run_rounds
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "rounds",
+    [
+        pytest.param(4, marks=pytest.mark.timeout(300)),
+        pytest.param(200, marks=[pytest.mark.proof, pytest.mark.timeout(3600)]),
+    ],
+)
+def test_every_recording_has_one_result_that_was_announced_once(tmp_path: Path, rounds: int) -> None:
+    folder = tmp_path / f"service_{rounds}"
+    folder.mkdir()
+    assert run_rounds(rounds, 3, folder) == []

@@ -1,0 +1,85 @@
+"""Job of re-identification beside a locked history and a worker that has the recording already."""
+
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from armident.configs import config_path, load_session
+from armident.daq.recording import Recording, read_recording, write_recording
+from armident.identify.identification.api import identify_recording
+from armident.identify.monitoring import history_schema
+from armident.identify.monitoring.history import History
+from armident.identify.monitoring.ledger import FILE, Ledger
+from armident.identify.monitoring.reidentify import keep, run
+from armident.identify.monitoring.reidentify.baseline import Baseline
+from armident.identify.monitoring.reidentify.publish import StatusPublisher
+from armident.identify.monitoring.reidentify.run import Job, carry_out
+from tests.fixtures import arms
+
+pytestmark = pytest.mark.slow
+
+
+class Published:
+    """Takes what a job publishes."""
+
+    def __init__(self) -> None:
+        self.results: list[str] = []
+        self.states: list[str] = []
+
+    def status(self, state: str, **_: Any) -> None:
+        self.states.append(state)
+
+    def result(self, text: str) -> None:
+        self.results.append(text)
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Recording:
+    session = load_session("emps_cell.yaml")
+    path = tmp_path / "emps-20260105T060000-000Z.mcap"
+    write_recording(replace(arms.recording("emps", "emps_excitation", 2), session=session), path)
+    return read_recording(path)
+
+
+def job(folder: Path, baseline: Recording) -> Job:
+    session = load_session("emps_cell.yaml")
+    document = identify_recording(baseline).document
+    store = f"sqlite:///{folder}/h.sqlite"
+    return Job(config_path("emps_cell.yaml"), session, baseline.robot, Baseline(document, "b"), store, folder, 1e-4)
+
+
+@pytest.fixture
+def quickly(monkeypatch: pytest.MonkeyPatch, recorded: Recording) -> None:
+    """Short waits, and the recording in place of a motion."""
+    monkeypatch.setattr(history_schema, "BUSY_S", 0.1)
+    monkeypatch.setattr(keep, "RETRY_S", 0.5)
+    monkeypatch.setattr(run, "record_run", lambda *_: recorded)
+
+
+@pytest.mark.usefixtures("quickly")
+def test_a_locked_history_is_reported_and_the_verdict_is_published(tmp_path: Path, recorded: Recording) -> None:
+    work = job(tmp_path, arms.recording("emps", "emps_excitation", 1))
+    History(work.store)
+    heard, said = Published(), list[str]()
+    db = sqlite3.connect(tmp_path / "h.sqlite")
+    db.execute("BEGIN EXCLUSIVE")
+    outcome = carry_out(work, cast(StatusPublisher, heard), said.append)
+    db.rollback()
+    db.close()
+    assert outcome.drift is not None
+    assert not outcome.changed
+    assert len(heard.results) == 1
+    assert heard.states[-1] == "done"
+    assert any("locked by another process" in line for line in said)
+    assert any("the history lacks this run" in line for line in said)
+    # Again, as after a crash: the result is taken from its file, entered, and not announced again.
+    again = Published()
+    carry_out(work, cast(StatusPublisher, again), said.append)
+    assert again.results == []
+    assert [r.document for r in History(work.store).runs()] == [outcome.document]
+    entry = Ledger(tmp_path / FILE, "x").entry(recorded.sha256)
+    assert entry is not None
+    assert entry.announced
