@@ -129,7 +129,8 @@ class RecursiveEstimator:
     """
 
     _saved = (
-        "matcher", "equations", "noise", "window", "test", "state", "covariance", "information", "motion_instants",
+        "matcher", "equations", "noise", "window_noise", "window", "test", "state", "covariance", "information",
+        "motion_instants",
         "raw", "raw_std", "raw_difference", "speed_error",
     )  # fmt: skip
 
@@ -152,7 +153,9 @@ class RecursiveEstimator:
         )  # fmt: skip
         rate = self.equations.rate_hz
         self._period = 1.0 / rate
+        # Residuals of the recursive estimate, and of the last window, which follows a change at once.
         self.noise = RunningNoise(model.n, rate, self.settings)
+        self.window_noise = RunningNoise(model.n, rate, self.settings)
         self.window = Window(self.reference)
         self.test = FrictionTest(model.n, self.settings)
         self._window_instants = max(1, round(self.settings.window_s * rate))
@@ -171,6 +174,7 @@ class RecursiveEstimator:
         self.equations.instants, self.equations.restarts = 0, 0
         self.equations.lag_sums = np.zeros((2, n))
         self.noise.reset()
+        self.window_noise.reset()
         self.window.reset()
         self.test.reset()
         self.state = np.zeros(b)
@@ -209,7 +213,7 @@ class RecursiveEstimator:
         if not begun:
             self.matcher.start_capture()
         self.equations.restart()
-        self.noise.interrupt()
+        self._interrupt_noise()
 
     def result(self) -> RecursiveResult:
         """Return the state after the last block."""
@@ -242,7 +246,7 @@ class RecursiveEstimator:
             parameters_filtered=theta + self.state,
             parameters_std=np.sqrt(np.diag(self.covariance)),
             parameters_valid=np.where(trusted, theta + self.state, np.nan),
-            noise_std=np.sqrt(self.noise.variance),
+            noise_std=np.sqrt(self._variance),
             lag_s=self.equations.lag_s,
             gaps=self.equations.restarts,
             without_reference=self.matcher.without_reference,
@@ -273,7 +277,17 @@ class RecursiveEstimator:
         restarts = self.equations.restarts
         self.equations.add(sync, values)
         if self.equations.restarts != restarts:
-            self.noise.interrupt()
+            self._interrupt_noise()
+
+    def _interrupt_noise(self) -> None:
+        self.noise.interrupt()
+        self.window_noise.interrupt()
+
+    @property
+    def _variance(self) -> Array:
+        """Variance (n,) of the equations: the smaller one of both residuals, as the other may contain a change."""
+        variance, later = self.noise.variance, self.window_noise.variance
+        return np.where(self.window_noise.ready & (later < variance), later, variance)
 
     def _on_instant(self, instant: Instant) -> None:
         """Gate, predict, update; the noise first."""
@@ -282,8 +296,10 @@ class RecursiveEstimator:
         residual = instant.y - _rows_times(instant.x, reference.theta)
         innovation = residual - _rows_times(instant.x, self.state)
         ready = self.noise.ready
-        variance = self.noise.variance
+        variance = self._variance
         self.noise.add(innovation, moving)
+        if self.test.windows:
+            self.window_noise.add(residual - _rows_times(instant.x, self.raw_difference), moving)
         use = moving & ready & (variance > 0.0) & self._instruments(instant, moving)
         if not use.any():
             return
