@@ -135,6 +135,20 @@ def seconds_to_alarm(joint: str, motion: str, seed: int, factor: float = 1.1, pe
     return None
 
 
+def cost(period: float = 2e-4) -> float:
+    """CPU time of the estimator over the time of the stream, compiled, in blocks of 10 ms."""
+    recording = play("tx40_1", 31, {}, 8, period)
+    estimator = RecursiveEstimator(load_robot("tx40"), reference(period=period), 1.0 / period)
+    blocks = list(blocks_of(recording, round(0.01 / period)))
+    for block in blocks:
+        estimator.handle(block)
+    estimator.reset()
+    began = time.process_time()
+    for block in blocks:
+        estimator.handle(block)
+    return (time.process_time() - began) / (recording.samples.sync.size * period)
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -142,7 +156,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--period", type=float, default=PERIOD_S, help="SYNC period with --changes, s")
     parser.add_argument("--changes", action="store_true", help="time to see 10 % more friction, all joints and motions")
+    parser.add_argument("--cost", action="store_true", help="CPU time of a replay at 5 kHz against real time")
     asked = parser.parse_args()
+    if asked.cost:
+        print(f"{100 * cost():.1f} % of a core")
+        return
     if asked.changes:
         for motion in MOTIONS:
             for joint in load_robot("tx40").joints:

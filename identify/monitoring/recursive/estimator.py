@@ -15,6 +15,7 @@ from armident.identify.monitoring.recursive.noise import RunningNoise
 from armident.identify.monitoring.recursive.reference import reference_from
 from armident.identify.monitoring.recursive.rows import RowMatcher, SampleBlock
 from armident.identify.monitoring.recursive.saved_state import read_state, restore_state, state_of, write_state
+from armident.identify.monitoring.recursive.self_check import check_update
 from armident.identify.monitoring.recursive.settings import RecursiveSettings
 from armident.identify.monitoring.recursive.windows import Window, friction_change
 
@@ -143,6 +144,7 @@ class RecursiveEstimator:
         with_reference: bool = True,
         settings: RecursiveSettings | None = None,
     ) -> None:
+        check_update()
         self.settings = settings or RecursiveSettings()
         self.reference = reference_from(reference, robot, self.settings)
         model = self.reference.model
