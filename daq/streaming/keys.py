@@ -53,10 +53,15 @@ class Keys:
         """The last diagnosis document (published, and answered to queries)."""
         return f"{self.base}/result/diagnosis"
 
+    @property
+    def recursive(self) -> str:
+        """Friction and parameters tracked on the live stream, every second (JSON, published and answered)."""
+        return f"{self.base}/result/recursive"
+
     def command(self, name: str) -> str:
         """Key of a command to the capture (``save``, ``mark``, ``stop``), which is answered like a query."""
         return f"{self.base}/command/{name}"
 
     def alive(self, component: str) -> str:
-        """Key of the liveliness token of a component (``capture``, ``worker``)."""
+        """Key of the liveliness token of a component (``capture``, ``worker``, ``watch``)."""
         return f"{self.base}/alive/{component}"

@@ -85,6 +85,8 @@ class VelocityFilter:
         If ``dt`` or a ratio is not positive, or ``order`` neither 2 nor 3.
     """
 
+    _saved = ("_x", "_p", "_squares", "_measured")
+
     def __init__(self, n: int, dt: float, nvr: ArrayLike, order: int = 3) -> None:
         ratios = np.asarray(nvr, dtype=np.float64)
         if order not in (2, 3):

@@ -1,0 +1,370 @@
+"""``armident watch``: the recursive estimator on the stream of a cell, or on recordings."""
+
+import json
+import logging
+import math
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Self
+
+import zenoh
+import zenoh.ext
+from rich.console import Console
+from rich.live import Live
+
+from armident.configs import ConfigError, DataError, RobotConfig, SessionConfig, load_robot, load_session
+from armident.daq.recording import read_recording
+from armident.daq.streaming import Keys, decode_block, open_session
+from armident.identify.document import IdentificationDocument, load_document
+from armident.identify.monitoring.recursive.estimator import RecursiveEstimator, RecursiveResult
+from armident.identify.monitoring.recursive.replay import blocks_of, has_reference
+from armident.identify.monitoring.recursive.report import document, friction_table, joint_states
+from armident.identify.monitoring.recursive.rows import SampleBlock
+
+log = logging.getLogger(__name__)
+
+FOUND = 4
+"""Exit code after an alarm."""
+SHOWN_S = 1.0
+"""Time of the stream between two results, s."""
+SAVED_S = 60.0
+"""Time between two saved states, s."""
+REPLAY_SYNCS = 1000
+"""SYNCs per block of a replay."""
+HISTORY_BLOCKS = 2000
+"""Blocks that a watch requests from the capture's cache when it starts."""
+WAITING_BLOCKS = 4000
+"""Blocks that wait while the estimator is busy; further ones are dropped and counted."""
+
+
+@dataclass(frozen=True)
+class WatchOptions:
+    """Options of ``armident watch``.
+
+    Parameters
+    ----------
+    reference
+        Identification of the healthy arm.
+    state
+        File of the saved state; ``None``: none is kept.
+    as_json
+        One JSON document per line in place of the table.
+    duration
+        Time after which a live watch ends, s; ``None``: at a signal.
+    """
+
+    reference: Path
+    state: Path | None
+    as_json: bool
+    duration: float | None = None
+
+
+class Screen:
+    """Shows results: JSON lines, a table that is renewed on a terminal, or one line per change of state.
+
+    Parameters
+    ----------
+    robot
+        Configuration of the arm.
+    as_json
+        Print JSON lines.
+    """
+
+    def __init__(self, robot: RobotConfig, as_json: bool) -> None:
+        self._robot, self._as_json = robot, as_json
+        self._states: list[str] = []
+        self._console = Console()
+        self._live = Live(console=self._console, auto_refresh=False) if self._console.is_terminal else None
+
+    def __enter__(self) -> Self:
+        """Begin the renewed table."""
+        if self._live is not None and not self._as_json:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the renewed table."""
+        if self._live is not None and not self._as_json:
+            self._live.stop()
+
+    def show(self, result: RecursiveResult) -> None:
+        """Show a result."""
+        if self._as_json:
+            print(json.dumps(document(result, self._robot)), flush=True)
+            return
+        if self._live is not None:
+            self._live.update(friction_table(result, self._robot), refresh=True)
+            return
+        states = joint_states(result)
+        for joint, before, now in zip(self._robot.joints, self._states or [""] * len(states), states, strict=True):
+            if before and now != before:
+                print(f"{result.motion_s:.0f} s of motion: {joint.name}: {now}", flush=True)
+        self._states = states
+
+    def end(self, result: RecursiveResult) -> None:
+        """Show the last result."""
+        if not self._as_json and self._live is None:
+            self._console.print(friction_table(result, self._robot))
+
+
+class Watch:
+    """Hands blocks to the estimator, and results to a listener every `SHOWN_S` of the stream.
+
+    Parameters
+    ----------
+    estimator
+        The estimator.
+    rate_hz
+        Rate of SYNC, 1/s.
+    show
+        Takes each result.
+    """
+
+    def __init__(self, estimator: RecursiveEstimator, rate_hz: float, show: Callable[[RecursiveResult], None]) -> None:
+        self._estimator, self._show = estimator, show
+        self._every = max(1, round(SHOWN_S * rate_hz))
+        self._shown = -1
+
+    def handle(self, block: SampleBlock) -> None:
+        """Process a block; show a result where a further second of the stream is complete."""
+        self._estimator.handle(block)
+        second = self._estimator.matcher.last_sync // self._every
+        if second != self._shown:
+            self._shown = second
+            self._show(self._estimator.result())
+
+
+def watch_recordings(paths: Sequence[Path], config: Path | None, options: WatchOptions) -> int:
+    """Carry out ``armident watch RECORDING``.
+
+    Parameters
+    ----------
+    paths
+        Recordings of one robot in the order of time.
+    config
+        Robot configuration; ``None``: that of the first recording.
+    options
+        Options.
+
+    Returns
+    -------
+    int
+        4 after an alarm, 3 if no joint had enough excitation, otherwise 0.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If a file is wrong, or the reference does not fit.
+    """
+    reference = load_document(options.reference, IdentificationDocument)
+    first = read_recording(paths[0])
+    robot = first.robot if config is None else load_robot(config)
+    estimator = RecursiveEstimator(robot, reference, first.sample_rate_hz, with_reference=has_reference(first))
+    _load_state(estimator, options.state)
+    if not has_reference(first):
+        log.warning("no reference positions: recursive least squares, which encoder noise may bias")
+    with Screen(robot, options.as_json) as screen:
+        watch = Watch(estimator, first.sample_rate_hz, screen.show)
+        for k, path in enumerate(paths):
+            recording = first if k == 0 else read_recording(path)
+            if abs(recording.sample_rate_hz / first.sample_rate_hz - 1.0) > 1e-6:
+                raise DataError(
+                    f"{path}: {recording.sample_rate_hz:g} samples/s, {paths[0]} has {first.sample_rate_hz:g}: "
+                    "watch them one by one"
+                )
+            estimator.start_capture()
+            for block in blocks_of(recording, REPLAY_SYNCS):
+                watch.handle(block)
+        result = estimator.result()
+        screen.show(result)
+    screen.end(result)
+    if options.state is not None:
+        estimator.save(options.state)
+    if result.alarm.any():
+        return FOUND
+    if not (result.information >= result.needed_information).any():
+        raise DataError(
+            f"too little motion for any joint in {result.motion_s:.1f} s: watch a longer or faster motion "
+            "(excitation in the table; armident check RECORDING)"
+        )
+    return 0
+
+
+def _load_state(estimator: RecursiveEstimator, path: Path | None) -> None:
+    if path is not None and path.exists():
+        estimator.load(path)
+        log.info("continues from %s", path)
+
+
+class LiveWatch:
+    """Subscribes to the stream of a cell and publishes the results of the estimator.
+
+    Parameters
+    ----------
+    session
+        Configuration of the cell.
+    robot
+        Configuration of its robot.
+    estimator
+        The estimator.
+    """
+
+    def __init__(self, session: SessionConfig, robot: RobotConfig, estimator: RecursiveEstimator) -> None:
+        self._robot = robot
+        self._keys = Keys(session.cell, robot.name)
+        self._waiting: queue.Queue[bytes] = queue.Queue(WAITING_BLOCKS)
+        self._last: bytes | None = None
+        self.dropped = self.refused = 0
+        self.estimator = estimator
+        self._rate = 1.0 / session.sync_period
+        self._session = open_session(session, "observer")
+
+    def __enter__(self) -> Self:
+        """Subscribe, answer queries, and declare the liveliness token."""
+        # Blocks that were missed are fetched again from the cache of the capture; repeated ones are skipped.
+        self._subscriber = zenoh.ext.declare_advanced_subscriber(
+            self._session,
+            self._keys.samples,
+            self._on_block,
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=HISTORY_BLOCKS),
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+            subscriber_detection=True,
+        )
+        self._queryable = self._session.declare_queryable(self._keys.recursive, self._on_query)
+        self._token = self._session.liveliness().declare_token(self._keys.alive("watch"))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the session."""
+        self._token.undeclare()
+        self._session.close()
+
+    def run(
+        self, stop: threading.Event, show: Callable[[RecursiveResult], None], save: Callable[[], None],
+        duration: float | None = None,
+    ) -> None:  # fmt: skip
+        """Process blocks until a stop.
+
+        Parameters
+        ----------
+        stop
+            Set to end.
+        show
+            Takes each result.
+        save
+            Called every `SAVED_S`.
+        duration
+            Time after which to end, s; ``None``: only at the stop.
+        """
+
+        def publish(result: RecursiveResult) -> None:
+            self._last = json.dumps(document(result, self._robot)).encode()
+            self._session.put(self._keys.recursive, self._last)
+            show(result)
+
+        watch = Watch(self.estimator, self._rate, publish)
+        began = saved = time.monotonic()
+        while not stop.is_set() and (duration is None or time.monotonic() - began < duration):
+            try:
+                watch.handle(decode_block(self._waiting.get(timeout=0.2)))
+            except queue.Empty:
+                pass
+            except DataError as error:
+                self._refuse(error)
+            if time.monotonic() - saved > SAVED_S:
+                saved = time.monotonic()
+                save()
+
+    def _on_block(self, sample: zenoh.Sample) -> None:
+        try:
+            self._waiting.put_nowait(bytes(sample.payload))
+        except queue.Full:
+            self.dropped += 1
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        if self._last is None:
+            query.reply_err(b"no result yet")
+        else:
+            query.reply(self._keys.recursive, self._last)
+
+    def _refuse(self, error: DataError) -> None:
+        """Report an invalid block: the first one, the tenth, the hundredth, and so on."""
+        self.refused += 1
+        if math.log10(self.refused).is_integer():
+            log.warning("%s (%d times)", error, self.refused)
+
+
+def live_estimator(session: SessionConfig, robot: RobotConfig, reference: IdentificationDocument) -> RecursiveEstimator:
+    """Return the estimator for the streams of a cell.
+
+    Parameters
+    ----------
+    session
+        Configuration of the cell.
+    robot
+        Configuration of its robot.
+    reference
+        Identification of the healthy arm.
+    """
+    with_reference = any("demand" in stream.objects for stream in session.streams.values())
+    return RecursiveEstimator(robot, reference, 1.0 / session.sync_period, with_reference=with_reference)
+
+
+def watch_cell(config: Path | None, options: WatchOptions) -> int:
+    """Carry out ``armident watch --config SESSION`` until SIGTERM or SIGINT.
+
+    Parameters
+    ----------
+    config
+        Session configuration.
+    options
+        Options.
+
+    Returns
+    -------
+    int
+        4 after an alarm, otherwise 0.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If a file is wrong, or the reference does not fit.
+    """
+    if config is None:
+        raise ConfigError("give a RECORDING, or --config SESSION for the live stream of a cell")
+    session = load_session(config)
+    robot = load_robot(session.robot)
+    estimator = live_estimator(session, robot, load_document(options.reference, IdentificationDocument))
+    _load_state(estimator, options.state)
+    stopped = threading.Event()
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        stopped.set()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, stop)
+
+    def save() -> None:
+        if options.state is not None:
+            estimator.save(options.state)
+
+    with LiveWatch(session, robot, estimator) as live, Screen(robot, options.as_json) as screen:
+        print("watch: ready", file=sys.stderr, flush=True)
+        live.run(stopped, screen.show, save, options.duration)
+    save()
+    result = estimator.result()
+    screen.end(result)
+    if live.dropped:
+        log.warning("%d blocks were dropped: this machine is too busy for the stream", live.dropped)
+    return FOUND if result.alarm.any() else 0

@@ -1,0 +1,174 @@
+"""Healthy life of the virtual TX40 on the recursive estimator, and the time to see 10 % more friction.
+
+``python -m tests.statistics.recursive_life --hours 50`` plays the shipped trajectories in random order, one after
+the other, with fresh noise. The friction of all joints follows a slow temperature: a sine of `SWING` with a period of
+`CYCLE_H`.
+"""
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from armident.configs import Trajectory, load_robot, load_trajectory
+from armident.configs.schema.scenario import HiddenEffect, Scenario
+from armident.daq.recording import Recording
+from armident.identify.document import IdentificationDocument
+from armident.identify.identification.api import identify_recording
+from armident.identify.monitoring.recursive.estimator import RecursiveEstimator
+from armident.identify.monitoring.recursive.replay import blocks_of
+from armident.virtual_robot.offline import simulate_recording
+
+PERIOD_S = 1e-3
+"""SYNC period of the recordings, s; the drives themselves run at 5 kHz."""
+SWING = 0.02
+"""Relative amplitude of the friction by temperature."""
+CYCLE_H = 6.0
+"""Period of the temperature, h."""
+MOTIONS = ("tx40_excitation", "tx40_1", "tx40_2", "tx40_3", "tx40_4")
+BLOCK = 50
+
+
+@dataclass(frozen=True)
+class Life:
+    """Outcome of a healthy life."""
+
+    hours: float
+    motion_h: float
+    windows: int
+    alarms: list[str]
+    largest_evidence: float
+    threshold: float
+    largest_change: float
+    cpu_share: float
+
+
+def friction(factors: dict[str, float]) -> Scenario | None:
+    """Scenario with the friction of some joints scaled."""
+    effects = tuple(
+        HiddenEffect(effect="friction_scale", joint=joint, parameters={"factor": factor})
+        for joint, factor in factors.items()
+    )
+    return Scenario(schema="armident/scenario/1", effects=effects) if effects else None
+
+
+def repeated(name: str, times: int) -> Trajectory:
+    """A shipped trajectory, several times in a row."""
+    once = load_trajectory(f"trajectories/{name}.yaml")
+    return once.model_copy(update={"moves": once.moves * times})
+
+
+def play(name: str, seed: int, factors: dict[str, float], times: int = 4, period: float = PERIOD_S) -> Recording:
+    """Simulate one piece of life."""
+    return simulate_recording(load_robot("tx40"), repeated(name, times), seed, 1.0, friction(factors), period)
+
+
+@cache
+def reference(seed: int = 100, period: float = PERIOD_S) -> IdentificationDocument:
+    """Identification of the healthy arm on its exciting trajectory."""
+    return identify_recording(play("tx40_excitation", seed, {}, 2, period), load_robot("tx40")).document
+
+
+def healthy_pieces(hours: float, seed: int) -> Iterator[Recording]:
+    """Yield recordings of healthy motion until they have a length."""
+    random = np.random.default_rng(seed)
+    joints = [joint.name for joint in load_robot("tx40").joints]
+    elapsed = 0.0
+    while elapsed < 3600.0 * hours:
+        factor = 1.0 + SWING * math.sin(2 * math.pi * elapsed / 3600.0 / CYCLE_H)
+        name, number = MOTIONS[random.integers(len(MOTIONS))], int(random.integers(1 << 31))
+        piece = play(name, number, dict.fromkeys(joints, factor))
+        elapsed += piece.samples.sync.size / piece.sample_rate_hz
+        yield piece
+
+
+def healthy_life(hours: float, seed: int = 1, *, progress: bool = False) -> Life:
+    """Let a healthy arm live on the estimator."""
+    robot = load_robot("tx40")
+    estimator = RecursiveEstimator(robot, reference(), 1.0 / PERIOD_S)
+    elapsed, cpu, evidence, change, shown = 0.0, 0.0, 0.0, 0.0, 0.0
+    for piece in healthy_pieces(hours, seed):
+        estimator.start_capture()
+        began = time.process_time()
+        for block in blocks_of(piece, BLOCK):
+            estimator.handle(block)
+        cpu += time.process_time() - began
+        elapsed += piece.samples.sync.size / piece.sample_rate_hz
+        result = estimator.result()
+        evidence = max(evidence, float(result.evidence.max()))
+        change = max(change, float(np.nanmax(np.abs(result.filtered))))
+        if progress and elapsed - shown > 600:
+            shown = elapsed
+            print(f"{elapsed / 3600:.2f} h, evidence {evidence:.2f}, alarms {result.alarm.sum()}", flush=True)
+    result = estimator.result()
+    alarms = [joint.name for joint, alarm in zip(robot.joints, result.alarm, strict=True) if alarm]
+    return Life(
+        elapsed / 3600, result.motion_s / 3600, estimator.test.windows, alarms, evidence, result.threshold, change,
+        cpu / elapsed,
+    )  # fmt: skip
+
+
+def seconds_to_alarm(joint: str, motion: str, seed: int, factor: float = 1.1, period: float = PERIOD_S) -> float | None:
+    """Time from the change of a joint's friction to its alarm, s; ``None``: no alarm, or one of another joint."""
+    robot = load_robot("tx40")
+    estimator = RecursiveEstimator(robot, reference(period=period), 1.0 / period)
+    syncs = round(BLOCK * PERIOD_S / period)
+    for block in blocks_of(play(motion, 1000 * seed, {}, period=period), syncs):
+        estimator.handle(block)
+    elapsed, k = 0.0, 1
+    while elapsed < 90.0:
+        estimator.start_capture()
+        for block in blocks_of(play(motion, 1000 * seed + k, {joint: factor}, period=period), syncs):
+            estimator.handle(block)
+            if block.layout.name == "samples":
+                elapsed += len(block.sync) * period
+            alarm = estimator.test.alarm >= 0
+            if alarm.any():
+                names = [j.name for j, a in zip(robot.joints, alarm, strict=True) if a]
+                return elapsed if names == [joint] else None
+        k += 1
+    return None
+
+
+def cost(period: float = 2e-4) -> float:
+    """CPU time of the estimator over the time of the stream, compiled, in blocks of 10 ms."""
+    recording = play("tx40_1", 31, {}, 8, period)
+    estimator = RecursiveEstimator(load_robot("tx40"), reference(period=period), 1.0 / period)
+    blocks = list(blocks_of(recording, round(0.01 / period)))
+    for block in blocks:
+        estimator.handle(block)
+    estimator.reset()
+    began = time.process_time()
+    for block in blocks:
+        estimator.handle(block)
+    return (time.process_time() - began) / (recording.samples.sync.size * period)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--hours", type=float, default=50.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--period", type=float, default=PERIOD_S, help="SYNC period with --changes, s")
+    parser.add_argument("--changes", action="store_true", help="time to see 10 % more friction, all joints and motions")
+    parser.add_argument("--cost", action="store_true", help="CPU time of a replay at 5 kHz against real time")
+    asked = parser.parse_args()
+    if asked.cost:
+        print(f"{100 * cost():.1f} % of a core")
+        return
+    if asked.changes:
+        for motion in MOTIONS:
+            for joint in load_robot("tx40").joints:
+                seconds = seconds_to_alarm(joint.name, motion, asked.seed, period=asked.period)
+                print(motion, joint.name, seconds, flush=True)
+        return
+    print(json.dumps(vars(healthy_life(asked.hours, asked.seed, progress=True)), indent=1))
+
+
+if __name__ == "__main__":
+    main()
