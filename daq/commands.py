@@ -62,7 +62,9 @@ def command(
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, rosbag2, bus log, or recording.")],
+    file: Annotated[
+        Path, typer.Argument(help="CSV, MAT, NPZ, Parquet, ROS 2 bag (file or folder), bus log, or recording.")
+    ],
     out: Annotated[Path, typer.Option("--out", help="The recording to write.")],
     config: Annotated[
         str | None,
@@ -90,12 +92,22 @@ def import_(
             "--polled", help="Timestamps jitter because samples were polled: resample to an even clock at --rate."
         ),
     ] = False,
+    topic: Annotated[
+        str | None, typer.Option("--topic", help="Topic of joint states, if a bag has several with the robot's joints.")
+    ] = None,
+    joints: Annotated[
+        str, typer.Option("--joints", help="Joint names in a bag, in the robot's order: NAME,NAME,...")
+    ] = "",
+    by_position: Annotated[
+        bool, typer.Option("--by-position", help="Take joints of other names in the order of the bag.")
+    ] = False,
 ) -> None:
     """Convert measurements of other tools to a recording.
 
     CSV columns: t (s), q1..qn, tau1..taun or current1..currentn, optionally the reference qr1..qrn; SI units. MAT, NPZ
-    and Parquet: the same names, or positions, torques, times. ROS 2 bags (.mcap): sensor_msgs/msg/JointState. Logs of
-    a bus (candump -l, .asc, .blf, .trc): SYNC and TPDOs, as the session configuration maps them.
+    and Parquet: the same names, or positions, torques, times. ROS 2 bags (.mcap, .db3, or the folder):
+    sensor_msgs/msg/JointState, joints by their names. Logs of a bus (candump -l, .asc, .blf, .trc): SYNC and TPDOs, as
+    the session configuration maps them.
 
     A recording of armident (.mcap) is resampled to --rate, with an anti-alias filter.
 
@@ -110,7 +122,7 @@ def import_(
     if config is None and not own:
         raise ConfigError(f"{file}: --config is missing, the robot configuration")
     if file.suffix.lower() in SUFFIXES:
-        if effort is not None or motor_side or rate is not None or names or polled:
+        if effort is not None or motor_side or rate is not None or names or polled or topic or joints or by_position:
             raise ConfigError(f"{file}: a bus log takes no option but --config and --out")
         session = load_session(str(config))
         logged = recording_from_log(file, session, load_robot(session.robot))
@@ -131,10 +143,13 @@ def import_(
         rate_hz=rate,
         names={key: value for key, _, value in pairs},
         polled=polled,
+        topic=topic,
+        joints=[name.strip() for name in joints.split(",")] if joints else None,
+        by_position=by_position,
     )
     write_recording(recording, out)
-    rows, fields = recording.samples.sync.size, _fields(recording)
-    print(f"{out}: {rows} samples at {recording.sample_rate_hz:g} Hz, {fields}")
+    rows, gaps, fields = recording.samples.sync.size, recording.counters.get("samples.in_gaps", 0), _fields(recording)
+    print(f"{out}: {rows} samples at {recording.sample_rate_hz:g} Hz, {f'{gaps} in gaps, ' if gaps else ''}{fields}")
 
 
 def _fields(recording: "Recording") -> str:

@@ -1,6 +1,7 @@
-"""Import of measured motion from CSV, MAT, NPZ, Parquet and rosbag2."""
+"""Import of measured motion from CSV, MAT, NPZ, Parquet and bags of ROS 2."""
 
 import hashlib
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +12,10 @@ from numpy.typing import NDArray
 
 from armident.configs import ConfigError, DataError, RobotConfig
 from armident.configs.yaml_loader import is_file
+from armident.daq.interchange.bag_files import bag_files, is_bag
 from armident.daq.interchange.rate_conversion import at_rate
 from armident.daq.interchange.resample import onto_even_clock
+from armident.daq.interchange.sample_clock import HOLE, gaps_and_counters, sample_numbers
 from armident.daq.interchange.sandbox import error_line, read_in_subprocess
 from armident.daq.recording import Field, Recording, Stream, is_recording, read_recording
 from armident.daq.recording.model import Quantity, Side
@@ -56,11 +59,17 @@ class Source:
         Arrays by name, (N,) or (N, n).
     first_line
         Line number of the first row in a text file; ``None`` for other formats.
+    remarks
+        Sentences on what was assumed, passed over or is missing, for the user.
+    t_ns
+        Stamps of the samples, ns, (N,); ``None`` if the rows have none, or a column of times.
     """
 
     path: Path
     table: Table
     first_line: int | None = None
+    remarks: tuple[str, ...] = ()
+    t_ns: NDArray[np.int64] | None = None
 
     def place(self, row: int, name: str) -> str:
         """Return the position of a value in the file, for messages.
@@ -85,13 +94,17 @@ def import_recording(
     rate_hz: float | None = None,
     names: Mapping[str, str] | None = None,
     polled: bool = False,
+    topic: str | None = None,
+    joints: Sequence[str] | None = None,
+    by_position: bool = False,
 ) -> Recording:
     """Return measured motion and effort as a recording, after checks of content and units.
 
     Parameters
     ----------
     path
-        CSV with a header line, MAT (up to version 7), NPZ, Parquet, or joint states in an MCAP of ROS 2; SI units.
+        CSV with a header line, MAT (up to version 7), NPZ, Parquet, or joint states in a bag of ROS 2 (MCAP, SQLite,
+        or a folder); SI units.
         A recording of armident is resampled to ``rate_hz`` (`armident.daq.interchange.rate_conversion`).
     robot
         The robot that was measured; ``None`` for a recording: the one inside it.
@@ -108,6 +121,9 @@ def import_recording(
     polled
         The rows were polled from a controller of ``rate_hz``, so that some samples are repeated and some missed: they
         are resampled onto its clock (`armident.daq.interchange.resample`).
+    topic, joints, by_position
+        Of a bag: the topic of joint states, the names of the robot's joints in it, and True to take joints of other
+        names in their order (`armident.daq.interchange.rosbag`).
 
     Raises
     ------
@@ -118,7 +134,7 @@ def import_recording(
         or a demand that no joint followed.
     """
     if is_recording(path):
-        if effort is not None or motor_side or names or polled:
+        if effort is not None or motor_side or names or polled or topic or joints or by_position:
             raise ConfigError(f"{path}: a recording of armident takes no option but --rate, --config and --out")
         return _resampled(path, robot, rate_hz)
     if robot is None:
@@ -129,8 +145,15 @@ def import_recording(
         raise ConfigError(f"--map: no quantity named {unknown[0]!r}; expected one of {', '.join(NAMES)}")
     if polled and rate_hz is None:
         raise ConfigError("--polled: needs --rate, the sampling rate of the controller")
-    source = _pair(path, effort, robot) if effort is not None else _load(path, robot)
-    rate = rate_hz if rate_hz is not None else _rate(source, names)
+    if is_bag(path) and effort is None:
+        source = _bag(path, robot, topic, joints, by_position)
+    elif topic is not None or joints is not None or by_position:
+        raise ConfigError(f"{path}: --topic, --joints and --by-position are options of ROS 2 bags")
+    else:
+        source = _pair(path, effort, robot) if effort is not None else _load(path)
+    for remark in source.remarks:
+        logging.getLogger(__name__).warning("%s: %s", path, remark)
+    numbers, rate = _clock(source, names, rate_hz, polled)
     side: Side = "motor" if motor_side else "joint"
     fields: dict[str, Field] = {}
     raw: dict[str, NDArray[Any]] = {}
@@ -151,9 +174,11 @@ def import_recording(
     _check_units(path, robot, fields, raw, known)
     if polled and known != slice(0, len(raw["position"])):
         raise DataError(f"{source.place(0, 'demand')}: --polled needs a demand in every row, or --map demand={OMITTED}")
-    facts = {"source": path.name, "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    facts = {"source": path.name, "source_sha256": _digest(path)}
     if effort is not None:
-        facts |= {"effort": effort.name, "effort_sha256": hashlib.sha256(effort.read_bytes()).hexdigest()}
+        facts |= {"effort": effort.name, "effort_sha256": _digest(effort)}
+    if source.remarks:
+        facts |= {"source_remarks": "; ".join(source.remarks)}
     if polled:
         try:
             even = onto_even_clock(raw)
@@ -162,19 +187,15 @@ def import_recording(
         raw = dict(even.values)
         facts |= {"polled.repeated": str(even.repeated), "polled.interpolated": str(even.interpolated)}
     count = len(raw["position"])
-    sync = np.arange(count, dtype=np.int64)
+    sync = np.arange(count, dtype=np.int64) if numbers is None else numbers
     t_ns = np.round(sync * (1e9 / rate)).astype(np.int64)
     streams: dict[str, Stream] = {}
     if known != slice(0, count) and not polled:
         demand, field = raw.pop("demand")[known], fields.pop("demand")
         streams["demand"] = Stream("demand", 1, sync[known], t_ns[known], {"demand": field}, {"demand": demand})
     streams["samples"] = Stream("samples", 1, sync, t_ns, fields, raw)
-    counters = {
-        f"{name}.{what}": number
-        for name, stream in streams.items()
-        for what, number in (("expected", stream.sync.size), ("rows", stream.sync.size), ("in_gaps", 0))
-    }
-    return Recording(None, robot, None, rate, streams, counters=counters, metadata=facts)
+    gaps, counters = gaps_and_counters(streams)
+    return Recording(None, robot, None, rate, streams, gaps=gaps, counters=counters, metadata=facts)
 
 
 def _resampled(path: Path, robot: RobotConfig | None, rate_hz: float | None) -> Recording:
@@ -199,7 +220,7 @@ def _rows_with_demand(demand: NDArray[np.float64]) -> slice:
     return slice(int(rows[0]), int(rows[-1]) + 1) if rows.size else slice(0, len(demand))
 
 
-def _load(path: Path, robot: RobotConfig) -> Source:
+def _load(path: Path) -> Source:
     if not is_file(path):
         raise ConfigError(f"{path}: no such file")
     kind = path.suffix.lower()
@@ -219,14 +240,28 @@ def _load(path: Path, robot: RobotConfig) -> Source:
         return Source(path, _numeric(_mat(path)))
     if kind == ".parquet":
         return Source(path, _numeric(_parquet(path)))
-    if kind == ".mcap":
-        from armident.daq.interchange.rosbag import read_joint_states
-
-        return Source(path, read_joint_states(path, robot))
     raise ConfigError(
         f"{path}: cannot import {kind or 'a file without suffix'}; expected .csv, .mat, .npz, .parquet, "
-        "an .mcap of ROS 2, or the log of a bus (.log, .asc, .blf, .trc)"
+        "a bag of ROS 2 (.mcap, .db3, or its folder), or the log of a bus (.log, .asc, .blf, .trc)"
     )
+
+
+def _bag(path: Path, robot: RobotConfig, topic: str | None, joints: Sequence[str] | None, by_position: bool) -> Source:
+    """Return the joint states of a bag of ROS 2."""
+    from armident.daq.interchange.rosbag import read_joint_states
+
+    states = read_joint_states(path, robot, topic=topic, joints=joints, by_position=by_position)
+    return Source(path, {"q": states.q, "tau": states.tau}, remarks=states.remarks, t_ns=states.t_ns)
+
+
+def _digest(path: Path) -> str:
+    """Return the SHA-256 of a file, or of the files of a bag folder in their order."""
+    digest = hashlib.sha256()
+    for file in bag_files(path)[0] if path.is_dir() else [path]:
+        with file.open("rb") as opened:
+            while block := opened.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
 
 
 def _parquet(path: Path) -> dict[str, Any]:
@@ -374,6 +409,23 @@ def _check_finite(source: Source, values: NDArray[np.float64], labels: Sequence[
         row, column = rows.start + int(bad[0, 0]), int(bad[0, 1])
         more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
         raise DataError(f"{source.place(row, labels[column])}: {values[row, column]} is not a number{more}")
+
+
+def _clock(
+    source: Source, names: Mapping[str, str], rate_hz: float | None, polled: bool
+) -> tuple[NDArray[np.int64] | None, float]:
+    """Return the sample numbers, ``None`` if all rows follow each other, and the sampling rate, 1/s."""
+    if source.t_ns is None:
+        return None, rate_hz if rate_hz is not None else _rate(source, names)
+    if polled and rate_hz is not None:
+        longest = float(np.diff(source.t_ns).max(initial=0)) / 1e9
+        if longest * rate_hz > HOLE:
+            raise DataError(f"{source.path}: no sample for {longest:.6g} s: --polled does not fill holes")
+        return None, rate_hz
+    try:
+        return sample_numbers(source.t_ns, rate_hz)
+    except DataError as error:
+        raise DataError(f"{source.path}: {error}") from error
 
 
 def _rate(source: Source, names: Mapping[str, str]) -> float:
