@@ -185,6 +185,8 @@ def geometry_from_urdf(given: UrdfGeometry, where: Path) -> dict[str, Any]:
             if quantity not in limits:
                 raise ConfigError(f"{where}: joints: {joint.name}: limits.{quantity}: not in {file.name}, say it here")
         settings = more.model_dump(include={"drive", "rotor_inertia"}, exclude_none=True)
+        if joint.name != name:
+            settings["source_name"] = joint.name
         plain.append({"name": name, "type": MOVING[joint.type], "mdh": mdh.model_dump(), "limits": limits} | settings)
     gravity = chain.base[:3, :3].T @ np.array(given.gravity)
     return {"joints": plain, "gravity": [float(g) for g in np.where(np.abs(gravity) < 1e-14, 0.0, gravity)]}

@@ -94,6 +94,8 @@ class Joint(FrozenModel):
     ----------
     name, type
         Name, and ``revolute`` or ``prismatic``.
+    source_name
+        Name of the joint in its URDF and in messages of ROS 2; ``None``: the same as ``name``.
     mdh
         Modified Denavit-Hartenberg parameters.
     limits
@@ -106,6 +108,7 @@ class Joint(FrozenModel):
 
     name: Name
     type: Literal["revolute", "prismatic"] = "revolute"
+    source_name: Annotated[str, Field(min_length=1)] | None = None
     mdh: Mdh
     limits: Limits
     drive: Drive = Drive()
@@ -266,6 +269,9 @@ class RobotConfig(FrozenModel):
         names = [j.name for j in self.joints]
         if len(set(names)) != n:
             raise ValueError("joints: names must be unique")
+        sources = [j.source_name for j in self.joints if j.source_name is not None]
+        if len(set(sources)) != len(sources):
+            raise ValueError("joints: source names must be unique")
         if len(self.transmission) != n or any(len(row) != n for row in self.transmission):
             raise ValueError(f"transmission: expected {n} rows of {n} numbers (motor rows, joint columns)")
         if abs(np.linalg.det(np.array(self.transmission))) < 1e-12:
