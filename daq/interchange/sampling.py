@@ -10,7 +10,7 @@ from armident.daq.interchange.even_times import onto_even_times, usual_rate
 from armident.daq.interchange.resample import onto_even_clock
 from armident.daq.interchange.table_files import Source
 from armident.daq.interchange.table_rows import Rows
-from armident.daq.interchange.time_stamps import clock_of, in_seconds, repeated_share
+from armident.daq.interchange.time_stamps import EQUAL, clock_of, in_seconds, repeated_share
 from armident.daq.recording.model import Quantity
 
 _POLLED_SHARE = 0.01
@@ -150,6 +150,11 @@ def _from_polled(rows: Rows, times: Floats | None, rate_hz: float, polled: bool,
 
 def _from_jitter(rows: Rows, times: Floats, rate_hz: float, notes: list[str]) -> Sampled:
     first = np.append(True, np.diff(times) > 0)
+    if float(np.mean(~first)) > EQUAL:
+        raise DataError(
+            f"{int((~first).sum())} of {times.size} rows have the time of the row before: they have too few digits "
+            f"to resample by them; --rate {times.size / max(float(np.ptp(times)), 1e-9):.2g} if the samples are even"
+        )
     if not first.all():
         notes.append(f"{int((~first).sum())} rows have the time of the row before: left out")
         rows, times = rows.taken(first), times[first]

@@ -119,7 +119,22 @@ def complete_rows(
         "t" if time is None else time[0],
         tuple(dict.fromkeys(notes)),
     )
-    return _single(_complete(source, _joined(rows)))
+    return _single(_without_odd_times(source, _complete(source, _joined(rows))))
+
+
+def _without_odd_times(source: Source, rows: Rows) -> Rows:
+    """Return the rows without those whose time is out of order while their neighbours are in order."""
+    if rows.times is None or rows.times.size < 4:
+        return rows
+    t = rows.times
+    odd = np.zeros(t.size, np.bool_)
+    odd[1:-1] = (t[:-2] < t[2:]) & ((t[1:-1] < t[:-2]) | (t[1:-1] > t[2:]))
+    count = int(odd.sum())
+    if not count or count > max(1, _MOST_BAD_SHARE * t.size) or np.any(np.diff(t[~odd]) < 0):
+        return rows
+    where = source.place(int(rows.row[np.flatnonzero(odd)[0]]), rows.time_name)
+    note = f"rows whose time is out of order left out: {count}, the first: {where}"
+    return replace(rows.taken(~odd), notes=(*rows.notes, note))
 
 
 def _single(rows: Rows) -> Rows:

@@ -28,6 +28,8 @@ _JITTER = 3.0
 """Longest step of even samples whose times jitter, periods; longer ones are holes of an unknown length."""
 _REPEATED = 0.01
 """Share of rows that repeat the row before above which samples were polled."""
+EQUAL = 0.01
+"""Share of equal times above which times have too few digits to tell the instants of the samples."""
 _WINDOWS = 200
 """Velocities are differences over this part of the recording."""
 
@@ -211,6 +213,11 @@ def _jittering(times: Floats, rate_hz: float | None, repeated: float, how: str) 
         raise JitterError(
             f"the times jitter: {spread}, and {100 * repeated:.1f} % of the rows repeat the row before: the samples "
             "were polled; --resample RATE, with the rate of the controller, puts them on its clock"
+        )
+    if rate_hz is None and float(np.mean(steps == 0)) > EQUAL:
+        raise JitterError(
+            f"the times have too few digits: {spread}; --rate {_nice(mean):g} if the samples are even, "
+            "or write the times with more digits"
         )
     typical = _nice(1.0 / float(np.median(steps)) if np.median(steps) > 0 else mean)
     if rate_hz is None:

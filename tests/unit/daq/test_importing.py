@@ -59,7 +59,7 @@ def broken(what: str, path: Path) -> Path:
     if what == "nan":
         values[10:18:2, 3] = np.nan
     elif what == "back":
-        values[20, 0] = values[18, 0]
+        values[20:, 0] -= 0.01
     elif what == "uneven":
         values[20:, 0] += np.linspace(0, 0.01, 30)
     elif what == "missing":

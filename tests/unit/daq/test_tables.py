@@ -196,6 +196,27 @@ def test_missing_rows_are_gaps(tmp_path: Path, rate: float | None) -> None:
     assert found.counters["samples.in_gaps"] == len(missing)
 
 
+@pytest.mark.parametrize("odd", [0.1, -5.0, 1e12])
+def test_a_single_time_out_of_order_is_a_gap(tmp_path: Path, odd: float) -> None:
+    values = motion()
+    values[200, 0] = odd
+    found = import_recording(written(tmp_path / "a.csv", values), TX40)
+    assert [(gap.first, gap.last) for gap in found.gaps] == [(200, 200)]
+    assert "left out: 1, the first:" in found.metadata["import_notes"]
+    assert "line 202, column t" in found.metadata["import_notes"]
+
+
+def test_times_with_too_few_digits_need_a_rate(tmp_path: Path) -> None:
+    values = motion()
+    values[:, 0] = np.round(values[:, 0], 2)
+    path = written(tmp_path / "a.csv", values)
+    with pytest.raises(DataError, match=r"too few digits: .*; --rate 1000 if the samples are even"):
+        import_recording(path, TX40)
+    with pytest.raises(DataError, match=r"359 of 400 rows have the time of the row before: .* too few digits"):
+        import_recording(path, TX40, resample_hz=1000.0)
+    assert same(import_recording(path, TX40, rate_hz=1000.0), motion())
+
+
 def test_rows_that_are_there_twice_are_taken_once(tmp_path: Path) -> None:
     values = motion()
     found = import_recording(written(tmp_path / "a.csv", values[np.sort(np.append(np.arange(400), [7, 90]))]), TX40)
